@@ -76,7 +76,7 @@ class Attack:
         return "other JSON", json.dumps(self._random.choice([None, 1, "x", [], {}, {"kind": 1}]))
 
     def _command(self) -> dict[str, Any]:
-        more = {"file": "../../etc/passwd", "percent": 10**6, "index": -1, "to": 2**70, "name": ""}
+        more = {"file": "../../etc/passwd", "percent": 10**6, "pose": "\0", "to": 2**70, "name": ""}
         extra = {k: v for k, v in more.items() if self._random.random() < 0.3}
         return {"kind": "command", "id": 1, "command": self._random.choice(COMMANDS), **extra}
 

@@ -111,7 +111,7 @@ class RenameCommand(_Command):
     """A taught pose gets another name."""
 
     command: Literal["rename"]
-    index: Index
+    pose: Text
     name: Text
 
 
@@ -119,15 +119,15 @@ class MoveCommand(_Command):
     """A taught pose gets another place in the order."""
 
     command: Literal["move"]
-    index: Index
+    pose: Text
     to: Index
 
 
-class IndexCommand(_Command):
+class ForgetCommand(_Command):
     """A taught pose goes."""
 
     command: Literal["forget"]
-    index: Index
+    pose: Text
 
 
 class Held(_Said):
@@ -168,7 +168,7 @@ Message = (
     | PickCommand
     | RenameCommand
     | MoveCommand
-    | IndexCommand
+    | ForgetCommand
 )
 _Commands = Annotated[Message, Field(discriminator="command")]
 _ANY: TypeAdapter[Message | Held | LetGo] = TypeAdapter(

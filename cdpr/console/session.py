@@ -16,8 +16,8 @@ import numpy as np
 from cdpr.console.commands import (
     CompareCommand,
     FileCommand,
+    ForgetCommand,
     Held,
-    IndexCommand,
     LetGo,
     Message,
     MoveCommand,
@@ -267,11 +267,11 @@ class Console:
             case PickCommand():
                 self.poses.teach(message.name, self._picked(message))
             case RenameCommand():
-                self.poses.rename(message.index, message.name)
+                self.poses.rename(message.pose, message.name)
             case MoveCommand():
-                self.poses.move(message.index, message.to)
-            case IndexCommand():
-                self.poses.forget(message.index)
+                self.poses.move(message.pose, message.to)
+            case ForgetCommand():
+                self.poses.forget(message.pose)
             case _:
                 return self._plain(message.command)
         return ""

@@ -83,39 +83,40 @@ class TaughtPoses:
         document = PoseDocument.of(pose)
         self._keep([*self._poses, _named(document, name)])
 
-    def rename(self, index: int, name: str) -> None:
+    def rename(self, pose: str, name: str) -> None:
         """Gives a pose another name.
 
         Raises:
             BadInput: There is no such pose, or the name is taken or none.
         """
-        self._require(index)
-        if name != self._poses[index].name:
+        index = self._index(pose)
+        if name != pose:
             self._require_free(name)
         changed = list(self._poses)
         changed[index] = _named(changed[index], name)
         self._keep(changed)
 
-    def move(self, index: int, to: int) -> None:
-        """Puts a pose at another place of the order.
+    def move(self, pose: str, to: int) -> None:
+        """Puts a pose at another place of the order, from 0.
 
         Raises:
-            BadInput: There is no such place.
+            BadInput: There is no such pose or place.
         """
-        self._require(index)
-        self._require(to)
+        index = self._index(pose)
+        if not 0 <= to < len(self._poses):
+            raise _refusal(f"the order has no place {to + 1}", "look at the list again")
         changed = list(self._poses)
         changed.insert(to, changed.pop(index))
         self._keep(changed)
 
-    def forget(self, index: int) -> None:
+    def forget(self, pose: str) -> None:
         """Removes a pose.
 
         Raises:
             BadInput: There is no such pose.
         """
-        self._require(index)
-        self._keep([pose for k, pose in enumerate(self._poses) if k != index])
+        index = self._index(pose)
+        self._keep([*self._poses[:index], *self._poses[index + 1 :]])
 
     def scene(self, around: Scene, name: str) -> SceneDocument:
         """From the first to the last through all others, among what is around.
@@ -157,9 +158,12 @@ class TaughtPoses:
         write_atomic(self._path, document.model_dump_json(indent=1) + "\n")
         self._poses = poses
 
-    def _require(self, index: int) -> None:
-        if not 0 <= index < len(self._poses):
-            raise _refusal(f"there is no pose {index + 1}", "look at the list again")
+    def _index(self, name: str) -> int:
+        """A pose goes by its name: what the operator saw, wherever it is in the order by now."""
+        for index, pose in enumerate(self._poses):
+            if pose.name == name:
+                return index
+        raise _refusal(f"there is no pose '{name}' any more", "look at the list again")
 
     def _require_free(self, name: str) -> None:
         if any(pose.name == name for pose in self._poses):

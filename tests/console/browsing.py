@@ -97,6 +97,13 @@ class Visit:
         self.page.locator("#take-control").click()
         expect(self.page.locator("#lamp-control")).to_have_text("You have control")
 
+    def taught(self, *names: str) -> None:
+        """The current pose is stored under each name."""
+        for name in names:
+            self.page.locator("#teach-name").fill(name)
+            self.page.locator("#teach").click()
+            expect(self.page.locator("#poses li").last.locator("input")).to_have_value(name)
+
     def load(self, name: str = "plans/circle.json") -> None:
         self.view("operate")
         self.page.locator(f"input[name=plan-file][value='{name}']").check(force=True)

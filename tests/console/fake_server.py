@@ -408,7 +408,7 @@ class Fake:
         return active, "" if active else "nothing moves"
 
     def _obey(self, message: dict[str, Any]) -> tuple[bool, str]:
-        command, index = message["command"], message.get("index", 0)
+        command, pose = message["command"], message.get("pose")
         if command == "give_control":
             self.in_control, self.service = None, False
         elif command in ("service_begin", "service_end"):
@@ -445,14 +445,14 @@ class Fake:
             ]
         elif command == "rename":
             self.poses = [
-                {**p, "name": message["name"]} if k == index else p
-                for k, p in enumerate(self.poses)
+                {**p, "name": message["name"]} if p["name"] == pose else p for p in self.poses
             ]
         elif command == "forget":
-            self.poses = [p for k, p in enumerate(self.poses) if k != index]
+            self.poses = [p for p in self.poses if p["name"] != pose]
         elif command == "move":
-            rest = [p for k, p in enumerate(self.poses) if k != index]
-            self.poses = [*rest[: message["to"]], self.poses[index], *rest[message["to"] :]]
+            rest = [p for p in self.poses if p["name"] != pose]
+            moved = [p for p in self.poses if p["name"] == pose]
+            self.poses = [*rest[: message["to"]], *moved, *rest[message["to"] :]]
         else:
             return False, f"no such command: {command}"
         return True, f"{command.replace('_', ' ')}: done"

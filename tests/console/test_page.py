@@ -280,10 +280,7 @@ def test_looking_through_a_plan_is_marked_and_ends_when_something_moves(desk: Vi
 def test_poses_are_taught_named_ordered_forgotten_and_planned(desk: Visit) -> None:
     desk.take_control()
     desk.view("teach")
-    for name in ("one", "two", "three"):
-        desk.page.locator("#teach-name").fill(name)
-        desk.page.locator("#teach").click()
-        expect(desk.page.locator("#poses li").last.locator("input")).to_have_value(name)
+    desk.taught("one", "two", "three")
     desk.page.get_by_role("button", name="Move three up").click()
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["one", "three", "two"])
     desk.page.get_by_role("button", name="Forget one").click()
@@ -295,6 +292,21 @@ def test_poses_are_taught_named_ordered_forgotten_and_planned(desk: Visit) -> No
     desk.page.locator("#plan-poses").click()
     found = desk.fake.wait(desk.page, lambda f: f["plan"] is not None)["received"][-1]
     assert (found["scene"], found["objective"]) == (None, "clearance")
+
+
+def test_a_name_being_typed_outlives_what_happens_to_the_other_poses(desk: Visit) -> None:
+    desk.take_control()
+    desk.view("teach")
+    desk.taught("one", "two", "three")
+    two = desk.page.get_by_role("textbox", name="Name of pose 2")
+    two.press("End")
+    two.press("x")
+    poses = [p for p in desk.fake.ask()["poses"] if p["name"] != "one"]
+    desk.fake.ask(poses=poses[::-1])
+    expect(desk.page.locator("#poses li").first.locator("input")).to_have_value("three")
+    desk.page.keyboard.press("y")
+    desk.page.keyboard.press("Enter")
+    desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["three", "twoxy"])
 
 
 # What it shows.

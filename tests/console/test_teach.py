@@ -34,30 +34,30 @@ def test_list_and_file_agree_with_a_plain_list(
     path = tmp_path_factory.mktemp("taught") / "console" / "poses.json"
     taught, names = TaughtPoses(path), list[str]()
     for number, (what, index, other) in enumerate(steps):
-        name = f"pose {other}"
+        name, new = f"pose {index}", f"pose {other}"
         expected = list(names)
-        ok = index < len(names)
+        ok = name in names
         if what == "teach":
-            ok = name not in names
+            ok = not ok
             expected.append(name)
-        elif what == "rename":
-            ok = ok and (names[index] == name or name not in names)
-            expected[index : index + 1] = [name]
-        elif what == "move":
-            ok = ok and other < len(names)
-            if ok:
-                expected.insert(other, expected.pop(index))
-        else:
-            expected[index : index + 1] = []
+        elif ok and what == "rename":
+            ok = new == name or new not in names
+            expected[names.index(name)] = new
+        elif ok and what == "move":
+            ok = other < len(names)
+            expected.remove(name)
+            expected.insert(other, name)
+        elif ok:
+            expected.remove(name)
         try:
             if what == "teach":
                 taught.teach(name, pose(number))
             elif what == "rename":
-                taught.rename(index, name)
+                taught.rename(name, new)
             elif what == "move":
-                taught.move(index, other)
+                taught.move(name, other)
             else:
-                taught.forget(index)
+                taught.forget(name)
         except BadInput:
             assert not ok
         else:

@@ -203,7 +203,7 @@ def taught_and_run(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
         ended = me.until(lambda state: state["busy"] is None)["outcome"]
         assert ended["ok"], ended["text"]
         assert [pose["name"] for pose in me.state["poses"]] == ["low", "high", "beside"]
-        assert me.command("move", index=2, to=0)["ok"]
+        assert me.command("move", pose="beside", to=0)["ok"]
 
         planned = me.does("plan")
         assert planned["ok"], planned["text"]

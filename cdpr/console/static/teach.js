@@ -1,6 +1,6 @@
 /* Taught poses: store where the platform is, name, order and remove them, plan a path through them. */
 
-import { at, chosen, freeName, known, make, write } from "./elements.js";
+import { at, chosen, freeName, known, make, mark, write } from "./elements.js";
 
 export class Teach {
   #page;
@@ -27,25 +27,50 @@ export class Teach {
     if (text === this.#shown) return;
     this.#shown = text;
     at("poses-none").hidden = poses.length > 0;
-    // Whatever had the focus has it again, unless a name is being typed.
-    const focused = document.activeElement?.dataset?.key;
-    at("poses").replaceChildren(...poses.map((pose, k) => this.#row(pose, k, poses.length)));
-    if (focused) at("poses").querySelector(`[data-key="${focused}"]`)?.focus();
+    this.#arrange(poses);
   }
 
-  #row({ name, position_mm: position }, index, count) {
+  /** A pose keeps its row for as long as it has its name, with what is being typed there. */
+  #arrange(poses) {
+    const list = at("poses"), focused = document.activeElement;
+    const place = [...list.children].findIndex((row) => row.contains(focused));
+    const rows = new Map([...list.children].map((row) => [row.dataset.pose, row]));
+    for (const [name, row] of rows) if (!poses.some((pose) => pose.name === name)) row.remove();
+    poses.forEach(({ name, position_mm: position }, k) => {
+      const row = rows.get(name) ?? this.#row(name);
+      if (list.children[k] !== row) list.insertBefore(row, list.children[k] ?? null);
+      const part = (key) => row.querySelector(`[data-key="${key}"]`);
+      write(part("number"), String(k + 1));
+      write(part("position"), `${position.map((v) => known(v, 0)).join(", ")} mm`);
+      mark(part("name"), "aria-label", `Name of pose ${k + 1}`);
+      part("up").hidden = k === 0;
+      part("down").hidden = k === poses.length - 1;
+    });
+    // What had the focus has it again; of a row that is gone, the one that took its place.
+    if (focused.isConnected) focused.focus();
+    else if (place >= 0) list.children[place]?.querySelector(`[data-key="${focused.dataset.key}"]`)?.focus();
+  }
+
+  #row(name) {
     const { command } = this.#page;
-    const field = make("input", { type: "text", value: name, maxlength: 60, "data-button": "edit_pose", "data-key": `name ${index}`, "aria-label": `Name of pose ${index + 1}` });
-    field.addEventListener("change", () => field.value.trim() && command("rename", { index, name: field.value.trim() }));
+    const field = make("input", { type: "text", value: name, maxlength: 60, "data-button": "edit_pose", "data-key": "name" });
+    field.addEventListener("change", async () => {
+      const wanted = field.value.trim();
+      if (!wanted || !(await command("rename", { pose: name, name: wanted })).ok) field.value = name;
+    });
     const button = (text, title, key, press) =>
-      make("button", { type: "button", "data-button": "edit_pose", "data-title": title, "data-name": title, "data-key": `${key} ${index}`, "aria-label": title, onclick: press }, text);
-    const move = (to) => () => command("move", { index, to });
-    return make("li", {},
-      make("span", { class: "number" }, String(index + 1)),
-      make("div", { class: "pose" }, field, make("span", { class: "figure quiet" }, `${position.map((v) => known(v, 0)).join(", ")} mm`)),
+      make("button", { type: "button", "data-button": "edit_pose", "data-title": title, "data-name": title, "data-key": key, "aria-label": title, onclick: press }, text);
+    const move = (by) => () => {
+      const to = [...at("poses").children].indexOf(row) + by;
+      command("move", { pose: name, to });
+    };
+    const row = make("li", { "data-pose": name },
+      make("span", { class: "number", "data-key": "number" }),
+      make("div", { class: "pose" }, field, make("span", { class: "figure quiet", "data-key": "position" })),
       make("div", { class: "row" },
-        ...(index > 0 ? [button("↑", `Move ${name} up`, "up", move(index - 1))] : []),
-        ...(index < count - 1 ? [button("↓", `Move ${name} down`, "down", move(index + 1))] : []),
-        button("✕", `Forget ${name}`, "forget", () => command("forget", { index }))));
+        button("↑", `Move ${name} up`, "up", move(-1)),
+        button("↓", `Move ${name} down`, "down", move(1)),
+        button("✕", `Forget ${name}`, "forget", () => command("forget", { pose: name }))));
+    return row;
   }
 }
