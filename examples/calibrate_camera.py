@@ -1,8 +1,8 @@
-"""Calibrates a camera from images of a chessboard and puts the result into a rig in memory.
+"""Calibrates a camera from images of a chessboard and applies the result to a rig in memory.
 
     python examples/calibrate_camera.py [FOLDER]
 
-Without a folder it uses OpenCV's well-known images that the tests of this repository hold.
+Without a folder it uses OpenCV's sample images from the tests of this repository.
 """
 
 import sys
@@ -24,8 +24,8 @@ def main(folder: str = str(ROOT / "tests/calibration/photographs")) -> None:
 
     rig = cdpr.load_rig(ROOT / "configs/gachon_8_6.yaml")
     try:
-        rig = rig.with_calibration(camera)  # in memory; the rig file stays as it is
-    except cdpr.BadInput as error:  # the rig file's camera takes larger images than these
+        rig = rig.with_calibration(camera)  # in memory; the rig file does not change
+    except cdpr.BadInput as error:  # these images are smaller than those of the rig file's camera
         print(error)
 
 

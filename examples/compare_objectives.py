@@ -1,8 +1,8 @@
-"""Plans one scene for four objectives and compares what they give.
+"""Plans one scene for four objectives and compares the results.
 
     python examples/compare_objectives.py
 
-With a fixed number of rounds and a seed the same paths come out on every computer.
+With a fixed number of rounds and a seed the paths are the same on every computer.
 """
 
 from pathlib import Path

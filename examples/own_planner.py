@@ -1,8 +1,8 @@
-"""Uses a planner of your own: its waypoints are proved like a plan of ours, and can be run.
+"""Checks the waypoints of your own planner like any other plan, and saves them for a run.
 
     python examples/own_planner.py
 
-The planner here knows two ways: straight, and around the obstacle over corners read off a drawing.
+This planner has two paths: a straight line, and one around the obstacle through given corners.
 """
 
 from pathlib import Path

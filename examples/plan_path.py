@@ -1,8 +1,8 @@
-"""Plans a path, has it proved, and looks at the robot on the way.
+"""Plans a path, checks it, and prints the state of the robot along it.
 
     python examples/plan_path.py
 
-Leaves `plan.json`, which `cdpr run` takes, and a figure, `plan.png`, in the current folder.
+Writes `plan.json` for `cdpr run` and the figure `plan.png` into the current folder.
 """
 
 from pathlib import Path

@@ -1,9 +1,9 @@
-"""Runs a plan file on the drives of a CAN bus, after asking.
+"""Runs a plan file on the drives of a CAN bus, after a confirmation.
 
     python examples/run_on_can.py rig.yaml plan.json --channel can0
     python examples/run_on_can.py rig.yaml plan.json --simulated     # no bus: rehearse it first
 
-Read docs/safety.md and docs/commissioning.md before the drives have power.
+Read docs/safety.md and docs/commissioning.md before you power the drives.
 """
 
 import argparse
@@ -16,10 +16,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("rig")
     parser.add_argument("plan")
-    parser.add_argument("--interface", default="socketcan", help="as python-can names it")
+    parser.add_argument("--interface", default="socketcan", help="python-can's name")
     parser.add_argument("--channel", default="can0")
-    parser.add_argument("--camera", help="index of the camera; without one nothing is measured")
-    parser.add_argument("--simulated", action="store_true", help="drives of this process")
+    parser.add_argument("--camera", help="index of the camera; default: no measurement")
+    parser.add_argument("--simulated", action="store_true", help="drives in this process")
     options = parser.parse_args(arguments)
 
     def confirm(proposal: object) -> bool:
@@ -43,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
             confirm=confirm,
             on_event=print,
         )
-    except cdpr.CdprError as error:  # refused before anything moved, or no drive answers
+    except cdpr.CdprError as error:  # refused before anything moved, or drives do not answer
         print(error, file=sys.stderr)
         return error.exit_code
     print(run.verdict, "-", run.sentence)

@@ -2,7 +2,7 @@
 
     python examples/run_simulated.py
 
-Drives, platform and cameras are simulated in this process. Leaves the run folder `runs/simulated`.
+Drives, platform and cameras are simulated in this process. Writes the folder `runs/simulated`.
 """
 
 from pathlib import Path

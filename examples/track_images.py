@@ -1,4 +1,4 @@
-"""Measures the platform's pose in images of your own, frame by frame.
+"""Measures the platform's pose in your own images, frame by frame.
 
     python examples/track_images.py [RIG] [SOURCE]
 

@@ -35,7 +35,7 @@ def test_the_steps_of_the_first_page_lead_to_a_run_that_passed(
         assert answer.code == 0, answer
     (run,) = (tmp_path / "runs").iterdir()
     assert (run / "report.html").is_file()
-    refused = commands("See it stop")[-1]
+    refused = commands("Stop it")[-1]
     answer = call(*refused)
     assert answer.code == 3, answer
     assert "not at the start of the plan" in answer.err
@@ -45,7 +45,7 @@ def test_the_steps_of_the_first_page_lead_to_a_run_that_passed(
 def test_every_command_of_the_page_is_one_of_the_program_with_options_it_knows() -> None:
     found = [
         step
-        for heading in ("See it stop", "Drives in another process, in real time")
+        for heading in ("Stop it", "Drives in another process, in real time")
         for step in commands(heading)
     ]
     verbs = {"run", "monitor", "hold", "resume", "speed", "stop", "sim"}
