@@ -3,9 +3,9 @@
     python benchmarks/camera_place.py [--trials 200]
 
 Tags on the floor around a rig are surveyed with random errors and seen by a camera with known
-noise. Told are the errors of points of the work space that the camera then puts elsewhere, beside
-the Cramér-Rao bound of the same sights: no unbiased estimator that knows of the errors of survey
-and corners what is told here can do better.
+noise. The output lists the resulting errors of points in the work space beside the Cramér-Rao bound
+of the same observations: no unbiased estimator that knows the errors of survey and corners has
+smaller ones.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from calibration.extrinsics.result import workspace_corners
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags
-from calibration.tag_map.observations import TagSights
+from calibration.tag_map.observations import TagObservations
 from model.pose import Array, Pose, matrix_from_rotation_vector, skew
 from model.rig import Rig, Tag, load_rig
 from tracking.camera_model import project_undistorted
@@ -87,7 +87,7 @@ def error(
         target = whitening @ pixels.ravel()
         squares[tag.id] = RefinedTag(pixels, whitening, target, np.ones(4, bool))
     found = locate_by_frame_tags(
-        replace(rig, frame_tags=tags), camera, TagSights({"picture": squares}, {}), survey
+        replace(rig, frame_tags=tags), camera, TagObservations({"picture": squares}, {}), survey
     )
     back = found.world_from_camera.apply(there.apply(found.points)) - found.points
     return float(np.mean(np.sum(back**2, axis=1))), found.error

@@ -39,7 +39,7 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 FLIP = np.radians(5.0)
 #: Targets of position [m] and rotation [rad], RMS, from an image height on.
 TARGETS = {720: (0.8e-3, np.radians(0.1)), 1080: (0.3e-3, np.radians(0.03))}
-#: Pictures of a bare wall.
+#: ImageSet of a bare wall.
 WALLS = 15
 
 

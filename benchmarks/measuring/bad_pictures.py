@@ -34,7 +34,7 @@ EXPOSURE = 0.01
 
 @dataclass(frozen=True)
 class Kind:
-    """Pictures of one kind: optics, motion in the picture [px], and whether one face is seen."""
+    """ImageSet of one kind: optics, motion in the picture [px], and whether one face is seen."""
 
     optics: Optics
     smear: float = 0.0

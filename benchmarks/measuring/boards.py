@@ -27,13 +27,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from calibration.targets.boards import Board, Charuco, Chessboard, Seen
+from calibration.targets.boards import Board, Charuco, Chessboard, DetectedBoard
 from calibration.targets.grids import CircleGrid, TagGrid
 from tracking.camera_model import Image
 from tracking.detection.tags import dictionary, upright_corners
 
 ROOT = Path(__file__).parents[2]
-Finder = Callable[[Image], Seen | None]
+Finder = Callable[[Image], DetectedBoard | None]
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
 
 
@@ -69,13 +69,13 @@ def peers_of(board: Board) -> dict[str, Finder]:
 
 
 def _chessboard(board: Chessboard, find: Callable[..., object], refined: bool = True) -> Finder:
-    def finder(image: Image) -> Seen | None:
+    def finder(image: Image) -> DetectedBoard | None:
         good, corners = find(image, (board.columns, board.rows))
         if not good:
             return None
         if refined:
             corners = cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), _STOP)
-        return Seen(board.points(), np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+        return DetectedBoard(board.points(), np.asarray(corners, dtype=np.float64).reshape(-1, 2))
 
     return finder
 
@@ -83,11 +83,11 @@ def _chessboard(board: Chessboard, find: Callable[..., object], refined: bool = 
 def _circles(board: CircleGrid) -> Finder:
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
 
-    def finder(image: Image) -> Seen | None:
+    def finder(image: Image) -> DetectedBoard | None:
         good, centres = cv2.findCirclesGrid(image, (board.columns, board.rows), flags=kind)
         if not good:
             return None
-        return Seen(board.points(), np.asarray(centres, dtype=np.float64).reshape(-1, 2))
+        return DetectedBoard(board.points(), np.asarray(centres, dtype=np.float64).reshape(-1, 2))
 
     return finder
 
@@ -97,12 +97,12 @@ def _charuco(board: Charuco) -> Finder:
     drawn = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, named)
     detector = cv2.aruco.CharucoDetector(drawn)
 
-    def finder(image: Image) -> Seen | None:
+    def finder(image: Image) -> DetectedBoard | None:
         corners, numbers, _, _ = detector.detectBoard(image)
         if np.size(numbers) < 8:
             return None
         points = np.asarray(drawn.getChessboardCorners(), dtype=np.float64)[np.ravel(numbers)]
-        return Seen(points, np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+        return DetectedBoard(points, np.asarray(corners, dtype=np.float64).reshape(-1, 2))
 
     return finder
 
@@ -114,7 +114,7 @@ def _tags(board: TagGrid) -> Finder:
     detector = cv2.aruco.ArucoDetector(dictionary(board.family), parameters)
     numbers_of = range(board.first, board.first + board.columns * board.rows)
 
-    def finder(image: Image) -> Seen | None:
+    def finder(image: Image) -> DetectedBoard | None:
         squares, ids, _ = detector.detectMarkers(image)
         pairs = zip([] if ids is None else np.ravel(ids).tolist(), squares, strict=True)
         found = {
@@ -124,12 +124,12 @@ def _tags(board: TagGrid) -> Finder:
         }
         if len(found) < 2:
             return None
-        return Seen(board.points_of(found), np.concatenate(list(found.values())))
+        return DetectedBoard(board.points_of(found), np.concatenate(list(found.values())))
 
     return finder
 
 
-def held_out(views: Mapping[str, Seen], size: tuple[int, int], flags: int) -> float:
+def held_out(views: Mapping[str, DetectedBoard], size: tuple[int, int], flags: int) -> float:
     """RMS error of pictures that the fit has not seen, [px]; nan where there are too few."""
     names, squares, count = list(views), 0.0, 0
     for which in (0, 1):
@@ -182,7 +182,7 @@ def main() -> int:
     size = next(iter(pictures.values())).shape[::-1]
     print(f"{board} in {len(pictures)} pictures; times are CPU")
     print(f"{'finder':14s}{'found':>6s}{'ms each':>9s}{'found by both':>15s}{'held out, px':>22s}")
-    ours: dict[str, Seen] = {}
+    ours: dict[str, DetectedBoard] = {}
     for name, find in {"ours": board.find, **peers_of(board)}.items():
         start = time.process_time()
         seen = {key: find(image) for key, image in pictures.items()}

@@ -28,10 +28,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from calibration.intrinsics.lens import LENSES, LensFit, LensModel, choose_lens, error_of, fit_lens
-from calibration.targets.boards import Chessboard, Seen
+from calibration.targets.boards import Chessboard, DetectedBoard
 
 ROOT = Path(__file__).parents[2]
-Views = Mapping[str, Seen]
+Views = Mapping[str, DetectedBoard]
 Size = tuple[int, int]
 Fitter = Callable[[Views, Size], LensFit]
 WORSE = 1.02

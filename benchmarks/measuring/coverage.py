@@ -31,8 +31,8 @@ from calibration.extrinsics.result import judge_extrinsics
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags
 from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views
 from calibration.intrinsics.quality import judge_camera
-from calibration.tag_map.observations import TagSights
-from calibration.targets.boards import Seen
+from calibration.tag_map.observations import TagObservations
+from calibration.targets.boards import DetectedBoard
 from model.clearance import ClearanceModel
 from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, Tag, load_rig
@@ -59,7 +59,7 @@ class Kind:
     """Labs that take the same care.
 
     Attributes:
-        views: Pictures of the board.
+        views: ImageSet of the board.
         tilt: Of the board, most, [deg].
         tags: On the floor.
         survey: Of them, one standard deviation, [m].
@@ -125,9 +125,9 @@ def seen_by(camera: Camera, points: Array) -> Array:
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
-def board_views(camera: Camera, kind: Kind, rng: np.random.Generator) -> dict[str, Seen]:
+def board_views(camera: Camera, kind: Kind, rng: np.random.Generator) -> dict[str, DetectedBoard]:
     """The board all over the picture."""
-    views: dict[str, Seen] = {}
+    views: dict[str, DetectedBoard] = {}
     size = np.array([camera.width, camera.height])
     middle = BOARD.mean(axis=0)
     while len(views) < kind.views:
@@ -140,7 +140,7 @@ def board_views(camera: Camera, kind: Kind, rng: np.random.Generator) -> dict[st
         if (pixels < 5).any() or (pixels > size - 5).any():
             continue
         noisy = pixels + CORNER_PX * rng.standard_normal(pixels.shape)
-        views[str(len(views))] = Seen(BOARD, noisy)
+        views[str(len(views))] = DetectedBoard(BOARD, noisy)
     return views
 
 
@@ -248,8 +248,8 @@ class Lab:
             true = moved_tag(tag, kind.survey, turn, rng)
             squares[tag.id] = square_of(self._truth, camera, there.apply(tag_corners(true)), rng)
         rig = replace(self._rig, frame_tags=tags)
-        sights = TagSights({"picture": squares}, {})
-        found = locate_by_frame_tags(rig, camera, sights, Survey(kind.survey, turn))
+        observations = TagObservations({"picture": squares}, {})
+        found = locate_by_frame_tags(rig, camera, observations, Survey(kind.survey, turn))
         off = step_between(found.world_from_camera, self._truth.world_from_camera)
         tally.inside["extrinsics"] += (np.abs(off) <= found.half_widths).tolist()
         back = found.world_from_camera.apply(there.apply(found.points)) - found.points

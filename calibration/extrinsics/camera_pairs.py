@@ -18,20 +18,20 @@ from scipy.spatial.transform import Rotation
 
 from calibration.extrinsics.result import (
     ExtrinsicCalibration,
+    extrinsics_facts,
     extrinsics_page,
     extrinsics_result,
     judge_extrinsics,
-    place_facts,
     widths_of,
     workspace_corners,
 )
 from calibration.intrinsics.calibrate import NOT_FOUND
-from calibration.pictures import USUAL_PICTURES, PicturesFrom, opened_pictures
+from calibration.pictures import DEFAULT_IMAGES, ImageSource, open_image_source
 from calibration.procedures import ExtrinsicsOutcome
 from calibration.results import Calibration, Destination, Issue, data_hash
 from calibration.tag_map.bundle_adjustment import require_tags
-from calibration.tag_map.observations import TagSights, platform_pose, sights_of
-from calibration.targets.boards import Board, Charuco, Seen
+from calibration.tag_map.observations import TagObservations, observe_tags, platform_pose
+from calibration.targets.boards import Board, Charuco, DetectedBoard
 from calibration.targets.grids import TagGrid
 from executor.kernels import ready_to_measure
 from model.cameras import SURE
@@ -65,9 +65,11 @@ class BodyLook:
     error: float
 
 
-def looks_at_tags(rig: Rig, camera: Camera, sights: TagSights) -> dict[str, BodyLook]:
+def looks_at_tags(rig: Rig, camera: Camera, observations: TagObservations) -> dict[str, BodyLook]:
     """The platform in every image in which its tags allow one pose."""
-    bundles = {n: platform_pose(rig, camera, squares) for n, squares in sights.squares.items()}
+    bundles = {
+        n: platform_pose(rig, camera, squares) for n, squares in observations.squares.items()
+    }
     return {
         name: BodyLook(bundle.camera_from_body, bundle.covariance, bundle.reprojection)
         for name, bundle in bundles.items()
@@ -94,7 +96,7 @@ def look_at_board(board: Board, camera: Camera, image: Image) -> BodyLook | None
     return None if seen is None else _board_pose(seen, camera)
 
 
-def _board_pose(seen: Seen, camera: Camera) -> BodyLook | None:
+def _board_pose(seen: DetectedBoard, camera: Camera) -> BodyLook | None:
     ideal = ideal_from_pixels(camera, seen.corners)
     good, turn, place = cv2.solvePnP(seen.points, ideal, camera.matrix, np.zeros(4))
     if not good:
@@ -150,13 +152,13 @@ def locate_by_pairs(
     world_from_camera = reference.world_from_camera.compose(between)
     shared = _by_place(reference, world_from_camera)
     own_widths = widths_of(relative, without)
-    lacks = []
+    issues = []
     if len(pairs) < GOOD_PAIRS:
         what = f"{len(pairs)} pairs of images were used; {GOOD_PAIRS} are required"
-        lacks.append(Issue(what, "take more, all over what both cameras see"))
+        issues.append(Issue(what, "take more, all over what both cameras see"))
     if reference.place_covariance is None:
         what = f"how far off the pose of camera {reference.name!r} is, is not stated"
-        lacks.append(Issue(what, "calibrate its extrinsics, and pass that result's file too"))
+        issues.append(Issue(what, "calibrate its extrinsics, and pass that result's file too"))
     error = float(np.sqrt(np.mean([look.error**2 for look, _ in looks])))
     return ExtrinsicCalibration(
         camera=replace(camera, world_from_camera=world_from_camera),
@@ -168,7 +170,7 @@ def locate_by_pairs(
         tag_errors={} if not rig.platform_tags else {rig.platform_tags[0].id: error},
         pictures=len(pairs),
         unused=unused,
-        lacks=tuple(lacks),
+        issues=tuple(issues),
         data_hash=hash_of_data,
     )
 
@@ -177,8 +179,8 @@ def _by_place(reference: Camera, world_from_camera: Pose) -> Array:
     """Covariance of a pose by the place of the camera that measured it, (6, 6); 0 if unstated."""
     if reference.place_covariance is None:
         return np.zeros((6, 6))
-    by_place = carried(world_from_camera.position - reference.world_from_camera.position)
-    return np.asarray(by_place @ reference.place_covariance @ by_place.T)
+    by_position = carried(world_from_camera.position - reference.world_from_camera.position)
+    return np.asarray(by_position @ reference.place_covariance @ by_position.T)
 
 
 def _fitted(looks: Sequence[tuple[BodyLook, BodyLook]]) -> tuple[Pose, Array, Array]:
@@ -226,7 +228,7 @@ def locate_camera_by_another(
     rig: Rig,
     camera: Camera,
     reference: Camera,
-    sources: tuple[PicturesFrom, PicturesFrom],
+    sources: tuple[ImageSource, ImageSource],
     *,
     board: Board | None = None,
     wanted: float = 1e-3,
@@ -279,23 +281,23 @@ def locate_camera_by_another(
     verdict = judge_extrinsics(found, wanted)
     result = extrinsics_result(found, verdict, rig.document, to.on)
     page = extrinsics_page(found, result, verdict, camera.world_from_camera)
-    facts = place_facts(found, camera.world_from_camera)
+    facts = extrinsics_facts(found, camera.world_from_camera)
     return Calibration(result, page, found, verdict, facts).saved_in(to.folder)
 
 
 def _looks(
-    rig: Rig, camera: Camera, source: PicturesFrom, board: Board | None, listener: Listener
+    rig: Rig, camera: Camera, source: ImageSource, board: Board | None, listener: Listener
 ) -> tuple[dict[str, BodyLook], dict[str, str]]:
     """What a camera saw by image, and why other images are not used."""
-    pictures = opened_pictures(source, camera, USUAL_PICTURES)
+    pictures = open_image_source(source, camera, DEFAULT_IMAGES)
     found: dict[str, BodyLook] = {}
     unused = dict(pictures.unused)
     with pictures.reported(f"camera {camera.name}", listener) as images:
         if board is None:
             numbers = [tag.id for tag in rig.platform_tags]
-            sights = sights_of(images, rig, camera, numbers, unused)
-            found, unused = looks_at_tags(rig, camera, sights), dict(sights.unused)
-            unused |= {n: "allows no unique pose" for n in sights.squares if n not in found}
+            observations = observe_tags(images, rig, camera, numbers, unused)
+            found, unused = looks_at_tags(rig, camera, observations), dict(observations.unused)
+            unused |= {n: "allows no unique pose" for n in observations.squares if n not in found}
             return found, unused
         for name, image in images:
             look = look_at_board(board, camera, image)

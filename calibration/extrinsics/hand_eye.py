@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.extrinsics.result import ExtrinsicCalibration, widths_of, workspace_corners
 from calibration.results import Issue
-from calibration.tag_map.observations import TagSights, platform_pose
+from calibration.tag_map.observations import TagObservations, platform_pose
 from model.errors import BadInput, InvalidFile, Problem
 from model.files.reading import CsvFile
 from model.pose import Array, Pose, read_only
@@ -111,31 +111,33 @@ class _HandEyeFit:
 
 
 def locate_by_motion(
-    rig: Rig, camera: Camera, sights: TagSights, poses: Mapping[str, Pose]
+    rig: Rig, camera: Camera, observations: TagObservations, poses: Mapping[str, Pose]
 ) -> ExtrinsicCalibration:
     """Finds a camera's place from images of the platform at known poses.
 
     Args:
         rig: Its platform tags.
         camera: Its matrix and distortion hold; its place in the rig file does not matter.
-        sights: Of platform tags.
+        observations: Of platform tags.
         poses: ``world_from_platform`` at each image, from the rig's file of poses.
 
     Raises:
         BadInput: Too few images have a pose.
     """
-    sights = sights.each_view_once()
-    unknown = {name: "has no pose" for name in sights.squares if name not in poses}
-    sights = sights.without(unknown)
-    found = {name: _look(rig, camera, sights, name, poses[name]) for name in sights.squares}
+    observations = observations.without_duplicates()
+    unknown = {name: "has no pose" for name in observations.squares if name not in poses}
+    observations = observations.without(unknown)
+    found = {
+        name: _look(rig, camera, observations, name, poses[name]) for name in observations.squares
+    }
     unsure = {name: "allows no unique pose" for name, look in found.items() if look is None}
-    sights = sights.without(unsure)
+    observations = observations.without(unsure)
     looks = [look for look in found.values() if look is not None]
     if len(looks) < 3:
         raise BadInput(
             f"{len(looks)} images show the platform at a known pose; at least 3 are required",
             where=f"camera {camera.name}",
-            why="; ".join(f"{name} {why}" for name, why in list(sights.unused.items())[:4]),
+            why="; ".join(f"{name} {why}" for name, why in list(observations.unused.items())[:4]),
             next_step="take images at more poses, and list each in the pose file",
         )
     best = _settled(looks)
@@ -149,14 +151,16 @@ def locate_by_motion(
         points=workspace_corners(rig),
         tag_errors=_tag_errors(looks),
         pictures=len(looks),
-        unused=sights.unused,
-        lacks=tuple(_lacks(looks)),
-        data_hash=sights.data_hash(),
+        unused=observations.unused,
+        issues=tuple(_lacks(looks)),
+        data_hash=observations.data_hash(),
     )
 
 
-def _look(rig: Rig, camera: Camera, sights: TagSights, name: str, pose: Pose) -> _CameraLook | None:
-    squares = sights.squares[name]
+def _look(
+    rig: Rig, camera: Camera, observations: TagObservations, name: str, pose: Pose
+) -> _CameraLook | None:
+    squares = observations.squares[name]
     found = platform_pose(rig, camera, squares)
     if found is None:
         return None
@@ -222,16 +226,16 @@ def _tag_errors(looks: Sequence[_CameraLook]) -> dict[int, float]:
 
 
 def _lacks(looks: Sequence[_CameraLook]) -> list[Issue]:
-    lacks = []
+    issues = []
     if len(looks) < LEAST_POSES:
         what = f"{len(looks)} poses were seen; {LEAST_POSES} are required"
-        lacks.append(Issue(what, "take images at more poses, far apart"))
+        issues.append(Issue(what, "take images at more poses, far apart"))
     places = np.array([look.world_from_platform.position for look in looks])
     span = float(np.ptp(places, axis=0).max())
     if span < _LEAST_SPAN:
         what = f"all poses lie within {span * 1e3:.0f} mm; {_LEAST_SPAN * 1e3:.0f} mm are required"
-        lacks.append(Issue(what, "take images at more poses, far apart"))
-    return lacks
+        issues.append(Issue(what, "take images at more poses, far apart"))
+    return issues
 
 
 # Poses of the platform by the names of images, from a CSV file with units in its columns.

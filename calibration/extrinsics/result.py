@@ -39,7 +39,7 @@ class ExtrinsicCalibration:
         tag_errors: RMS corner error of each tag, by number, [px].
         pictures: How many images it rests on.
         unused: Why each of the others is not used, by name.
-        lacks: What it lacks, beside precision.
+        issues: What it issues, beside precision.
         data_hash: Of what was seen.
     """
 
@@ -52,7 +52,7 @@ class ExtrinsicCalibration:
     tag_errors: Mapping[int, float]
     pictures: int
     unused: Mapping[str, str]
-    lacks: tuple[Issue, ...]
+    issues: tuple[Issue, ...]
     data_hash: str
 
     @property
@@ -87,7 +87,7 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
         result: What was found.
         wanted: What is good enough, in the work space, [m].
     """
-    lacks, error = list(result.lacks), result.error
+    issues, error = list(result.issues), result.error
     if not error <= wanted:
         more = "survey more tags, all around the camera's view"
         if result.by == "rig motion":
@@ -98,8 +98,8 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
             f"points of the workspace are measured within {error * 1e3:.2g} mm;"
             f" {wanted * 1e3:.2g} mm are required"
         )
-        lacks.append(Issue(what, more))
-    return CalibrationVerdict.of(error, wanted, "in the workspace", lacks)
+        issues.append(Issue(what, more))
+    return CalibrationVerdict.of(error, wanted, "in the workspace", issues)
 
 
 def widths_of(covariance: Array, without: Sequence[Array]) -> Array:
@@ -236,7 +236,7 @@ def pose_intervals(result: ExtrinsicCalibration) -> dict[str, Interval]:
 def pose_rows(stated: Mapping[str, Interval]) -> list[tuple[str, str]]:
     """Numbers of poses for people; turns from the stated rotation are 0 by their meaning."""
     return [
-        (name, interval.doubt if "turn_" in name else str(interval))
+        (name, interval.half_width_text if "turn_" in name else str(interval))
         for name, interval in stated.items()
     ]
 
@@ -304,7 +304,7 @@ def extrinsics_page(
     )
 
 
-def place_facts(found: ExtrinsicCalibration, before: Pose) -> list[tuple[str, str]]:
+def extrinsics_facts(found: ExtrinsicCalibration, before: Pose) -> list[tuple[str, str]]:
     """What was found beside the numbers, for people; ``before`` is the pose in the rig file."""
     return [
         ("by", f"{found.by}, {found.pictures} images"),

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from calibration.extrinsics.result import ExtrinsicCalibration, workspace_corners
 from calibration.results import Issue
 from calibration.statistics import CONFIDENCE, widened
-from calibration.tag_map.observations import TagSights
+from calibration.tag_map.observations import TagObservations
 from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
@@ -109,22 +109,22 @@ def require_frame_tags(rig: Rig) -> None:
 
 
 def locate_by_frame_tags(
-    rig: Rig, camera: Camera, sights: TagSights, survey: Survey
+    rig: Rig, camera: Camera, observations: TagObservations, survey: Survey
 ) -> ExtrinsicCalibration:
     """Finds the camera's place from images taken while it stood still.
 
     Args:
         rig: Its frame tags are the surveyed ones.
         camera: Its matrix and distortion hold; its place in the rig file does not matter.
-        sights: Of frame tags.
+        observations: Of frame tags.
         survey: How well the tags were surveyed.
 
     Raises:
         BadInput: The tags allow no place.
     """
-    sights = _still(sights)
-    start = _start(rig, camera, sights)
-    tags = _seen_tags(rig, camera, sights, start, survey)
+    observations = _still(observations)
+    start = _start(rig, camera, observations)
+    tags = _seen_tags(rig, camera, observations, start, survey)
     tags, strangers = _agreeing(camera, tags, start)
     best = _fit(camera, tags, start)
     unused = {f"tag {tag.number}": _is_off(camera, tag, best) for tag in strangers}
@@ -149,37 +149,39 @@ def locate_by_frame_tags(
         by_lens=by_lens,
         points=workspace_corners(rig),
         tag_errors={t.number: float(np.sqrt(np.mean(t.errors(camera, best) ** 2))) for t in tags},
-        pictures=len(sights.squares),
-        unused={**sights.unused, **unused},
-        lacks=tuple(_lacks(camera, tags, best)),
-        data_hash=sights.data_hash(),
+        pictures=len(observations.squares),
+        unused={**observations.unused, **unused},
+        issues=tuple(_lacks(camera, tags, best)),
+        data_hash=observations.data_hash(),
     )
 
 
-def _still(sights: TagSights) -> TagSights:
+def _still(observations: TagObservations) -> TagObservations:
     """Without images in which all is seen elsewhere than in most."""
     middle = {
-        number: np.median([s[number].corners for s in sights.squares.values() if number in s], 0)
-        for number in sights.numbers
+        number: np.median(
+            [s[number].corners for s in observations.squares.values() if number in s], 0
+        )
+        for number in observations.numbers
     }
     unused = {}
-    for name, squares in sights.squares.items():
+    for name, squares in observations.squares.items():
         off = [np.linalg.norm(s.corners - middle[k], axis=1).mean() for k, s in squares.items()]
-        if len(sights.squares) > 2 and np.median(off) > MOVED_PX:
+        if len(observations.squares) > 2 and np.median(off) > MOVED_PX:
             unused[name] = (
                 f"shows the tags {np.median(off):.1f} px off the other images: the camera moved"
             )
-    return sights.without(unused)
+    return observations.without(unused)
 
 
-def _start(rig: Rig, camera: Camera, sights: TagSights) -> Pose:
+def _start(rig: Rig, camera: Camera, observations: TagObservations) -> Pose:
     """``camera_from_world`` by the tags of one image.
 
     Raises:
         BadInput: They allow none.
     """
     tags = {tag.id: tag for tag in rig.frame_tags}
-    fullest = max(sights.squares.values(), key=len)
+    fullest = max(observations.squares.values(), key=len)
     views = [TagView(tags[number], square) for number, square in fullest.items()]
     found = solve_pnp(camera, views, camera.world_from_camera.inverse())
     if found is None:
@@ -193,12 +195,12 @@ def _start(rig: Rig, camera: Camera, sights: TagSights) -> Pose:
 
 
 def _seen_tags(
-    rig: Rig, camera: Camera, sights: TagSights, start: Pose, survey: Survey
+    rig: Rig, camera: Camera, observations: TagObservations, start: Pose, survey: Survey
 ) -> list[_SeenTag]:
     tags = {tag.id: tag for tag in rig.frame_tags}
     found = []
-    for number in sights.numbers:
-        squares = [s[number] for s in sights.squares.values() if number in s]
+    for number in observations.numbers:
+        squares = [s[number] for s in observations.squares.values() if number in s]
         corners = tag_corners(tags[number])
         covariance = _of_picture(squares) + survey.of_pixels(camera, start, tags[number])
         pixels = np.mean([square.corners.reshape(8) for square in squares], axis=0)
@@ -293,16 +295,16 @@ def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose, slopes: Ar
 
 
 def _lacks(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> list[Issue]:
-    lacks = []
+    issues = []
     if len(tags) < LEAST_TAGS:
         seen = f"{len(tags)} frame tag{'s are' if len(tags) != 1 else ' is'} seen"
         what = f"{seen}; {LEAST_TAGS} are required"
         step = "survey more tags, all around the camera's view"
-        lacks.append(Issue(what, step))
+        issues.append(Issue(what, step))
     for tag in tags:
         size = np.sqrt(np.mean((tag.whitening @ tag.errors(camera, best)) ** 2))
         if len(tags) >= LEAST_TAGS and size > _OFF:
             what = f"tag {tag.number} {_is_off(camera, tag, best)}"
             step = f"survey tag {tag.number} again, or remove it from the rig file"
-            lacks.append(Issue(what, step))
-    return lacks
+            issues.append(Issue(what, step))
+    return issues

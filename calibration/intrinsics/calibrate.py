@@ -27,14 +27,14 @@ from calibration.statistics import (
     CONFIDENCE,
     EvenSample,
     Interval,
-    as_in,
+    duplicate_reason,
     is_duplicate_view,
     jackknife,
     kept_share,
     rms_bound,
     widened,
 )
-from calibration.targets.boards import Board, Seen, mirrored
+from calibration.targets.boards import Board, DetectedBoard, mirrored
 from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
@@ -82,7 +82,7 @@ class Uncertainty:
 
 
 def uncertainty_of(
-    views: Sequence[Seen],
+    views: Sequence[DetectedBoard],
     turns: Sequence[Array],
     places: Sequence[Array],
     matrix: Array,
@@ -189,7 +189,7 @@ class CameraCalibration:
     distortion: Array
     lens: LensModel
     uncertainty: Uncertainty
-    views: Mapping[str, Seen]
+    views: Mapping[str, DetectedBoard]
     boards: Mapping[str, Pose]
     view_errors: Mapping[str, float]
     unused: Mapping[str, str]
@@ -225,13 +225,13 @@ def fit_camera(
     Args:
         pictures: Names and grey images of one size.
         board: What they show.
-        unused: Pictures that were left out before, with the reasons.
+        unused: ImageSet that were left out before, with the reasons.
         lens: One of `calibration.intrinsics.lens.LENSES`, or `AUTO`.
 
     Raises:
         BadInput: Images of different sizes, or too few that show the board.
     """
-    views: dict[str, Seen] = {}
+    views: dict[str, DetectedBoard] = {}
     previews: dict[str, Image] = {}
     left_out = dict(unused or {})
     size: tuple[int, int] | None = None
@@ -250,7 +250,7 @@ def fit_camera(
             left_out[name] = NOT_FOUND
             without.add((name, image))
         elif first := next((n for n, before in views.items() if _same(seen, before)), None):
-            left_out[name] = as_in(first)
+            left_out[name] = duplicate_reason(first)
         else:
             views[name] = seen
             previews[name] = _reduced(image)
@@ -266,13 +266,13 @@ def _reduced(image: Image) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _same(seen: Seen, before: Seen) -> bool:
+def _same(seen: DetectedBoard, before: DetectedBoard) -> bool:
     same_points = np.array_equal(seen.points, before.points)
     return same_points and is_duplicate_view(seen.corners, before.corners)
 
 
 def fit_corners(
-    views: Mapping[str, Seen], size: tuple[int, int], lens: str, where: str
+    views: Mapping[str, DetectedBoard], size: tuple[int, int], lens: str, where: str
 ) -> CameraCalibration:
     """Fits a camera to corners that another program detected.
 
@@ -299,7 +299,7 @@ def fit_corners(
 
 
 def calibrate_from_views(
-    views: Mapping[str, Seen],
+    views: Mapping[str, DetectedBoard],
     size: tuple[int, int],
     unused: Mapping[str, str] | None = None,
     lens: str = AUTO,
@@ -348,7 +348,7 @@ def calibrate_from_views(
     )
 
 
-def _fit(views: Mapping[str, Seen], size: tuple[int, int], lens: str) -> LensFit:
+def _fit(views: Mapping[str, DetectedBoard], size: tuple[int, int], lens: str) -> LensFit:
     try:
         fit = choose_lens(views, size) if lens == AUTO else fit_lens(LENSES[lens], views, size)
     except (cv2.error, np.linalg.LinAlgError):
@@ -358,7 +358,7 @@ def _fit(views: Mapping[str, Seen], size: tuple[int, int], lens: str) -> LensFit
     return fit
 
 
-def _errors(fit: LensFit, views: Mapping[str, Seen]) -> dict[str, float]:
+def _errors(fit: LensFit, views: Mapping[str, DetectedBoard]) -> dict[str, float]:
     """RMS distance of each picture's corners, [px]."""
     return {
         name: float(np.sqrt(np.mean(np.sum(fit.residuals(name, seen) ** 2, axis=1))))
@@ -391,7 +391,7 @@ def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
 
 
 def _too_few(
-    views: Mapping[str, Seen],
+    views: Mapping[str, DetectedBoard],
     unused: Mapping[str, str],
     board: Board,
     without: Sequence[tuple[str, Image]],

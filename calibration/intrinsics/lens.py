@@ -19,7 +19,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from calibration.targets.boards import Seen
+from calibration.targets.boards import DetectedBoard
 from model.files.camera_file import LensName
 from model.pose import Array
 from tracking.camera_model import rays_of
@@ -129,7 +129,7 @@ class LensFit:
     turns: dict[str, Array]
     places: dict[str, Array]
 
-    def residuals(self, name: str, seen: Seen) -> Array:
+    def residuals(self, name: str, seen: DetectedBoard) -> Array:
         """Corners less where they are expected, shape (n, 2), [px]."""
         turn, place = self.turns[name], self.places[name]
         there = self.lens.slopes(seen.points, turn, place, self.matrix, self.distortion)[0]
@@ -142,7 +142,7 @@ class LensFit:
         return bool(known and self.matrix[0, 0] > 0.0 and self.matrix[1, 1] > 0.0)
 
 
-def fit_lens(lens: LensModel, views: Mapping[str, Seen], size: tuple[int, int]) -> LensFit:
+def fit_lens(lens: LensModel, views: Mapping[str, DetectedBoard], size: tuple[int, int]) -> LensFit:
     """The camera that explains views best, by least squares.
 
     Raises:
@@ -164,7 +164,9 @@ def fit_lens(lens: LensModel, views: Mapping[str, Seen], size: tuple[int, int]) 
     return min(fits, key=lambda fit: _squares(fit, views))
 
 
-def _fit_pinhole(lens: LensModel, views: Mapping[str, Seen], size: tuple[int, int]) -> LensFit:
+def _fit_pinhole(
+    lens: LensModel, views: Mapping[str, DetectedBoard], size: tuple[int, int]
+) -> LensFit:
     points = [seen.points.astype(np.float32).reshape(-1, 1, 3) for seen in views.values()]
     corners = [seen.corners.astype(np.float32).reshape(-1, 1, 2) for seen in views.values()]
     _, matrix, distortion, turns, places = cv2.calibrateCamera(
@@ -180,7 +182,7 @@ def _fit_pinhole(lens: LensModel, views: Mapping[str, Seen], size: tuple[int, in
 
 
 def _polished(
-    lens: LensModel, views: Mapping[str, Seen], matrix: Array, distortion: Array
+    lens: LensModel, views: Mapping[str, DetectedBoard], matrix: Array, distortion: Array
 ) -> LensFit:
     """Damped least squares over camera and poses, the poses eliminated picture by picture."""
     poses = {name: _first_pose(lens, seen, matrix, distortion) for name, seen in views.items()}
@@ -207,7 +209,7 @@ def _polished(
     return fit
 
 
-def _stepped(fit: LensFit, views: Mapping[str, Seen], damping: float) -> LensFit:
+def _stepped(fit: LensFit, views: Mapping[str, DetectedBoard], damping: float) -> LensFit:
     lens, count = fit.lens, 4 + len(fit.distortion)
     normal, score, parts = np.zeros((count, count)), np.zeros(count), {}
     for name, seen in views.items():
@@ -236,12 +238,12 @@ def _stepped(fit: LensFit, views: Mapping[str, Seen], damping: float) -> LensFit
     )
 
 
-def _squares(fit: LensFit, views: Mapping[str, Seen]) -> float:
+def _squares(fit: LensFit, views: Mapping[str, DetectedBoard]) -> float:
     total = sum(float(np.sum(fit.residuals(name, seen) ** 2)) for name, seen in views.items())
     return total if np.isfinite(total) else np.inf
 
 
-def _first_pose(lens: LensModel, seen: Seen, matrix: Array, distortion: Array) -> Array:
+def _first_pose(lens: LensModel, seen: DetectedBoard, matrix: Array, distortion: Array) -> Array:
     """Rotation vector and place of a board, from rays; shape (6,)."""
     rays = rays_of(lens.kind, matrix, distortion, seen.corners)
     _, turn, place = cv2.solvePnP(seen.points, rays, np.eye(3), np.zeros(0))
@@ -249,7 +251,7 @@ def _first_pose(lens: LensModel, seen: Seen, matrix: Array, distortion: Array) -
 
 
 def held_out_errors(
-    lens: LensModel, views: Mapping[str, Seen], size: tuple[int, int]
+    lens: LensModel, views: Mapping[str, DetectedBoard], size: tuple[int, int]
 ) -> dict[str, float]:
     """Mean squared error of each picture by fits that have not seen it, [px²].
 
@@ -267,7 +269,7 @@ def held_out_errors(
     return {name: errors[name] for name in names}
 
 
-def error_of(fit: LensFit, seen: Seen) -> float:
+def error_of(fit: LensFit, seen: DetectedBoard) -> float:
     """Mean squared error of a picture that a fit has not seen, its pose fitted, [px²]."""
     try:
         pose = _first_pose(fit.lens, seen, fit.matrix, fit.distortion)
@@ -283,7 +285,7 @@ def error_of(fit: LensFit, seen: Seen) -> float:
     return mean if np.isfinite(mean) else np.inf
 
 
-def choose_lens(views: Mapping[str, Seen], size: tuple[int, int]) -> LensFit:
+def choose_lens(views: Mapping[str, DetectedBoard], size: tuple[int, int]) -> LensFit:
     """The fit of the lens model that suits pictures best.
 
     Five coefficients, unless their errors show a radial pattern (`RADIAL`) and another model has a

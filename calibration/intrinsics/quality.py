@@ -108,7 +108,7 @@ def judge_camera(
     halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
     bow, bent = bow_of(result)
     radial = radial_share(*corner_errors(result), result.matrix)
-    lacks = [
+    issues = [
         *_about_pictures(result, coverage, tilts),
         *_about_the_board(bow, bent),
         *_about_the_lens(result, radial),
@@ -121,8 +121,8 @@ def judge_camera(
             what = (
                 f"points are seen within {error / scale:.2g} px, {GOOD_PIXELS:.0f} px is required"
             )
-            lacks.append(Issue(what, f"{_more(result)}, or pass --distance-m"))
-    verdict = CalibrationVerdict.of(error, wanted, where, lacks)
+            issues.append(Issue(what, f"{_more(result)}, or pass --distance-m"))
+    verdict = CalibrationVerdict.of(error, wanted, where, issues)
     nearest, farthest = min(away), max(away)
     return CameraQuality(
         verdict, coverage, tilts, distance, nearest, farthest, halves, bow, bent, radial
@@ -287,24 +287,24 @@ def is_below(share: float, limit: float) -> bool:
 
 
 def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) -> list[Issue]:
-    """What the set of images lacks, and what to add."""
-    lacks = []
+    """What the set of images issues, and what to add."""
+    issues = []
     if len(result.views) < GOOD_VIEWS:
         what = f"{len(result.views)} images show the board; {GOOD_VIEWS} are required"
-        lacks.append(Issue(what, MORE))
+        issues.append(Issue(what, MORE))
     share = float(np.mean(coverage > 0))
     if is_below(share, GOOD_COVERAGE):
         empty = [side for side, axis, at in _SIDES if not coverage.take(at, axis=axis).any()]
         place = f", none at the {' and '.join(empty)}" if empty else ""
         what = f"the board covered {share:.0%} of the image{place}; {GOOD_COVERAGE:.0%} is required"
-        lacks.append(Issue(what, EDGES))
+        issues.append(Issue(what, EDGES))
     for axis, name in enumerate(("forward and backward", "left and right")):
         span = float(np.ptp(tilts[:, axis]))
         if span < 2.0 * GOOD_TILT:
             needed = f"{2 * GOOD_TILT:.0f}° is required"
             what = f"the board was tilted {name} over only {span:.0f}°; {needed}"
-            lacks.append(Issue(what, "tilt the board up to 40° in every direction"))
-    return lacks
+            issues.append(Issue(what, "tilt the board up to 40° in every direction"))
+    return issues
 
 
 def _about_errors(
@@ -315,23 +315,23 @@ def _about_errors(
     wanted: float,
     distance: float,
 ) -> list[Issue]:
-    """What the numbers lack, and what to do."""
-    lacks = []
+    """What the numbers issue, and what to do."""
+    issues = []
     if result.error > GOOD_ERROR:
         what = f"the reprojection error is {result.error:.2f} px"
         step = "take sharp images of a flat board, held still, and check its dimensions"
-        lacks.append(Issue(what, step))
+        issues.append(Issue(what, step))
     if not error <= wanted:
         what = (
             f"points at {distance:.2g} m are measured within {error * 1e3:.2g} mm;"
             f" {wanted * 1e3:.2g} mm are required"
         )
-        lacks.append(Issue(what, _more(result)))
+        issues.append(Issue(what, _more(result)))
         share = float(np.mean(coverage > 0))
         if not is_below(share, GOOD_COVERAGE) and is_below(share, FULL_COVERAGE):
             what = f"the board covered {share:.0%} of the image, {FULL_COVERAGE:.0%} are required"
-            lacks.append(Issue(what, EDGES))
+            issues.append(Issue(what, EDGES))
     if not halves <= 2.0 * wanted:
         what = f"two halves of the pictures see them {halves * 1e3:.2g} mm apart"
-        lacks.append(Issue(what, _more(result)))
-    return lacks
+        issues.append(Issue(what, _more(result)))
+    return issues

@@ -23,7 +23,7 @@ from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, interval_rows, page_of, table_of
 from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import CONFIDENCE, Interval
-from calibration.tag_map.observations import TagSights
+from calibration.tag_map.observations import TagObservations
 from model.errors import BadInput
 from model.files.camera_file import Readout
 from model.files.documents import AnyNonNegative, Positive
@@ -98,20 +98,20 @@ class _Moving:
 
 
 def fit_readout(
-    rig: Rig, camera: Camera, sights: TagSights, times: Mapping[str, float]
+    rig: Rig, camera: Camera, observations: TagObservations, times: Mapping[str, float]
 ) -> ReadoutCalibration:
     """Finds the readout.
 
     Args:
         rig: Its platform carries the tags.
         camera: Its matrix and distortion hold.
-        sights: What was seen in images of the moving platform.
+        observations: What was seen in images of the moving platform.
         times: When these were taken, by name, [s].
 
     Raises:
         BadInput: Too few images show the platform in motion, or its motion shows nothing.
     """
-    moving, unused = _moving(rig, camera, sights, times)
+    moving, unused = _moving(rig, camera, observations, times)
     if len(moving) < LEAST:
         raise BadInput(
             f"{len(moving)} images show the platform between two others at most {MEMORY:g} s away;"
@@ -152,20 +152,20 @@ def fit_readout(
         speeds={n: float(np.linalg.norm(i.motion.velocity)) for n, i in moving.items()},
         before=float(np.sqrt(costs(0.0).sum() / edges)),
         after=float(np.sqrt(middle.sum() / edges)),
-        unused={**sights.unused, **unused},
-        data_hash=sights.data_hash(),
+        unused={**observations.unused, **unused},
+        data_hash=observations.data_hash(),
     )
 
 
 def _moving(
-    rig: Rig, camera: Camera, sights: TagSights, times: Mapping[str, float]
+    rig: Rig, camera: Camera, observations: TagObservations, times: Mapping[str, float]
 ) -> tuple[dict[str, _Moving], dict[str, str]]:
     """Images whose motion is known by their neighbours, and why others are not used."""
     tags = {tag.id: tag for tag in rig.platform_tags}
     seen: list[tuple[str, list[TagView], Pose]] = []
     unused = {}
-    for name in sorted(sights.squares, key=lambda n: times[n]):
-        views = [TagView(tags[k], square) for k, square in sights.squares[name].items()]
+    for name in sorted(observations.squares, key=lambda n: times[n]):
+        views = [TagView(tags[k], square) for k, square in observations.squares[name].items()]
         bundle = solve_pnp(camera, views, seen[-1][2] if seen else None)
         if bundle is None:
             unused[name] = "no pose fits its tags"
@@ -208,15 +208,15 @@ def judge_readout(found: ReadoutCalibration, wanted: float, speed: float) -> Cal
         speed: Of the platform, for which the error is stated, [m/s].
     """
     error = 0.5 * found.half_width * speed  # rows at an edge of the image
-    lacks = []
+    issues = []
     step = "record more images of a faster platform, with tags all over the image's height"
     if len(found.speeds) < GOOD:
-        lacks.append(Issue(f"{len(found.speeds)} images were used; {GOOD} are required", step))
+        issues.append(Issue(f"{len(found.speeds)} images were used; {GOOD} are required", step))
     if not error <= wanted:
         what = f"{error * 1e3:.2g} mm remain open, {wanted * 1e3:.2g} mm are required"
-        lacks.append(Issue(what, step))
+        issues.append(Issue(what, step))
     where = f"at {speed * 1e3:.0f} mm/s"
-    return CalibrationVerdict.of(error, wanted, where, lacks)
+    return CalibrationVerdict.of(error, wanted, where, issues)
 
 
 class ReadoutResult(ResultDocument):

@@ -25,7 +25,7 @@ from calibration.intrinsics.quality import (
 )
 from calibration.report import Section, drawing, interval_rows, page_of, table_of
 from calibration.results import ResultDocument, common_keys
-from calibration.targets.boards import Seen
+from calibration.targets.boards import DetectedBoard
 from model.errors import BadInput
 from model.files.camera_file import CameraDocument, LensCovariance, LensName
 from model.files.documents import AnyNonNegative, AnyNumber, Positive
@@ -202,7 +202,7 @@ def worst_picture(result: CameraCalibration) -> Sequence[Section]:
     return [Section("The worst image", drawing(shapes, size, label), label)]
 
 
-def _neighbours(seen: Seen) -> list[tuple[int, int]]:
+def _neighbours(seen: DetectedBoard) -> list[tuple[int, int]]:
     """Pairs of points of a board that are next to each other."""
     gaps = np.linalg.norm(seen.points[:, None] - seen.points[None], axis=2)
     np.fill_diagonal(gaps, np.inf)

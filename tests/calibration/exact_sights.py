@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from calibration.tag_map.observations import TagSights
+from calibration.tag_map.observations import TagObservations
 from model.pose import Pose
 from model.rig import Camera, Tag
 from tracking.camera_model import project_undistorted
@@ -37,10 +37,10 @@ def sights_at(
     poses: Mapping[str, Pose],
     noise: float,
     rng: np.random.Generator,
-) -> TagSights:
+) -> TagObservations:
     """Tags of a carrier at poses ``camera_from_carrier``, by image."""
     squares = {}
     for name, pose in poses.items():
         seen = {tag.id: seen_tag(camera, pose, tag, noise, rng) for tag in tags}
         squares[name] = {number: square for number, square in seen.items() if square is not None}
-    return TagSights({name: found for name, found in squares.items() if found}, {})
+    return TagObservations({name: found for name, found in squares.items() if found}, {})

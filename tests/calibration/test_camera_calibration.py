@@ -19,7 +19,7 @@ from calibration.intrinsics.quality import is_below, judge_camera
 from calibration.intrinsics.result import camera_result
 from calibration.result_files import load_result
 from calibration.results import write_result
-from calibration.targets.boards import Chessboard, Seen
+from calibration.targets.boards import Chessboard, DetectedBoard
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import DISTORTION, MATRIX, SIZE, sample_rays
@@ -43,13 +43,13 @@ def corners_at(pose: Pose) -> Array:
     return cv2.projectPoints(points, zero, zero, MATRIX, DISTORTION)[0].reshape(-1, 2)
 
 
-def views(count: int, noise: float, seed: int = 5) -> dict[str, Seen]:
+def views(count: int, noise: float, seed: int = 5) -> dict[str, DetectedBoard]:
     rng = np.random.default_rng(seed)
     found = {}
     for k, pose in enumerate(board_poses(count)):
         corners = corners_at(pose)
         noisy = corners + noise * rng.standard_normal(corners.shape)
-        found[f"view {k}"] = Seen(BOARD.points(), noisy)
+        found[f"view {k}"] = DetectedBoard(BOARD.points(), noisy)
     return found
 
 
@@ -99,7 +99,7 @@ def test_corners_that_err_together_widen_the_intervals() -> None:
     for k, (name, seen) in enumerate(straight.items()):
         shift = 0.4 * np.array([np.sin(2.0 * k), np.cos(3.0 * k)])
         wave = np.sin(np.arange(len(seen.corners)) / 5.0 + k)[:, None]
-        bent[name] = Seen(seen.points, seen.corners + shift * wave)
+        bent[name] = DetectedBoard(seen.points, seen.corners + shift * wave)
     sure = calibrate_from_views(straight, SIZE).uncertainty.half_widths
     unsure = calibrate_from_views(bent, SIZE).uncertainty.half_widths
     assert (unsure[:4] > 3.0 * sure[:4]).all()
@@ -118,7 +118,7 @@ def test_a_picture_whose_corners_are_mistaken_is_left_out_by_name() -> None:
     all_views = views(12, 0.05)
     wrong = all_views["view 3"]
     rolled = np.roll(wrong.corners, 1, axis=0)
-    all_views["view 3"] = Seen(wrong.points, rolled)
+    all_views["view 3"] = DetectedBoard(wrong.points, rolled)
     found = calibrate_from_views(all_views, SIZE)
     assert list(found.unused) == ["view 3"]
     assert "px" in found.unused["view 3"]
@@ -184,7 +184,7 @@ def test_a_bowed_board_is_named_with_its_bow() -> None:
         turn = cv2.Rodrigues(poses[name].rotation)[0]
         there = cv2.projectPoints(high, turn, poses[name].position, MATRIX, DISTORTION)[0]
         noise = np.random.default_rng(len(bent)).normal(scale=0.05, size=seen.corners.shape)
-        bent[name] = Seen(seen.points, there.reshape(-1, 2) + noise)
+        bent[name] = DetectedBoard(seen.points, there.reshape(-1, 2) + noise)
     quality = judge_camera(calibrate_from_views(bent, SIZE), 1e-3)
     assert quality.bow == pytest.approx(1e-3, rel=0.3)
     assert any("the board is not flat" in reason for reason in quality.verdict.reasons)

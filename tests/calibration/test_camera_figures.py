@@ -58,7 +58,7 @@ def test_the_map_of_uncertainty_makes_up_the_verdicts_error(found) -> None:
 
 
 def test_the_map_is_darkest_where_no_board_was_seen() -> None:
-    """Pictures of the left half: the right edge is not known."""
+    """ImageSet of the left half: the right edge is not known."""
     left = {
         name: seen for name, seen in views("five", 90).items() if seen.corners[:, 0].max() < 520
     }

@@ -17,7 +17,7 @@ from calibration.extrinsics.camera_pairs import (
     locate_by_pairs,
     require_oriented,
 )
-from calibration.targets.boards import Chessboard, Seen
+from calibration.targets.boards import Chessboard, DetectedBoard
 from calibration.targets.grids import TagGrid
 from model.errors import BadInput
 from model.files.documents import PoseDocument
@@ -128,7 +128,7 @@ def test_a_boards_pose_and_its_covariance_are_honest(two) -> None:
     for _ in range(200):
         corners = pixels_of(camera, pose.apply(points))
         look = _board_pose(
-            Seen(points, corners + noise * rng.standard_normal(corners.shape)), camera
+            DetectedBoard(points, corners + noise * rng.standard_normal(corners.shape)), camera
         )
         assert look is not None
         gap = look.camera_from_body.position - pose.position

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from calibration.intrinsics.calibrate import calibrate_from_views
-from calibration.targets.boards import Seen, read_corners
+from calibration.targets.boards import DetectedBoard, read_corners
 from model.errors import BadInput
 from tests.calibration.test_lens_models import SIZE, views
 from tests.cli.program import call, one_message
@@ -16,7 +16,7 @@ from tests.cli.program import call, one_message
 HEAD = "picture,x_px,y_px,board_x_mm,board_y_mm"
 
 
-def text_of(seen: dict[str, Seen]) -> str:
+def text_of(seen: dict[str, DetectedBoard]) -> str:
     lines = [
         f"{name},{x:.9f},{y:.9f},{p[0] * 1e3:.6f},{p[1] * 1e3:.6f}"
         for name, view in seen.items()

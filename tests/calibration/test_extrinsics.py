@@ -18,7 +18,7 @@ from calibration.extrinsics.result import (
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
 from calibration.result_files import load_result
 from calibration.results import write_result
-from calibration.tag_map.observations import sights_of
+from calibration.tag_map.observations import observe_tags
 from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
@@ -61,7 +61,7 @@ def numbers(rig: Rig) -> list[int]:
 def test_a_camera_is_located_to_half_a_millimetre(rig: Rig, pictures) -> None:
     truth, camera = elsewhere(rig), rig.cameras[0]
     found = locate_by_frame_tags(
-        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(0.1e-3)
+        rig, camera, observe_tags(pictures, rig, camera, numbers(rig)), Survey(0.1e-3)
     )
     pose = found.world_from_camera
     assert pose.distance_to(truth) < 0.5e-3
@@ -131,10 +131,10 @@ def test_who_knows_that_tags_are_turned_as_told_finds_the_camera_twice_as_well(r
             replace(tag, pose=Pose(tag.pose.position + shift, tag.pose.rotation))
             for tag, shift in zip(tags, shifts, strict=True)
         ]
-        sights = sights_at(camera, there, {"a": truth.inverse()}, 0.03, rng)
+        observations = sights_at(camera, there, {"a": truth.inverse()}, 0.03, rng)
         errors.append([])
         for survey in (Survey(1e-3), Survey(1e-3, 0.0)):
-            found = locate_by_frame_tags(rig, camera, sights, survey)
+            found = locate_by_frame_tags(rig, camera, observations, survey)
             back = found.world_from_camera.apply(truth.inverse().apply(found.points))
             off = np.sqrt(np.mean(np.sum((back - found.points) ** 2, axis=1)))
             errors[-1].append(off)
@@ -169,8 +169,8 @@ def test_a_tag_that_was_knocked_is_named_and_does_not_move_the_camera(rig: Rig) 
     tags = [Tag(401 + k, 0.12, Pose.level([x, y, 0.0])) for k, (x, y) in enumerate(places)]
     rig = replace(rig, frame_tags=tuple(tags))
     knocked = [replace(tags[0], pose=Pose.level([0.44, 0.0, 0.0])), *tags[1:]]
-    sights = sights_at(camera, knocked, {"a": truth.inverse()}, 0.02, rng)
-    found = locate_by_frame_tags(rig, camera, sights, Survey(0.2e-3))
+    observations = sights_at(camera, knocked, {"a": truth.inverse()}, 0.02, rng)
+    found = locate_by_frame_tags(rig, camera, observations, Survey(0.2e-3))
     assert list(found.unused) == ["tag 401"]
     away = float(found.unused["tag 401"].split()[2])
     assert away == pytest.approx(18.0, abs=4.0)  # 20 mm along the floor, seen aslant
@@ -193,8 +193,8 @@ def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
 def test_too_few_tags_are_not_good_enough(rig: Rig, count: int, seen: str) -> None:
     camera, truth = rig.cameras[0], elsewhere(rig)
     rng = np.random.default_rng(3)
-    sights = sights_at(camera, rig.frame_tags[:count], {"a": truth.inverse()}, 0.02, rng)
-    found = locate_by_frame_tags(rig, camera, sights, Survey(0.5e-3))
+    observations = sights_at(camera, rig.frame_tags[:count], {"a": truth.inverse()}, 0.02, rng)
+    found = locate_by_frame_tags(rig, camera, observations, Survey(0.5e-3))
     verdict = judge_extrinsics(found, 1e-3)
     assert f"{seen} seen; 3 are required" in verdict.reasons
     assert "survey more tags, all around the camera's view" in verdict.next_steps
@@ -229,7 +229,7 @@ def test_the_inverse_of_a_pose_changes_as_told() -> None:
 def test_the_result_takes_the_place_of_the_rig_files(rig: Rig, pictures, tmp_path: Path) -> None:
     camera = rig.cameras[0]
     found = locate_by_frame_tags(
-        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4)
+        rig, camera, observe_tags(pictures, rig, camera, numbers(rig)), Survey(5e-4)
     )
     verdict = judge_extrinsics(found, 1e-3)
     result = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
@@ -245,7 +245,7 @@ def test_the_result_takes_the_place_of_the_rig_files(rig: Rig, pictures, tmp_pat
 def test_a_result_is_refused_where_what_it_rests_on_was_changed(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
     found = locate_by_frame_tags(
-        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4)
+        rig, camera, observe_tags(pictures, rig, camera, numbers(rig)), Survey(5e-4)
     )
     result = extrinsics_result(found, judge_extrinsics(found, 1e-3), rig.document, date(2026, 3, 2))
     other = rig.document.cameras[0].model_copy(update={"fx_px": 901.0})
@@ -257,7 +257,7 @@ def test_a_result_is_refused_where_what_it_rests_on_was_changed(rig: Rig, pictur
 def test_two_results_are_compared_by_what_they_do_in_the_work_space(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
     found = locate_by_frame_tags(
-        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4)
+        rig, camera, observe_tags(pictures, rig, camera, numbers(rig)), Survey(5e-4)
     )
     verdict = judge_extrinsics(found, 1e-3)
     one = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
@@ -282,43 +282,43 @@ def test_pictures_of_no_use_are_told_by_name(rig: Rig, pictures) -> None:
     blank = np.full((720, 1280), 100, np.uint8)
     first, image = pictures[0]
     more = [("blank.png", blank), ("copy.png", image.copy())]
-    sights = sights_of([*pictures, *more], rig, camera, numbers(rig))
-    assert sights.unused == {
+    observations = observe_tags([*pictures, *more], rig, camera, numbers(rig))
+    assert observations.unused == {
         "blank.png": "shows no complete tag",
         "copy.png": f"is the same image as {first}",
     }
-    assert sights.squares.keys() == {name for name, _ in pictures}
+    assert observations.squares.keys() == {name for name, _ in pictures}
     with pytest.raises(BadInput, match="none of the tag36h11 tags 401, 402, 403, 404"):
-        sights_of([("blank.png", blank)], rig, camera, numbers(rig))
+        observe_tags([("blank.png", blank)], rig, camera, numbers(rig))
 
 
 def test_mirrored_pictures_and_other_tags_are_told(rig: Rig, pictures) -> None:
     camera, (name, image) = rig.cameras[0], pictures[0]
     flipped = np.ascontiguousarray(image[:, ::-1])
     with pytest.raises(BadInput) as caught:
-        sights_of([(name, flipped)], rig, camera, numbers(rig))
+        observe_tags([(name, flipped)], rig, camera, numbers(rig))
     assert "mirrored" in caught.value.why
     with pytest.raises(BadInput) as caught:
-        sights_of([(name, image)], rig, camera, [411, 412])
+        observe_tags([(name, image)], rig, camera, [411, 412])
     assert "shows tag36h11" in caught.value.why
     assert "401" in caught.value.why
     with pytest.raises(BadInput, match="none of the tag25h9 tags 401") as caught:
-        sights_of([(name, image)], replace(rig, tag_family="tag25h9"), camera, numbers(rig))
+        observe_tags([(name, image)], replace(rig, tag_family="tag25h9"), camera, numbers(rig))
     assert "shows tag36h11 301" in caught.value.why
 
 
 def test_a_number_that_is_seen_twice_is_left_out_by_name(rig: Rig, pictures) -> None:
     camera, (name, image) = rig.cameras[0], pictures[0]
-    seen = sights_of(pictures[:1], rig, camera, numbers(rig)).squares[name]
+    seen = observe_tags(pictures[:1], rig, camera, numbers(rig)).squares[name]
     corners = seen[402].corners
     low, high = corners.min(axis=0).astype(int) - 8, corners.max(axis=0).astype(int) + 9
     patch = image[low[1] : high[1], low[0] : high[0]]
     doubled = image.copy()
     doubled[4 : 4 + patch.shape[0], 4 : 4 + patch.shape[1]] = patch
-    sights = sights_of([(name, doubled)], rig, camera, numbers(rig))
-    assert sights.unused == {f"{name}, tag 402": "is detected more than once"}
-    assert 402 not in sights.squares[name]
-    assert sights.squares[name].keys() == seen.keys() - {402}
+    observations = observe_tags([(name, doubled)], rig, camera, numbers(rig))
+    assert observations.unused == {f"{name}, tag 402": "is detected more than once"}
+    assert 402 not in observations.squares[name]
+    assert observations.squares[name].keys() == seen.keys() - {402}
 
 
 def test_a_rig_without_frame_tags_is_refused(rig: Rig) -> None:
@@ -343,7 +343,7 @@ def test_the_stated_error_of_a_place_is_exceeded_in_one_case_of_twenty(rig, seed
         tag_errors={},
         pictures=1,
         unused={},
-        lacks=(),
+        issues=(),
         data_hash="",
     )
     arms = place.points - camera.world_from_camera.position

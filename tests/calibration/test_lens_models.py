@@ -25,7 +25,7 @@ from calibration.intrinsics.quality import (
     judge_camera,
     picture_grid,
 )
-from calibration.targets.boards import Chessboard, Seen
+from calibration.targets.boards import Chessboard, DetectedBoard
 from model.cameras import camera_from
 from model.errors import BadInput
 from model.files.camera_file import CameraDocument
@@ -60,7 +60,9 @@ def matrix_of(focal: float) -> np.ndarray:
     return np.array([[focal, 0.0, 470.0], [0.0, focal * 1.002, 305.0], [0.0, 0.0, 1.0]])
 
 
-def views(name: str, count: int = 30, noise: float = 0.08, seed: int = 3) -> dict[str, Seen]:
+def views(
+    name: str, count: int = 30, noise: float = 0.08, seed: int = 3
+) -> dict[str, DetectedBoard]:
     """A board that is held all over the picture, near to its corners too."""
     rng, found = np.random.default_rng(seed), {}
     focal, lens = TRUTH[name]
@@ -77,7 +79,7 @@ def views(name: str, count: int = 30, noise: float = 0.08, seed: int = 3) -> dic
         if (corners < 2.0).any() or (corners > np.array(SIZE) - 2.0).any():
             continue
         noisy = corners + noise * rng.standard_normal(corners.shape)
-        found[f"{len(found)}"] = Seen(BOARD.points(), noisy)
+        found[f"{len(found)}"] = DetectedBoard(BOARD.points(), noisy)
     assert len(found) == count
     return found
 

@@ -95,8 +95,8 @@ def test_a_file_of_positions_needs_no_rotation_and_half_of_one_is_refused(
     lines = [",".join(names), *(",".join(f"{x:.6f}" for x in row) for row in rows)]
     file.write_text("\n".join(lines))
     back = read_rig_data(file, 8)
-    assert back.posed.all()
-    assert not back.turned.any()
+    assert back.has_position.all()
+    assert not back.has_rotation.any()
     np.testing.assert_allclose(back.positions, data.positions, atol=1e-8)
     np.testing.assert_allclose(back.covariances[0, :3, :3], 4e-8 * np.eye(3))
     answer = call("calibrate", "rig", RIG, file, "--reflector-mm", "0", "0", "0", "--tilt-deg", "0")

@@ -128,8 +128,8 @@ def test_a_number_is_never_a_negative_zero() -> None:
 
 
 def test_a_verdict_says_each_next_step_once() -> None:
-    lacks = [Issue("few", "take more"), Issue("wide", "take more"), Issue("flat", "tilt")]
-    verdict = CalibrationVerdict.of(2e-3, 1e-3, "at 1 m", lacks)
+    issues = [Issue("few", "take more"), Issue("wide", "take more"), Issue("flat", "tilt")]
+    verdict = CalibrationVerdict.of(2e-3, 1e-3, "at 1 m", issues)
     assert not verdict.good
     assert verdict.next_steps == ("take more", "tilt")
     assert str(verdict) == "not good enough: few; wide; flat"
@@ -161,7 +161,7 @@ def test_what_the_place_of_a_camera_may_be_off_by_goes_into_the_rig(rig: Rig) ->
         tag_errors={},
         pictures=3,
         unused={},
-        lacks=(),
+        issues=(),
         data_hash="sha256:0",
     )
     verdict = judge_extrinsics(found, 1e-3)

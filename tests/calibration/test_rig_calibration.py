@@ -33,9 +33,14 @@ from calibration.geometry.measurements import (
 )
 from calibration.geometry.model import CountedLengths, RigModel
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
-from calibration.geometry.quality import compliance_told, differences_told, judge_rig, judged_places
+from calibration.geometry.quality import (
+    estimate_cable_compliances,
+    estimate_compliance,
+    judge_rig,
+    workspace_poses,
+)
 from calibration.geometry.report import number_rows, rig_page
-from calibration.geometry.result import RigResult, require_one_drawing, rig_result
+from calibration.geometry.result import RigResult, require_same_nominal, rig_result
 from calibration.result_files import load_result
 from model.errors import BadInput, InvalidFile
 from model.files.rig_file import RigDocument
@@ -276,7 +281,7 @@ def test_what_leaving_a_place_out_changes_is_what_fits_without_it_find(
     apart = (changes - changes.mean(axis=0)) / parameters.deviations @ known
     by_drawing = np.linalg.inv(known.T @ fit.information @ known + np.eye(known.shape[1]))
     expected = 19.0 / 20.0 * apart.T @ apart + by_drawing @ by_drawing
-    stated = found.by_places / np.outer(parameters.deviations, parameters.deviations)
+    stated = found.by_jackknife / np.outer(parameters.deviations, parameters.deviations)
     stated = known.T @ stated @ known
     assert np.diag(stated) == pytest.approx(np.diag(expected), rel=0.05)
 
@@ -287,11 +292,11 @@ def test_places_that_err_each_as_one_widen_the_intervals(rig: Rig, turned: Truth
     shaken = turned.measured.positions + 2e-3 * random.standard_normal((60, 3))
     data = replace(turned.measured, positions=shaken)
     result = fit_rig(rig, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    scatter, by_places = (
+    scatter, by_jackknife = (
         np.sqrt(np.diag(covariance))
-        for covariance in (result.uncertainty.by_scatter, result.uncertainty.by_places)
+        for covariance in (result.uncertainty.by_scatter, result.uncertainty.by_jackknife)
     )
-    assert np.median(by_places / scatter) > 1.3
+    assert np.median(by_jackknife / scatter) > 1.3
     assert share_inside(result.intervals, true_numbers(rig)) >= 0.9
 
 
@@ -307,7 +312,7 @@ def test_without_turning_it_names_what_cannot_be_told_and_leaves_it_as_drawn(
     moved = found_level.fit.values / spread
     assert np.abs(found_level.observability.unknown.T @ moved).max() < 1e-9
     turned_error = judge_rig(found_level, 0.5e-3, np.radians(15.0))
-    assert turned_error.turned > 2.0 * turned_error.level
+    assert turned_error.rotated > 2.0 * turned_error.level
     assert not turned_error.verdict.good
     assert any("rotated" in step for step in turned_error.verdict.next_steps)
 
@@ -477,9 +482,9 @@ def test_two_results_are_compared_by_where_the_platform_goes(
     assert 0.0 < apart < 0.3
     assert rms(outlets) > 3.0 * apart
     assert one.apart_mm(one) == 0.0
-    sent = judged_places(rig, 0.0)[0]
-    assert np.linalg.norm(found.reached(*judged_places(rig, 0.0)) - sent, axis=1).max() > 1e-3
-    with pytest.raises(BadInput, match="rest on different rig files"):
+    sent = workspace_poses(rig, 0.0)[0]
+    assert np.linalg.norm(found.reached(*workspace_poses(rig, 0.0)) - sent, axis=1).max() > 1e-3
+    with pytest.raises(BadInput, match="depend on different rig files"):
         one.apart_mm(one.model_copy(update={"rests_on": "another"}))
 
 
@@ -498,13 +503,13 @@ def test_counts_of_home_lead_the_corrected_rig_to_the_lengths_that_were_fitted(
 def test_runs_of_another_rig_or_of_two_references_are_refused(rig: Rig) -> None:
     other = load_rig(ROOT / "configs/gachon_8_6.yaml")
     with pytest.raises(BadInput, match="this run was made with outlets"):
-        require_one_drawing(rig, [("runs/a", other)])
+        require_same_nominal(rig, [("runs/a", other)])
     winches = [w.model_copy(update={"home_counts": 5}) for w in rig.document.winches]
     again = rig_from_document(rig.document.model_copy(update={"winches": winches}))
     with pytest.raises(BadInput, match="homed again"):
-        require_one_drawing(rig, [("runs/a", rig), ("runs/b", again)])
-    assert require_one_drawing(rig, [("runs/b", again)]) is again
-    assert require_one_drawing(rig, []) is rig
+        require_same_nominal(rig, [("runs/a", rig), ("runs/b", again)])
+    assert require_same_nominal(rig, [("runs/b", again)]) is again
+    assert require_same_nominal(rig, []) is rig
 
 
 def test_too_few_places_and_nothing_to_look_for_are_refused(rig: Rig, turned: Truth) -> None:
@@ -524,10 +529,10 @@ def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
     turns = [matrix_from_rotation_vector((0.0, 0.0, 1e-3 * (-1) ** k)) for k in range(len(seen))]
     run = Recording(
         time=time,
-        asked=counts,
+        setpoints=counts,
         counts=counts,
         tensions=np.full((len(time), 2), 20.0),
-        seen=seen,
+        pose_times=seen,
         positions=np.stack([np.clip(seen - 1.0, 0.0, 1.0), 0 * seen, 0 * seen], axis=1),
         rotations=np.array(turns),
         covariances=np.tile(np.eye(6) * 1e-8, (len(seen), 1, 1)),
@@ -543,7 +548,7 @@ def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
         "blind",
         replace(
             run,
-            seen=seen[:8],
+            pose_times=seen[:8],
             positions=run.positions[:8],
             rotations=run.rotations[:8],
             covariances=run.covariances[:8],
@@ -585,7 +590,7 @@ def test_a_wrong_stiffness_is_told_with_the_true_one(turned: Truth, poses: bool)
     drawn = load_rig(ROOT / "configs/gachon_8_6.yaml")
     data = turned.measured if poses else turned.measured.without_poses()
     result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    compliance = compliance_told(result)
+    compliance = estimate_compliance(result)
     assert compliance is not None
     assert 1.0 / compliance.estimated == pytest.approx(6000.0, rel=0.05 if poses else 0.35)
     verdict = judge_rig(result, 1e-3, 0.0).verdict
@@ -600,7 +605,7 @@ def test_the_stiffness_that_the_data_tell_is_the_same_for_every_rig_file(
 ) -> None:
     drawn = drawn_with(rig, stiffness)
     result = fit_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    compliance, differences = compliance_told(result), differences_told(result)
+    compliance, differences = estimate_compliance(result), estimate_cable_compliances(result)
     assert compliance is not None
     assert differences is not None
     assert 1.0 / compliance.estimated == pytest.approx(6000.0, rel=0.05)
@@ -642,7 +647,7 @@ def test_cables_that_differ_are_told_and_others_are_not(rig: Rig) -> None:
         built = built_otherwise(rig, 5, [6000.0] * 2 + [weak] + [6000.0] * 5)
         data = places(built, 60, tilt=np.radians(8.0), seed=6).measured
         result = fit_rig(built, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-        differences = differences_told(result)
+        differences = estimate_cable_compliances(result)
         assert differences is not None
         reasons = judge_rig(result, 1e-3, 0.0).verdict.reasons
         assert any("the cables differ" in reason for reason in reasons) == (weak < 6000.0)
@@ -650,14 +655,14 @@ def test_cables_that_differ_are_told_and_others_are_not(rig: Rig) -> None:
     assert 1.0 / differences.estimated[2] == pytest.approx(3000.0, rel=0.25)
     blind = replace(data, tensions=np.full_like(data.tensions, np.nan))
     told = fit_rig(built, blind, {"offsets": 2e-3}, LENGTH_DEVIATION)
-    assert differences_told(told) is None
+    assert estimate_cable_compliances(told) is None
 
 
 def test_the_true_stiffness_is_not_doubted(
     found: RigCalibration, found_level: RigCalibration
 ) -> None:
     for result in (found, found_level):
-        compliance = compliance_told(result)
+        compliance = estimate_compliance(result)
         assert compliance is not None
         assert not compliance.contradicts
         stiffness = result.intervals["stiffness_n"]

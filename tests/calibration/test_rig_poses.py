@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
-from calibration.geometry.pose_selection import Wish, _in_order, _most_telling, chosen_poses
+from calibration.geometry.pose_selection import (
+    PoseRequirements,
+    _d_optimal,
+    _in_order,
+    choose_poses,
+)
 from model.clearance import ClearanceModel
 from model.errors import NoSolution
 from model.pose import Pose
@@ -18,7 +23,9 @@ from model.scene import Scene, load_scene
 from model.statics.gravity import working_tensions
 
 ROOT = Path(__file__).resolve().parents[2]
-WISH = Wish(12, np.radians(15.0), np.radians(15.0), 60, 4.0, 0.1e-3, (0.3e-3,) * 3 + (1e-3,) * 3)
+WISH = PoseRequirements(
+    12, np.radians(15.0), np.radians(15.0), 60, 4.0, 0.1e-3, (0.3e-3,) * 3 + (1e-3,) * 3
+)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +40,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def poses(rig: Rig, scene: Scene) -> list[Pose]:
-    return chosen_poses(rig, scene, WISH, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=1)
+    return choose_poses(rig, scene, WISH, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=1)
 
 
 def test_every_pose_can_be_held_and_is_free(rig: Rig, scene: Scene, poses: list[Pose]) -> None:
@@ -57,7 +64,7 @@ def test_the_platform_is_turned_no_further_than_its_cables_let_it_on_the_way(
 
 
 def test_the_same_seed_chooses_the_same_poses(rig: Rig, scene: Scene, poses: list[Pose]) -> None:
-    again = chosen_poses(rig, scene, WISH, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=1)
+    again = choose_poses(rig, scene, WISH, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=1)
     assert all(a.distance_to(b) == 0.0 for a, b in zip(poses, again, strict=True))
 
 
@@ -69,7 +76,7 @@ def test_what_is_chosen_tells_more_than_chance() -> None:
         information = np.eye(10) + sum(rows[k].T @ rows[k] for k in chosen)
         return float(np.linalg.slogdet(information)[1])
 
-    chosen = _most_telling(rows, 15)
+    chosen = _d_optimal(rows, 15)
     assert len(set(chosen)) == 15
     others = [told(random.choice(80, 15, replace=False).tolist()) for _ in range(50)]
     assert told(chosen) > max(others)
@@ -86,6 +93,6 @@ def test_the_way_through_all_poses_has_no_detour() -> None:
 def test_a_scene_without_room_is_told(rig: Rig, scene: Scene) -> None:
     narrow = replace(scene, self_clearance=0.05)
     with pytest.raises(NoSolution, match="tried poses are feasible and free"):
-        chosen_poses(
+        choose_poses(
             rig, narrow, replace(WISH, candidates=15), Parameters.of(rig, {"offsets": 1e-3}), 0
         )

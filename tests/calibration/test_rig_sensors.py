@@ -19,7 +19,7 @@ from calibration.geometry.model import RigModel
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.quality import judge_rig
 from calibration.geometry.report import number_rows, rig_page
-from calibration.geometry.result import RigResult, drawing_of, rig_result
+from calibration.geometry.result import RigResult, nominal_geometry, rig_result
 from model.errors import BadInput
 from model.pose import matrix_from_rotation_vector
 from model.rig import Rig, load_rig
@@ -154,11 +154,11 @@ def test_a_common_factor_keeps_the_differences_of_the_rig_file(
 
 def test_results_of_rig_files_without_the_new_key_still_apply(rig: Rig) -> None:
     """What a result rests on has no key that is left out."""
-    (winch, *_) = drawing_of(rig.document)["winches"]
+    (winch, *_) = nominal_geometry(rig.document)["winches"]
     assert "cable_stiffness_n" not in winch
     other = rig.document.winches[0].model_copy(update={"cable_stiffness_n": 5.0})
     changed = rig.document.model_copy(update={"winches": [other, *rig.document.winches[1:]]})
-    assert drawing_of(changed) != drawing_of(rig.document)
+    assert nominal_geometry(changed) != nominal_geometry(rig.document)
 
 
 def widths(rig: Rig, data: RigMeasurements) -> dict[str, float]:
@@ -295,7 +295,7 @@ def test_sensors_are_read_from_their_columns(
 def test_an_acceleration_that_is_not_gravitys_is_refused(
     data: RigMeasurements, tmp_path: Path
 ) -> None:
-    with pytest.raises(BadInput, match=r"line 2: accel_x_m_s2.* are 1 together; at rest it"):
+    with pytest.raises(BadInput, match=r"line 2: accel_x_m_s2.* are 1 in magnitude; at rest it"):
         read_rig_data(written(tmp_path / "wrong.csv", data, "m_s2", 1.0), 10)
 
 

@@ -20,7 +20,7 @@ from calibration.tag_map.bundle_adjustment import (
     measure_layout,
     require_tags,
 )
-from calibration.tag_map.observations import TagSights, TagViews, moved_tags
+from calibration.tag_map.observations import TagObservations, TagViews, moved_tags
 from calibration.tag_map.result import judge_layout, tags_result
 from model.errors import BadInput
 from model.pose import Pose
@@ -58,7 +58,7 @@ def around(rig: Rig, count: int, rng: np.random.Generator) -> dict[str, Pose]:
     return poses
 
 
-def session(rig: Rig, tags, count: int, seed: int, noise: float = 0.02) -> TagSights:
+def session(rig: Rig, tags, count: int, seed: int, noise: float = 0.02) -> TagObservations:
     rng = np.random.default_rng(seed)
     return sights_at(rig.cameras[0], tags, around(rig, count, rng), noise, rng)
 
@@ -67,7 +67,7 @@ def gaps(found: TagLayout, truth) -> tuple[float, float]:
     """RMS error of corners [mm] and of turns [deg], the truth put where it fits the drawing."""
     true = {tag.id: tag for tag in truth}
     here = np.concatenate([tag_corners(true[tag.id]) for tag in found.tags])
-    there = np.concatenate([tag_corners(tag) for tag in found.drawn])
+    there = np.concatenate([tag_corners(tag) for tag in found.nominal])
     middle, target = here.mean(axis=0), there.mean(axis=0)
     u, _, vt = np.linalg.svd((there - target).T @ (here - middle))
     turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
@@ -97,10 +97,10 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig) -> None:
     inside, errors, stated = [], [], []
     for seed in range(8):
         tags = as_glued(rig, np.random.default_rng(seed))
-        sights = session(rig, tags, 16, seed=100 + seed, noise=0.05)
-        found = measure_layout(rig, rig.cameras[0], sights, fixed=301)
+        observations = session(rig, tags, 16, seed=100 + seed, noise=0.05)
+        found = measure_layout(rig, rig.cameras[0], observations, fixed=301)
         true = {tag.id: tag for tag in tags}
-        home = next(tag for tag in found.drawn if tag.id == 301)
+        home = next(tag for tag in found.nominal if tag.id == 301)
         shift = home.pose.compose(true[301].pose.inverse())
         off = np.array(
             [tag.pose.position - shift.compose(true[tag.id].pose).position for tag in found.tags]
@@ -115,12 +115,14 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig) -> None:
 
 
 def test_slopes_are_those_of_finite_differences(rig: Rig) -> None:
-    sights = session(rig, rig.platform_tags, 4, seed=3)
+    observations = session(rig, rig.platform_tags, 4, seed=3)
     tags = tuple(rig.platform_tags)
-    views = TagViews.of(rig.cameras[0], sights, tags)
+    views = TagViews.of(rig.cameras[0], observations, tags)
     rng = np.random.default_rng(3)
     poses = [
-        p for name, p in around(rig, 4, np.random.default_rng(3)).items() if name in sights.squares
+        p
+        for name, p in around(rig, 4, np.random.default_rng(3)).items()
+        if name in observations.squares
     ]
     poses = [moved(p, 1e-3 * rng.standard_normal(6)) for p in poses]
     exact = views.dense_slopes(poses, tags)
@@ -140,12 +142,13 @@ def test_slopes_are_those_of_finite_differences(rig: Rig) -> None:
 
 def test_what_pictures_cannot_tell_is_said(rig: Rig) -> None:
     """A tag that is never seen with others stays as drawn; an image of one tag tells nothing."""
-    sights = session(rig, rig.platform_tags, 24, seed=4)
+    observations = session(rig, rig.platform_tags, 24, seed=4)
     squares = {
-        name: {k: s for k, s in seen.items() if k != 306} for name, seen in sights.squares.items()
+        name: {k: s for k, s in seen.items() if k != 306}
+        for name, seen in observations.squares.items()
     }
     squares["alone.png"] = {301: next(s[301] for s in squares.values() if 301 in s)}
-    found = measure_layout(rig, rig.cameras[0], TagSights(squares, {}))
+    found = measure_layout(rig, rig.cameras[0], TagObservations(squares, {}))
     assert found.unseen == {306: "was not detected together with the others"}
     assert "only one tag" in found.unused["alone.png"]
     verdict = judge_layout(found, 1e-3)
@@ -172,18 +175,20 @@ def test_a_tag_that_was_glued_elsewhere_is_named(rig: Rig) -> None:
 
 
 def test_a_picture_of_another_tag_is_left_out_by_name(rig: Rig) -> None:
-    sights = session(rig, rig.platform_tags, 16, seed=8)
-    numbers = [number for seen in sights.squares.values() for number in seen]
+    observations = session(rig, rig.platform_tags, 16, seed=8)
+    numbers = [number for seen in observations.squares.values() for number in seen]
     number = max(set(numbers), key=numbers.count)
-    name, seen = next((n, s) for n, s in sights.squares.items() if number in s and len(s) == 3)
+    name, seen = next(
+        (n, s) for n, s in observations.squares.items() if number in s and len(s) == 3
+    )
     square = seen[number]
     off = replace(
         square,
         corners=square.corners + 12.0,
         target=square.whitening @ (square.corners + 12.0).ravel(),
     )
-    wrong = {**sights.squares, name: {**seen, number: off}}
-    found = measure_layout(rig, rig.cameras[0], TagSights(wrong, {}))
+    wrong = {**observations.squares, name: {**seen, number: off}}
+    found = measure_layout(rig, rig.cameras[0], TagObservations(wrong, {}))
     others = [why for other, why in found.unused.items() if other != name]
     assert all("only one tag" in why for why in others)
     assert "px, far more than the others" in found.unused[name]
@@ -195,8 +200,8 @@ def test_pictures_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
     base = next(iter(around(rig, 1, rng).values()))
     poses = {f"{k}.png": moved(base, 0.01 * rng.standard_normal(6)) for k in range(20)}
     camera = rig.cameras[0]
-    sights = sights_at(camera, rig.platform_tags, poses, 0.02, rng)
-    verdict = judge_layout(measure_layout(rig, camera, sights), 1.0)
+    observations = sights_at(camera, rig.platform_tags, poses, 0.02, rng)
+    verdict = judge_layout(measure_layout(rig, camera, observations), 1.0)
     assert any("all images are taken from within" in reason for reason in verdict.reasons)
     assert "take images from all sides, all different" in verdict.next_steps
 

@@ -296,7 +296,7 @@ CABLES = {"outlets_error_mm": 1.0, "anchors_error_mm": 0.5}
 
 
 @pytest.mark.parametrize(
-    ("camera_says", "tags_say", "rig_says", "lacks"),
+    ("camera_says", "tags_say", "rig_says", "issues"),
     [
         ({}, None, {}, "lens_covariance.*pose_covariance.*tags.*outlets.*anchors"),
         (ALL, 0.1, {}, "outlets_error_mm"),
@@ -312,7 +312,7 @@ def test_no_clearance_is_measured_where_nothing_says_how_far_off_it_is(
     camera_says: dict,
     tags_say: float | None,
     rig_says: dict,
-    lacks: str,
+    issues: str,
 ) -> None:
     plain = rig.document.model_dump(mode="json", exclude_unset=True)
     plain["cameras"][0] |= {"error_mm": None} | camera_says
@@ -321,9 +321,9 @@ def test_no_clearance_is_measured_where_nothing_says_how_far_off_it_is(
     picture = SyntheticCamera(said, crowded, said.cameras[0], 3).render(said.home, 0)
     found = Tracker(said, said.cameras[0]).observe(picture, 0.0)
     assert isinstance(found, PoseMeasurement)
-    assert found.unstated is bool(lacks)
-    if lacks:
-        with pytest.raises(BadInput, match=f"(?s){lacks}"):
+    assert found.unstated is bool(issues)
+    if issues:
+        with pytest.raises(BadInput, match=f"(?s){issues}"):
             require_stated_errors(said, said.cameras)
         with pytest.raises(BadInput, match="error_mm"):
             clearance_of(ClearanceModel(said, crowded), found)
