@@ -82,12 +82,12 @@ def widened(covariance: Array, without: Array) -> Array:
     """
     count, size = without.shape
     ratio = float(np.trace(np.linalg.solve(covariance, jackknife(without)))) / size
-    ratio *= kept_share(count, size)
+    ratio *= leverage_factor(count, size)
     by_chance = 2.0 * float(np.sqrt(2.0 / (size * (count - 1))))
     return np.asarray(covariance * (ratio if ratio > 1.0 + by_chance else 1.0))
 
 
-def kept_share(parts: int, numbers: int) -> float:
+def leverage_factor(parts: int, numbers: int) -> float:
     """Correction factor for a jackknife's variance, which is too wide with influential parts.
 
     It takes off half of their mean leverage, numbers by parts.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views, fit_camera
-from calibration.intrinsics.quality import judge_camera, picture_grid, pixel_uncertainty
+from calibration.intrinsics.quality import image_grid, judge_camera, pixel_uncertainty
 from calibration.intrinsics.result import (
     camera_page,
     radial_pattern,
@@ -50,7 +50,7 @@ def photographed() -> CameraCalibration:
 def test_the_map_of_uncertainty_makes_up_the_verdicts_error(found) -> None:
     quality = judge_camera(found, 1e-3, 1.0)
     focal = np.sqrt(found.matrix[0, 0] * found.matrix[1, 1])
-    each = pixel_uncertainty(found, picture_grid(SIZE))
+    each = pixel_uncertainty(found, image_grid(SIZE))
     whole = np.sqrt(np.mean(each**2)) / focal
     assert each.shape == (81,)
     # Pixel by pixel the larger of both covariances counts, for the whole that of the whole.

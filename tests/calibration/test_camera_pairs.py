@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from calibration.extrinsics.camera_pairs import (
-    BodyLook,
+    BodyObservation,
     _board_pose,
     locate_by_pairs,
     require_oriented,
@@ -106,7 +106,7 @@ def test_a_second_camera_is_located_by_the_first(two, folders: Path, tmp_path: P
 def test_mistakes_are_refused_in_one_message(folders: Path) -> None:
     rig, side = folders / "rig.yaml", folders / "side"
     verb = ("calibrate", "extrinsics", rig, side, "--camera", "side", "--beside")
-    one_message(call(*verb, f"side={side}"), 2, "cannot be located by itself")
+    one_message(call(*verb, f"side={side}"), 2, "cannot be located relative to itself")
     one_message(call(*verb, f"top={side}"), 2, "'top'")
     board = ("--columns", 9, "--rows", 6, "--square-mm", 25)
     one_message(call(*verb, f"front={folders / 'front'}", *board), 2, "turned by 180")
@@ -145,8 +145,8 @@ def test_pairs_that_agree_but_for_one_are_not_led_astray(two) -> None:
         off = 0.05 if number == 3 else 0.0
         body = Pose(pose.position + off, pose.rotation)
         pairs[str(number)] = (
-            BodyLook(truth.inverse().compose(pose), covariance, 0.1),
-            BodyLook(front.world_from_camera.inverse().compose(body), covariance, 0.1),
+            BodyObservation(truth.inverse().compose(pose), covariance, 0.1),
+            BodyObservation(front.world_from_camera.inverse().compose(body), covariance, 0.1),
         )
     found = locate_by_pairs(rig, rig.cameras[1], front, pairs, {}, "sha256:0")
     assert found.world_from_camera.distance_to(truth) < 1e-3

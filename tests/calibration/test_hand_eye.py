@@ -142,7 +142,7 @@ def test_pictures_without_a_pose_are_named_and_too_few_are_refused(rig: Rig) -> 
     del told["2.png"]
     found = locate_by_motion(rig, rig.cameras[0], observations, told)
     assert found.unused == {"2.png": "has no pose"}
-    assert any("5 poses were seen; 8 are required" in issue.reason for issue in found.issues)
+    assert any("5 poses were observed; 8 are required" in issue.reason for issue in found.issues)
     few = {name: told[name] for name in ("0.png", "1.png")}
     with pytest.raises(BadInput, match="2 images show the platform at a known pose"):
         locate_by_motion(rig, rig.cameras[0], observations, few)
