@@ -28,7 +28,7 @@ from model.rig import load_rig
 from model.scene import load_scene
 from simulation.camera.camera import SyntheticCamera
 from tests.tracking.hard_pictures import Condition, HardPicture, HardPrinter
-from tracking.camera_model import Image, pixels_from_ideal
+from tracking.camera_model import Image, distort_pixels
 from tracking.detection.detector import TagDetector
 from tracking.detection.tags import dictionary, modules_across, upright_corners
 from tracking.edges.refine import refine
@@ -67,11 +67,11 @@ def ours(family: str, printer: HardPrinter) -> Finder:
     def find(image: Image, number: int) -> Mapping[int, Array]:
         seen = detector.detect(image)
         if number not in {d.id for d in seen}:
-            seen = detector.detect(image, thorough=True)
+            seen = detector.detect(image, exhaustive=True)
         rough = np.array([d.corners for d in seen]).reshape(-1, 4, 2)
         squares = refine(image, printer.camera, rough, modules)
         return {
-            d.id: pixels_from_ideal(printer.camera, s.corners) if s is not None else d.corners
+            d.id: distort_pixels(printer.camera, s.corners) if s is not None else d.corners
             for d, s in zip(seen, squares, strict=True)
         }
 
@@ -194,7 +194,7 @@ def times(rounds: int) -> None:
         "ours": lambda: detector.detect(image),
         "cv2 NONE": lambda: peer(image, 0),
         "cv2 SUBPIX": lambda: sub_pixel(image, 0),
-        "ours, thorough": lambda: detector.detect(image, thorough=True),
+        "ours, exhaustive": lambda: detector.detect(image, exhaustive=True),
     }
     if library is not None:
         who["pyapriltags"] = lambda: library(image, 0)

@@ -38,12 +38,12 @@ NEAR = 2.0
 Finder = Callable[[Image], Sequence[Array]]
 
 
-def ours(family: str, thorough: bool) -> Finder:
+def ours(family: str, exhaustive: bool) -> Finder:
     """What `cdpr` does: the detector, then the edges of those whose edges can be measured."""
     detector, modules = TagDetector(family), modules_across(family)
 
     def find(image: Image) -> Sequence[Array]:
-        rough = np.array([d.corners for d in detector.detect_all(image, thorough=thorough)])
+        rough = np.array([d.corners for d in detector.detect_all(image, exhaustive=exhaustive)])
         squares = refine(image, _some_camera(image), rough.reshape(-1, 4, 2), modules)
         return [
             s.corners if s is not None and s.whole else corners
@@ -107,8 +107,8 @@ def main() -> int:
     arguments = parser.parse_args()
     shipped = sorted((ROOT / "tests" / "tracking" / "photographs").glob("*.jpg"))
     finders = {
-        "ours": ours(arguments.family, thorough=False),
-        "ours, thorough": ours(arguments.family, thorough=True),
+        "ours": ours(arguments.family, exhaustive=False),
+        "ours, exhaustive": ours(arguments.family, exhaustive=True),
         "cv2": opencv(arguments.family),
     }
     library = apriltag_library(arguments.family)

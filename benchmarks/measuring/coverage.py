@@ -37,7 +37,7 @@ from model.clearance import ClearanceModel
 from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, Tag, load_rig
 from model.scene import Scene, load_scene
-from tracking.camera_model import ideal_from_pixels
+from tracking.camera_model import undistort_pixels
 from tracking.clearance import clearance_of
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
@@ -160,7 +160,7 @@ def moved_tag(tag: Tag, shift: float, turn: float, rng: np.random.Generator) -> 
 def square_of(truth: Camera, told: Camera, points: Array, rng: np.random.Generator) -> RefinedTag:
     """Corners in the camera's frame as they are seen, freed of the told lens."""
     pixels = seen_by(truth, points) + TAG_PX * rng.standard_normal((4, 2))
-    ideal = ideal_from_pixels(told, pixels)
+    ideal = undistort_pixels(told, pixels)
     whitening = np.eye(8) / TAG_PX
     return RefinedTag(ideal, whitening, whitening @ ideal.ravel(), np.ones(4, bool))
 

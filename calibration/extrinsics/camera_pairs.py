@@ -39,7 +39,7 @@ from model.errors import BadInput
 from model.pose import Array, Pose, carried, matrix_from_rotation_vector, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
-from tracking.camera_model import Image, ideal_from_pixels, project_undistorted
+from tracking.camera_model import Image, project_undistorted, undistort_pixels
 from tracking.pnp import moved, pose_slopes
 
 LEAST_PAIRS = 4
@@ -99,16 +99,16 @@ def observe_board(board: Board, camera: Camera, image: Image) -> BodyObservation
 
 
 def _board_pose(seen: DetectedBoard, camera: Camera) -> BodyObservation | None:
-    ideal = ideal_from_pixels(camera, seen.corners)
-    good, turn, origin = cv2.solvePnP(seen.points, ideal, camera.matrix, np.zeros(4))
+    undistorted = undistort_pixels(camera, seen.corners)
+    good, turn, origin = cv2.solvePnP(seen.points, undistorted, camera.matrix, np.zeros(4))
     if not good:
         return None
     turn, origin = cv2.solvePnPRefineLM(
-        seen.points, ideal, camera.matrix, np.zeros(4), turn, origin
+        seen.points, undistorted, camera.matrix, np.zeros(4), turn, origin
     )
     pose = Pose(np.ravel(origin).astype(np.float64), matrix_from_rotation_vector(np.ravel(turn)))
     slopes = pose_slopes(camera, seen.points, pose).reshape(-1, 6)
-    errors = ideal - project_undistorted(camera, pose.apply(seen.points))
+    errors = undistorted - project_undistorted(camera, pose.apply(seen.points))
     freedom = max(errors.size - 6, 1)
     scatter = max(float(np.sum(errors**2)) / freedom, _LEAST_SCATTER**2)
     error = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))

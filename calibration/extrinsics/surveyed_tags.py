@@ -21,7 +21,7 @@ from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import ideal_slopes, project_undistorted
+from tracking.camera_model import project_undistorted, undistorted_slopes
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, moved, solve_pnp
@@ -278,7 +278,7 @@ def _by_lens(camera: Camera, tags: Sequence[_SeenTag], best: Pose, slopes: Array
     if camera.lens_covariance is None:
         return None
     by_lens = [
-        tag.whitening @ ideal_slopes(camera, tag.pixels.reshape(4, 2)).reshape(8, -1)
+        tag.whitening @ undistorted_slopes(camera, tag.pixels.reshape(4, 2)).reshape(8, -1)
         for tag in tags
     ]
     steps = np.linalg.lstsq(slopes, np.concatenate(by_lens), rcond=None)[0]

@@ -32,7 +32,7 @@ from model.pose import Array, PlatformMotion, Pose
 from model.rig import Camera, Rig
 from tracking.measurement import MEMORY
 from tracking.pnp import TagView, refine_pnp, solve_pnp
-from tracking.rolling_shutter import rows_at_once
+from tracking.rolling_shutter import correct_rolling_shutter
 
 LEAST = 5
 """Minimum number of images with a known motion; fewer do not show the scatter."""
@@ -91,7 +91,7 @@ class _Moving:
 
     def cost(self, camera: Camera) -> float:
         """Huber cost of the edges at the camera's readout, in variances."""
-        views = rows_at_once(camera, self.views, self.pose, self.motion)
+        views = correct_rolling_shutter(camera, self.views, self.pose, self.motion)
         found = refine_pnp(camera, views, self.camera_from_body)
         return float("inf") if found is None else found.cost
 

@@ -36,11 +36,11 @@ from simulation.camera.camera import SyntheticCamera
 from tests.cli.program import call, one_message
 from tracking.camera_model import (
     WIDEST,
-    ideal_from_pixels,
-    pixels_from_ideal,
+    distort_pixels,
     pixels_of,
     project,
     rays_of,
+    undistort_pixels,
 )
 from tracking.measurement import PoseMeasurement
 from tracking.shared_errors import CameraMoved
@@ -193,15 +193,15 @@ def some_camera(name: str) -> Camera:
 def test_pixels_come_back_from_ideal_ones(name: str) -> None:
     camera = some_camera(name)
     across = np.stack(np.meshgrid(np.linspace(120, 820, 9), np.linspace(60, 540, 7)), axis=-1)
-    ideal = ideal_from_pixels(camera, across)
-    np.testing.assert_allclose(pixels_from_ideal(camera, ideal), across, atol=1e-5)
+    ideal = undistort_pixels(camera, across)
+    np.testing.assert_allclose(distort_pixels(camera, ideal), across, atol=1e-5)
 
 
 def test_rays_beside_and_behind_a_fisheye_are_put_at_its_rim() -> None:
     """Not on the other side of the picture, where OpenCV's iteration puts them."""
     camera = some_camera("fisheye")
     corners = np.array([[5.0, 5.0], [955.0, 5.0], [5.0, 595.0], [955.0, 595.0]])
-    ideal = ideal_from_pixels(camera, corners) - camera.matrix[:2, 2]
+    ideal = undistort_pixels(camera, corners) - camera.matrix[:2, 2]
     assert (np.sign(ideal) == np.sign(corners - camera.matrix[:2, 2])).all()
     reach = np.linalg.norm(ideal / [camera.matrix[0, 0], camera.matrix[1, 1]], axis=1)
     np.testing.assert_allclose(np.arctan(reach), WIDEST, atol=1e-3)

@@ -8,7 +8,7 @@ import pytest
 from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, Tag
 from tests.tracking.tag_pictures import small_camera
-from tracking.camera_model import ideal_from_pixels, pixels_from_ideal, project_undistorted
+from tracking.camera_model import distort_pixels, project_undistorted, undistort_pixels
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, _Squares, moved, refine_pnp, solve_pnp
@@ -166,5 +166,5 @@ def test_a_start_behind_the_camera_gives_no_pose(rig: Rig) -> None:
 def test_distortion_is_put_on_and_taken_off(distortion: tuple[float, ...]) -> None:
     camera = small_camera(distortion)
     points: Array = np.random.default_rng(7).uniform([0, 0], [319, 239], (5, 4, 2))
-    back = pixels_from_ideal(camera, ideal_from_pixels(camera, points))
+    back = distort_pixels(camera, undistort_pixels(camera, points))
     np.testing.assert_allclose(back, points, atol=1e-5)

@@ -15,7 +15,7 @@ from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.fusion import MultiCameraFusion, together
+from tracking.fusion import MultiCameraFusion, fuse_poses
 from tracking.measurement import NoPose, PoseMeasurement, extrapolate
 from tracking.tracker import Tracker
 
@@ -38,7 +38,7 @@ def measured(place: list[float], sigma: list[float]) -> PoseMeasurement:
 def test_each_camera_counts_where_it_measures_well() -> None:
     a = measured([1e-3, 0.0, 0.4], [1e-3, 1e-5, 1e-3])
     b = measured([0.0, 1e-3, 0.4], [1e-5, 1e-3, 1e-3])
-    found = together({"a": a, "b": b})
+    found = fuse_poses({"a": a, "b": b})
     assert isinstance(found, PoseMeasurement)
     assert np.abs(found.pose.position - [0.0, 0.0, 0.4]).max() < 1e-6
     assert np.sqrt(np.diag(found.covariance)[:2]).max() < 1.01e-5
@@ -63,7 +63,7 @@ def test_two_cameras_give_a_better_pose_than_each_alone(
             name: Tracker(rig, eyes[name]).observe(pictures[name].render(truth, frame), 0.0)
             for name in eyes
         }
-        for name, one in {**seen, "both": together(seen)}.items():
+        for name, one in {**seen, "both": fuse_poses(seen)}.items():
             assert isinstance(one, PoseMeasurement), one
             error = error_of(one, truth)
             squares[name].append(float(error[:3] @ error[:3]))
@@ -77,7 +77,7 @@ def test_two_cameras_give_a_better_pose_than_each_alone(
 
 def test_of_two_that_disagree_there_is_no_pose() -> None:
     a, b = measured([0.0, 0.0, 0.4], [1e-4] * 3), measured([0.01, 0.0, 0.4], [1e-4] * 3)
-    found = together({"front": a, "side": b})
+    found = fuse_poses({"front": a, "side": b})
     assert isinstance(found, NoPose)
     assert found.reason == "cameras front and side disagree by 10.0 mm"
 
@@ -85,7 +85,7 @@ def test_of_two_that_disagree_there_is_no_pose() -> None:
 def test_of_three_the_one_that_disagrees_is_left_out() -> None:
     good = [measured([0.0, 0.0, 0.4], [1e-4] * 3), measured([1e-4, 0.0, 0.4], [1e-4] * 3)]
     wrong = measured([0.03, 0.0, 0.4], [1e-4] * 3)
-    found = together({"a": good[0], "wrong": wrong, "b": good[1]})
+    found = fuse_poses({"a": good[0], "wrong": wrong, "b": good[1]})
     assert isinstance(found, PoseMeasurement)
     assert found.pose.distance_to(Pose.level([5e-5, 0.0, 0.4])) < 1e-9
 
@@ -188,8 +188,8 @@ def test_a_pose_is_of_the_time_it_states_though_no_speed_is_known(
 
 def test_one_that_sees_nothing_leaves_it_to_the_others() -> None:
     good = measured([0.0, 0.0, 0.4], [1e-4] * 3)
-    assert together({"a": NoPose(0.0, "dark"), "b": good}) is good
-    none = together({"a": NoPose(0.0, "dark", (7,)), "b": NoPose(0.0, "covered")})
+    assert fuse_poses({"a": NoPose(0.0, "dark"), "b": good}) is good
+    none = fuse_poses({"a": NoPose(0.0, "dark", (7,)), "b": NoPose(0.0, "covered")})
     assert isinstance(none, NoPose)
     assert none.reason == "a: dark; b: covered"
     assert none.seen == (7,)

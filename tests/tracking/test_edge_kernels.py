@@ -27,20 +27,20 @@ from tracking.edges.fit import (
 )
 from tracking.edges.sampling import (
     ACROSS,
+    ALONG,
     BOXED,
     COLUMNS,
     HALF,
     MIDDLE,
     OFFSET,
     OFFSET_VARIANCE,
-    PLACE,
     SHARE,
     SPREAD,
     TILT,
     VALUE,
     beside,
+    blurred_step,
     plane_of,
-    rise,
     sample_edge,
 )
 
@@ -50,7 +50,7 @@ NO_BOW = np.zeros((1, 4, 2))
 
 @given(x=st.floats(-6.0, 6.0), boxed=st.floats(0.0, 1.0))
 def test_the_rise_is_that_of_a_bell_and_a_box_of_unit_variance(x: float, boxed: float) -> None:
-    share, slope, kind = rise(x, boxed)
+    share, slope, kind = blurred_step(x, boxed)
     box = uniform(-math.sqrt(3.0), 2.0 * math.sqrt(3.0))
     assert box.var() == pytest.approx(1.0)
     bell = norm.cdf(x) if abs(x) < 4.5 else float(x > 0)
@@ -114,11 +114,11 @@ def test_the_pixels_beside_an_edge_are_all_that_lie_there(edge: int) -> None:
     count = sample_edge(image, SQUARE, edge, np.zeros(2), (4.0, 41.5), 3.3, pixels)
     wanted = brute_band(image, edge, (4.0, 41.5), 3.3)
     assert count == wanted.shape[1] > 200
-    np.testing.assert_allclose(pixels[[PLACE, ACROSS, VALUE], :count], wanted, atol=1e-9)
+    np.testing.assert_allclose(pixels[[ALONG, ACROSS, VALUE], :count], wanted, atol=1e-9)
     few = np.zeros((6, 120))
     some = sample_edge(image, SQUARE, edge, np.zeros(2), (4.0, 41.5), 3.3, few)
     assert 60 < some <= 120
-    assert np.ptp(few[PLACE, :some]) > 1.7  # spread along the whole edge
+    assert np.ptp(few[ALONG, :some]) > 1.7  # spread along the whole edge
 
 
 def black_square(

@@ -18,7 +18,7 @@ from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
 from tracking.measurement import NoPose, PoseMeasurement
-from tracking.tracker import MEMORY, DrivesAhead, EncoderPrior, Tracker
+from tracking.tracker import MEMORY, EncoderExtrapolator, EncoderPrior, Tracker
 
 Image = NDArray[np.uint8]
 
@@ -79,7 +79,7 @@ def test_the_drives_pose_is_that_of_the_pictures_own_time(
     def at(time: float) -> Pose:
         return Pose.level(np.array([0.0, 0.0, 0.4]) + time * np.array(speed))
 
-    ahead = DrivesAhead()
+    ahead = EncoderExtrapolator()
     ahead.at(delay, 0.0, at(0.0))
     found = ahead.at(period + delay, period, at(period))
     assert found is not None
@@ -87,7 +87,7 @@ def test_the_drives_pose_is_that_of_the_pictures_own_time(
 
 
 def test_drives_that_were_not_heard_for_long_are_not_carried_on() -> None:
-    ahead, here, there = DrivesAhead(), Pose.level([0, 0, 0.4]), Pose.level([0.1, 0, 0.4])
+    ahead, here, there = EncoderExtrapolator(), Pose.level([0, 0, 0.4]), Pose.level([0.1, 0, 0.4])
     assert ahead.at(0.1, 0.0, here) is here
     assert ahead.at(2.1, 2.0, there) is there
     assert ahead.at(2.2, 2.1, None) is None

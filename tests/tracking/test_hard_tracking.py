@@ -14,8 +14,8 @@ from model.rig import Camera, Rig, Tag
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.estimator import TrackerSettings, agreeing
-from tracking.measurement import NoPose, PoseMeasurement, predicted
+from tracking.estimator import TrackerSettings, find_consensus
+from tracking.measurement import NoPose, PoseMeasurement, predict
 from tracking.pnp import TagView
 from tracking.tracker import Tracker
 
@@ -89,7 +89,7 @@ def test_another_print_of_a_frame_tag_does_not_move_the_camera(
 
 def test_no_squares_agree_on_nothing(camera: Camera) -> None:
     nothing: list[TagView] = []
-    assert agreeing(camera, nothing, lambda _: True).views == []
+    assert find_consensus(camera, nothing, lambda _: True).views == []
 
 
 def test_tags_covered_in_part_are_followed(rig: Rig, camera: Camera, empty: Scene) -> None:
@@ -116,12 +116,12 @@ def test_motion_is_carried_on() -> None:
         pose = Pose(np.array([0.1 * time, 0.0, 0.4]), turn)
         return PoseMeasurement(time, pose, np.eye(6), (301,), 0.1, "tracked")
 
-    ahead = predicted(at(0.2), at(0.1), 0.4)
+    ahead = predict(at(0.2), at(0.1), 0.4)
     assert ahead.distance_to(at(0.4).pose) < 1e-12
     assert ahead.angle_to(at(0.4).pose) < 1e-6
     long_ago = at(0.2)
-    assert predicted(long_ago, at(0.1), 9.0) is long_ago.pose
-    assert predicted(long_ago, None, 0.3) is long_ago.pose
+    assert predict(long_ago, at(0.1), 9.0) is long_ago.pose
+    assert predict(long_ago, None, 0.3) is long_ago.pose
 
 
 def test_a_fast_platform_is_followed_by_its_speed(rig: Rig, camera: Camera, empty: Scene) -> None:
@@ -175,7 +175,7 @@ def test_a_smear_is_named_with_its_length(rig: Rig, camera: Camera, empty: Scene
     limits = replace(TrackerSettings(), position_deviation=1e-6)
     found = Tracker(rig, camera, limits).observe(image, 0.0)
     assert isinstance(found, NoPose)
-    smear = re.search(r"smeared by (\d+) px: shorten the exposure", found.reason)
+    smear = re.search(r"blurred by (\d+) px of motion: shorten the exposure", found.reason)
     assert smear is not None
     assert abs(int(smear[1]) - length) <= 1
 

@@ -17,11 +17,11 @@ from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_m
 from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene, load_scene
 from simulation.camera.camera import SyntheticCamera
-from tracking.camera_model import ideal_from_pixels, pixels_from_ideal, project_undistorted
+from tracking.camera_model import distort_pixels, project_undistorted, undistort_pixels
 from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
-from tracking.fusion import together
+from tracking.fusion import fuse_poses
 from tracking.measurement import PoseMeasurement
 from tracking.pnp import TagView, moved, solve_pnp
 from tracking.shared_errors import (
@@ -242,7 +242,7 @@ def test_a_lens_error_counts_by_what_it_does_to_place_and_pose_together(
         off = replace(camera, matrix=matrix, distortion=distortion, world_from_camera=place)
         views = []
         for view in square(rig, camera, pose):
-            corners = ideal_from_pixels(off, pixels_from_ideal(camera, view.seen.corners))
+            corners = undistort_pixels(off, distort_pixels(camera, view.seen.corners))
             whitening = view.seen.whitening
             seen = replace(view.seen, corners=corners, target=whitening @ corners.ravel())
             views.append(TagView(view.tag, seen))
@@ -282,11 +282,11 @@ def test_a_mean_over_pictures_makes_no_shared_error_smaller(rig: Rig) -> None:
     known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
     shared = shared_of(known, camera, pose)
     one = replace(measurement(pose, np.eye(6) * 1e-8), shared=shared, unstated=False)
-    both = together({"a": one, "b": one})
+    both = fuse_poses({"a": one, "b": one})
     assert isinstance(both, PoseMeasurement)
     np.testing.assert_allclose(both.shared, shared, rtol=1e-9)
     assert not both.unstated
-    half = together({"a": one, "b": replace(one, unstated=True)})
+    half = fuse_poses({"a": one, "b": replace(one, unstated=True)})
     assert isinstance(half, PoseMeasurement)
     assert half.unstated
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tracking.fusion import moments
+from tracking.fusion import synchronize_frames
 from tracking.measurement import NoPose
 from tracking.pose_log import LoggedPicture
 
@@ -22,7 +22,7 @@ def grouped(times: Mapping[str, Sequence[float]], within: float) -> list[dict[st
     }
     return [
         {name: one.observation.time for name, one in moment.items()}
-        for moment in moments(streams, within)
+        for moment in synchronize_frames(streams, within)
     ]
 
 
