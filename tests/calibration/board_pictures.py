@@ -23,8 +23,8 @@ def poses_before_the_camera(
     poses = []
     for _ in range(count):
         turn = matrix_from_rotation_vector(rng.uniform(-0.6, 0.6, 3))
-        place = np.array([*rng.uniform(-spread, spread, 2), rng.uniform(0.4, 0.6)])
-        poses.append(Pose(place - turn @ middle, turn))
+        position = np.array([*rng.uniform(-spread, spread, 2), rng.uniform(0.4, 0.6)])
+        poses.append(Pose(position - turn @ middle, turn))
     return poses
 
 
@@ -49,8 +49,8 @@ def picture_of(print_: np.ndarray, pixel: float, origin: Array, pose: Pose) -> n
     """
     rays = sample_rays() @ pose.rotation
     eye = -pose.rotation.T @ pose.position
-    places = (eye + (-eye[2] / rays[:, 2])[:, None] * rays)[:, :2]
-    found = ((places + origin) / pixel - 0.5).astype(np.float32)
+    on_board = (eye + (-eye[2] / rays[:, 2])[:, None] * rays)[:, :2]
+    found = ((on_board + origin) / pixel - 0.5).astype(np.float32)
     shape = (SIZE[1] * _SUB, SIZE[0] * _SUB)
     fine = cv2.remap(
         print_.astype(np.float32),

@@ -1,4 +1,4 @@
-"""Places at rest of a rig that is not built as its file says, with exact truth."""
+"""Stationary samples of a rig that differs from its file, with exact ground truth."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Truth:
     rotations: Array
 
 
-def places(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) -> Truth:
-    """Where a simulated rig comes to rest when its drives are told to go to random poses."""
+def samples(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) -> Truth:
+    """Samples of a simulated rig whose drives are commanded to random poses."""
     random = np.random.default_rng(seed)
     winches, plant = WinchMap(rig), _plant(rig)
     span = rig.workspace_upper - rig.workspace_lower
@@ -61,7 +61,7 @@ def places(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) 
     ]
     covariance = np.diag([POSITION_NOISE**2] * 3 + [TURN_NOISE**2] * 3)
     measured = RigMeasurements(
-        names=tuple(f"place {k}" for k in range(count)),
+        names=tuple(f"sample {k}" for k in range(count)),
         counts=np.array([counts for counts, _, _ in rows]),
         tensions=np.array([t for _, t, _ in rows]),
         positions=np.array([p for p, _ in shaken]),
@@ -135,7 +135,7 @@ def _plant(rig: Rig) -> Plant:
     return Plant(rig_as_built(rig), rig.home, None, stiffness_as_built(rig))
 
 
-def write_places(path: Path, measured: RigMeasurements, *, poses: bool = True) -> None:
+def write_samples(path: Path, measured: RigMeasurements, *, poses: bool = True) -> None:
     """As a CSV file of docs/data-formats.md."""
     m = measured.counts.shape[1]
     names = [f"actual_{i}_counts" for i in range(1, m + 1)]
@@ -143,7 +143,7 @@ def write_places(path: Path, measured: RigMeasurements, *, poses: bool = True) -
     table = [measured.counts, measured.tensions]
     if poses:
         names += ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"]
-        turned = [Pose(np.zeros(3), r).quaternion for r in measured.rotations]
-        table += [measured.positions * 1e3, np.array(turned)]
+        quaternions = [Pose(np.zeros(3), r).quaternion for r in measured.rotations]
+        table += [measured.positions * 1e3, np.array(quaternions)]
     rows = [",".join(f"{x:.9g}" for x in row) for row in np.concatenate(table, axis=1)]
     path.write_text("\n".join([",".join(names), *rows]) + "\n", encoding="utf-8")

@@ -57,8 +57,8 @@ def board_picture(pose: Pose) -> np.ndarray:
     """The board rendered by meeting its plane with every ray, 2 x 2 samples a pixel."""
     rays = sample_rays() @ pose.rotation
     origin = -pose.rotation.T @ pose.position
-    places = (origin + (-origin[2] / rays[:, 2])[:, None] * rays)[:, :2] / BOARD.square + 1.0
-    squares = np.floor(places).astype(int)
+    on_board = (origin + (-origin[2] / rays[:, 2])[:, None] * rays)[:, :2] / BOARD.square + 1.0
+    squares = np.floor(on_board).astype(int)
     board = (squares[:, 0] >= 0) & (squares[:, 0] <= BOARD.columns)
     board &= (squares[:, 1] >= 0) & (squares[:, 1] <= BOARD.rows)
     black = board & (squares.sum(axis=1) % 2 == 0)
@@ -105,7 +105,7 @@ def test_corners_that_err_together_widen_the_intervals() -> None:
     assert (unsure[:4] > 3.0 * sure[:4]).all()
 
 
-def test_leaving_a_picture_out_is_told_as_a_fit_without_it_finds() -> None:
+def test_the_change_without_an_image_is_that_of_a_fit_without_it() -> None:
     all_views = views(12, 0.1)
     found = calibrate_from_views(all_views, SIZE)
     for k, name in enumerate(list(all_views)[:4]):

@@ -1,4 +1,4 @@
-"""Which images a live camera takes, and what the person with the board is told."""
+"""Which images a live camera captures, and the instructions to the operator."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Shown:
 
 
 def held(x: float, y: float, turn: Array | list[float] = (0.0, 0.0, 0.0), z: float = 0.6) -> Pose:
-    """A board whose middle is at a place before the camera, [m], turned about its middle."""
+    """A board with its centre at a position in front of the camera, [m], rotated about it."""
     rotation = matrix_from_rotation_vector(turn)
     return Pose(np.array([x, y, z]) - rotation @ POINTS.mean(axis=0), rotation)
 
@@ -51,7 +51,7 @@ def show(guide: CaptureGuide, board: Shown, pose: Pose | None, times: int = 2):
     return advice[-1]
 
 
-def test_a_picture_is_taken_when_the_board_stands_still_and_shows_something_new(shown) -> None:
+def test_an_image_is_taken_when_the_board_is_at_rest_and_shows_something_new(shown) -> None:
     guide = CaptureGuide(shown, wanted=10)
     assert guide.judge(BLANK).text == "0 of 10 images: show the board"
     shown.pose = held(0.0, 0.0)

@@ -32,9 +32,9 @@ def test_corners_of_a_file_calibrate_as_those_that_were_found(tmp_path: Path) ->
     direct = calibrate_from_views(seen, SIZE, lens="five")
     answer = call("calibrate", "camera", file, "--size-px", *SIZE, "--lens", "five", "--json")
     assert answer.code in (0, 3), answer
-    told = json.loads(answer.out)
-    assert told["fx_px"] == pytest.approx(direct.matrix[0, 0], abs=0.01)
-    assert told["pictures_used"] == 14
+    result = json.loads(answer.out)
+    assert result["fx_px"] == pytest.approx(direct.matrix[0, 0], abs=0.01)
+    assert result["pictures_used"] == 14
 
 
 def test_pictures_with_few_corners_are_left_out(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_pictures_with_few_corners_are_left_out(tmp_path: Path) -> None:
         ("picture,x_px,y_px,board_x_mm\na,1,2,3\n", "'board_y_mm' is missing"),
         (f"{HEAD}\na,1,2,3\n", "line 2"),
         (f"{HEAD}\na,1,2,3,nan\n", "line 2"),
-        (f"{HEAD}\na,1,2,3,4\n", "no picture has 8 corners"),
+        (f"{HEAD}\na,1,2,3,4\n", "no image has 8 corners"),
     ],
 )
 def test_files_that_hold_no_corners_are_refused(tmp_path: Path, text: str, named: str) -> None:

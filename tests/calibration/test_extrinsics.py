@@ -1,4 +1,4 @@
-"""The camera's place from surveyed tags on the frame, and how honest its intervals are."""
+"""The camera's pose from surveyed frame tags, and the coverage of its intervals."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def rig() -> Rig:
 
 
 def elsewhere(rig: Rig) -> Pose:
-    """Where the camera truly stands: not where the rig file says."""
+    """The true pose of the camera, which differs from the rig file's."""
     named = rig.cameras[0].world_from_camera
     turn = matrix_from_rotation_vector([0.02, -0.01, 0.015])
     return Pose(named.position + np.array([0.03, -0.02, 0.01]), turn @ named.rotation)
@@ -116,7 +116,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) 
     assert np.median(stated) < 3.0 * np.median(errors)  # and not by promising nothing
 
 
-def test_who_knows_that_tags_are_turned_as_told_finds_the_camera_twice_as_well(rig: Rig) -> None:
+def test_known_tag_rotations_halve_the_error_of_the_camera(rig: Rig) -> None:
     """Eight tags in the plane of the floor, each 1 mm off as a whole."""
     truth, camera, errors = elsewhere(rig), rig.cameras[0], []
     tags = [
@@ -144,7 +144,7 @@ def test_who_knows_that_tags_are_turned_as_told_finds_the_camera_twice_as_well(r
 
 
 @pytest.mark.parametrize("turn", [None, 0.0, 0.01])
-def test_the_pixels_of_a_survey_scatter_as_told(rig: Rig, turn: float | None) -> None:
+def test_the_pixels_of_a_survey_scatter_as_predicted(rig: Rig, turn: float | None) -> None:
     """Against pixels of tags that were drawn at random."""
     rng, camera, tag = np.random.default_rng(5), rig.cameras[0], rig.frame_tags[0]
     world, survey = elsewhere(rig).inverse(), Survey(1e-3, turn)
@@ -158,15 +158,15 @@ def test_the_pixels_of_a_survey_scatter_as_told(rig: Rig, turn: float | None) ->
             middle = tag.pose.position
             corners = (corners - middle) @ off.T + middle + 1e-3 * rng.standard_normal(3)
         pixels.append(project_undistorted(camera, world.apply(corners)).ravel())
-    told = survey.of_pixels(camera, world, tag)
+    predicted = survey.of_pixels(camera, world, tag)
     found = np.cov(np.array(pixels).T)
-    np.testing.assert_allclose(found, told, atol=0.08 * np.diag(told).max())
+    np.testing.assert_allclose(found, predicted, atol=0.08 * np.diag(predicted).max())
 
 
 def test_a_tag_that_was_knocked_is_named_and_does_not_move_the_camera(rig: Rig) -> None:
     camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
-    places = [(0.42, 0), (0, 0.42), (-0.42, 0), (0, -0.42), (0.3, 0.3), (-0.3, 0.3)]
-    tags = [Tag(401 + k, 0.12, Pose.level([x, y, 0.0])) for k, (x, y) in enumerate(places)]
+    positions = [(0.42, 0), (0, 0.42), (-0.42, 0), (0, -0.42), (0.3, 0.3), (-0.3, 0.3)]
+    tags = [Tag(401 + k, 0.12, Pose.level([x, y, 0.0])) for k, (x, y) in enumerate(positions)]
     rig = replace(rig, frame_tags=tuple(tags))
     knocked = [replace(tags[0], pose=Pose.level([0.44, 0.0, 0.0])), *tags[1:]]
     observations = sights_at(camera, knocked, {"a": truth.inverse()}, 0.02, rng)
@@ -212,7 +212,7 @@ def test_a_picture_of_a_camera_that_was_moved_is_left_out_by_name(rig: Rig) -> N
     assert found.pictures == 3
 
 
-def test_the_inverse_of_a_pose_changes_as_told() -> None:
+def test_the_inverse_of_a_pose_changes_as_predicted() -> None:
     base = Pose(np.array([0.1, -0.3, 1.2]), matrix_from_rotation_vector([0.4, 2.0, -0.7]))
     change = np.zeros((6, 6))
     for k in range(6):
@@ -226,7 +226,7 @@ def test_the_inverse_of_a_pose_changes_as_told() -> None:
     np.testing.assert_allclose(change_of_inverse(base), change, atol=1e-6)
 
 
-def test_the_result_takes_the_place_of_the_rig_files(rig: Rig, pictures, tmp_path: Path) -> None:
+def test_the_result_replaces_the_pose_of_the_rig_file(rig: Rig, pictures, tmp_path: Path) -> None:
     camera = rig.cameras[0]
     found = locate_by_frame_tags(
         rig, camera, observe_tags(pictures, rig, camera, numbers(rig)), Survey(5e-4)
@@ -262,11 +262,11 @@ def test_two_results_are_compared_by_what_they_do_in_the_work_space(rig: Rig, pi
     verdict = judge_extrinsics(found, 1e-3)
     one = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
     pose = found.world_from_camera
-    turned = Pose(
+    rotated = Pose(
         pose.position + np.array([0.001, 0.0, 0.0]),
         matrix_from_rotation_vector([0, 0, 0.002]) @ pose.rotation,
     )
-    there = replace(found, camera=replace(found.camera, world_from_camera=turned))
+    there = replace(found, camera=replace(found.camera, world_from_camera=rotated))
     two = extrinsics_result(there, verdict, rig.document, date(2026, 3, 3))
     changes = one.changes_to(two)
     assert changes["x_mm"] == pytest.approx(1.0, abs=1e-6)
@@ -277,7 +277,7 @@ def test_two_results_are_compared_by_what_they_do_in_the_work_space(rig: Rig, pi
     assert one.apart_mm(two) == pytest.approx(expected, rel=2e-3)
 
 
-def test_pictures_of_no_use_are_told_by_name(rig: Rig, pictures) -> None:
+def test_unused_images_are_listed_by_name(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
     blank = np.full((720, 1280), 100, np.uint8)
     first, image = pictures[0]
@@ -292,7 +292,7 @@ def test_pictures_of_no_use_are_told_by_name(rig: Rig, pictures) -> None:
         observe_tags([("blank.png", blank)], rig, camera, numbers(rig))
 
 
-def test_mirrored_pictures_and_other_tags_are_told(rig: Rig, pictures) -> None:
+def test_mirrored_images_and_other_tags_are_reported(rig: Rig, pictures) -> None:
     camera, (name, image) = rig.cameras[0], pictures[0]
     flipped = np.ascontiguousarray(image[:, ::-1])
     with pytest.raises(BadInput) as caught:
@@ -327,13 +327,15 @@ def test_a_rig_without_frame_tags_is_refused(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_stated_error_of_a_place_is_exceeded_in_one_case_of_twenty(rig, seed: int) -> None:
-    """Taken as 1.96 RMS it was exceeded in one of 200, and good places were refused."""
+def test_the_stated_error_of_a_camera_pose_is_exceeded_in_one_case_of_twenty(
+    rig, seed: int
+) -> None:
+    """As 1.96 RMS it was exceeded in one of 200, and good poses were refused."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(6, 6)) * np.array([*[3e-4] * 3, *[3e-4] * 3])[:, None]
     camera = rig.cameras[0]
     covariance = root @ root.T
-    place = ExtrinsicCalibration(
+    result = ExtrinsicCalibration(
         camera=camera,
         by="frame tags",
         covariance=covariance,
@@ -346,8 +348,8 @@ def test_the_stated_error_of_a_place_is_exceeded_in_one_case_of_twenty(rig, seed
         issues=(),
         data_hash="",
     )
-    arms = place.points - camera.world_from_camera.position
+    arms = result.points - camera.world_from_camera.position
     steps = rng.multivariate_normal(np.zeros(6), covariance, size=4000)
     moved_by = steps[:, None, :3] + np.cross(steps[:, None, 3:], arms)
     errors = np.sqrt(np.mean(np.sum(moved_by**2, axis=2), axis=1))
-    assert np.mean(errors > place.error) == pytest.approx(0.05, abs=0.015)
+    assert np.mean(errors > result.error) == pytest.approx(0.05, abs=0.015)

@@ -120,10 +120,10 @@ def test_the_model_is_chosen_by_pictures_held_out(true: str, accepted: set[str])
 
 @pytest.mark.parametrize("true", ["rational", "fisheye"])
 def test_the_advice_names_the_lens_where_errors_run_along_the_radius(true: str) -> None:
-    told = judge_camera(calibrate_from_views(views(true), SIZE, lens="five"), 1e-3)
-    assert told.radial > 0.02
-    assert any("the lens model" in reason for reason in told.verdict.reasons)
-    assert any("--lens" in step and "fisheye" in step for step in told.verdict.next_steps)
+    result = judge_camera(calibrate_from_views(views(true), SIZE, lens="five"), 1e-3)
+    assert result.radial > 0.02
+    assert any("the lens model" in reason for reason in result.verdict.reasons)
+    assert any("--lens" in step and "fisheye" in step for step in result.verdict.next_steps)
     right = judge_camera(chosen(true), 1e-3)
     assert not any("lens" in reason for reason in right.verdict.reasons)
 
@@ -139,7 +139,7 @@ def test_the_radial_share_is_nothing_for_noise_and_all_for_a_pure_pattern() -> N
 
 
 def apart_without_rotation(found: CameraCalibration, true: str) -> float:
-    """RMS distance of points a metre away, as seen by both cameras turned to agree best, [m]."""
+    """RMS distance of points 1 m away by both cameras, rotated for the best agreement, [m]."""
     focal, lens = TRUTH[true]
     pixels = image_grid(SIZE)
     kind = LENSES[true].kind
@@ -152,13 +152,13 @@ def apart_without_rotation(found: CameraCalibration, true: str) -> float:
     ]
     units = [part / np.linalg.norm(part, axis=1, keepdims=True) for part in rays]
     turn = Rotation.align_vectors(*units)[0].as_matrix()
-    turned = rays[1] @ turn.T
-    gaps = turned[:, :2] / turned[:, 2:] - rays[0][:, :2]
+    rotated = rays[1] @ turn.T
+    gaps = rotated[:, :2] / rotated[:, 2:] - rays[0][:, :2]
     return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
 
 
 def test_a_clean_camera_is_good_and_the_truth_within_what_is_stated() -> None:
-    """The rotation that the camera's place takes up does not count: cx alone is 0.5 mm off."""
+    """The rotation that the extrinsics compensate does not count: cx alone is 0.5 mm off."""
     good, inside, ratios = 0, 0, []
     for seed in range(12):
         found = calibrate_from_views(views("five", 40, 0.05, seed), SIZE)
@@ -306,20 +306,20 @@ def test_a_camera_of_a_kalibr_chain_is_read_by_its_entry(rig, tmp_path) -> None:
     assert (first.fx_px, first.fy_px, first.cx_px, first.cy_px) == (
         461.629, 460.152, 362.680, 246.049)  # fmt: skip
     assert (second.width_px, second.height_px) == (512, 512)
-    with pytest.raises(BadInput) as told:
+    with pytest.raises(BadInput) as caught:
         imported_camera(file, plain)
-    assert "cam0, cam1; say which with --entry" in str(told.value.why)
-    with pytest.raises(BadInput) as told:
+    assert "cam0, cam1; choose one with --entry" in str(caught.value.why)
+    with pytest.raises(BadInput) as caught:
         imported_camera(file, plain, "cam7")
-    assert "no 'cam7'" in str(told.value.why)
+    assert "not 'cam7'" in str(caught.value.why)
 
 
 def test_kalibr_models_that_rig_files_lack_are_named(rig, tmp_path) -> None:
     file = tmp_path / "camchain.yaml"
     file.write_text(KALIBR.replace("camera_model: pinhole", "camera_model: ds", 1))
-    with pytest.raises(BadInput) as told:
+    with pytest.raises(BadInput) as caught:
         imported_camera(file, rig.document.cameras[0], "cam0")
-    assert "cam0 is ds-radtan" in str(told.value.why)
+    assert "cam0 is ds-radtan" in str(caught.value.why)
 
 
 MRCAL = """# generated on 2024-01-01 with mrcal-calibrate-cameras
@@ -351,9 +351,9 @@ def test_a_camera_of_mrcal_is_read_and_a_splined_one_refused(rig, tmp_path) -> N
         2196,
     )
     file.write_text(MRCAL.replace("LENSMODEL_OPENCV8", "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3"))
-    with pytest.raises(BadInput) as told:
+    with pytest.raises(BadInput) as caught:
         imported_camera(file, plain)
-    assert "mrcal-convert-lensmodel" in str(told.value.why)
+    assert "mrcal-convert-lensmodel" in str(caught.value.why)
 
 
 @pytest.mark.skipif(not Path("/usr/bin/mrcal-to-cahvor").exists(), reason="needs Debian's mrcal")
@@ -370,11 +370,11 @@ def test_mrcal_itself_reads_what_is_written_and_projects_alike(rig, tmp_path) ->
         " np.array([float(x) for x in sys.argv[2:]]));"
         "print(*mrcal.project(p, *m.intrinsics()))"
     )
-    told = subprocess.run(
+    result = subprocess.run(
         ["/usr/bin/python3", "-c", code, str(file), *map(str, point[0])],
         capture_output=True, text=True, check=True, timeout=60,
     )  # fmt: skip
-    theirs = [float(x) for x in told.stdout.split()]
+    theirs = [float(x) for x in result.stdout.split()]
     np.testing.assert_allclose(
         theirs, pixels_of(camera, np.array([[0.1, -0.2, 1.0]]))[0], atol=1e-6
     )

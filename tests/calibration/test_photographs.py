@@ -12,7 +12,7 @@ from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
 from calibration.intrinsics.quality import judge_camera
 from calibration.targets.boards import Charuco, Chessboard
 from drivers.cameras.files import OneCamerasPictures, read_picture
-from tests.calibration.exif import turned_by_exif
+from tests.calibration.exif import rotated_by_exif
 from tracking.detection.detector import TagDetector
 
 FOLDER = Path(__file__).parent / "photographs"
@@ -70,10 +70,10 @@ def test_every_board_is_found_that_any_finder_of_opencv_finds(factor: float) -> 
         assert (BOARD.find(255 - image) is not None) >= theirs, path.name
 
 
-def test_turned_and_coloured_photographs_show_the_same(tmp_path: Path) -> None:
-    """JPEG turned by EXIF, and PNG in colour."""
+def test_rotated_and_coloured_photographs_show_the_same(tmp_path: Path) -> None:
+    """JPEG rotated by EXIF, and PNG in colour."""
     grey = read_picture(chessboards()[0])
-    (tmp_path / "a.jpg").write_bytes(turned_by_exif(grey))
+    (tmp_path / "a.jpg").write_bytes(rotated_by_exif(grey))
     cv2.imwrite(str(tmp_path / "b.png"), cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
     expected = BOARD.find(grey).corners
     for name, image in OneCamerasPictures(tmp_path):

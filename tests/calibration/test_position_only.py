@@ -17,7 +17,7 @@ from calibration.geometry.result import rig_result
 from model.errors import BadInput
 from model.pose import read_only
 from model.rig import Rig, load_rig
-from tests.calibration.rig_places import Truth, places
+from tests.calibration.rig_places import Truth, samples
 from tests.calibration.test_rig_calibration import LENGTH_DEVIATION, TODAY, errors_of, rms
 from tests.cli.program import call
 
@@ -32,7 +32,7 @@ def rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def truth(rig: Rig) -> Truth:
-    return places(rig, 60, tilt=np.radians(12.0), seed=5)
+    return samples(rig, 60, tilt=np.radians(12.0), seed=5)
 
 
 def followed(truth: Truth, reflector: np.ndarray) -> RigMeasurements:

@@ -82,14 +82,14 @@ def test_the_verb_writes_a_result_that_applies_to_the_rig(film: Path, tmp_path: 
     out = tmp_path / "out"
     answer = call("calibrate", "readout", RIG, film, "--rate-hz", RATE, "-o", out, "--json")
     assert answer.code == 0, answer
-    told = json.loads(answer.out)
-    assert told["kind"] == "readout"
+    result = json.loads(answer.out)
+    assert result["kind"] == "readout"
     [file] = out.glob("calibration_readout_front_*.yaml")
     assert load_result(file).good_enough
     assert "Readout of camera front" in file.with_suffix(".html").read_text()
     new = tmp_path / "new.yaml"
     assert call("calibrate", "apply", RIG, file, "-o", new).code == 0
-    assert yaml.safe_load(new.read_text())["cameras"][0]["readout_ms"] == told["readout_ms"]
+    assert yaml.safe_load(new.read_text())["cameras"][0]["readout_ms"] == result["readout_ms"]
 
 
 def test_few_images_and_a_rate_for_a_video_are_refused(rig: Rig, film: Path, tmp_path) -> None:

@@ -63,7 +63,7 @@ def test_a_seal_outlives_the_file_whatever_the_number(tmp_path_factory, value: f
     assert load_result(path).stated  # read, so the hash fits
 
 
-def test_a_camera_result_takes_the_place_of_the_rig_files_numbers(rig: Rig) -> None:
+def test_a_camera_result_replaces_the_parameters_of_the_rig_file(rig: Rig) -> None:
     better = rig.with_calibration(camera_result_of())
     assert better.cameras[0].matrix[0, 0] == 905.0
     assert better.cameras[0].distortion.tolist() == [-0.1, 0.04, 0.0, 0.0, 0.0]
@@ -99,7 +99,9 @@ def test_two_results_of_one_camera_are_refused(rig: Rig) -> None:
         ("kind: [\n", "yaml"),
     ],
 )
-def test_files_that_are_no_results_are_told_by_name(tmp_path: Path, text: str, named: str) -> None:
+def test_files_that_are_not_results_are_refused_by_name(
+    tmp_path: Path, text: str, named: str
+) -> None:
     path = tmp_path / "wrong.yaml"
     path.write_text(text)
     with pytest.raises(BadInput) as caught:
@@ -148,7 +150,7 @@ def test_a_camera_result_from_before_there_were_lens_models_is_read(tmp_path: Pa
         load_result(path)
 
 
-def test_what_the_place_of_a_camera_may_be_off_by_goes_into_the_rig(rig: Rig) -> None:
+def test_the_covariance_of_a_camera_pose_goes_into_the_rig(rig: Rig) -> None:
     deviations = np.array([2e-3, 1e-3, 3e-3, 1e-3, 2e-3, 5e-4])
     by_lens = np.arange(48.0).reshape(6, 8) * 1e-4
     found = ExtrinsicCalibration(

@@ -1,4 +1,4 @@
-"""Poses chosen for measuring: they tell more than others, can be held, and are free."""
+"""Poses selected for measuring: more informative than others, feasible and free."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.pose_selection import (
     PoseRequirements,
     _d_optimal,
-    _in_order,
+    _short_tour,
     choose_poses,
 )
 from model.clearance import ClearanceModel
@@ -55,7 +55,7 @@ def test_every_pose_can_be_held_and_is_free(rig: Rig, scene: Scene, poses: list[
         assert model.self_clearance(pose).distance > scene.self_clearance
 
 
-def test_the_platform_is_turned_no_further_than_its_cables_let_it_on_the_way(
+def test_the_platform_is_rotated_no_further_than_its_cables_allow(
     rig: Rig, poses: list[Pose]
 ) -> None:
     """At 12° and more cables of this rig are apart again, but have passed through each other."""
@@ -72,25 +72,25 @@ def test_what_is_chosen_tells_more_than_chance() -> None:
     random = np.random.default_rng(3)
     rows = random.normal(size=(80, 4, 10)) * random.uniform(0.1, 3.0, (80, 1, 1))
 
-    def told(chosen: list[int]) -> float:
+    def log_determinant(chosen: list[int]) -> float:
         information = np.eye(10) + sum(rows[k].T @ rows[k] for k in chosen)
         return float(np.linalg.slogdet(information)[1])
 
     chosen = _d_optimal(rows, 15)
     assert len(set(chosen)) == 15
-    others = [told(random.choice(80, 15, replace=False).tolist()) for _ in range(50)]
-    assert told(chosen) > max(others)
-    first = max(range(80), key=lambda k: told([k]))
+    others = [log_determinant(random.choice(80, 15, replace=False).tolist()) for _ in range(50)]
+    assert log_determinant(chosen) > max(others)
+    first = max(range(80), key=lambda k: log_determinant([k]))
     assert chosen[0] == first
 
 
-def test_the_way_through_all_poses_has_no_detour() -> None:
+def test_the_tour_through_all_poses_has_no_detour() -> None:
     line = [Pose.level([x, 0.0, 0.0]) for x in (0.3, 0.1, 0.5, 0.2, 0.4)]
-    ordered = _in_order(line, Pose.level([0.0, 0.0, 0.0]), 0.1)
+    ordered = _short_tour(line, Pose.level([0.0, 0.0, 0.0]), 0.1)
     assert [round(float(p.position[0]), 1) for p in ordered] == [0.1, 0.2, 0.3, 0.4, 0.5]
 
 
-def test_a_scene_without_room_is_told(rig: Rig, scene: Scene) -> None:
+def test_a_scene_without_room_is_refused(rig: Rig, scene: Scene) -> None:
     narrow = replace(scene, self_clearance=0.05)
     with pytest.raises(NoSolution, match="tried poses are feasible and free"):
         choose_poses(

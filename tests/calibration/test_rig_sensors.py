@@ -24,7 +24,7 @@ from model.errors import BadInput
 from model.pose import matrix_from_rotation_vector
 from model.rig import Rig, load_rig
 from model.winches import WinchMap
-from tests.calibration.rig_places import write_places
+from tests.calibration.rig_places import write_samples
 from tests.calibration.synthetic_rig import (
     LENGTH_NOISE,
     SPREAD,
@@ -64,9 +64,9 @@ def found(rig: Rig, data: RigMeasurements) -> RigCalibration:
 
 def inside(result: RigCalibration, built: BuiltRig, group: str) -> float:
     """How many numbers of a group are in their 95 % intervals."""
-    place = result.parameters.slices()[group]
-    off = result.fit.values[place] - built.values((group,))
-    return float(np.mean(np.abs(off) < result.uncertainty.half_widths[place]))
+    columns = result.parameters.slices()[group]
+    off = result.fit.values[columns] - built.values((group,))
+    return float(np.mean(np.abs(off) < result.uncertainty.half_widths[columns]))
 
 
 @given(seed=st.integers(0, 10**6))
@@ -112,8 +112,8 @@ def test_every_number_is_found_with_its_interval(built: BuiltRig, found: RigCali
         assert stated[f"stiffness_{i}_n"].value == pytest.approx(true, rel=0.05)
         assert stated[f"stiffness_{i}_n"].half_width < 0.05 * true
     zeros = np.degrees(built.off["swivel_zeros"])
-    turned = np.degrees(built.off["imu_mounting"])
-    for key, true in {"swivel_zero_3_deg": zeros[2], "imu_mounting_x_deg": turned[0]}.items():
+    rotated = np.degrees(built.off["imu_mounting"])
+    for key, true in {"swivel_zero_3_deg": zeros[2], "imu_mounting_x_deg": rotated[0]}.items():
         assert abs(stated[key].value - true) < 2.0 * stated[key].half_width < 1.0
 
 
@@ -121,17 +121,17 @@ def test_a_result_holds_each_cables_stiffness_and_applies_it(
     rig: Rig, found: RigCalibration, data: RigMeasurements
 ) -> None:
     quality = judge_rig(found, 1e-3, 0.0)
-    told = rig_result(found, quality, "rig", TODAY)
-    again = RigResult.model_validate(told.model_dump())
+    document = rig_result(found, quality, "rig", TODAY)
+    again = RigResult.model_validate(document.model_dump())
     corrected = rig.with_calibration(again)
     assert corrected.cable_stiffness == pytest.approx(found.geometry.stiffness)
-    assert [w.cable_stiffness_n for w in corrected.document.winches] == told.cable_stiffness_n
+    assert [w.cable_stiffness_n for w in corrected.document.winches] == document.cable_stiffness_n
     winches = WinchMap(corrected)
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
     by_fit = RigModel(found.parameters, data).counted.by(found.geometry)
     assert lengths == pytest.approx(by_fit, abs=30e-6)  # a count is 12 micrometres
-    assert told.sensor_residuals_deg.keys() >= {"swivel 1", "swivel 10", "IMU 1", "IMU 2"}
-    assert all(0.05 < x < 0.15 for x in told.sensor_residuals_deg.values())
+    assert document.sensor_residuals_deg.keys() >= {"swivel 1", "swivel 10", "IMU 1", "IMU 2"}
+    assert all(0.05 < x < 0.15 for x in document.sensor_residuals_deg.values())
     page = rig_page(found, quality, "rig", "2026-11-23")
     for title in (
         "Stiffness of each cable [N]",
@@ -197,16 +197,16 @@ def test_a_wrong_reading_is_named_and_left_out(rig: Rig, data: RigMeasurements) 
     verticals[20] = matrix_from_rotation_vector([0.2, 0.0, 0.0]) @ verticals[20]
     spoiled = replace(data, swivels=swivels, verticals=verticals)
     result = fit_rig(rig, spoiled, PER_CABLE, LENGTH_NOISE)
-    assert set(result.measured.unused) == {"place 7", "place 20"}
-    assert "swivel 4 is " in result.measured.unused["place 7"]
-    assert "IMU " in result.measured.unused["place 20"]
-    assert "° off" in result.measured.unused["place 20"]
+    assert set(result.measured.unused) == {"sample 7", "sample 20"}
+    assert "swivel 4 is " in result.measured.unused["sample 7"]
+    assert "IMU " in result.measured.unused["sample 20"]
+    assert "° off" in result.measured.unused["sample 20"]
 
 
 def test_an_imu_whose_mounting_is_not_asked_for_is_found_to_scatter(
     rig: Rig, data: RigMeasurements
 ) -> None:
-    """It is turned by a degree, ten times what is stated."""
+    """It is rotated by a degree, ten times what is stated."""
     for sought, good in ((NO_MOUNTING, False), (PER_CABLE, True)):
         result = fit_rig(rig, data, sought, LENGTH_NOISE)
         reasons = judge_rig(result, 1e-2, 0.0).verdict.reasons
@@ -216,8 +216,8 @@ def test_an_imu_whose_mounting_is_not_asked_for_is_found_to_scatter(
 def test_whole_turns_of_a_swivel_encoder_do_not_matter(
     rig: Rig, data: RigMeasurements, found: RigCalibration
 ) -> None:
-    turned = replace(data, swivels=data.swivels + 2.0 * np.pi * np.arange(-5.0, 5.0))
-    fit, _ = identified(found.parameters, turned, LENGTH_NOISE)
+    rotated = replace(data, swivels=data.swivels + 2.0 * np.pi * np.arange(-5.0, 5.0))
+    fit, _ = identified(found.parameters, rotated, LENGTH_NOISE)
     assert fit.values == pytest.approx(found.fit.values, abs=1e-7)
 
 
@@ -271,7 +271,7 @@ def test_sensors_that_cannot_be_are_refused(rig: Rig, data: RigMeasurements) -> 
 
 def written(path: Path, data: RigMeasurements, unit: str = "m_s2", size: float = 9.81) -> Path:
     """The measurements with all sensors as a CSV file."""
-    write_places(path, data)
+    write_samples(path, data)
     lines = path.read_text(encoding="utf-8").splitlines()
     m = data.swivels.shape[1]
     names = [f"swivel_{i}_deg" for i in range(1, m + 1)] + [f"accel_{a}_{unit}" for a in "xyz"]
@@ -307,10 +307,10 @@ def test_the_program_finds_and_applies_them(
     options = ("--stiffness-per-cable", "--imu-mounting-deg", 1, "--swivel-deg", 0.1)
     done = call("calibrate", "rig", path, file, *options, "-o", out, "--json")
     assert done.code in (0, 3), done
-    told = json.loads(done.out)
-    assert told["cable_stiffness_n"] == pytest.approx(built.stiffness, rel=0.05)
-    assert {"swivel_zero_10_deg", "imu_mounting_z_deg"} <= told["intervals"].keys()
+    document = json.loads(done.out)
+    assert document["cable_stiffness_n"] == pytest.approx(built.stiffness, rel=0.05)
+    assert {"swivel_zero_10_deg", "imu_mounting_z_deg"} <= document["intervals"].keys()
     (result,) = out.glob("*.yaml")
     new = tmp_path / "new.yaml"
     assert call("calibrate", "apply", path, result, "-o", new).code == 0
-    assert load_rig(new).cable_stiffness == pytest.approx(told["cable_stiffness_n"])
+    assert load_rig(new).cable_stiffness == pytest.approx(document["cable_stiffness_n"])

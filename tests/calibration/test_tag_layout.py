@@ -1,4 +1,4 @@
-"""The tags' places on the platform from images taken from anywhere."""
+"""The tags' poses on the platform from images taken from anywhere."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def rig() -> Rig:
 
 
 def as_glued(rig: Rig, rng: np.random.Generator, shift: float = 1e-3) -> tuple[Tag, ...]:
-    """Tags where people glued them: off by so much, and turned by the like."""
+    """Tags as mounted by hand: shifted and rotated by small random amounts."""
     steps = rng.standard_normal((len(rig.platform_tags), 6)) * np.repeat([shift, 10 * shift], 3)
     return moved_tags(rig.platform_tags, steps.ravel())
 
 
 def around(rig: Rig, count: int, rng: np.random.Generator) -> dict[str, Pose]:
-    """Poses ``camera_from_platform`` of a platform that is turned every way before the camera.
+    """Poses ``camera_from_platform`` of a platform rotated in all directions before the camera.
 
     As asked for, no image looks straight at one face.
     """
@@ -53,8 +53,8 @@ def around(rig: Rig, count: int, rng: np.random.Generator) -> dict[str, Pose]:
         turn = Rotation.random(random_state=rng).as_matrix()
         while np.abs(turn[2]).max() > 0.85:
             turn = Rotation.random(random_state=rng).as_matrix()
-        place = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.5, 0.7)])
-        poses[f"{k:02}.png"] = Pose(place, turn)
+        position = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.5, 0.7)])
+        poses[f"{k:02}.png"] = Pose(position, turn)
     return poses
 
 
@@ -84,9 +84,9 @@ def gaps(found: TagLayout, truth) -> tuple[float, float]:
 def test_twenty_pictures_give_the_layout_to_hundredths_of_a_millimetre(rig: Rig) -> None:
     tags = as_glued(rig, np.random.default_rng(1))
     found = measure_layout(rig, rig.cameras[0], session(rig, tags, 24, seed=2))
-    off, turned = gaps(found, tags)
+    off, rotated = gaps(found, tags)
     assert off < 0.04
-    assert turned < 0.02
+    assert rotated < 0.02
     assert found.reprojection < 0.05
     assert found.unseen == {}
     verdict = judge_layout(found, 0.2e-3)
@@ -140,7 +140,7 @@ def test_slopes_are_those_of_finite_differences(rig: Rig) -> None:
     np.testing.assert_allclose(exact / scale, numeric / scale, atol=1e-6)
 
 
-def test_what_pictures_cannot_tell_is_said(rig: Rig) -> None:
+def test_what_images_do_not_determine_is_reported(rig: Rig) -> None:
     """A tag that is never seen with others stays as drawn; an image of one tag tells nothing."""
     observations = session(rig, rig.platform_tags, 24, seed=4)
     squares = {
@@ -155,8 +155,8 @@ def test_what_pictures_cannot_tell_is_said(rig: Rig) -> None:
     assert "take images that show tag 306 together with others" in verdict.next_steps
 
 
-def test_sizes_that_are_not_as_told_are_noticed(rig: Rig) -> None:
-    """All places are right, but the tags were printed at 97 %."""
+def test_wrong_tag_sizes_are_noticed(rig: Rig) -> None:
+    """All positions are right, but the tags were printed at 97 %."""
     small = tuple(replace(tag, size=0.97 * tag.size) for tag in rig.platform_tags)
     found = measure_layout(rig, rig.cameras[0], session(rig, small, 24, seed=5))
     verdict = judge_layout(found, 1.0)
@@ -217,12 +217,12 @@ def test_too_few_pictures_and_tags_are_refused(rig: Rig) -> None:
 
 def test_a_fixed_tag_that_no_picture_shows_is_refused_by_name(rig: Rig) -> None:
     unseen, *seen = rig.platform_tags
-    with pytest.raises(BadInput, match=f"^0 images show .* linked to tag {unseen.id}") as told:
+    with pytest.raises(BadInput, match=f"^0 images show .* linked to tag {unseen.id}") as caught:
         measure_layout(rig, rig.cameras[0], session(rig, seen, 6, seed=3), unseen.id)
-    assert f"no image shows together with tag {unseen.id}" in told.value.why
+    assert f"no image shows together with tag {unseen.id}" in caught.value.why
 
 
-def test_the_result_takes_the_place_of_the_drawing(rig: Rig, tmp_path: Path) -> None:
+def test_the_result_replaces_the_nominal_layout(rig: Rig, tmp_path: Path) -> None:
     tags = as_glued(rig, np.random.default_rng(1))
     found = measure_layout(rig, rig.cameras[0], session(rig, tags, 16, seed=2))
     verdict = judge_layout(found, 2e-4)

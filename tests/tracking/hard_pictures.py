@@ -26,7 +26,7 @@ class Condition:
     Attributes:
         side_px: Side of its square seen from the front.
         tilt: Between its normal and the view, [rad].
-        motion_px: Way of the image during the exposure.
+        motion_px: Motion of the image during the exposure.
         blur_px: Standard deviation of the lens's blur.
         contrast: Brightness of paper less that of ink, of 255.
         noise: Standard deviation, of 255.
@@ -63,7 +63,7 @@ class HardPrinter:
         self._rays = sample_rays(self.camera)
 
     def picture(self, condition: Condition, rng: np.random.Generator) -> HardPicture:
-        """An image with a tag somewhere in it, turned at will."""
+        """An image with a tag at a random position and rotation."""
         number = int(rng.integers(self.numbers))
         tag = Tag(number, SIZE, Pose.level(np.zeros(3)))
         pose = self._pose(condition, rng)
@@ -87,8 +87,8 @@ class HardPrinter:
         angle = rng.uniform(-np.pi, np.pi)
         axis = np.array([np.cos(angle), np.sin(angle), 0.0])
         lean = matrix_from_rotation_vector(axis * condition.tilt)
-        place = np.array([*rng.uniform(-0.1, 0.1, 2) * distance, distance])
-        return Pose(place, lean @ upright @ roll)
+        position = np.array([*rng.uniform(-0.1, 0.1, 2) * distance, distance])
+        return Pose(position, lean @ upright @ roll)
 
 
 def _streak(length: float, angle: float) -> NDArray[np.float32]:

@@ -25,14 +25,14 @@ HERE = Pose.level([0.05, 0.05, 0.4])
 def other_side(camera: Camera) -> Camera:
     """The same camera, standing a quarter turn round the frame."""
     quarter = matrix_from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
-    place = camera.world_from_camera
-    there = Pose(quarter @ place.position, quarter @ place.rotation)
+    pose = camera.world_from_camera
+    there = Pose(quarter @ pose.position, quarter @ pose.rotation)
     return replace(camera, name="side", world_from_camera=there)
 
 
-def measured(place: list[float], sigma: list[float]) -> PoseMeasurement:
+def measured(position: list[float], sigma: list[float]) -> PoseMeasurement:
     covariance = np.diag(np.square([*sigma, 1e-3, 1e-3, 1e-3]))
-    return PoseMeasurement(0.0, Pose.level(place), covariance, (301,), 0.1, "tracked")
+    return PoseMeasurement(0.0, Pose.level(position), covariance, (301,), 0.1, "tracked")
 
 
 def test_each_camera_counts_where_it_measures_well() -> None:

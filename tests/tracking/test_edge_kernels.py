@@ -1,4 +1,4 @@
-"""Compiled kernels beside plain NumPy and SciPy, each written another way."""
+"""Compiled kernels against independent implementations in plain NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -79,29 +79,31 @@ def test_symmetric_equations_are_solved(size: int) -> None:
     assert not factored(-matrix, size)
 
 
-def test_places_of_the_square_are_those_of_its_homography() -> None:
+def test_points_of_the_square_are_those_of_its_homography() -> None:
     plane = np.empty(8)
     plane_of(SQUARE, 1, plane)
     for (a, b), corner in zip([(0, 0), (1, 0), (1, 1), (0, 1)], [1, 2, 3, 0], strict=True):
         along, outside = beside(SQUARE, 1, plane, a, b)
-        way = (SQUARE[2] - SQUARE[1]) / np.linalg.norm(SQUARE[2] - SQUARE[1])
+        direction = (SQUARE[2] - SQUARE[1]) / np.linalg.norm(SQUARE[2] - SQUARE[1])
         gap = SQUARE[corner] - SQUARE[1]
-        assert (along, outside) == pytest.approx((gap @ way, gap @ [way[1], -way[0]]), abs=1e-9)
+        assert (along, outside) == pytest.approx(
+            (gap @ direction, gap @ [direction[1], -direction[0]]), abs=1e-9
+        )
     # Diagonals keep their crossing: it is the square's middle.
     along, outside = beside(SQUARE, 1, plane, 0.5, 0.5)
-    middle = SQUARE[1] + along * way + outside * np.array([way[1], -way[0]])
+    middle = SQUARE[1] + along * direction + outside * np.array([direction[1], -direction[0]])
     for one, other in ((0, 2), (1, 3)):
         p, q = SQUARE[other] - SQUARE[one], middle - SQUARE[one]
         assert p[0] * q[1] - p[1] * q[0] == pytest.approx(0.0, abs=1e-6)
 
 
 def brute_band(image: Array, edge: int, span: tuple[float, float], reach: float) -> Array:
-    """Place, distance and value of the pixels beside an edge, from all pixels."""
+    """Position, distance and value of the pixels near an edge, from all pixels."""
     start, end = SQUARE[edge], SQUARE[(edge + 1) % 4]
-    way = (end - start) / np.linalg.norm(end - start)
+    direction = (end - start) / np.linalg.norm(end - start)
     rows, columns = np.indices(image.shape)
     gap = np.stack([columns - start[0], rows - start[1]], axis=-1)
-    s, u = gap @ way, gap @ [way[1], -way[0]]
+    s, u = gap @ direction, gap @ [direction[1], -direction[0]]
     inside = (s >= span[0]) & (s <= span[1]) & (np.abs(u) <= reach)
     middle, half = (span[0] + span[1]) / 2.0, (span[1] - span[0]) / 2.0
     return np.array([(s[inside] - middle) / half, u[inside], image[inside]])
@@ -132,8 +134,8 @@ def black_square(
     ink = np.ones(rows.shape)
     for edge in range(4):
         start, end = SQUARE[edge], SQUARE[(edge + 1) % 4]
-        way = (end - start) / np.linalg.norm(end - start)
-        outside = (columns - start[0]) * way[1] - (rows - start[1]) * way[0]
+        direction = (end - start) / np.linalg.norm(end - start)
+        outside = (columns - start[0]) * direction[1] - (rows - start[1]) * direction[0]
         ink *= norm.sf(outside / spread)
     grain = np.random.default_rng(seed).standard_normal(ink.shape)
     if alike > 0.0:

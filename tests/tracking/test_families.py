@@ -76,13 +76,13 @@ def test_the_apriltag_library_refuses_families_it_does_not_know(family: str) -> 
         make_detector("apriltag", family)
 
 
-def test_a_missing_apriltag_library_is_told_with_how_to_get_it(
+def test_a_missing_apriltag_library_is_reported_with_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyapriltags", None)
-    with pytest.raises(BadInput, match="not installed") as told:
+    with pytest.raises(BadInput, match="not installed") as caught:
         make_detector("apriltag", FAMILY)
-    assert "cdpr[apriltag]" in told.value.next_step
+    assert "cdpr[apriltag]" in caught.value.next_step
 
 
 @pytest.mark.parametrize("family", ["tag16h5", "tag25h9", "tag36h11"])

@@ -14,8 +14,8 @@ TAG = np.array([3e-4] * 3 + [np.radians(0.03)] * 3)
 
 
 def truth_at(time: float) -> Pose:
-    place = np.array([0.03 * time, 0.05 * np.sin(0.4 * time), 0.4])
-    return Pose(place, matrix_from_rotation_vector(np.array([0.0, 0.0, 0.05 * time])))
+    position = np.array([0.03 * time, 0.05 * np.sin(0.4 * time), 0.4])
+    return Pose(position, matrix_from_rotation_vector(np.array([0.0, 0.0, 0.05 * time])))
 
 
 def error(found: Pose, truth: Pose) -> Array:

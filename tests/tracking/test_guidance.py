@@ -27,7 +27,7 @@ OFF = Pose(np.array([1.5e-3, -1e-3, 1e-3]), matrix_from_rotation_vector(np.array
 
 NUMBERS = st.floats(-0.3, 0.3)
 POSES = st.builds(
-    lambda place, turn: Pose(np.array(place), matrix_from_rotation_vector(np.array(turn))),
+    lambda position, turn: Pose(np.array(position), matrix_from_rotation_vector(np.array(turn))),
     st.tuples(NUMBERS, NUMBERS, NUMBERS),
     st.tuples(NUMBERS, NUMBERS, NUMBERS),
 )
@@ -51,7 +51,7 @@ def barred(image: Image) -> Image:
     return covered
 
 
-def place(k: int) -> Pose:
+def pose_at(k: int) -> Pose:
     return Pose.level([0.05 + 0.002 * k, 0.05, 0.42])
 
 
@@ -104,16 +104,16 @@ def test_tags_hidden_in_part_are_found_again_after_they_were_lost(
         def observed(
             k: int, image: Image, tracker: Tracker = tracker, guided: bool = guided
         ) -> object:
-            return tracker.observe(image, 0.1 * k, by_drives(place(k)) if guided else None)
+            return tracker.observe(image, 0.1 * k, by_drives(pose_at(k)) if guided else None)
 
-        assert isinstance(observed(0, eye.render(place(0), 0)), PoseMeasurement)
-        dark = np.full_like(eye.render(place(1), 1), 90)
+        assert isinstance(observed(0, eye.render(pose_at(0), 0)), PoseMeasurement)
+        dark = np.full_like(eye.render(pose_at(1), 1), 90)
         assert isinstance(observed(1, dark), NoPose)
-        again = observed(20, barred(eye.render(place(20), 20)))
+        again = observed(20, barred(eye.render(pose_at(20), 20)))
         assert isinstance(again, PoseMeasurement if guided else NoPose)
         if isinstance(again, PoseMeasurement):
             assert again.status == "guided"
-            error = error_of(again, place(20))
+            error = error_of(again, pose_at(20))
             assert error @ np.linalg.solve(again.covariance, error) < 30.0
 
 
@@ -124,21 +124,21 @@ def test_a_drum_that_slipped_leaves_the_cameras_pose_as_it_is(
     """Cable 3 slips on its drum while no tag is to be seen, and the drives do not know."""
     tracker, errors, apart = Tracker(rig, camera), [], []
     for k in range(12):
-        truth, slipped = place(k), k >= 3
+        truth, slipped = pose_at(k), k >= 3
         lengths = cable_lengths(rig, truth)
         lengths[2] += slip_mm * 1e-3 if slipped else 0.0
-        told = forward_kinematics(rig, lengths, truth).pose
+        encoder = forward_kinematics(rig, lengths, truth).pose
         picture = eye.render(truth, k)
         hidden = k in (2, 3, 6, 7)
         seen = np.full_like(picture, 90) if hidden else picture
-        found = tracker.observe(seen, 0.1 * k, told)
+        found = tracker.observe(seen, 0.1 * k, encoder)
         assert isinstance(found, NoPose if hidden else PoseMeasurement)
         if isinstance(found, PoseMeasurement) and slipped:
             alone = Tracker(rig, camera).observe(picture, 0.0)
             assert isinstance(alone, PoseMeasurement)
             error = error_of(found, truth)
             errors.append(error @ np.linalg.solve(found.covariance, error))
-            apart.append((told.distance_to(truth), found.pose.distance_to(alone.pose)))
+            apart.append((encoder.distance_to(truth), found.pose.distance_to(alone.pose)))
     assert len(errors) == 6
     assert np.mean(errors) < 14.0, "as far from the truth as it says: 6 on average"
     drives, camera_alone = np.max(apart, axis=0)

@@ -30,7 +30,7 @@ def empty(scene: Scene) -> Scene:
 
 def with_prints(rig: Rig, *prints: tuple[int, list[float]], size: float = 0.12) -> Rig:
     """The rig with further tags lying on the floor, which its file does not know."""
-    more = tuple(Tag(number, size, Pose(np.array(place), FLAT)) for number, place in prints)
+    more = tuple(Tag(number, size, Pose(np.array(position), FLAT)) for number, position in prints)
     return replace(rig, frame_tags=(*rig.frame_tags, *more))
 
 
@@ -64,9 +64,7 @@ def test_a_decoy_alone_that_lies_as_no_platform_can_gives_no_pose(
     assert isinstance(found, NoPose)
 
 
-def test_two_prints_of_one_tag_are_told_apart_by_nothing(
-    rig: Rig, camera: Camera, empty: Scene
-) -> None:
+def test_two_prints_of_one_tag_are_ambiguous(rig: Rig, camera: Camera, empty: Scene) -> None:
     """A platform with a single tag, and the same print within the frame."""
     one = replace(rig, platform_tags=rig.platform_tags[4:5])
     real = with_prints(one, (305, [0.25, -0.1, 0.15]), size=0.096)
@@ -185,14 +183,14 @@ def test_a_smear_is_named_with_its_length(rig: Rig, camera: Camera, empty: Scene
 def test_the_stated_covariance_is_that_of_the_errors(
     rig: Rig, camera: Camera, empty: Scene, blur: float
 ) -> None:
-    """Mean NEES over seeds and places; 6 where the covariance is exact."""
+    """Mean NEES over seeds and positions; 6 for an exact covariance."""
     rng, values = np.random.default_rng(12), []
     optics = Optics(noise=1.5, blur=blur)
     for seed in range(4):
         eye = SyntheticCamera(rig, empty, camera, seed=seed, optics=optics)
         for frame in range(15):
-            place = rng.uniform([-0.15, -0.15, 0.3], [0.15, 0.15, 0.55])
-            truth = Pose(place, matrix_from_rotation_vector(rng.normal(size=3) * 0.1))
+            position = rng.uniform([-0.15, -0.15, 0.3], [0.15, 0.15, 0.55])
+            truth = Pose(position, matrix_from_rotation_vector(rng.normal(size=3) * 0.1))
             found = Tracker(rig, camera).observe(eye.render(truth, frame), 0.0)
             assert isinstance(found, PoseMeasurement)
             error = error_of(found, truth)

@@ -59,8 +59,8 @@ def test_uncertainty_agrees_with_distances_at_scattered_poses(
     steps = rng.multivariate_normal(np.zeros(6), covariance, size=300)
     distances = []
     for step in steps:
-        turned = matrix_from_rotation_vector(step[3:]) @ pose.rotation
-        near = model.obstacles(Pose(pose.position + step[:3], turned))
+        rotation = matrix_from_rotation_vector(step[3:]) @ pose.rotation
+        near = model.obstacles(Pose(pose.position + step[:3], rotation))
         distances.append([n.distance for n in near])
     scatter = np.std(np.array(distances), axis=0)
     predicted = stated.uncertainties / SURE
@@ -118,14 +118,16 @@ def shared_of(rig: Rig, camera: Camera, pose: Pose) -> np.ndarray:
     return SharedErrors(rig, camera).of(pose, square(rig, camera, pose))
 
 
-PLACE = np.array([0.8, 0.5, 1.2, 0.06, 0.09, 0.03])
-"""Deviations of a camera's place, [mm] and [deg]."""
+POSE_DEVIATIONS = np.array([0.8, 0.5, 1.2, 0.06, 0.09, 0.03])
+"""Standard deviations of a camera's pose, [mm] and [deg]."""
 
 
-def test_errors_of_the_cameras_place_are_carried_to_the_clearance(rig: Rig, crowded: Scene) -> None:
+def test_errors_of_the_camera_pose_are_propagated_to_the_clearance(
+    rig: Rig, crowded: Scene
+) -> None:
     """Cameras that are off by chance as stated put the platform where the clearance differs."""
     rng = np.random.default_rng(5)
-    camera = looking(rig, pose_covariance=np.diag(PLACE**2).tolist(), error_mm=None)
+    camera = looking(rig, pose_covariance=np.diag(POSE_DEVIATIONS**2).tolist(), error_mm=None)
     known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
     camera = replace(camera, lens_covariance=np.zeros((8, 8)))
     model = ClearanceModel(rig, crowded)
@@ -138,10 +140,10 @@ def test_errors_of_the_cameras_place_are_carried_to_the_clearance(rig: Rig, crow
     stated = clearance_of(model, sure)
     assert stated is not None
     distances = []
-    for step in rng.normal(size=(300, 6)) * PLACE:
+    for step in rng.normal(size=(300, 6)) * POSE_DEVIATIONS:
         turn = matrix_from_rotation_vector(np.radians(step[3:]))
-        place = camera.world_from_camera
-        moved = Pose(place.position + step[:3] / 1e3, turn @ place.rotation)
+        here = camera.world_from_camera
+        moved = Pose(here.position + step[:3] / 1e3, turn @ here.rotation)
         distances.append([n.distance for n in model.obstacles(moved.compose(seen))])
     scatter = np.std(np.array(distances), axis=0)
     apart = np.array([n.distance > 0.005 for n in stated.nearest])
@@ -150,7 +152,7 @@ def test_errors_of_the_cameras_place_are_carried_to_the_clearance(rig: Rig, crow
     assert stated.uncertainties.max() > 1e-3  # where 0.5 mm were stated before, whatever was known
 
 
-def test_one_number_of_the_operator_stands_for_all_that_is_shared(rig: Rig, crowded: Scene) -> None:
+def test_one_value_by_the_operator_replaces_all_shared_errors(rig: Rig, crowded: Scene) -> None:
     """Also for the cables, unless calibrations state every part of the chain."""
     pose = Pose(np.array([0.05, -0.03, 0.55]), np.eye(3))
     shared = SharedErrors(rig, looking(rig, error_mm=1.96))
@@ -210,10 +212,10 @@ def test_tags_that_are_off_as_stated_count_once(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
-def test_a_lens_error_counts_by_what_it_does_to_place_and_pose_together(
+def test_a_lens_error_is_propagated_through_extrinsics_and_pose_together(
     rig: Rig, fisheye: bool
 ) -> None:
-    """Against poses that a lens off by a little gives, its camera's place found with it."""
+    """Against poses that a lens off by a little gives, its camera's pose found with it."""
     lens = {"lens": "fisheye", "distortion": [0.01, -0.004, 0.002, -0.001]} if fisheye else {}
     camera = looking(rig, **lens)
     pose = Pose(np.array([0.05, -0.03, 0.55]), matrix_from_rotation_vector([0.1, -0.05, 0.2]))
@@ -223,7 +225,7 @@ def test_a_lens_error_counts_by_what_it_does_to_place_and_pose_together(
     by_lens[3:, 2] = 1e-5, 2e-5, -1e-5
     deviations = np.array([0.3, 0.2, 0.5, 0.4, *[1e-3] * (count - 4)])
     known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
-    told = replace(
+    calibrated = replace(
         camera,
         error=None,
         lens_covariance=np.diag(deviations**2),
@@ -233,13 +235,14 @@ def test_a_lens_error_counts_by_what_it_does_to_place_and_pose_together(
     expected = np.zeros((6, 6))
     for k in range(count):
         step = by_lens[:, k] * deviations[k]
-        place = moved(camera.world_from_camera, step)
+        world_from_camera = moved(camera.world_from_camera, step)
         matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
         if k < 4:
             matrix[k % 2, k % 2 if k < 2 else 2] += deviations[k]
         else:
             distortion[k - 4] += deviations[k]
-        off = replace(camera, matrix=matrix, distortion=distortion, world_from_camera=place)
+        lens = {"matrix": matrix, "distortion": distortion}
+        off = replace(camera, **lens, world_from_camera=world_from_camera)
         views = []
         for view in square(rig, camera, pose):
             corners = undistort_pixels(off, distort_pixels(camera, view.seen.corners))
@@ -248,18 +251,18 @@ def test_a_lens_error_counts_by_what_it_does_to_place_and_pose_together(
             views.append(TagView(view.tag, seen))
         found = solve_pnp(off, views, camera.world_from_camera.inverse().compose(pose))
         assert found is not None
-        measured = place.compose(found.camera_from_body)
+        measured = world_from_camera.compose(found.camera_from_body)
         turn = rotation_vector_from_matrix(measured.rotation @ pose.rotation.T)
         change = np.concatenate([measured.position - pose.position, turn])
         expected += np.outer(change, change)
-    got = shared_of(known, told, pose)
+    got = shared_of(known, calibrated, pose)
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
         got / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03
     )
 
 
-def test_a_principal_point_that_is_off_is_a_camera_that_is_turned(rig: Rig) -> None:
+def test_an_error_of_the_principal_point_is_a_rotation_of_the_camera(rig: Rig) -> None:
     camera = looking(rig)
     by_lens = implied_rotation(camera)
     turn = camera.world_from_camera.rotation.T @ by_lens[:, 2]
@@ -276,8 +279,8 @@ def test_what_is_no_covariance_of_a_pose_is_refused(rig: Rig, rows: np.ndarray) 
 
 def test_a_mean_over_pictures_makes_no_shared_error_smaller(rig: Rig) -> None:
     """Two cameras of one survey err alike: both together are no surer than one."""
-    place = np.diag(PLACE**2).tolist()
-    camera = replace(looking(rig, pose_covariance=place), lens_covariance=np.zeros((8, 8)))
+    covariance = np.diag(POSE_DEVIATIONS**2).tolist()
+    camera = replace(looking(rig, pose_covariance=covariance), lens_covariance=np.zeros((8, 8)))
     pose = Pose(np.array([0.05, -0.03, 0.55]), np.eye(3))
     known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
     shared = shared_of(known, camera, pose)

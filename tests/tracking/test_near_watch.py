@@ -50,9 +50,9 @@ def test_the_run_stops_exactly_when_one_obstacle_is_surely_too_near(
     obstacles_mm: list[tuple[float, float]],
 ) -> None:
     watch = ClearanceMonitor(LIMIT_MM / 1e3)
-    told = [watch.take(measured(obstacles_mm)) for _ in range(NEAR_PICTURES)]
-    assert not any(told[:-1])
-    assert bool(told[-1]) is surely_too_near(obstacles_mm)
+    messages = [watch.take(measured(obstacles_mm)) for _ in range(NEAR_PICTURES)]
+    assert not any(messages[:-1])
+    assert bool(messages[-1]) is surely_too_near(obstacles_mm)
 
 
 @given(obstacles_mm=OBSTACLES)
@@ -76,10 +76,10 @@ def test_nearer_than_planned_counts_the_upper_side_too() -> None:
     assert "its 95 % interval ends at 31.00 mm" in against_plan.text
 
 
-def test_what_is_told_names_the_obstacle_that_is_surely_too_near() -> None:
+def test_the_message_names_the_obstacle_that_is_certainly_too_near() -> None:
     watch = ClearanceMonitor(LIMIT_MM / 1e3)
-    told = [watch.take(measured([(10.0, 15.0), (12.0, 1.0)])) for _ in range(2)][-1]
-    assert told == "platform to post 1: 12.0 ± 1.0 mm (95 % interval); the scene requires 20 mm"
+    message = [watch.take(measured([(10.0, 15.0), (12.0, 1.0)])) for _ in range(2)][-1]
+    assert message == "platform to post 1: 12.0 ± 1.0 mm (95 % interval); the scene requires 20 mm"
 
 
 @given(obstacles_mm=OBSTACLES, shares=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))

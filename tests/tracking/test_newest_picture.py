@@ -104,13 +104,13 @@ def test_no_picture_is_answered_twice(queue: Queue, camera: Camera) -> None:
         queue.unplug()
 
 
-def test_a_camera_that_goes_is_told_by_its_name_and_source(queue: Queue, camera: Camera) -> None:
+def test_a_lost_camera_is_reported_by_its_name_and_source(queue: Queue, camera: Camera) -> None:
     queue.take(1)
     with LiveCamera("7", camera, queue.clock) as live:
         queue.unplug()
-        with pytest.raises(Fault, match=f"{LOST_PICTURES} times in a row") as told:
+        with pytest.raises(Fault, match=f"{LOST_PICTURES} times in a row") as caught:
             live.read()
-    assert told.value.where == f"camera {camera.name} (7)"
+    assert caught.value.where == f"camera {camera.name} (7)"
 
 
 def test_a_camera_that_never_gave_a_picture_or_another_size_is_let_go_of(

@@ -1,4 +1,4 @@
-"""The synthetic camera: exact places, right order of what hides what, the same image again."""
+"""The synthetic camera: exact positions, correct occlusion, reproducible images."""
 
 from __future__ import annotations
 
@@ -105,13 +105,13 @@ def test_what_is_redrawn_equals_a_picture_drawn_whole(
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda s: type(s).__name__)
 def test_every_shape_is_drawn_where_its_points_are(shape: Shape) -> None:
     camera = small_camera(())
-    place = Pose(np.array([0.05, -0.03, 1.2]), matrix_from_rotation_vector([0.7, 0.4, 0.2]))
+    pose = Pose(np.array([0.05, -0.03, 1.2]), matrix_from_rotation_vector([0.7, 0.4, 0.2]))
     canvas = Canvas.blank(camera, sample_rays(camera))
-    vertices = place.apply(surface_of(shape).vertices)
+    vertices = pose.apply(surface_of(shape).vertices)
     draw_triangles(canvas, vertices, np.full(vertices.shape[:2], 200.0))
     inside = np.argwhere(np.isfinite(canvas.depth))[:, ::-1] / 2.0 - 0.25
     radius = getattr(shape, "radius", 0.0)
-    points = place.apply(shape_points(shape))
+    points = pose.apply(shape_points(shape))
     pixels = points[:, :2] / points[:, 2:] * 400.0 + [159.5, 119.5]
     slack = radius * 400.0 / (points[:, 2].min() - radius) + 1.0
     assert np.all(inside.min(axis=0) >= pixels.min(axis=0) - slack)
@@ -131,9 +131,9 @@ def test_every_shape_is_drawn_where_its_points_are(shape: Shape) -> None:
 def test_every_ray_is_that_of_its_sample(lens: str, focal: float, distortion: list[float]) -> None:
     matrix = np.array([[focal, 0.0, 159.5], [0.0, focal, 119.5], [0.0, 0.0, 1.0]])
     camera = replace(small_camera(()), lens=lens, matrix=matrix, distortion=np.array(distortion))
-    places = np.random.default_rng(3).integers(0, [640, 480], (2000, 2))
-    exact = rays_of(lens, matrix, camera.distortion, (places + 0.5) / 2.0 - 0.5)
-    off = np.abs(sample_rays(camera)[places[:, 1], places[:, 0]] - exact).max(axis=1)
+    coordinates = np.random.default_rng(3).integers(0, [640, 480], (2000, 2))
+    exact = rays_of(lens, matrix, camera.distortion, (coordinates + 0.5) / 2.0 - 0.5)
+    off = np.abs(sample_rays(camera)[coordinates[:, 1], coordinates[:, 0]] - exact).max(axis=1)
     assert (off < 2e-7 * (1.0 + np.sum(exact**2, axis=1))).all()
 
 
@@ -158,7 +158,7 @@ def test_a_ball_is_as_far_as_its_surface_on_every_ray(radius: float, x: float, y
     assert np.all(np.abs(canvas.depth - exact)[surely] < 0.03 * radius)
 
 
-def test_the_platform_hides_behind_an_obstacle_and_stands_before_one(
+def test_the_platform_is_hidden_by_an_obstacle_and_hides_another(
     rig: Rig, scene: Scene, camera: Camera
 ) -> None:
     toward = camera.world_from_camera.position - rig.home.position
@@ -166,8 +166,8 @@ def test_the_platform_hides_behind_an_obstacle_and_stands_before_one(
     wall = Box(np.array([0.2, 0.2, 0.2]))
     platform = _disk(camera, rig.home.position, 20)
 
-    def brightness_spread(place: np.ndarray) -> float:
-        obstacle = Obstacle("wall", wall, Pose.level(rig.home.position + place))
+    def brightness_spread(offset: np.ndarray) -> float:
+        obstacle = Obstacle("wall", wall, Pose.level(rig.home.position + offset))
         still = SyntheticCamera(
             rig, replace(scene, obstacles=(obstacle,)), camera, optics=Optics(noise=0.0)
         )
@@ -208,9 +208,9 @@ def _sampled(camera: Camera, pose: Pose, number: int, samples: int) -> np.ndarra
 
     modules = official_modules(FAMILY, number)
     light = float(shade(pose.rotation[:, 2]))
-    places = (np.arange(camera.width * samples) + 0.5) / samples - 0.5
+    coordinates = (np.arange(camera.width * samples) + 0.5) / samples - 0.5
     heights = (np.arange(camera.height * samples) + 0.5) / samples - 0.5
-    x = (places - camera.matrix[0, 2]) / camera.matrix[0, 0]
+    x = (coordinates - camera.matrix[0, 2]) / camera.matrix[0, 0]
     y = (heights - camera.matrix[1, 2]) / camera.matrix[1, 1]
     rays = np.dstack([*np.meshgrid(x, y), np.ones((len(y), len(x)))]) @ pose.rotation
     origin = -pose.rotation.T @ pose.position

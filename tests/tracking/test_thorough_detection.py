@@ -47,7 +47,9 @@ def test_exhaustive_detection_finds_what_standard_detection_misses(
     assert plain < 6
 
 
-def test_a_tag_found_both_ways_is_told_once(printer: HardPrinter, detector: TagDetector) -> None:
+def test_a_tag_found_by_both_searches_is_listed_once(
+    printer: HardPrinter, detector: TagDetector
+) -> None:
     picture = printer.picture(Condition(side_px=60), np.random.default_rng(1))
     assert len(detector.detect_all(picture.image, exhaustive=True)) == 1
 
@@ -121,7 +123,7 @@ def test_a_tag_without_white_around_it_or_without_contrast_is_not_read() -> None
     assert decoder.read(np.full_like(image, 128), corners) is None
 
 
-def test_the_pattern_of_a_given_tag_is_told_from_all_others() -> None:
+def test_the_pattern_of_a_given_tag_is_distinguished_from_all_others() -> None:
     image = square_picture(official_modules(FAMILY, 301))
     corners = (CORNER_SIGNS * [1, -1] + 1) * 40.0 + 19.5
     assert carries_tag(image, corners, FAMILY, 301)
