@@ -1,12 +1,12 @@
-"""How many boards are found in pictures that nobody here made, beside OpenCV in the same run.
+"""Board detection in third-party images, compared with OpenCV in the same run.
 
     python benchmarks/measuring/boards.py [--board chessboard --columns 9 --rows 6] [PICTURE ...]
 
-Without pictures the chessboards of Debian's `opencv-doc` that lie in the repository. The last
-column is the RMS reprojection error of pictures that the fit has not seen: every other picture
-calibrates, the others are held against it, in both directions, on the pictures that ours and the
-finder of the line both find. Only the corners differ: camera model and fit are OpenCV's, five
-coefficients (`--rational`: eight).
+Without arguments it uses the chessboards of Debian's `opencv-doc` in this repository. The last
+column is the RMS reprojection error of held-out images: every other image calibrates, the others
+are held out, in both directions, over the images in which both our detector and the row's find the
+board. Only the corners differ: camera model and fit are OpenCV's, five coefficients (`--rational`:
+eight).
 
 Other sets: `apt-get download opencv-doc && dpkg -x opencv-doc*.deb doc` (26 chessboards of two
 cameras), github.com/sourishg/fisheye-stereo-calibration (58, fisheye, 9 x 6),
@@ -38,7 +38,7 @@ _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
 
 
 def made_board(arguments: argparse.Namespace) -> Board:
-    """The board that the options describe; its size does not matter here."""
+    """The board described by the options; its size does not matter here."""
     count, tag, gap = (arguments.columns, arguments.rows), 0.05, 0.05 * arguments.gap
     match arguments.board:
         case "chessboard":
@@ -52,7 +52,7 @@ def made_board(arguments: argparse.Namespace) -> Board:
 
 
 def peers_of(board: Board) -> dict[str, Finder]:
-    """What OpenCV offers for the same board."""
+    """OpenCV's detectors for the same board."""
     match board:
         case Chessboard():
             return {
@@ -130,7 +130,7 @@ def _tags(board: TagGrid) -> Finder:
 
 
 def held_out(views: Mapping[str, DetectedBoard], size: tuple[int, int], flags: int) -> float:
-    """RMS error of pictures that the fit has not seen, [px]; nan where there are too few."""
+    """RMS error of held-out images, [px]; NaN if there are too few."""
     names, squares, count = list(views), 0.0, 0
     for which in (0, 1):
         used, rest = names[which::2], names[1 - which :: 2]
@@ -143,8 +143,8 @@ def held_out(views: Mapping[str, DetectedBoard], size: tuple[int, int], flags: i
         )
         for name in rest:
             seen = views[name]
-            _, turn, place = cv2.solvePnP(seen.points, seen.corners, matrix, lens)
-            there = cv2.projectPoints(seen.points, turn, place, matrix, lens)[0].reshape(-1, 2)
+            _, turn, shift = cv2.solvePnP(seen.points, seen.corners, matrix, lens)
+            there = cv2.projectPoints(seen.points, turn, shift, matrix, lens)[0].reshape(-1, 2)
             squares += float(np.sum((there - seen.corners) ** 2))
             count += len(there)
     return float(np.sqrt(squares / count))
@@ -170,17 +170,17 @@ def options() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """Prints a line for each finder."""
+    """Prints a line for each detector."""
     arguments = options().parse_args()
     shipped = sorted((ROOT / "tests" / "calibration" / "photographs").glob("left*.jpg"))
     pictures = {path.name: cv2.imread(str(path), 0) for path in arguments.pictures or shipped}
     if unread := [name for name, image in pictures.items() if image is None]:
-        print(f"not pictures that can be read: {', '.join(unread)}", file=sys.stderr)
+        print(f"not readable as images: {', '.join(unread)}", file=sys.stderr)
         return 2
     board = made_board(arguments)
     flags = cv2.CALIB_RATIONAL_MODEL if arguments.rational else 0
     size = next(iter(pictures.values())).shape[::-1]
-    print(f"{board} in {len(pictures)} pictures; times are CPU")
+    print(f"{board} in {len(pictures)} images; times are CPU")
     print(f"{'finder':14s}{'found':>6s}{'ms each':>9s}{'found by both':>15s}{'held out, px':>22s}")
     ours: dict[str, DetectedBoard] = {}
     for name, find in {"ours": board.find, **peers_of(board)}.items():
