@@ -39,8 +39,8 @@ from model.rig import Rig, load_rig
 from model.winches import WinchMap
 from tests.calibration.rig_places import (
     Truth,
-    built_otherwise,
-    drawn_with,
+    rig_with_errors,
+    with_nominal_stiffness,
     samples,
     share_inside,
     true_numbers,
@@ -169,9 +169,9 @@ def coverage(plants: int, count: int) -> None:
     for share in (1.0, 0.5, 2.0, 4.0, 100.0):
         inside, good, false = [], 0, 0
         for seed in range(plants):
-            built = built_otherwise(rig, seed)
+            built = rig_with_errors(rig, seed)
             data = samples(built, count, tilt=math.radians(8.0), seed=1000 + seed).measured
-            drawn = drawn_with(built, share * rig.document.cables.stiffness_n)
+            drawn = with_nominal_stiffness(built, share * rig.document.cables.stiffness_n)
             result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, 1e-4)
             verdict = judge_rig(result, 1e-3, math.radians(5.0)).verdict
             inside.append(share_inside(result.intervals, true_numbers(built)))
@@ -194,7 +194,7 @@ def cables_that_differ(plants: int, count: int) -> None:
             for seed in range(plants):
                 shares = np.exp(spread * np.random.default_rng(seed).standard_normal(8))
                 stiffness = rig.document.cables.stiffness_n * shares
-                built = built_otherwise(rig, seed, stiffness.tolist())
+                built = rig_with_errors(rig, seed, stiffness.tolist())
                 data = samples(built, count, tilt=math.radians(8.0), seed=1000 + seed).measured
                 result = fit_rig(built, data, deviations, 1e-4)
                 true = true_numbers(built)

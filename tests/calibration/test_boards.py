@@ -1,4 +1,4 @@
-"""Boards in rendered images: every point where it is, and no point that is not there."""
+"""Boards in rendered images: points at their true positions, and no false points."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def kalibr_print() -> np.ndarray:
 
 
 def circle_print(board: CircleGrid) -> np.ndarray:
-    """Black circles on white, the first one's middle `MARGIN` from the left and the top."""
+    """Black circles on white, the first centre `MARGIN` from the left and the top."""
     fine = 4
     centres = (board.points()[:, :2] + MARGIN) / PIXEL
     width, height = (centres.max(axis=0) + MARGIN / PIXEL).astype(int)
@@ -112,7 +112,7 @@ def off(board, pictures) -> np.ndarray:
     ("board", "points", "limit"), [(CIRCLES, 200, 0.04), (SHIFTED, 200, 0.05), (KALIBR, 500, 0.1)]
 )
 def test_centres_and_saddles_are_found_where_they_are(board, points: int, limit: float) -> None:
-    """Middles of ellipses would be 0.1 px and more off where circles are seen aslant."""
+    """Centres of ellipses would be off by 0.1 px and more for oblique circles."""
     errors = off(board, grid_pictures(board))
     assert len(errors) > points
     assert np.sqrt(np.mean(errors**2)) < limit
@@ -122,7 +122,7 @@ def test_centres_and_saddles_are_found_where_they_are(board, points: int, limit:
 def first(
     count: int, pictures: list[tuple[np.ndarray, Pose]], fits: Callable[[np.ndarray], bool]
 ) -> list[tuple[np.ndarray, Pose]]:
-    """The first pictures that fit; to look for a board takes long."""
+    """The first suitable images; detecting a board takes long."""
     return list(islice(((image, pose) for image, pose in pictures if fits(image)), count))
 
 
@@ -237,7 +237,7 @@ def test_the_message_names_what_images_show_instead(board, wrong, named: str) ->
 
 
 def test_the_message_names_what_most_images_show_instead() -> None:
-    """One image of another board lies among six."""
+    """One image of another board among six."""
     image, stray = (
         next(image for image, _ in pictures(board) if board.find(image) is not None)
         for board in (TAGS, CHARUCO)
@@ -301,7 +301,7 @@ def test_a_number_that_is_seen_twice_is_left_out_by_name(board, number: int) -> 
         (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", -1), "tags 0 to 586; .* -1 to 10"),
     ],
 )
-def test_boards_that_cannot_be_are_refused(make, named: str) -> None:
+def test_impossible_boards_are_refused(make, named: str) -> None:
     with pytest.raises(BadInput, match=named):
         make()
 

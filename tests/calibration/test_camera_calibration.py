@@ -1,4 +1,4 @@
-"""Intrinsics from a chessboard: the true ones come back from exact and from rendered images."""
+"""Intrinsics from a chessboard: recovered from exact corners and from rendered images."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def views(count: int, noise: float, seed: int = 5) -> dict[str, DetectedBoard]:
 
 
 def board_picture(pose: Pose) -> np.ndarray:
-    """The board rendered by meeting its plane with every ray, 2 x 2 samples a pixel."""
+    """The board rendered by ray casting, 2 x 2 samples per pixel."""
     rays = sample_rays() @ pose.rotation
     origin = -pose.rotation.T @ pose.position
     on_board = (origin + (-origin[2] / rays[:, 2])[:, None] * rays)[:, :2] / BOARD.square + 1.0
@@ -93,8 +93,8 @@ def test_noisy_corners_stay_within_the_stated_intervals() -> None:
     assert shares.mean() >= 0.9
 
 
-def test_corners_that_err_together_widen_the_intervals() -> None:
-    """As where a board bends: by the scatter alone each image is as sure as before."""
+def test_correlated_corner_errors_widen_the_intervals() -> None:
+    """As with a bent board: by scatter alone the intervals would not change."""
     straight, bent = views(14, 0.02), {}
     for k, (name, seen) in enumerate(straight.items()):
         shift = 0.4 * np.array([np.sin(2.0 * k), np.cos(3.0 * k)])
@@ -114,7 +114,7 @@ def test_the_change_without_an_image_is_that_of_a_fit_without_it() -> None:
         assert found.uncertainty.without[k, 0] == pytest.approx(change, abs=0.25)
 
 
-def test_a_picture_whose_corners_are_mistaken_is_left_out_by_name() -> None:
+def test_an_image_with_wrong_corners_is_left_out_by_name() -> None:
     all_views = views(12, 0.05)
     wrong = all_views["view 3"]
     rolled = np.roll(wrong.corners, 1, axis=0)
@@ -173,7 +173,7 @@ def test_other_data_have_another_hash() -> None:
 
 
 def test_a_bowed_board_is_named_with_its_bow() -> None:
-    """Of 200 mm by 125 mm, its middle 1 mm higher than its corners."""
+    """200 mm by 125 mm, with its centre 1 mm above its corners."""
     flat = views(14, 0.05)
     poses = calibrate_from_views(flat, SIZE).boards
     bent = {}
@@ -194,7 +194,7 @@ def test_a_bowed_board_is_named_with_its_bow() -> None:
 
 
 def test_no_advice_contradicts_what_is_there_already() -> None:
-    """Neither more pictures where there are enough, nor 90 % where 90 % are covered."""
+    """Neither more images if there are enough, nor 90 % coverage if it is 90 %."""
     many = views(42, 2.0)
     verdict = judge_camera(calibrate_from_views(many, SIZE), 1e-4).verdict
     assert not verdict.good

@@ -1,4 +1,4 @@
-"""A camera located by another one: both see the platform, or a board, at the same time."""
+"""A camera located by another: both see the platform, or a board, at the same time."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WRONG = np.array([0.03, -0.02, 0.01])
 
 
 def rotated_about_home(rig: Rig, degrees: float) -> Pose:
-    """The first camera's pose, carried around the vertical through home."""
+    """The first camera's pose, rotated about the vertical through home."""
     turn = matrix_from_rotation_vector(np.array([0.0, 0.0, np.radians(degrees)]))
     own = rig.cameras[0].world_from_camera
     return Pose(turn @ (own.position - rig.home.position) + rig.home.position, turn @ own.rotation)
@@ -42,7 +42,7 @@ def rotated_about_home(rig: Rig, degrees: float) -> Pose:
 
 @pytest.fixture(scope="module")
 def two() -> tuple[Rig, Pose]:
-    """A rig with a second camera, whose pose in the file is wrong, and where it truly is."""
+    """A rig with a second camera with a wrong pose in the file, and its true pose."""
     rig = load_rig(RIG)
     truth = rotated_about_home(rig, 25.0)
     first = rig.document.cameras[0]
@@ -112,14 +112,14 @@ def test_mistakes_are_refused_in_one_message(folders: Path) -> None:
     one_message(call(*verb, f"front={folders / 'front'}", *board), 2, "rotated by 180")
 
 
-def test_only_boards_that_show_their_orientation_will_do() -> None:
+def test_boards_without_a_unique_orientation_are_refused() -> None:
     require_oriented(TagGrid(4, 3, 0.05, 0.02, "tag36h11"))
     with pytest.raises(BadInput, match="180"):
         require_oriented(Chessboard(9, 6, 0.02))
 
 
 def test_a_boards_pose_and_its_covariance_are_honest(two) -> None:
-    """Of 200 noisy views of a board the squared error in units of the covariance is 6."""
+    """The squared error of 200 noisy views in units of the covariance is 6 on average."""
     camera = two[0].cameras[0]
     board = TagGrid(4, 3, 0.05, 0.02, "tag36h11")
     points = board.points_of(range(12))

@@ -17,7 +17,7 @@ BLANK = np.zeros((SIZE[1], SIZE[0]), np.uint8)
 
 
 class Shown:
-    """A board that is where a test holds it."""
+    """A board at a pose set by the test."""
 
     def __init__(self) -> None:
         self.pose: Pose | None = None

@@ -1,4 +1,4 @@
-"""Corners that another program detected, read from a CSV file."""
+"""Corners detected by another program, read from a CSV file."""
 
 from __future__ import annotations
 

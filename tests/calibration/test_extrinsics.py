@@ -25,7 +25,7 @@ from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_m
 from model.rig import Rig, Tag, load_rig
 from model.scene import load_scene
 from simulation.camera.camera import SyntheticCamera
-from tests.calibration.exact_sights import sights_at
+from tests.calibration.exact_sights import observe
 from tracking.camera_model import project_undistorted
 from tracking.detection.tags import tag_corners
 from tracking.pnp import moved
@@ -77,7 +77,7 @@ def test_a_camera_is_located_to_half_a_millimetre(rig: Rig, pictures) -> None:
 
 
 def crooked(tags: tuple[Tag, ...], survey: float, rng: np.random.Generator) -> tuple[Tag, ...]:
-    """Tags where they truly are: off from their survey by so much along each axis."""
+    """The true tags, with random survey errors along each axis."""
     return tuple(
         replace(
             tag,
@@ -101,7 +101,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) 
         found = locate_by_frame_tags(
             rig,
             camera,
-            sights_at(camera, tags, poses, 0.03, rng),
+            observe(camera, tags, poses, 0.03, rng),
             Survey(survey, 2.0 * survey / tags[0].size),
         )
         pose = found.world_from_camera
@@ -113,11 +113,11 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) 
         stated.append(found.error)
     assert np.mean(inside) >= 0.9
     assert np.mean(np.array(errors) <= stated) >= 0.9
-    assert np.median(stated) < 3.0 * np.median(errors)  # and not by promising nothing
+    assert np.median(stated) < 3.0 * np.median(errors)  # and not because the intervals are too wide
 
 
 def test_known_tag_rotations_halve_the_error_of_the_camera(rig: Rig) -> None:
-    """Eight tags in the plane of the floor, each 1 mm off as a whole."""
+    """Eight tags on the floor, each 1 mm off as a whole."""
     truth, camera, errors = elsewhere(rig), rig.cameras[0], []
     tags = [
         Tag(401 + k, 0.12, Pose.level([0.45 * np.cos(a), 0.45 * np.sin(a), 0.0]))
@@ -131,7 +131,7 @@ def test_known_tag_rotations_halve_the_error_of_the_camera(rig: Rig) -> None:
             replace(tag, pose=Pose(tag.pose.position + shift, tag.pose.rotation))
             for tag, shift in zip(tags, shifts, strict=True)
         ]
-        observations = sights_at(camera, there, {"a": truth.inverse()}, 0.03, rng)
+        observations = observe(camera, there, {"a": truth.inverse()}, 0.03, rng)
         errors.append([])
         for survey in (Survey(1e-3), Survey(1e-3, 0.0)):
             found = locate_by_frame_tags(rig, camera, observations, survey)
@@ -145,7 +145,7 @@ def test_known_tag_rotations_halve_the_error_of_the_camera(rig: Rig) -> None:
 
 @pytest.mark.parametrize("turn", [None, 0.0, 0.01])
 def test_the_pixels_of_a_survey_scatter_as_predicted(rig: Rig, turn: float | None) -> None:
-    """Against pixels of tags that were drawn at random."""
+    """Against pixels of random tags."""
     rng, camera, tag = np.random.default_rng(5), rig.cameras[0], rig.frame_tags[0]
     world, survey = elsewhere(rig).inverse(), Survey(1e-3, turn)
     pixels = []
@@ -169,11 +169,11 @@ def test_a_tag_that_was_knocked_is_named_and_does_not_move_the_camera(rig: Rig) 
     tags = [Tag(401 + k, 0.12, Pose.level([x, y, 0.0])) for k, (x, y) in enumerate(positions)]
     rig = replace(rig, frame_tags=tuple(tags))
     knocked = [replace(tags[0], pose=Pose.level([0.44, 0.0, 0.0])), *tags[1:]]
-    observations = sights_at(camera, knocked, {"a": truth.inverse()}, 0.02, rng)
+    observations = observe(camera, knocked, {"a": truth.inverse()}, 0.02, rng)
     found = locate_by_frame_tags(rig, camera, observations, Survey(0.2e-3))
     assert list(found.unused) == ["tag 401"]
     away = float(found.unused["tag 401"].split()[2])
-    assert away == pytest.approx(18.0, abs=4.0)  # 20 mm along the floor, seen aslant
+    assert away == pytest.approx(18.0, abs=4.0)  # 20 mm along the floor, at an oblique view
     assert found.world_from_camera.distance_to(truth) < 3e-3
 
 
@@ -181,7 +181,7 @@ def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
     camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
     tags = crooked(rig.frame_tags, 10e-3, rng)
     found = locate_by_frame_tags(
-        rig, camera, sights_at(camera, tags, {"a": truth.inverse()}, 0.02, rng), Survey(1e-4)
+        rig, camera, observe(camera, tags, {"a": truth.inverse()}, 0.02, rng), Survey(1e-4)
     )
     verdict = judge_extrinsics(found, 1.0)
     assert not verdict.good
@@ -193,7 +193,7 @@ def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
 def test_too_few_tags_are_not_good_enough(rig: Rig, count: int, seen: str) -> None:
     camera, truth = rig.cameras[0], elsewhere(rig)
     rng = np.random.default_rng(3)
-    observations = sights_at(camera, rig.frame_tags[:count], {"a": truth.inverse()}, 0.02, rng)
+    observations = observe(camera, rig.frame_tags[:count], {"a": truth.inverse()}, 0.02, rng)
     found = locate_by_frame_tags(rig, camera, observations, Survey(0.5e-3))
     verdict = judge_extrinsics(found, 1e-3)
     assert f"{seen} seen; 3 are required" in verdict.reasons
@@ -205,7 +205,7 @@ def test_a_picture_of_a_camera_that_was_moved_is_left_out_by_name(rig: Rig) -> N
     poses = {f"{k}.png": truth.inverse() for k in range(4)}
     poses["3.png"] = moved(truth.inverse(), np.array([0.01, 0, 0, 0, 0, 0]))
     found = locate_by_frame_tags(
-        rig, camera, sights_at(camera, rig.frame_tags, poses, 0.02, rng), Survey(1e-4)
+        rig, camera, observe(camera, rig.frame_tags, poses, 0.02, rng), Survey(1e-4)
     )
     assert list(found.unused) == ["3.png"]
     assert "the camera moved" in found.unused["3.png"]

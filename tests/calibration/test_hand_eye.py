@@ -14,7 +14,7 @@ from calibration.tag_map.observations import TagObservations
 from model.errors import BadInput, InvalidFile
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, load_rig
-from tests.calibration.exact_sights import sights_at
+from tests.calibration.exact_sights import observe
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -41,7 +41,7 @@ def session(
         pose = Pose(position, matrix_from_rotation_vector(rng.uniform(-turn, turn, 3)))
         encoder[f"{k}.png"] = shaken(pose, noise, rng)
         seen[f"{k}.png"] = camera.world_from_camera.inverse().compose(pose).compose(off)
-    return sights_at(camera, rig.platform_tags, seen, 0.03, rng), encoder
+    return observe(camera, rig.platform_tags, seen, 0.03, rng), encoder
 
 
 def unaware(camera: Camera) -> Camera:
@@ -102,13 +102,13 @@ def test_poses_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
     }
     world = camera.world_from_camera.inverse()
     seen = {name: world.compose(pose) for name, pose in encoder.items()}
-    observations = sights_at(camera, rig.platform_tags, seen, 0.03, rng)
+    observations = observe(camera, rig.platform_tags, seen, 0.03, rng)
     verdict = judge_extrinsics(locate_by_motion(rig, camera, observations, encoder), 1.0)
     assert any("all poses lie within" in reason for reason in verdict.reasons)
 
 
 def test_the_same_view_counts_once(rig: Rig) -> None:
-    """As of one image saved several times, or of a platform that stood still."""
+    """As with one image saved several times, or a platform at rest."""
     observations, encoder = session(rig, 10, 0.3, 1e-4, seed=7)
     rng = np.random.default_rng(1)
     copies = {

@@ -1,4 +1,4 @@
-"""Lens models: found with their uncertainty, chosen by held-out pictures, used everywhere alike."""
+"""Lens models: fitted with uncertainty, selected by held-out images, used consistently."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def matrix_of(focal: float) -> np.ndarray:
 def views(
     name: str, count: int = 30, noise: float = 0.08, seed: int = 3
 ) -> dict[str, DetectedBoard]:
-    """A board that is held all over the picture, near to its corners too."""
+    """A board all over the image, also near its corners."""
     rng, found = np.random.default_rng(seed), {}
     focal, lens = TRUTH[name]
     middle, tries = BOARD.points().mean(axis=0), 0
@@ -86,13 +86,13 @@ def views(
 
 @cache
 def chosen(name: str) -> CameraCalibration:
-    """The model left to choose."""
+    """The automatically selected model."""
     return calibrate_from_views(views(name), SIZE)
 
 
 @pytest.mark.parametrize("name", TRUTH)
 def test_a_lens_comes_back_within_its_intervals(name: str) -> None:
-    """Of three trials at least nine in ten numbers, each within its 95 % interval."""
+    """At least 90 % of the parameters in three trials are within their 95 % intervals."""
     focal, lens = TRUTH[name]
     m = matrix_of(focal)
     truth = np.array([m[0, 0], m[1, 1], m[0, 2], m[1, 2], *lens])
@@ -169,7 +169,7 @@ def test_a_clean_camera_is_good_and_the_truth_within_what_is_stated() -> None:
         inside += ratios[-1] < 1.0
     assert good == 12
     assert inside >= 11
-    assert np.median(ratios) > 0.15  # nor are intervals so wide that they say nothing
+    assert np.median(ratios) > 0.15  # and the intervals are not too wide
 
 
 def test_a_rotation_of_the_camera_is_no_error_of_it() -> None:
@@ -198,7 +198,7 @@ def test_pixels_come_back_from_ideal_ones(name: str) -> None:
 
 
 def test_rays_beside_and_behind_a_fisheye_are_put_at_its_rim() -> None:
-    """Not on the other side of the picture, where OpenCV's iteration puts them."""
+    """Not on the other side of the image, where OpenCV's iteration puts them."""
     camera = some_camera("fisheye")
     corners = np.array([[5.0, 5.0], [955.0, 5.0], [5.0, 595.0], [955.0, 595.0]])
     ideal = undistort_pixels(camera, corners) - camera.matrix[:2, 2]
@@ -241,7 +241,7 @@ def test_a_synthetic_camera_of_any_lens_is_tracked_to_a_millimetre(name: str) ->
     found = Tracker(bent, camera).observe(picture, 0.0)
     assert isinstance(found, PoseMeasurement)
     assert np.linalg.norm(found.pose.position - truth.position) < 1e-3
-    with pytest.raises(CameraMoved):  # the lens is left out
+    with pytest.raises(CameraMoved):  # without the lens
         Tracker(rig, plain).observe(picture, 0.0)
 
 
@@ -256,7 +256,7 @@ def with_lens(rig: Rig, kind: str, lens: list[float]) -> CameraDocument:
 
 
 UNKNOWN_THERE = {("kalibr", "five"), ("kalibr", "rational"), ("mrcal", "fisheye")}
-"""Lens models that a program does not have."""
+"""Lens models that a program does not support."""
 
 
 @pytest.mark.parametrize("form", FORMATS)

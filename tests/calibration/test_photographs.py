@@ -1,4 +1,4 @@
-"""Photographs that we did not render, in the formats, sizes and turns that people have."""
+"""Real photographs, in common formats, sizes and orientations."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_thirteen_photographs_with_a_small_error_are_not_said_to_be_good(found) 
 
 @pytest.mark.parametrize("factor", [1.0, 0.5])
 def test_every_board_is_found_that_any_finder_of_opencv_finds(factor: float) -> None:
-    """The sector finder alone loses two of thirteen, and more of the halved ones."""
+    """The sector-based detector alone misses two of thirteen, and more at half size."""
     exhaustive = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     for path in chessboards():
         image = cv2.resize(

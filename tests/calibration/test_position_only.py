@@ -1,4 +1,4 @@
-"""Rig calibration from positions of one point, as trackers with one reflector give them."""
+"""Rig calibration from positions of one point, as from trackers with one reflector."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def truth(rig: Rig) -> Truth:
 
 
 def followed(truth: Truth, reflector: np.ndarray) -> RigMeasurements:
-    """What a tracker of one reflector would have measured."""
+    """Measurements of a tracker with one reflector."""
     data = truth.measured
     points = data.positions + data.rotations @ reflector
     return replace(
@@ -69,7 +69,7 @@ def test_a_wrong_reflector_fits_worse(rig: Rig, truth: Truth) -> None:
 
 
 def test_what_a_position_says_of_a_pose_is_by_finite_differences(rig: Rig, truth: Truth) -> None:
-    """The gradient of the squared distances, about estimated poses."""
+    """The gradient of the squared distances, at estimated poses."""
     data = followed(truth, REFLECTOR)
     fitter = RigFitter(Parameters.of(rig, DEFAULT_DEVIATIONS), data, LENGTH_DEVIATION)
     positions, rotations = truth.positions + 1e-3, truth.rotations

@@ -1,4 +1,4 @@
-"""Printed boards and tags: exact to the micrometre, and found by our own detectors."""
+"""Printed boards and tags: exact to the micrometre, and detectable."""
 
 from __future__ import annotations
 

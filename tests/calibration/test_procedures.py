@@ -1,4 +1,4 @@
-"""Whole calibrations from a script: result, report and progress without the command line."""
+"""Complete calibrations from a script: result, report and progress."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ON = date(2026, 3, 1)
 
 
 class Heard(Listener):
-    """Remembers what was reported."""
+    """Records the reported progress."""
 
     def __init__(self) -> None:
         self.totals: list[tuple[str, float | None]] = []

@@ -26,7 +26,7 @@ TRUE, RATE = 0.025, 20.0
 
 
 def swinging(rig: Rig, time: float) -> Pose:
-    """Up and down and sideways, at most at about 0.12 m/s."""
+    """Vertical and lateral oscillation, at most 0.12 m/s."""
     shift = np.array([0.02 * np.sin(4.0 * time), 0.0, 0.02 * np.sin(5.0 * time + 1.0)])
     return Pose(rig.home.position + shift, rig.home.rotation)
 

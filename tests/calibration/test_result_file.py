@@ -1,4 +1,4 @@
-"""Result files: read as written, refused for other rigs, numbers shown with their widths."""
+"""Result files: read as written, refused for other rigs, values shown with half widths."""
 
 from __future__ import annotations
 
@@ -110,11 +110,11 @@ def test_files_that_are_not_results_are_refused_by_name(
     assert str(path) in str(caught.value)
 
 
-def test_a_result_tells_how_far_it_is_from_another() -> None:
+def test_a_result_states_its_distance_from_another() -> None:
     one, two = camera_result_of(), camera_result_of(fx=908.0)
     assert one.changes_to(two)["fx_px"] == pytest.approx(3.0)
     assert one.apart_mm(one) < 1e-9
-    # Points of a picture lie up to 0.7 of the distance off its axis; 3 of 905 px is 0.33 %.
+    # Points are up to 0.7 of the distance off the axis; 3 of 905 px is 0.33 %.
     assert 0.5 < one.apart_mm(two) < 3.5
 
 
@@ -139,7 +139,7 @@ def test_a_verdict_says_each_next_step_once() -> None:
 
 
 def test_a_camera_result_from_before_there_were_lens_models_is_read(tmp_path: Path) -> None:
-    """It has no key `lens`, and its hash knows of none."""
+    """It has no key `lens`, and its hash does not include one."""
     path = write_result(tmp_path, camera_result_of())
     text = path.read_text()
     assert "lens: pinhole\n" in text
@@ -157,7 +157,7 @@ def test_the_covariance_of_a_camera_pose_goes_into_the_rig(rig: Rig) -> None:
         camera=rig.cameras[0],
         by="frame tags",
         covariance=np.diag(deviations**2),
-        half_widths=2.0 * 1.96 * deviations,  # twice as wide by leaving tags out
+        half_widths=2.0 * 1.96 * deviations,  # twice as wide by the jackknife
         by_lens=by_lens,
         points=workspace_corners(rig),
         tag_errors={},

@@ -51,8 +51,8 @@ from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 from tests.calibration.rig_places import (
     Truth,
-    built_otherwise,
-    drawn_with,
+    rig_with_errors,
+    with_nominal_stiffness,
     samples,
     share_inside,
     true_numbers,
@@ -89,14 +89,14 @@ def found_level(rig: Rig, level: Truth) -> RigCalibration:
 
 
 def positions_by(rig: Rig, truth: Truth) -> Array:
-    """Where forward kinematics of a rig puts the platform, by its own winches, (n, 3), [m]."""
+    """Platform positions by forward kinematics of a rig with its own winches, (n, 3), [m]."""
     winches, data = WinchMap(rig), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
     return poses_near(rig, lengths, truth.positions, truth.rotations, steps=20)[0]
 
 
 def errors_of(rig: Rig, truth: Truth) -> Array:
-    """How far off that is, shape (n,), [m]."""
+    """Errors of these positions, shape (n,), [m]."""
     return np.asarray(np.linalg.norm(positions_by(rig, truth) - truth.positions, axis=1))
 
 
@@ -152,7 +152,7 @@ def test_derivatives_are_those_of_finite_differences(name: str, seed: int) -> No
 
 
 def test_the_fit_is_the_one_that_scipy_finds(rig: Rig, tilted: Truth) -> None:
-    """Unknowns and poses in one dense problem of another solver; no outlier, so plain squares."""
+    """One dense problem in another solver; without outliers, so plain least squares."""
     data = tilted.measured.part(np.arange(60) < 12)
     parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
     fit = RigFitter(parameters, data, LENGTH_DEVIATION).fit()
@@ -189,10 +189,10 @@ def test_the_error_at_unmeasured_poses_falls_by_a_factor_of_ten(
 
 @pytest.mark.parametrize("stiffness", [4000.0, 6000.0, 10000.0])
 def test_intervals_hold_the_truth_about_as_often_as_they_say(rig: Rig, stiffness: float) -> None:
-    """The cables have 6000 N, whatever the rig file says."""
-    built = built_otherwise(rig, seed=11)
+    """The cables have 6000 N, whatever the rig file states."""
+    built = rig_with_errors(rig, seed=11)
     data = samples(built, 60, tilt=np.radians(8.0), seed=12).measured
-    drawn = drawn_with(built, stiffness)
+    drawn = with_nominal_stiffness(built, stiffness)
     result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     true = true_numbers(built)
     assert len(true) == 57
@@ -202,8 +202,8 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(rig: Rig, stiffness
 
 
 def test_a_stiffness_that_is_found_is_applied(rig: Rig, tilted: Truth) -> None:
-    """The rig file tells half as much again as the cables have."""
-    drawn = drawn_with(rig, 9000.0)
+    """The rig file states 1.5 times the stiffness of the cables."""
+    drawn = with_nominal_stiffness(rig, 9000.0)
     result = fit_rig(drawn, tilted.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     document = rig_result(result, judge_rig(result, 1e-3, 0.0), "rig", TODAY)
     corrected = drawn.with_calibration(document)
@@ -235,7 +235,7 @@ def test_without_tensions_the_stiffness_stays_as_drawn_and_is_named(
 def test_without_tensions_cables_that_hardly_stretch_are_as_certain(
     rig: Rig, tilted: Truth
 ) -> None:
-    stiff = drawn_with(rig, 1e6)
+    stiff = with_nominal_stiffness(rig, 1e6)
     blind = replace(tilted.measured, tensions=np.full_like(tilted.measured.tensions, np.nan))
     model = RigModel(Parameters.of(stiff, DEFAULT_DEVIATIONS), blind)
     deviations = model.length_deviations(LENGTH_DEVIATION)
@@ -264,7 +264,7 @@ def test_missing_tensions_are_the_working_ones_of_their_pose(rig: Rig, tilted: T
 
 
 def test_the_change_without_a_sample_is_that_of_a_fit_without_it(rig: Rig, tilted: Truth) -> None:
-    """The jackknife to first order against twenty fits."""
+    """The first-order jackknife against twenty fits."""
     data = tilted.measured.part(np.arange(60) < 20)
     parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
     fit, observability = identified(parameters, data, LENGTH_DEVIATION)
@@ -299,7 +299,7 @@ def test_correlated_errors_within_samples_widen_the_intervals(rig: Rig, tilted: 
 def test_without_rotation_it_names_what_is_unidentified_and_keeps_it_nominal(
     rig: Rig, found_level: RigCalibration
 ) -> None:
-    """A cable of a platform that never turns tells outlet and anchor only as a sum."""
+    """Without rotation, a cable determines only the sum of outlet and anchor errors."""
     assert found_level.observability.unknown.shape[1] == 24
     assert found_level.not_identified == [
         "outlet and anchor of one cable moved together: every cable along x, y and z"
@@ -339,7 +339,7 @@ def test_one_badly_measured_cable_does_not_spoil_the_rest(rig: Rig, tilted: Trut
 def test_lengths_alone_make_cables_agree_and_report_the_world_as_unknown(
     rig: Rig, tilted: Truth
 ) -> None:
-    """As without a camera: eight lengths of a pose of six numbers must fit each other."""
+    """Without a camera: eight lengths of a pose with six degrees of freedom must agree."""
     alone = tilted.measured.without_poses()
     result = fit_rig(rig, alone, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     quality = judge_rig(result, 1e-3, 0.0)
@@ -363,14 +363,14 @@ def test_groups_that_are_known_stay_as_drawn(rig: Rig, tilted: Truth) -> None:
     }
 
 
-def test_pulleys_are_looked_for_only_where_the_rig_has_them(rig: Rig) -> None:
+def test_pulleys_are_estimated_only_if_the_rig_has_them(rig: Rig) -> None:
     hall = load_rig(ROOT / "configs/hall_10_6.yaml")
     assert "pulley_radius" in Parameters.of(hall, DEFAULT_DEVIATIONS).names
     assert "pulley_radius" not in Parameters.of(rig, DEFAULT_DEVIATIONS).names
 
 
 def test_a_rig_with_pulleys_is_more_accurate_than_by_its_file() -> None:
-    """Another rig: ten cables over pulleys of another radius than drawn."""
+    """Another rig: ten cables, with a pulley radius that differs from the file."""
     drawn = load_rig(ROOT / "configs/hall_10_6.yaml")
     document, random = drawn.document.model_dump(mode="json"), np.random.default_rng(3)
     m = drawn.cable_count
@@ -487,7 +487,7 @@ def test_two_results_are_compared_by_where_the_platform_goes(
 def test_counts_of_home_lead_the_corrected_rig_to_the_lengths_that_were_fitted(
     rig: Rig, found: RigCalibration
 ) -> None:
-    """Its winches pay out for a count what the fit says, to a count."""
+    """Its winches pay out the fitted length, to one count."""
     result = rig_result(found, judge_rig(found, 1e-3, 0.0), "rig", TODAY)
     corrected, data = rig.with_calibration(result), found.measured
     winches = WinchMap(corrected)
@@ -517,7 +517,7 @@ def test_too_few_samples_and_no_parameters_are_refused(rig: Rig, tilted: Truth) 
 
 
 def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
-    """Standing for 1 s, moving for 1 s, standing for 1 s; an image every 0.1 s."""
+    """At rest for 1 s, moving for 1 s, at rest for 1 s; an image every 0.1 s."""
     time = np.arange(0.0, 3.0, 0.01)
     travel = np.clip(time - 1.0, 0.0, 1.0)
     counts = np.rint(1000.0 * np.stack([travel, -travel], axis=1))
@@ -555,7 +555,7 @@ def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
 
 
 def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, tilted: Truth) -> None:
-    """Winches 1 and 2 changed over; the drums' largest error is 0.8 % of 0.5."""
+    """Winches 1 and 2 swapped, or a stated drum deviation far below the true error."""
     counts = tilted.measured.counts.copy()
     counts[:, [0, 1]] = counts[:, [1, 0]]
     swapped = replace(tilted.measured, counts=counts)
@@ -582,7 +582,7 @@ def test_a_pose_outside_the_rig_is_refused_by_name(rig: Rig, tilted: Truth) -> N
 
 @pytest.mark.parametrize("poses", [True, False])
 def test_a_wrong_stiffness_is_reported_with_the_true_one(tilted: Truth, poses: bool) -> None:
-    """The data are of cables with 6000 N, and the file of the paper's rig says 848230 N."""
+    """The cables have 6000 N, the paper's rig file states 848230 N."""
     drawn = load_rig(ROOT / "configs/gachon_8_6.yaml")
     data = tilted.measured if poses else tilted.measured.without_poses()
     result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
@@ -599,7 +599,7 @@ def test_a_wrong_stiffness_is_reported_with_the_true_one(tilted: Truth, poses: b
 def test_the_estimated_stiffness_is_the_same_for_every_rig_file(
     rig: Rig, tilted: Truth, stiffness: float
 ) -> None:
-    drawn = drawn_with(rig, stiffness)
+    drawn = with_nominal_stiffness(rig, stiffness)
     result = fit_rig(drawn, tilted.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     compliance, differences = estimate_compliance(result), estimate_cable_compliances(result)
     assert compliance is not None
@@ -609,7 +609,7 @@ def test_the_estimated_stiffness_is_the_same_for_every_rig_file(
 
 
 def test_a_stiffness_far_from_the_rig_file_is_reported_as_a_factor(rig: Rig, tilted: Truth) -> None:
-    drawn = drawn_with(rig, 60000.0)
+    drawn = with_nominal_stiffness(rig, 60000.0)
     result = fit_rig(drawn, tilted.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     factor = float(result.geometry.stiffness[0]) / 60000.0
     assert factor < 0.3
@@ -617,9 +617,7 @@ def test_a_stiffness_far_from_the_rig_file_is_reported_as_a_factor(rig: Rig, til
     assert reason.startswith(f"stiffness is {factor:.3g} times that of the rig file")
 
 
-def test_a_stiffness_that_nothing_tells_is_positive_however_uncertain(
-    rig: Rig, tilted: Truth
-) -> None:
+def test_an_undetermined_stiffness_is_positive_however_uncertain(rig: Rig, tilted: Truth) -> None:
     blind = replace(tilted.measured, tensions=np.full_like(tilted.measured.tensions, np.nan))
     loose = {"outlets": 4e-3, "stiffness": 2.0}
     stiffness = fit_rig(rig, blind, loose, LENGTH_DEVIATION).intervals["stiffness_n"]
@@ -628,7 +626,7 @@ def test_a_stiffness_that_nothing_tells_is_positive_however_uncertain(
 
 
 def test_a_stiffness_that_is_hardly_known_is_found_from_afar(tilted: Truth) -> None:
-    """As the next step of a contradiction advises: a hundred and forty times too stiff."""
+    """As advised for a contradiction: 140 times too stiff."""
     drawn = load_rig(ROOT / "configs/gachon_8_6.yaml")
     loose = {**DEFAULT_DEVIATIONS, "stiffness": 5.0}
     result = fit_rig(drawn, tilted.measured, loose, LENGTH_DEVIATION)
@@ -638,9 +636,9 @@ def test_a_stiffness_that_is_hardly_known_is_found_from_afar(tilted: Truth) -> N
 
 
 def test_cables_that_differ_are_reported_and_others_are_not(rig: Rig) -> None:
-    """Cable 3 is of half the stiffness; the tensions of all were measured."""
+    """Cable 3 has half the stiffness; all tensions were measured."""
     for weak in (6000.0, 3000.0):
-        built = built_otherwise(rig, 5, [6000.0] * 2 + [weak] + [6000.0] * 5)
+        built = rig_with_errors(rig, 5, [6000.0] * 2 + [weak] + [6000.0] * 5)
         data = samples(built, 60, tilt=np.radians(8.0), seed=6).measured
         result = fit_rig(built, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
         differences = estimate_cable_compliances(result)

@@ -58,7 +58,7 @@ def test_every_pose_can_be_held_and_is_free(rig: Rig, scene: Scene, poses: list[
 def test_the_platform_is_rotated_no_further_than_its_cables_allow(
     rig: Rig, poses: list[Pose]
 ) -> None:
-    """At 12° and more cables of this rig are apart again, but have passed through each other."""
+    """From 12° on, cables of this rig are apart again, but have passed through each other."""
     angles = np.degrees([pose.angle_to(rig.home) for pose in poses])
     assert 4.0 < angles.max() < 11.0
 
@@ -68,7 +68,7 @@ def test_the_same_seed_chooses_the_same_poses(rig: Rig, scene: Scene, poses: lis
     assert all(a.distance_to(b) == 0.0 for a, b in zip(poses, again, strict=True))
 
 
-def test_what_is_chosen_tells_more_than_chance() -> None:
+def test_selected_poses_are_more_informative_than_random_ones() -> None:
     random = np.random.default_rng(3)
     rows = random.normal(size=(80, 4, 10)) * random.uniform(0.1, 3.0, (80, 1, 1))
 

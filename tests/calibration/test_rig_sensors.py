@@ -1,4 +1,4 @@
-"""Tensions, swivel angles and an IMU in a rig's calibration, against rigs by other formulas."""
+"""Tensions, swivel angles and an IMU in rig calibration, against independent formulas."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def found(rig: Rig, data: RigMeasurements) -> RigCalibration:
 
 
 def inside(result: RigCalibration, built: BuiltRig, group: str) -> float:
-    """How many numbers of a group are in their 95 % intervals."""
+    """Share of a group's parameters within their 95 % intervals."""
     columns = result.parameters.slices()[group]
     off = result.fit.values[columns] - built.values((group,))
     return float(np.mean(np.abs(off) < result.uncertainty.half_widths[columns]))
@@ -72,7 +72,7 @@ def inside(result: RigCalibration, built: BuiltRig, group: str) -> float:
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=5)
 def test_the_truth_leaves_nothing_over(rig: Rig, seed: int) -> None:
-    """Without noise, lengths, swivel angles and verticals are what other formulas give."""
+    """Without noise, lengths, swivel angles and verticals agree with independent formulas."""
     built = built_rig(rig, seed)
     data = measured(built, 6, seed + 1, noise=0.0)
     parameters = Parameters.of(rig, PER_CABLE)
@@ -153,7 +153,7 @@ def test_a_common_factor_keeps_the_differences_of_the_rig_file(
 
 
 def test_results_of_rig_files_without_the_new_key_still_apply(rig: Rig) -> None:
-    """What a result rests on has no key that is left out."""
+    """The basis of a result does not include absent keys."""
     (winch, *_) = nominal_geometry(rig.document)["winches"]
     assert "cable_stiffness_n" not in winch
     other = rig.document.winches[0].model_copy(update={"cable_stiffness_n": 5.0})
@@ -162,7 +162,7 @@ def test_results_of_rig_files_without_the_new_key_still_apply(rig: Rig) -> None:
 
 
 def widths(rig: Rig, data: RigMeasurements) -> dict[str, float]:
-    """Half the 95 % intervals of what is not a sensor's own, by name."""
+    """Half widths of the geometry's parameters, by name."""
     own = {"swivel_zeros": data.swivels, "imu_mounting": data.verticals}
     absent = {group for group, values in own.items() if not np.isfinite(values).any()}
     sought = {group: d for group, d in PER_CABLE.items() if group not in absent}
@@ -174,7 +174,7 @@ def widths(rig: Rig, data: RigMeasurements) -> dict[str, float]:
 
 
 def test_a_sensor_more_does_not_widen_the_geometry(rig: Rig) -> None:
-    """In clean data; which directions stay as in the rig file may move single numbers a little."""
+    """In clean data; changes of unidentified directions may move single values slightly."""
     for seed in range(3):
         data = measured(built_rig(rig, seed), 30, 50 + seed, noise=0.3)
         before = widths(rig, only(data))
@@ -222,7 +222,7 @@ def test_whole_turns_of_a_swivel_encoder_do_not_matter(
 
 
 def test_sensors_of_a_part_of_the_data_count_there(rig: Rig, data: RigMeasurements) -> None:
-    """As of two files, one without their columns; it is as if they had been left out there."""
+    """As with two files, one without their columns: the same as leaving them out there."""
     first = np.arange(len(data)) < 20
     parts = [data.part(first), only(data.part(~first))]
     both = replace(
@@ -257,7 +257,7 @@ def test_what_is_missing_for_a_stiffness_is_said(rig: Rig, built: BuiltRig) -> N
     assert any("tension_1_n" in line for line in lines)
 
 
-def test_sensors_that_cannot_be_are_refused(rig: Rig, data: RigMeasurements) -> None:
+def test_impossible_sensor_data_are_refused(rig: Rig, data: RigMeasurements) -> None:
     points = load_rig(ROOT / "configs/gachon_8_6.yaml")
     eight = {k: getattr(data, k)[:, :8] for k in ("counts", "tensions", "swivels")}
     home = np.tile(points.home.position, (len(data), 1))

@@ -25,7 +25,7 @@ from calibration.tag_map.result import judge_layout, tags_result
 from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig, Tag, load_rig
-from tests.calibration.exact_sights import sights_at
+from tests.calibration.exact_sights import observe
 from tracking.detection.tags import tag_corners
 from tracking.pnp import moved
 
@@ -37,7 +37,7 @@ def rig() -> Rig:
     return load_rig(CONFIGS / "gachon_8_6.yaml")
 
 
-def as_glued(rig: Rig, rng: np.random.Generator, shift: float = 1e-3) -> tuple[Tag, ...]:
+def as_mounted(rig: Rig, rng: np.random.Generator, shift: float = 1e-3) -> tuple[Tag, ...]:
     """Tags as mounted by hand: shifted and rotated by small random amounts."""
     steps = rng.standard_normal((len(rig.platform_tags), 6)) * np.repeat([shift, 10 * shift], 3)
     return moved_tags(rig.platform_tags, steps.ravel())
@@ -46,7 +46,7 @@ def as_glued(rig: Rig, rng: np.random.Generator, shift: float = 1e-3) -> tuple[T
 def around(rig: Rig, count: int, rng: np.random.Generator) -> dict[str, Pose]:
     """Poses ``camera_from_platform`` of a platform rotated in all directions before the camera.
 
-    As asked for, no image looks straight at one face.
+    As recommended, no image is frontal to a face.
     """
     poses = {}
     for k in range(count):
@@ -60,11 +60,11 @@ def around(rig: Rig, count: int, rng: np.random.Generator) -> dict[str, Pose]:
 
 def session(rig: Rig, tags, count: int, seed: int, noise: float = 0.02) -> TagObservations:
     rng = np.random.default_rng(seed)
-    return sights_at(rig.cameras[0], tags, around(rig, count, rng), noise, rng)
+    return observe(rig.cameras[0], tags, around(rig, count, rng), noise, rng)
 
 
 def gaps(found: TagLayout, truth) -> tuple[float, float]:
-    """RMS error of corners [mm] and of turns [deg], the truth put where it fits the drawing."""
+    """RMS error of corners [mm] and rotations [deg], with the truth aligned to the rig file."""
     true = {tag.id: tag for tag in truth}
     here = np.concatenate([tag_corners(true[tag.id]) for tag in found.tags])
     there = np.concatenate([tag_corners(tag) for tag in found.nominal])
@@ -82,7 +82,7 @@ def gaps(found: TagLayout, truth) -> tuple[float, float]:
 
 
 def test_twenty_pictures_give_the_layout_to_hundredths_of_a_millimetre(rig: Rig) -> None:
-    tags = as_glued(rig, np.random.default_rng(1))
+    tags = as_mounted(rig, np.random.default_rng(1))
     found = measure_layout(rig, rig.cameras[0], session(rig, tags, 24, seed=2))
     off, rotated = gaps(found, tags)
     assert off < 0.04
@@ -96,7 +96,7 @@ def test_twenty_pictures_give_the_layout_to_hundredths_of_a_millimetre(rig: Rig)
 def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig) -> None:
     inside, errors, stated = [], [], []
     for seed in range(8):
-        tags = as_glued(rig, np.random.default_rng(seed))
+        tags = as_mounted(rig, np.random.default_rng(seed))
         observations = session(rig, tags, 16, seed=100 + seed, noise=0.05)
         found = measure_layout(rig, rig.cameras[0], observations, fixed=301)
         true = {tag.id: tag for tag in tags}
@@ -141,7 +141,7 @@ def test_slopes_are_those_of_finite_differences(rig: Rig) -> None:
 
 
 def test_what_images_do_not_determine_is_reported(rig: Rig) -> None:
-    """A tag that is never seen with others stays as drawn; an image of one tag tells nothing."""
+    """A tag never seen with others stays nominal; an image of one tag adds nothing."""
     observations = session(rig, rig.platform_tags, 24, seed=4)
     squares = {
         name: {k: s for k, s in seen.items() if k != 306}
@@ -200,7 +200,7 @@ def test_pictures_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
     base = next(iter(around(rig, 1, rng).values()))
     poses = {f"{k}.png": moved(base, 0.01 * rng.standard_normal(6)) for k in range(20)}
     camera = rig.cameras[0]
-    observations = sights_at(camera, rig.platform_tags, poses, 0.02, rng)
+    observations = observe(camera, rig.platform_tags, poses, 0.02, rng)
     verdict = judge_layout(measure_layout(rig, camera, observations), 1.0)
     assert any("all images are taken from within" in reason for reason in verdict.reasons)
     assert "take images from all sides, all different" in verdict.next_steps
@@ -223,7 +223,7 @@ def test_a_fixed_tag_that_no_picture_shows_is_refused_by_name(rig: Rig) -> None:
 
 
 def test_the_result_replaces_the_nominal_layout(rig: Rig, tmp_path: Path) -> None:
-    tags = as_glued(rig, np.random.default_rng(1))
+    tags = as_mounted(rig, np.random.default_rng(1))
     found = measure_layout(rig, rig.cameras[0], session(rig, tags, 16, seed=2))
     verdict = judge_layout(found, 2e-4)
     result = tags_result(found, verdict, rig.document, date(2026, 3, 4))
@@ -267,7 +267,7 @@ def test_results_are_compared_tag_by_tag(rig: Rig) -> None:
     pictures=st.lists(st.sets(st.integers(0, 7), min_size=1, max_size=3), max_size=8),
     fixed=st.one_of(st.none(), st.integers(0, 7)),
 )
-def test_tags_are_tied_as_by_walking_from_picture_to_picture(pictures, fixed) -> None:
+def test_tags_are_connected_as_by_a_walk_from_image_to_image(pictures, fixed) -> None:
     found = connected_tags(pictures, fixed)
 
     def walked(start: int) -> set[int]:

@@ -156,7 +156,7 @@ def test_a_place_that_cannot_be_drawn_to_is_refused(
     one_message(answer, 2, words, name)
 
 
-def test_a_detector_nobody_knows_is_refused(plan: Path, tmp_path: Path) -> None:
+def test_an_unknown_detector_is_refused(plan: Path, tmp_path: Path) -> None:
     arguments = ("synthetic", "--plan", plan, "-o", tmp_path / "poses.csv", "--detector", "eyes")
     with nothing_written(tmp_path):
         answer = call("track", RIG, *arguments)

@@ -21,14 +21,14 @@ WALL = 120.0
 
 @dataclass(frozen=True)
 class Condition:
-    """How a tag is seen.
+    """Imaging condition of a tag.
 
     Attributes:
-        side_px: Side of its square seen from the front.
+        side_px: Side of its square in a frontal view.
         tilt: Between its normal and the view, [rad].
         motion_px: Motion of the image during the exposure.
         blur_px: Standard deviation of the lens's blur.
-        contrast: Brightness of paper less that of ink, of 255.
+        contrast: Brightness of paper minus that of ink, of 255.
         noise: Standard deviation, of 255.
     """
 
@@ -50,12 +50,12 @@ class HardPicture:
 
 
 class HardPrinter:
-    """Renders one tag before a grey wall.
+    """Renders one tag in front of a grey wall.
 
     Args:
         family: Of the tag.
-        numbers: As many the family has.
-        camera: Whose images they are.
+        numbers: Number of tags in the family.
+        camera: The camera of the images.
     """
 
     def __init__(self, family: str, numbers: int, camera: Camera | None = None) -> None:
@@ -92,7 +92,7 @@ class HardPrinter:
 
 
 def _streak(length: float, angle: float) -> NDArray[np.float32]:
-    """A line about the middle, of samples: what a steady motion does to a point."""
+    """Blur kernel of a steady motion: a line about the centre, in samples."""
     size = 2 * (int(length) // 2 + 2) + 1
     kernel = np.zeros((size, size), dtype=np.float64)
     middle = size // 2

@@ -32,11 +32,11 @@ class TagPicture:
     image: NDArray[np.uint8]
     tag: Tag
     camera_from_tag: Pose
-    corners: Array  # ideal pixels, (4, 2)
+    corners: Array  # undistorted pixels, (4, 2)
 
 
 class TagPrinter:
-    """Renders one tag before a grey wall."""
+    """Renders one tag in front of a grey wall."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera

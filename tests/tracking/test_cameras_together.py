@@ -1,4 +1,4 @@
-"""Several cameras: better than each alone, one that is wrong does not count."""
+"""Several cameras: better than each alone, robust against a wrong one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HERE = Pose.level([0.05, 0.05, 0.4])
 
 
 def other_side(camera: Camera) -> Camera:
-    """The same camera, standing a quarter turn round the frame."""
+    """The same camera, rotated by 90° about the frame."""
     quarter = matrix_from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
     pose = camera.world_from_camera
     there = Pose(quarter @ pose.position, quarter @ pose.rotation)
@@ -95,7 +95,7 @@ def test_of_three_the_one_that_disagrees_is_left_out() -> None:
     late=st.floats(0.0, 0.049),
     period=st.floats(0.06, 0.4),
 )
-def test_cameras_that_look_a_little_apart_in_time_agree_on_a_platform_that_moves(
+def test_cameras_slightly_apart_in_time_agree_on_a_moving_platform(
     speed: tuple[float, float, float], late: float, period: float
 ) -> None:
     def seen(time: float, deviation: float) -> PoseMeasurement:
@@ -113,8 +113,8 @@ def test_cameras_that_look_a_little_apart_in_time_agree_on_a_platform_that_moves
     assert (found.position_deviation <= 2e-4 + 1e-12).all()
 
 
-def test_what_carrying_on_costs_is_in_the_covariance() -> None:
-    """By many noisy pairs: the later pose scatters as its covariance says."""
+def test_the_covariance_includes_the_extrapolation() -> None:
+    """From many noisy pairs: the extrapolated pose scatters as its covariance states."""
     rng, errors = np.random.default_rng(3), []
     for _ in range(400):
         noise = rng.normal(0.0, 1e-4, (2, 3))
@@ -153,7 +153,7 @@ def test_the_camera_that_is_named_first_does_not_decide_which_pictures_count(fir
 
 @pytest.mark.parametrize("late", [0.0, 0.07, 0.099])
 def test_cameras_that_run_free_at_the_same_rate_are_taken_together(late: float) -> None:
-    """Asked every 0.1 s, each answers with an image of its own time: up to a period apart."""
+    """Triggered every 0.1 s, each returns an image of its own time: up to a period apart."""
     front, common = measured([0.0, 0.0, 0.4], [1e-4] * 3), MultiCameraFusion(0.05)
     for now in (0.0, 0.1):
         seen = {"front": replace(front, time=now), "side": replace(front, time=now + late)}
@@ -170,7 +170,7 @@ def test_cameras_that_run_free_at_the_same_rate_are_taken_together(late: float) 
 def test_a_pose_is_of_the_time_it_states_though_no_speed_is_known(
     speed: float, late: float, pause: float
 ) -> None:
-    """First images, and those after nothing was seen for long: the later, worse camera."""
+    """First images, and those after a long gap: the later, worse camera counts."""
 
     def seen(time: float, deviation: float) -> PoseMeasurement:
         one = measured([speed * time, 0.0, 0.4], [deviation] * 3)

@@ -1,4 +1,4 @@
-"""Drives and camera together: better than each alone, blind to outliers, aligned in time."""
+"""Encoders and camera fused: better than each alone, robust to outliers, synchronised."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def moved(pose: Pose, step: Array) -> Pose:
 
 
 def drives(times: Array, drift: float = 2e-4) -> list[Pose]:
-    """Off by 4 mm and half a degree, wandering by ``drift`` [m/s]."""
+    """Encoder poses off by 4 mm and half a degree, with a drift [m/s]."""
     off = [np.array([0.004, -0.002, drift * t, 0.0, 0.008, 0.0]) for t in times]
     return [moved(truth_at(t), o) for t, o in zip(times, off, strict=True)]
 
@@ -67,15 +67,15 @@ def test_one_measurement_in_ten_is_wrong_and_none_of_them_moves_the_pose() -> No
 
 
 def test_measurements_are_compared_with_the_drives_at_their_own_time() -> None:
-    """At 0.03 m/s an image that is taken for 50 ms younger than it is costs 1.5 mm."""
-    times = np.arange(0.0, 4.0, 0.1)  # slow drives, so that cycles lie far from images
+    """At 0.03 m/s a time error of 50 ms costs 1.5 mm."""
+    times = np.arange(0.0, 4.0, 0.1)  # slow cycles, so that they are far from images
     exact = [Measured(t + 0.05, truth_at(t + 0.05), np.eye(6) * 1e-12) for t in times[:-1]]
     found = list(fuse_with_encoders(times.tolist(), [truth_at(t) for t in times], exact))
     assert max(f.pose.distance_to(truth_at(f.time)) for f in found) < 1e-4
 
 
 def test_a_difference_that_jumps_is_believed_after_some_time() -> None:
-    """A cable that slipped: from then on the drives are off by something else."""
+    """A cable slips: from then on the encoders have another error."""
     times = np.arange(0.0, 6.0, CYCLE)
     by_drives = [
         moved(truth_at(t), np.array([0.02 if t > 3.0 else 0.0, 0, 0, 0, 0, 0])) for t in times

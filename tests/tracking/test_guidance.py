@@ -1,4 +1,4 @@
-"""Drives say where to look for the platform, and nothing of what is found there."""
+"""Encoder poses guide the search for the platform, but do not enter the result."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tracking.tracker import MEMORY, EncoderExtrapolator, EncoderPrior, Tracker
 
 Image = NDArray[np.uint8]
 
-#: The drives' own error: as cable lengths that are a little off make it.
+#: Error of the encoder pose, as from small cable length errors.
 OFF = Pose(np.array([1.5e-3, -1e-3, 1e-3]), matrix_from_rotation_vector(np.array([5e-3, 0, 3e-3])))
 
 NUMBERS = st.floats(-0.3, 0.3)
@@ -56,7 +56,7 @@ def pose_at(k: int) -> Pose:
 
 
 @given(measured=POSES, drives=POSES, later=POSES)
-def test_the_drives_motion_leads_on_from_where_the_camera_saw_the_platform(
+def test_encoder_motion_continues_from_the_last_camera_pose(
     measured: Pose, drives: Pose, later: Pose
 ) -> None:
     guidance = EncoderPrior()
@@ -86,7 +86,7 @@ def test_the_drives_pose_is_that_of_the_pictures_own_time(
     assert found.distance_to(at(period + delay)) < 1e-12
 
 
-def test_drives_that_were_not_heard_for_long_are_not_carried_on() -> None:
+def test_encoder_poses_after_a_long_gap_are_not_extrapolated() -> None:
     ahead, here, there = EncoderExtrapolator(), Pose.level([0, 0, 0.4]), Pose.level([0.1, 0, 0.4])
     assert ahead.at(0.1, 0.0, here) is here
     assert ahead.at(2.1, 2.0, there) is there
@@ -97,7 +97,7 @@ def test_drives_that_were_not_heard_for_long_are_not_carried_on() -> None:
 def test_tags_hidden_in_part_are_found_again_after_they_were_lost(
     rig: Rig, camera: Camera, eye: SyntheticCamera
 ) -> None:
-    """Nothing else finds them: the detector needs whole outlines."""
+    """The detector misses them: it needs complete outlines."""
     for guided in (False, True):
         tracker = Tracker(rig, camera)
 
@@ -121,7 +121,7 @@ def test_tags_hidden_in_part_are_found_again_after_they_were_lost(
 def test_a_drum_that_slipped_leaves_the_cameras_pose_as_it_is(
     rig: Rig, camera: Camera, eye: SyntheticCamera, slip_mm: float
 ) -> None:
-    """Cable 3 slips on its drum while no tag is to be seen, and the drives do not know."""
+    """Cable 3 slips on its drum while no tag is visible; the encoders do not show it."""
     tracker, errors, apart = Tracker(rig, camera), [], []
     for k in range(12):
         truth, slipped = pose_at(k), k >= 3

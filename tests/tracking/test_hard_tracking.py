@@ -1,4 +1,4 @@
-"""Tracking against decoys, covers and blur, and what the stated covariance is worth."""
+"""Tracking with decoys, occlusion and blur, and the validity of the covariance."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def empty(scene: Scene) -> Scene:
 
 
 def with_prints(rig: Rig, *prints: tuple[int, list[float]], size: float = 0.12) -> Rig:
-    """The rig with further tags lying on the floor, which its file does not know."""
+    """The rig with further tags on the floor that are not in its file."""
     more = tuple(Tag(number, size, Pose(np.array(position), FLAT)) for number, position in prints)
     return replace(rig, frame_tags=(*rig.frame_tags, *more))
 
@@ -38,7 +38,7 @@ def with_prints(rig: Rig, *prints: tuple[int, list[float]], size: float = 0.12) 
 def test_another_print_of_a_tag_does_not_move_the_pose(
     rig: Rig, camera: Camera, empty: Scene, number: int
 ) -> None:
-    """302 looks away from the camera, so only the decoy of it is seen."""
+    """Tag 302 faces away from the camera, so only its decoy is visible."""
     real = with_prints(rig, (number, [-0.30, 0.42, 0.0]), size=0.16)
     image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
     tracker = Tracker(rig, camera)
@@ -91,7 +91,7 @@ def test_no_squares_agree_on_nothing(camera: Camera) -> None:
 
 
 def test_tags_covered_in_part_are_followed(rig: Rig, camera: Camera, empty: Scene) -> None:
-    """A bar over each tag hides them from the detector; their free edges go on to be used."""
+    """A bar over each tag hides it from the detector; its free edges are still used."""
     eye, tracker = SyntheticCamera(rig, empty, camera, seed=5), Tracker(rig, camera)
     first = tracker.observe(eye.render(HERE, 0), 0.0)
     assert isinstance(first, PoseMeasurement)
@@ -108,7 +108,7 @@ def test_tags_covered_in_part_are_followed(rig: Rig, camera: Camera, empty: Scen
     assert found.pose.distance_to(truth) < 2e-3
 
 
-def test_motion_is_carried_on() -> None:
+def test_motion_is_extrapolated() -> None:
     def at(time: float) -> PoseMeasurement:
         turn = matrix_from_rotation_vector(np.array([0.0, 0.3 * time, 0.0]))
         pose = Pose(np.array([0.1 * time, 0.0, 0.4]), turn)
@@ -146,7 +146,7 @@ PLAIN = Optics(noise=1.5, blur=0.6)
 def test_images_whose_edges_are_not_where_they_seem_are_refused_by_name(
     rig: Rig, camera: Camera, empty: Scene, optics: Optics, named: str
 ) -> None:
-    """Their intervals held the truth in one of three images."""
+    """Their intervals contained the truth in one of three images."""
     image = SyntheticCamera(rig, empty, camera, seed=3, optics=optics).render(HERE, 0)
     found = Tracker(rig, camera).observe(image, 0.0)
     assert isinstance(found, NoPose)

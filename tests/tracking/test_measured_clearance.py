@@ -1,4 +1,4 @@
-"""The uncertainty of a clearance follows from the pose's."""
+"""The uncertainty of a clearance follows from that of the pose."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_the_smallest_distance_counts_the_others_uncertainty_too(rig: Rig, crowd
     first, second = replace(near[0], distance=0.010), replace(near[1], distance=0.011)
     measured = MeasuredClearance((first, second), np.array([0.001, 0.004]))
     assert measured.distance == pytest.approx(0.010)
-    assert measured.uncertainty == pytest.approx(0.003)  # the second may be as near as 7 mm
+    assert measured.uncertainty == pytest.approx(0.003)  # the second may be only 7 mm away
 
 
 def test_touching_bodies_take_the_worst_direction(rig: Rig, crowded: Scene) -> None:
@@ -94,14 +94,14 @@ def test_a_scene_without_obstacles_has_no_clearance(rig: Rig, crowded: Scene) ->
 
 
 def looking(rig: Rig, **said: object) -> Camera:
-    """The rig's camera, as a rig file with these keys makes it."""
+    """The rig's camera, from a rig file with these keys."""
     plain = rig.document.model_dump(mode="json", exclude_unset=True)
     plain["cameras"][0] |= said
     return rig_from_document(RigDocument.model_validate(plain)).cameras[0]
 
 
 def square(rig: Rig, camera: Camera, pose: Pose) -> list[TagView]:
-    """The platform's tags that face the camera, seen without an error."""
+    """The platform's tags that face the camera, observed without errors."""
     there = camera.world_from_camera.inverse().compose(pose)
     views = []
     for tag in rig.platform_tags:
@@ -125,7 +125,7 @@ POSE_DEVIATIONS = np.array([0.8, 0.5, 1.2, 0.06, 0.09, 0.03])
 def test_errors_of_the_camera_pose_are_propagated_to_the_clearance(
     rig: Rig, crowded: Scene
 ) -> None:
-    """Cameras that are off by chance as stated put the platform where the clearance differs."""
+    """Cameras with random errors as stated measure clearances that scatter as stated."""
     rng = np.random.default_rng(5)
     camera = looking(rig, pose_covariance=np.diag(POSE_DEVIATIONS**2).tolist(), error_mm=None)
     known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
@@ -153,7 +153,7 @@ def test_errors_of_the_camera_pose_are_propagated_to_the_clearance(
 
 
 def test_one_value_by_the_operator_replaces_all_shared_errors(rig: Rig, crowded: Scene) -> None:
-    """Also for the cables, unless calibrations state every part of the chain."""
+    """For the cables too, unless calibrations state every part of the chain."""
     pose = Pose(np.array([0.05, -0.03, 0.55]), np.eye(3))
     shared = SharedErrors(rig, looking(rig, error_mm=1.96))
     one = np.diag([1e-6] * 3 + [0.0] * 3)
@@ -172,7 +172,7 @@ def test_one_value_by_the_operator_replaces_all_shared_errors(rig: Rig, crowded:
 
 
 def test_tags_that_are_off_as_stated_count_once(rig: Rig) -> None:
-    """Edges fit worse where tags are off: that is no reason to widen the pose's own scatter."""
+    """Tag errors make edges fit worse, which must not widen the pose's own scatter."""
     rng, scatter, values = np.random.default_rng(8), 0.03, []
     camera = looking(rig)
     count = 4 + camera.distortion.size
@@ -215,7 +215,7 @@ def test_tags_that_are_off_as_stated_count_once(rig: Rig) -> None:
 def test_a_lens_error_is_propagated_through_extrinsics_and_pose_together(
     rig: Rig, fisheye: bool
 ) -> None:
-    """Against poses that a lens off by a little gives, its camera's pose found with it."""
+    """Against poses by a slightly wrong lens, with extrinsics found with it."""
     lens = {"lens": "fisheye", "distortion": [0.01, -0.004, 0.002, -0.001]} if fisheye else {}
     camera = looking(rig, **lens)
     pose = Pose(np.array([0.05, -0.03, 0.55]), matrix_from_rotation_vector([0.1, -0.05, 0.2]))
@@ -278,7 +278,7 @@ def test_what_is_no_covariance_of_a_pose_is_refused(rig: Rig, rows: np.ndarray) 
 
 
 def test_a_mean_over_pictures_makes_no_shared_error_smaller(rig: Rig) -> None:
-    """Two cameras of one survey err alike: both together are no surer than one."""
+    """Two cameras of one survey have common errors: both are no more accurate than one."""
     covariance = np.diag(POSE_DEVIATIONS**2).tolist()
     camera = replace(looking(rig, pose_covariance=covariance), lens_covariance=np.zeros((8, 8)))
     pose = Pose(np.array([0.05, -0.03, 0.55]), np.eye(3))

@@ -1,4 +1,4 @@
-"""Images of several cameras are put together by their times, and none is lost."""
+"""Images of several cameras are grouped by their times, and none is lost."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def grouped(times: Mapping[str, Sequence[float]], within: float) -> list[dict[st
 
 
 @given(times=st.tuples(TIMES, TIMES, TIMES), within=st.integers(0, 20))
-def test_every_picture_is_in_one_moment_and_moments_are_in_order(
+def test_every_image_is_in_one_frame_set_and_frame_sets_are_in_order(
     times: tuple[list[int], list[int], list[int]], within: int
 ) -> None:
     cameras = dict(zip("abc", times, strict=True))

@@ -25,7 +25,7 @@ TRUTH = [Pose.level([0.10 - 0.01 * k, 0.1, 0.4]) for k in range(4)]
 
 @pytest.fixture
 def folder(tmp_path: Path, synthetic: SyntheticCamera) -> Path:
-    """Images 8 to 11, so that the order of names is not that of letters."""
+    """Images 8 to 11, so that numeric and alphabetic order differ."""
     directory = tmp_path / "some images"
     directory.mkdir()
     for k, pose in enumerate(TRUTH):
@@ -155,7 +155,7 @@ def test_pictures_with_other_tags_say_which(
 def test_a_camera_out_of_focus_is_named_and_no_size_is_doubted(
     rig: Rig, camera: Camera, synthetic: SyntheticCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Tags are read, but no edge of theirs is found."""
+    """Tags are decoded, but their edges are not found."""
     monkeypatch.setattr(
         "tracking.estimator.refine", lambda _image, _camera, rough, _m: [None] * len(rough)
     )
@@ -166,9 +166,7 @@ def test_a_camera_out_of_focus_is_named_and_no_size_is_doubted(
     assert "size_mm" not in caught.value.next_step
 
 
-def test_a_source_without_pictures_and_one_without_an_end_come_to_an_end(
-    rig: Rig, camera: Camera
-) -> None:
+def test_an_empty_source_and_an_endless_one_finish(rig: Rig, camera: Camera) -> None:
     with pytest.raises(NoPlatformSeen, match="no images"):
         list(track([], Tracker(rig, camera)))
 

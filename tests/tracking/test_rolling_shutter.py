@@ -1,4 +1,4 @@
-"""Cameras whose rows are exposed one after the other: rendered so, and measured as if at once."""
+"""Rolling-shutter cameras: rendered row by row, and measured with correction."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_platform_at_rest_looks_the_same_by_any_shutter(rig: Rig, camera: Came
 def test_a_moving_platform_is_measured_at_the_middle_rows_time(
     rig: Rig, camera: Camera, axis: str
 ) -> None:
-    """From the second image on: the first one knows of no motion, and says so."""
+    """From the second image on: for the first the motion is unknown, which it states."""
     found = list(flown(rig, camera, READOUT, VELOCITY[axis]))
     poses = [one for one, _ in found if isinstance(one, PoseMeasurement)]
     assert len(poses) == len(found)
@@ -128,7 +128,7 @@ def test_a_motion_turns_and_shifts() -> None:
 
 
 def test_the_motion_of_a_swing_is_found_to_a_hundredth() -> None:
-    """Back and forth at 100 mm/s as in the benchmark: its acceleration changes all the time."""
+    """Oscillation at 100 mm/s as in the benchmark: its acceleration changes all the time."""
     recent, swing, speed = RecentMotion(READOUT), 0.04, 0.1
     off = []
     for number in range(60):

@@ -85,7 +85,7 @@ def test_lamps_shadows_and_a_cameras_own_processing_spoil_pictures_as_they_do(
         assert abs(more.mean()) < 1.0
 
 
-def test_a_picture_does_not_hang_on_the_ones_before(rig: Rig, synthetic: SyntheticCamera) -> None:
+def test_an_image_does_not_depend_on_earlier_ones(rig: Rig, synthetic: SyntheticCamera) -> None:
     before = synthetic.render(rig.home, 0)
     synthetic.render(Pose.level([0.2, -0.2, 0.3]), 1)
     np.testing.assert_array_equal(before, synthetic.render(rig.home, 0))
@@ -94,7 +94,7 @@ def test_a_picture_does_not_hang_on_the_ones_before(rig: Rig, synthetic: Synthet
 def test_what_is_redrawn_equals_a_picture_drawn_whole(
     rig: Rig, scene: Scene, camera: Camera
 ) -> None:
-    """Only the platform's surroundings are redrawn: nothing of it may lie outside of them."""
+    """Only the platform's surroundings are redrawn: none of it may be outside of them."""
     quiet = SyntheticCamera(rig, scene, camera, optics=Optics(noise=0.0))
     pose = Pose(np.array([0.1, 0.05, 0.4]), matrix_from_rotation_vector([0.1, -0.2, 0.4]))
     part = quiet.render(pose)
@@ -125,7 +125,7 @@ def test_every_shape_is_drawn_where_its_points_are(shape: Shape) -> None:
     [
         ("pinhole", 300.0, [-0.12, 0.05, 0.0008, -0.0006, 0.01]),
         ("pinhole", 110.0, [0.42, 0.01, 0.001, -0.001, 0.0, 0.73, 0.07, 0.0]),
-        ("fisheye", 90.0, [0.03, -0.02, 0.015, -0.005]),  # wider than rays are looked for
+        ("fisheye", 90.0, [0.03, -0.02, 0.015, -0.005]),  # wider than the search for rays
     ],
 )
 def test_every_ray_is_that_of_its_sample(lens: str, focal: float, distortion: list[float]) -> None:
@@ -173,7 +173,7 @@ def test_the_platform_is_hidden_by_an_obstacle_and_hides_another(
         )
         return float(np.std(still.render(rig.home)[platform]))
 
-    assert brightness_spread(-0.6 * toward) > 40.0  # tags are to be seen
+    assert brightness_spread(-0.6 * toward) > 40.0  # tags are visible
     assert brightness_spread(0.6 * toward) < 25.0  # the wall covers them
 
 

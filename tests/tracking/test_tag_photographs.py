@@ -1,4 +1,4 @@
-"""Tags in photographs that nobody rendered, beside what the AprilTag library finds in them."""
+"""Tags in real photographs, compared with the AprilTag library's detections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tags that are small, blurred or faint, and squares that are none."""
+"""Tags that are small, blurred or faint, and squares that are not tags."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_region_is_searched_exhaustively_too(printer: HardPrinter, detector: T
 def test_no_tag_that_can_be_read_is_in_a_blank_picture(
     printer: HardPrinter, detector: TagDetector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A blank picture is not searched: no tag that a search would find may look so."""
+    """A blank image is not searched: no detectable tag may count as blank."""
     rng, blank = np.random.default_rng(6), 0
     for _ in range(60):
         condition = Condition(

@@ -1,4 +1,4 @@
-"""Measuring whole sources from a script, as `cdpr track` does."""
+"""Measuring whole sources from a script, as with `cdpr track`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TRUTH = [Pose.level([0.10 - 0.01 * k, 0.1, 0.4]) for k in range(3)]
 
 @pytest.fixture
 def folder(tmp_path: Path, synthetic: SyntheticCamera) -> Path:
-    """Three images, and a file that is no image."""
+    """Three images, and a file that is not an image."""
     images = tmp_path / "pictures"
     images.mkdir()
     for k, pose in enumerate(TRUTH):
