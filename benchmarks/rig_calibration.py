@@ -40,10 +40,10 @@ from model.winches import WinchMap
 from tests.calibration.rig_places import (
     Truth,
     rig_with_errors,
-    with_nominal_stiffness,
     samples,
     share_inside,
     true_numbers,
+    with_nominal_stiffness,
 )
 from tests.calibration.synthetic_rig import LENGTH_NOISE, built_rig, measured, only
 

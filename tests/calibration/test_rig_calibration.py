@@ -52,10 +52,10 @@ from model.winches import WinchMap
 from tests.calibration.rig_places import (
     Truth,
     rig_with_errors,
-    with_nominal_stiffness,
     samples,
     share_inside,
     true_numbers,
+    with_nominal_stiffness,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
