@@ -171,8 +171,8 @@ def locate_camera(
             camera; taken while the camera does not move.
         camera: Which of the rig's cameras took them; the first when left out. Its matrix and
             distortion are taken as known.
-        poses: The platform's by image, or a CSV file of them, or a run folder: go by the rig's
-            motion. Left out, by the tags on the frame.
+        poses: Platform poses by image, a CSV file of them, or a run folder, to use the rig's
+            motion; the frame tags are used when left out.
         survey: How well the frame tags were surveyed; each corner to 0.5 mm when left out.
         wanted: Required error in the work space, 95 %, [m].
         output: Folder for the result file and its report; nothing is written when left out.

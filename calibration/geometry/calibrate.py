@@ -126,7 +126,7 @@ def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation
 def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, posed: bool) -> Array:
     """Errors of held-out samples, shape (n,), [m]."""
     model, geometry = RigModel(parameters, measured), parameters.geometry(values)
-    lengths, rig = model.counted.by(geometry), rig_with(parameters.rig, geometry)
+    lengths, rig = model.counted.lengths(geometry), rig_with(parameters.rig, geometry)
     if not posed:
         solutions = poses_from_lengths(rig, lengths)
         return np.array([float(np.sqrt(np.mean(one.residual**2))) for one in solutions])
@@ -273,7 +273,7 @@ class RigCalibration:
             Shape (k, 3), [m].
         """
         there = _sent_to(self.rig, positions, rotations)
-        lengths = RigModel(self.parameters, there).counted.by(self.geometry)
+        lengths = RigModel(self.parameters, there).counted.lengths(self.geometry)
         rig = rig_with(self.rig, self.geometry)
         return poses_near(rig, lengths, positions, rotations, steps=10)[0]
 

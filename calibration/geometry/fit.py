@@ -197,7 +197,7 @@ class RigFitter:
         Forward kinematics uses the rig file and starts at the previous pose.
         """
         rig, counted = self._parameters.rig, self._model.counted
-        lengths = counted.by(self._parameters.geometry(np.zeros(len(self._parameters))))
+        lengths = counted.lengths(self._parameters.geometry(np.zeros(len(self._parameters))))
         positions, rotations = self._measured.positions.copy(), self._measured.rotations.copy()
         unknown = np.flatnonzero(~(self._posed & self._rotated))
         for k, found in zip(unknown, poses_from_lengths(rig, lengths[unknown]), strict=True):

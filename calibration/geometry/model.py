@@ -61,7 +61,7 @@ class CountedLengths:
         unstrained: Array = reaching + geometry.offsets
         return unstrained
 
-    def by(self, geometry: RigGeometry) -> Array:
+    def lengths(self, geometry: RigGeometry) -> Array:
         """Lengths from outlet to anchor with these parameters, shape (n, m), [m]."""
         paid_out = self.paid_out * (1.0 + geometry.drum_scale)
         unstrained = self.at_home(geometry) + paid_out
@@ -69,7 +69,7 @@ class CountedLengths:
         return lengths
 
     def by_compliance(self, geometry: RigGeometry) -> Array:
-        """Derivative of `by` by the cables' compliance, 1 / stiffness, shape (n, m), [m N]."""
+        """Derivative of `lengths` by the cables' compliance, 1 / stiffness, shape (n, m), [m N]."""
         at_home = self.at_home(geometry)
         unstrained = at_home + self.paid_out * (1.0 + geometry.drum_scale)
         less = (at_home - geometry.offsets) * self._at_home / self.stretch_at_home(geometry)
@@ -283,7 +283,7 @@ class RigModel:
                 stretch at the rig file's stiffness.
         """
         rig, nominal = self.parameters.rig, self.parameters.geometry(np.zeros(len(self.parameters)))
-        stretched = tension_sigma(rig) / rig.cable_stiffness * self.counted.by(nominal)
+        stretched = tension_sigma(rig) / rig.cable_stiffness * self.counted.lengths(nominal)
         added = np.where(self._tension_known, 0.0, stretched)
         deviations: Array = np.hypot(length_deviation, added)
         return deviations
@@ -291,7 +291,7 @@ class RigModel:
     def residuals(self, values: Array, positions: Array, rotations: Array) -> Array:
         """As in `Linearised`."""
         state = self._state(values, positions, rotations)
-        lengths = state.cables.lengths - self.counted.by(state.geometry)
+        lengths = state.cables.lengths - self.counted.lengths(state.geometry)
         return np.concatenate([lengths, *(one.residuals(state) for one in self.sensors)], axis=1)
 
     def linearised(self, values: Array, positions: Array, rotations: Array) -> Linearised:
@@ -332,7 +332,7 @@ class RigModel:
                 by_values[:, :, slices["stiffness"].start] = by_logarithm
             if "cable_stiffness" in slices:
                 by_values[:, each, slices["cable_stiffness"].start + each] = by_logarithm
-        residuals = state.cables.lengths - self.counted.by(geometry)
+        residuals = state.cables.lengths - self.counted.lengths(geometry)
         return Linearised(residuals, by_values, state.by_pose(-state.cables.directions))
 
     def _by_geometry(self, state: RigAtPoses) -> Array:

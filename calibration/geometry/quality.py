@@ -56,7 +56,7 @@ class Compliance:
 
 
 @dataclass(frozen=True, slots=True)
-class Differences:
+class CableCompliances:
     """Estimate of each cable's own compliance.
 
     Attributes:
@@ -95,7 +95,7 @@ def estimate_compliance(result: RigCalibration) -> Compliance | None:
     return Compliance(nominal * compliance, (nominal + change) * compliance, deviation * compliance)
 
 
-def estimate_cable_compliances(result: RigCalibration) -> Differences | None:
+def estimate_cable_compliances(result: RigCalibration) -> CableCompliances | None:
     """Estimates each cable's compliance; None where tensions are missing in some samples.
 
     Args:
@@ -108,7 +108,7 @@ def estimate_cable_compliances(result: RigCalibration) -> Differences | None:
     change = -np.asarray(np.linalg.solve(information, pull))
     chance = float(chi2.sf(-pull @ change, cables))
     estimated: Array = (_nominal_compliance(result) + change) / result.rig.cable_stiffness
-    return Differences(estimated, chance)
+    return CableCompliances(estimated, chance)
 
 
 def _nominal_compliance(result: RigCalibration) -> Array:
@@ -222,8 +222,8 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     out = result.held_out
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
-    issues = _far_numbers(result) + _other_stiffness(result) + _unknown_stretch(result)
-    issues += _scattered_sensors(result)
+    issues = _deviation_issues(result) + _stiffness_issues(result) + _tension_issues(result)
+    issues += _sensor_issues(result)
     if missed > wanted:
         what = "samples" if out.poses else "cable lengths of samples"
         issues.append(
@@ -263,7 +263,7 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     return RigQuality(verdict, before, after, level, rotated, tilt)
 
 
-def _far_numbers(result: RigCalibration) -> list[Issue]:
+def _deviation_issues(result: RigCalibration) -> list[Issue]:
     """An issue if the parameter farthest from the rig file is not credible."""
     parameters, values = result.parameters, result.fit.values
     times = np.abs(values) / parameters.deviations
@@ -300,12 +300,12 @@ def _far(group: str, value: float) -> str:
     return f"{abs(value) * 1e3:.3g} mm from the rig file"
 
 
-def _other_stiffness(result: RigCalibration) -> list[Issue]:
+def _stiffness_issues(result: RigCalibration) -> list[Issue]:
     compliance = estimate_compliance(result)
     if compliance is None or "cable_stiffness" in result.parameters.groups:
         return []
     if not compliance.contradicts:
-        return _cables_that_differ(result)
+        return _difference_issues(result)
     return [
         Issue(
             f"the data give a cable stiffness of {compliance}, the rig file"
@@ -316,7 +316,7 @@ def _other_stiffness(result: RigCalibration) -> list[Issue]:
     ]
 
 
-def _cables_that_differ(result: RigCalibration) -> list[Issue]:
+def _difference_issues(result: RigCalibration) -> list[Issue]:
     differences = estimate_cable_compliances(result)
     if differences is None or not differences.contradict:
         return []
@@ -330,7 +330,7 @@ def _cables_that_differ(result: RigCalibration) -> list[Issue]:
     ]
 
 
-def _unknown_stretch(result: RigCalibration) -> list[Issue]:
+def _tension_issues(result: RigCalibration) -> list[Issue]:
     """An issue if missing tensions matter: their errors are correlated between samples."""
     usual = result.length_deviation
     lengths = result.fit.deviations[:, : result.rig.cable_count]
@@ -347,7 +347,7 @@ def _unknown_stretch(result: RigCalibration) -> list[Issue]:
     ]
 
 
-def _scattered_sensors(result: RigCalibration) -> list[Issue]:
+def _sensor_issues(result: RigCalibration) -> list[Issue]:
     """An issue if sensors scatter more than stated, as with a wrong pulley axis."""
     fit, m = result.fit, result.rig.cable_count
     times = fit.sensor_rms / fit.deviations[:, m:].min(axis=0)

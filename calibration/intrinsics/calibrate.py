@@ -33,7 +33,7 @@ from calibration.statistics import (
     rms_bound,
     widened,
 )
-from calibration.targets.boards import Board, DetectedBoard, mirrored
+from calibration.targets.boards import Board, DetectedBoard, is_mirrored
 from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
@@ -377,8 +377,8 @@ def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
     """What most images without the board show instead, if known."""
     shown: dict[str, list[str]] = {}
     for name, image in without:
-        flipped = mirrored(board, image)
-        if what := _MIRRORED if flipped else board.instead(image):
+        flipped = is_mirrored(board, image)
+        if what := _MIRRORED if flipped else board.describe_other(image):
             shown.setdefault(what, []).append(name)
     if not shown:
         return ""

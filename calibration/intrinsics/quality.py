@@ -109,10 +109,10 @@ def judge_camera(
     bow, bent = bow_of(result)
     radial = radial_share(*corner_errors(result), result.matrix)
     issues = [
-        *_about_pictures(result, coverage, tilts),
-        *_about_the_board(bow, bent),
-        *_about_the_lens(result, radial),
-        *_about_errors(result, coverage, error, halves, wanted, distance),
+        *_image_issues(result, coverage, tilts),
+        *_board_issues(bow, bent),
+        *_lens_issues(result, radial),
+        *_error_issues(result, coverage, error, halves, wanted, distance),
     ]
     where = f"at {distance:.2g} m"
     if not distance_given:
@@ -246,7 +246,7 @@ def _bow_shapes(positions: Array) -> Array:
     return np.column_stack([x * x, x * y, y * y])
 
 
-def _about_the_board(bow: float, bent: float) -> list[Issue]:
+def _board_issues(bow: float, bent: float) -> list[Issue]:
     if bent < _BENT:
         return []
     what = f"the board is not flat: it bows by {bow * 1e3:.2g} mm"
@@ -265,7 +265,7 @@ def corner_errors(result: CameraCalibration) -> tuple[Array, Array]:
     return np.concatenate(corners), np.concatenate(errors)
 
 
-def _about_the_lens(result: CameraCalibration, radial: float) -> list[Issue]:
+def _lens_issues(result: CameraCalibration, radial: float) -> list[Issue]:
     if radial < RADIAL or result.error < _SEEN:
         return []
     what = (
@@ -286,7 +286,7 @@ def is_below(share: float, limit: float) -> bool:
     return round(100.0 * share) < round(100.0 * limit)
 
 
-def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) -> list[Issue]:
+def _image_issues(result: CameraCalibration, coverage: Array, tilts: Array) -> list[Issue]:
     """Issues of the set of images."""
     issues = []
     if len(result.views) < GOOD_VIEWS:
@@ -307,7 +307,7 @@ def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) ->
     return issues
 
 
-def _about_errors(
+def _error_issues(
     result: CameraCalibration,
     coverage: Array,
     error: float,

@@ -259,7 +259,7 @@ def judge_layout(result: TagLayout, wanted: float) -> CalibrationVerdict:
         result: The measured layout.
         wanted: Required error of tag corners, [m].
     """
-    issues = [*_about_pictures(result), *_about_tags(result)]
+    issues = [*_image_issues(result), *_tag_issues(result)]
     error = result.error
     if not error <= wanted:
         what = f"tags are located within {error * 1e3:.2g} mm; {wanted * 1e3:.2g} mm are required"
@@ -267,7 +267,7 @@ def judge_layout(result: TagLayout, wanted: float) -> CalibrationVerdict:
     return CalibrationVerdict.of(error, wanted, "in the tags' positions", issues)
 
 
-def _about_pictures(result: TagLayout) -> list[Issue]:
+def _image_issues(result: TagLayout) -> list[Issue]:
     issues = []
     if len(result.errors) < GOOD_PICTURES:
         what = f"{len(result.errors)} images show two tags or more; {GOOD_PICTURES} are required"
@@ -291,7 +291,7 @@ def _about_pictures(result: TagLayout) -> list[Issue]:
     return issues
 
 
-def _about_tags(result: TagLayout) -> list[Issue]:
+def _tag_issues(result: TagLayout) -> list[Issue]:
     issues = []
     for number, why in result.unseen.items():
         step = f"take images that show tag {number} together with others"

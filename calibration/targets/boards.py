@@ -48,7 +48,7 @@ class Board(Protocol):
         """Detects the board in a grey image; None where too little of it is visible."""
         ...
 
-    def instead(self, image: Image) -> str:
+    def describe_other(self, image: Image) -> str:
         """What an image without the board shows instead, for messages; empty if unknown."""
         ...
 
@@ -57,7 +57,7 @@ class Board(Protocol):
         ...
 
 
-def mirrored(board: Board, image: Image) -> bool:
+def is_mirrored(board: Board, image: Image) -> bool:
     """Whether an image shows the board mirrored."""
     return board.find(np.ascontiguousarray(image[:, ::-1])) is not None
 
@@ -205,7 +205,7 @@ class Chessboard:
                 return np.asarray(corners, dtype=np.float64).reshape(-1, 2)
         return None
 
-    def instead(self, image: Image) -> str:
+    def describe_other(self, image: Image) -> str:
         """Size of another chessboard that the image shows."""
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
         try:
@@ -312,7 +312,7 @@ class Charuco:
             return None
         return DetectedBoard(chosen, np.asarray(corners, dtype=np.float64).reshape(-1, 2), twice)
 
-    def instead(self, image: Image) -> str:
+    def describe_other(self, image: Image) -> str:
         """OpenCV's other pattern, else tags and markers that the image shows."""
         if replace(self, legacy=not self.legacy).find(image) is not None:
             use = "without --legacy" if self.legacy else "with --legacy"

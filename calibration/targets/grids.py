@@ -102,7 +102,7 @@ class CircleGrid:
                 return DetectedBoard(self.points(), self._refined(dark, centres))
         return None
 
-    def instead(self, image: Image) -> str:
+    def describe_other(self, image: Image) -> str:
         """The same grid with rows and columns exchanged, or of the other kind."""
         others = [
             CircleGrid(*count, self.spacing, min(self.diameter, 0.9 * self.spacing), asymmetric)
@@ -350,7 +350,7 @@ class TagGrid:
     def _other_order(self) -> str:
         return next(order for order in ORDERS if order != self.order)
 
-    def instead(self, image: Image) -> str:
+    def describe_other(self, image: Image) -> str:
         """The tags in another order, else tags that the image shows."""
         other = self._other_order()
         if replace(self, order=other).find(image) is not None:

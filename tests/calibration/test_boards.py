@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from calibration.intrinsics.calibrate import fit_camera
 from calibration.statistics import EvenSample
-from calibration.targets.boards import Charuco, Chessboard, mirrored
+from calibration.targets.boards import Charuco, Chessboard, is_mirrored
 from calibration.targets.grids import CircleGrid, TagGrid
 from model.errors import BadInput
 from model.pose import Pose
@@ -155,7 +155,7 @@ def test_own_tags_in_the_order_of_kalibr_are_rejected() -> None:
     assert whole
     for image, _ in whole:
         assert other.find(image) is None
-        assert "--order rows" in other.instead(image)
+        assert "--order rows" in other.describe_other(image)
 
 
 def test_a_charuco_board_of_an_old_opencv_is_named() -> None:
@@ -164,7 +164,7 @@ def test_a_charuco_board_of_an_old_opencv_is_named() -> None:
     drawn.setLegacyPattern(True)
     image = cv2.copyMakeBorder(drawn.generateImage((400, 480)), 40, 40, 40, 40, 0, value=255)
     assert Charuco(5, 6, 0.040, 0.030, "4X4_50", legacy=True).find(image) is not None
-    assert "try with --legacy" in Charuco(5, 6, 0.040, 0.030, "4X4_50").instead(image)
+    assert "try with --legacy" in Charuco(5, 6, 0.040, 0.030, "4X4_50").describe_other(image)
 
 
 @cache
@@ -213,7 +213,7 @@ def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid
     assert other.find(image) is None
     flipped = np.ascontiguousarray(image[:, ::-1])
     assert board.find(flipped) is None
-    assert mirrored(board, flipped)
+    assert is_mirrored(board, flipped)
     with pytest.raises(BadInput) as caught:
         fit_camera([("a", flipped), ("b", flipped)], board)
     assert "mirrored" in caught.value.why

@@ -30,7 +30,7 @@ class Shown:
         corners = cv2.projectPoints(points, zero, zero, MATRIX, np.zeros(5))[0].reshape(-1, 2)
         return DetectedBoard(POINTS, corners)
 
-    def instead(self, image: np.ndarray) -> str:
+    def describe_other(self, image: np.ndarray) -> str:
         return ""
 
 

@@ -492,7 +492,7 @@ def test_counts_of_home_lead_the_corrected_rig_to_the_lengths_that_were_fitted(
     corrected, data = rig.with_calibration(result), found.measured
     winches = WinchMap(corrected)
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
-    by_fit = RigModel(found.parameters, data).counted.by(found.geometry)
+    by_fit = RigModel(found.parameters, data).counted.lengths(found.geometry)
     assert lengths == pytest.approx(by_fit, abs=3e-6)
 
 
@@ -670,7 +670,7 @@ def test_the_derivative_by_compliance_is_that_of_finite_differences(
     counted, geometry = CountedLengths(rig, data.counts, data.tensions), found.geometry
     compliance = 1.0 / geometry.stiffness
     ends = [
-        counted.by(replace(geometry, stiffness=1.0 / (compliance + sign * step)))
+        counted.lengths(replace(geometry, stiffness=1.0 / (compliance + sign * step)))
         for sign in (1.0, -1.0)
     ]
     slope = counted.by_compliance(geometry)

@@ -128,7 +128,7 @@ def test_a_result_holds_each_cables_stiffness_and_applies_it(
     assert [w.cable_stiffness_n for w in corrected.document.winches] == document.cable_stiffness_n
     winches = WinchMap(corrected)
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
-    by_fit = RigModel(found.parameters, data).counted.by(found.geometry)
+    by_fit = RigModel(found.parameters, data).counted.lengths(found.geometry)
     assert lengths == pytest.approx(by_fit, abs=30e-6)  # a count is 12 micrometres
     assert document.sensor_residuals_deg.keys() >= {"swivel 1", "swivel 10", "IMU 1", "IMU 2"}
     assert all(0.05 < x < 0.15 for x in document.sensor_residuals_deg.values())

@@ -57,9 +57,7 @@ def test_a_path_is_measured_to_half_a_millimetre(
     rotation = np.degrees(np.linalg.norm(by_pose[:, 3:], axis=1))
     assert np.sqrt(np.mean(position**2)) < 0.5e-3
     assert np.sqrt(np.mean(rotation**2)) < 0.1
-    assert (
-        np.mean(normalised) < 8.0
-    )  # 6 would be exact; a higher value means too small a covariance
+    assert np.mean(normalised) < 8.0  # 6 would be exact
     assert np.all(position < 5e-3)
     assert states[0] == "found"
     assert states.count("tracked") >= len(states) - 3
