@@ -1,4 +1,4 @@
-"""A place of its own for a benchmark: it sees no run of another program, and stops none."""
+"""An isolated environment for a benchmark: it sees and stops no run of another program."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 
 @contextmanager
 def alone() -> Iterator[Path]:
-    """A temporary folder for all that this process and its children keep, to the end."""
-    with tempfile.TemporaryDirectory() as place:
+    """A temporary folder for all files of this process and its children, until it ends."""
+    with tempfile.TemporaryDirectory() as folder:
         for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
-            os.environ[name] = place
+            os.environ[name] = folder
         tempfile.tempdir = None
-        with chdir(place):
-            yield Path(place)
+        with chdir(folder):
+            yield Path(folder)

@@ -1,10 +1,9 @@
-"""How often the stated intervals of a calibration hold the true camera, and how far off it is.
+"""Coverage of a camera calibration's stated intervals, and its errors.
 
     python benchmarks/camera_calibration.py [--trials 50] [--pictures 20]
 
-Every trial renders a chessboard with a lens, noise and random poses, finds it in the images and
-calibrates; the peer is plain OpenCV (`findChessboardCornersSB`, `calibrateCamera`) on the same
-images.
+Every trial renders a chessboard with a lens, noise and random poses, detects it and calibrates; the
+reference is plain OpenCV (`findChessboardCornersSB`, `calibrateCamera`) on the same images.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ def rendered(count: int, seed: int) -> list[tuple[str, np.ndarray]]:
 
 
 def plain(pictures: list[tuple[str, np.ndarray]]) -> np.ndarray:
-    """What OpenCV alone finds."""
+    """Parameters estimated by OpenCV alone."""
     corners = []
     for _, image in pictures:
         found, seen = cv2.findChessboardCornersSB(image, (9, 6))
@@ -81,7 +80,7 @@ def main() -> None:
     for k, name in enumerate(LENSES["five"].names):
         print(f"{name:8s}{np.mean(inside, axis=0)[k]:9.0%}{ours[k]:12.4g}{theirs[k]:14.4g}")
     every = np.mean([row[:4].all() for row in inside])
-    print(f"all four of the matrix inside: {every:.0%}; over all numbers: {np.mean(inside):.0%}")
+    print(f"all four of the matrix inside: {every:.0%}; over all values: {np.mean(inside):.0%}")
 
 
 if __name__ == "__main__":

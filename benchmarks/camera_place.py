@@ -1,11 +1,11 @@
-"""How far off the place of a camera by surveyed tags is, and how near to the best that can be.
+"""Error of a camera's pose from surveyed tags, and its ratio to the Cramér-Rao bound.
 
     python benchmarks/camera_place.py [--trials 200]
 
 Tags on the floor around a rig are surveyed with random errors and seen by a camera with known
-noise. Told are the errors of points of the work space that the camera then puts elsewhere, beside
-the Cramér-Rao bound of the same sights: no unbiased estimator that knows of the errors of survey
-and corners what is told here can do better.
+noise. The output lists the resulting errors of points in the work space beside the Cramér-Rao bound
+of the same observations: no unbiased estimator that knows the errors of survey and corners has
+smaller ones.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from calibration.extrinsics.result import workspace_corners
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags
-from calibration.tag_map.observations import TagSights
+from calibration.tag_map.observations import TagObservations
 from model.pose import Array, Pose, matrix_from_rotation_vector, skew
 from model.rig import Rig, Tag, load_rig
 from tracking.camera_model import project_undistorted
@@ -35,20 +35,20 @@ RING = [(0.5 * np.cos(a), 0.5 * np.sin(a)) for a in np.linspace(0.0, 2.0 * np.pi
 INNER = [
     (0.28 * np.cos(a), 0.28 * np.sin(a)) for a in np.linspace(0.2, 0.2 + 2.0 * np.pi, 8, False)
 ]
-PLACES = {17: [(0.0, 0.0), *RING, *INNER], 4: RING[1::2], 1: [(0.0, 0.0)]}
+POSITIONS = {17: [(0.0, 0.0), *RING, *INNER], 4: RING[1::2], 1: [(0.0, 0.0)]}
 
 
-SURVEYS = ("each corner", "each tag, turned as told", "each tag, and its turns")
+SURVEYS = ("each corner", "each tag, rotations known", "each tag, and its rotation")
 
 
 def survey_called(name: str, size: float) -> Survey:
-    """A survey of that kind, of one size of errors, [m]."""
+    """A survey of a kind, with errors of a size, [m]."""
     turns = {SURVEYS[0]: None, SURVEYS[1]: 0.0, SURVEYS[2]: 2.0 * size / SIZE}
     return Survey(size, turns[name])
 
 
 def by_pose(rig: Rig, tags: tuple[Tag, ...], camera_from_world: Pose) -> Array:
-    """Slopes of all pixels by the camera's pose, shape (8 t, 6)."""
+    """Derivatives of all pixels by the camera's pose, shape (8 t, 6)."""
     corners = np.concatenate([tag_corners(tag) for tag in tags])
 
     def pixels(step: Array) -> Array:
@@ -75,7 +75,7 @@ def bound(rig: Rig, tags: tuple[Tag, ...], survey: Survey) -> float:
 def error(
     rig: Rig, tags: tuple[Tag, ...], survey: Survey, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Of one survey and one image: mean square of points of the work space, and as stated."""
+    """Mean square error of points of the work space in one trial, and the stated error."""
     camera = rig.cameras[0]
     there, squares = camera.world_from_camera.inverse(), {}
     for tag in tags:
@@ -87,7 +87,7 @@ def error(
         target = whitening @ pixels.ravel()
         squares[tag.id] = RefinedTag(pixels, whitening, target, np.ones(4, bool))
     found = locate_by_frame_tags(
-        replace(rig, frame_tags=tags), camera, TagSights({"picture": squares}, {}), survey
+        replace(rig, frame_tags=tags), camera, TagObservations({"picture": squares}, {}), survey
     )
     back = found.world_from_camera.apply(there.apply(found.points)) - found.points
     return float(np.mean(np.sum(back**2, axis=1))), found.error
@@ -108,12 +108,12 @@ def main() -> None:
     print(
         f"{'tags':>5s} {'surveyed was':28s}{'error':>9s}{'bound':>9s}{'ratio':>7s}{'in 95 %':>9s}"
     )
-    for count, places in PLACES.items():
+    for count, positions in POSITIONS.items():
         tags = tuple(
             Tag(
                 401 + k, SIZE, Pose(np.array([x, y, 0.0]), matrix_from_rotation_vector(np.zeros(3)))
             )
-            for k, (x, y) in enumerate(places)
+            for k, (x, y) in enumerate(positions)
         )
         for name in SURVEYS:
             survey, rng = survey_called(name, size), np.random.default_rng([11, count])

@@ -1,12 +1,11 @@
 """The campaign: every environment, many seeds, two clearances; plan, check, run, measure, table.
 
-    python benchmarks/campaign.py                       # all of it: about half an hour on one core
+    python benchmarks/campaign.py                       # everything: about half an hour on one core
     python benchmarks/campaign.py --seeds 2 -o out.jsonl
 
-Each plan is written, read back, and checked as `cdpr check` does. Runs go as `cdpr run --fast`
-does: without a camera for the first ``--runs`` seeds, with the synthetic camera for the first
-``--camera-runs`` seeds, both at the first clearance. Exits with 1 when anything asked for does not
-hold.
+Each plan is written, read back, and checked as by `cdpr check`. Runs are those of `cdpr run
+--fast`: without a camera for the first ``--runs`` seeds, with the synthetic camera for the first
+``--camera-runs`` seeds, both at the first clearance. Exits with 1 if any requirement is not met.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ TAG_RMS_MM = 1.0
 
 @dataclass(frozen=True)
 class PlanResult:
-    """One plan and its check; ``problem`` says why there is none."""
+    """One plan and its check; ``problem`` is the reason if there is none."""
 
     environment: int
     clearance_mm: float
@@ -58,8 +57,8 @@ class PlanResult:
 class RunResult:
     """One run; tag figures are NaN without a camera.
 
-    ``beyond_mm`` is the largest amount by which a measured clearance was below the planned one of
-    the same moment, less the stated uncertainty: not above 0 when all is well.
+    ``beyond_mm`` is the largest amount by which a measured clearance was below the planned one at
+    the same time, less the stated uncertainty: at most 0 if the intervals hold.
     """
 
     environment: int
@@ -88,13 +87,13 @@ def plan_one(rig: Rig, environment: int, clearance_mm: float, seed: int, path: P
         return PlanResult(*key, problem=error.what, plan_s=time.perf_counter() - begin)
     planned = time.perf_counter()
     plan = load_plan(path)
-    report = check_path(rig, scene, plan.waypoints, plan.stops)
+    checked = check_path(rig, scene, plan.waypoints, plan.stops)
     return PlanResult(
         *key,
-        passed=report.passed,
-        clearance_proved_mm=report.proved_obstacle_clearance * 1000.0,
+        passed=checked.passed,
+        clearance_proved_mm=checked.proved_obstacle_clearance * 1000.0,
         goal_error_m=plan.waypoints[-1].distance_to(scene.goal),
-        length_mm=report.length * 1000.0,
+        length_mm=checked.length * 1000.0,
         plan_s=planned - begin,
         check_s=time.perf_counter() - planned,
     )
@@ -105,8 +104,8 @@ def run_one(
 ) -> RunResult:
     """Runs a plan as `cdpr run --fast` does and reads the figures from its folder."""
     begin = time.perf_counter()
-    with TemporaryDirectory(prefix="cdpr-campaign-") as place:
-        output = Path(place) / "run"
+    with TemporaryDirectory(prefix="cdpr-campaign-") as folder:
+        output = Path(folder) / "run"
         cameras = None if camera else ()
         done = runner.run(load_plan(path), rig, folder=output, cameras=cameras, realtime=False)
         summary = done.summary
@@ -133,18 +132,18 @@ def campaign(
     clearances_mm: Sequence[float],
     runs: int,
     camera_runs: int,
-    tell: Callable[[Result], None],
+    report: Callable[[Result], None],
 ) -> list[Result]:
-    """All of it, told one by one; see the head of this file."""
+    """Runs the campaign and reports each result; see the top of this file."""
     rig = load_rig(ready_folder() / PAPER_RIG)
     results: list[Result] = []
 
     def take(result: Result) -> None:
         results.append(result)
-        tell(result)
+        report(result)
 
-    with TemporaryDirectory(prefix="cdpr-campaign-") as place:
-        path = Path(place) / "plan.json"
+    with TemporaryDirectory(prefix="cdpr-campaign-") as folder:
+        path = Path(folder) / "plan.json"
         for seed in seeds:
             for environment in environments:
                 for clearance in clearances_mm:
@@ -160,7 +159,7 @@ def campaign(
 
 
 def failures(results: Iterable[Result]) -> list[str]:
-    """What does not hold, a line each."""
+    """Violated requirements, one line each."""
     found = []
     for result in results:
         key = f"environment {result.environment}, {result.clearance_mm:g} mm, seed {result.seed}"
@@ -238,10 +237,10 @@ def _spread(values: Sequence[float], digits: str) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs it from the shell; returns the exit code."""
+    """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(description="Plans, checks, runs and measures in quantity.")
     parser.add_argument("--environments", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--seeds", type=int, default=20, help="so many, from --first-seed on")
+    parser.add_argument("--seeds", type=int, default=20, help="number, from --first-seed on")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--clearances-mm", type=float, nargs="+", default=[10.0, 20.0])
     parser.add_argument("--runs", type=int, default=20, help="seeds to run without a camera")
@@ -249,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, help="also write every result as a JSON line")
     asked = parser.parse_args(arguments)
 
-    def tell(result: Result) -> None:
+    def report(result: Result) -> None:
         line = json.dumps({"kind": type(result).__name__, **asdict(result)})
         print(line, file=sys.stderr, flush=True)
         if asked.output is not None:
@@ -258,11 +257,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     seeds = range(asked.first_seed, asked.first_seed + asked.seeds)
     results = campaign(
-        asked.environments, seeds, asked.clearances_mm, asked.runs, asked.camera_runs, tell
+        asked.environments, seeds, asked.clearances_mm, asked.runs, asked.camera_runs, report
     )
     print(table(results))
     found = failures(results)
-    print("\n".join(found) or "everything asked for holds")
+    print("\n".join(found) or "all requirements are met")
     return 1 if found else 0
 
 

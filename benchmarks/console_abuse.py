@@ -1,15 +1,14 @@
-"""A million hostile requests and messages to the console's server, while a robot could be jogged.
+"""A million hostile requests and messages to the console's server while a robot can be jogged.
 
     python benchmarks/console_abuse.py [--messages 1000000]
 
-The server is `cdpr console` in a process of its own, with simulated drives over UDP in real time;
-an operator's page has control and has enabled the drives for jogging. One in ten is an HTTP
-request: no token, a wrong one, another origin, another host, paths that leave the folder, garbage,
-heads that are too long. The others come over sockets of pages without control: broken JSON, wrong
-types, values out of range, what is too long, binary, deep, commands, and what the operator's page
-said before. Nothing may move, nothing may be started, and the server's memory, threads and
-descriptors must stay where they were. Prints the figures; exit code 1 if anything was wrong. It
-takes half an hour or more.
+The server is `cdpr console` in its own process, with simulated drives over UDP in real time; an
+operator's page has control and has enabled the drives for jogging. One in ten is an HTTP request:
+no token, a wrong one, another origin, another host, paths outside the folder, garbage, oversized
+headers. The others arrive on sockets of pages without control: broken JSON, wrong types, values out
+of range, oversized, binary or deeply nested messages, commands, and replayed messages of the
+operator's page. Nothing may move or start, and the server's memory, threads and descriptors must
+not grow. Prints the figures; exit code 1 if anything was wrong. It takes half an hour or more.
 """
 
 from __future__ import annotations
@@ -45,17 +44,17 @@ COMMANDS = (
 
 
 class Attack:
-    """What is sent, and what came of it."""
+    """Hostile messages and requests, and counts of the answers."""
 
     def __init__(self, address: str, heard: list[str], seed: int) -> None:
-        """Against an address with its token; ``heard`` was said by the page that has control."""
+        """Attacks an address with its token; ``heard`` has messages of the page in control."""
         self.host, _, self.token = address.removeprefix("http://").partition("/?token=")
         self._heard, self._random = heard, random.Random(seed)
         self.sent: Counter[str] = Counter()
         self.answers: Counter[str] = Counter()
 
     def message(self) -> tuple[str, str | bytes]:
-        """Its kind, and what is sent."""
+        """A random kind and content."""
         pick = self._random.random()
         if pick < 0.0005:
             return "too long", "x" * 5000
@@ -90,7 +89,7 @@ class Attack:
         return said
 
     async def sockets(self, count: int) -> None:
-        """Sends so many messages by a page without control."""
+        """Sends messages from a page without control."""
         left = count
         while left > 0:
             with suppress(ConnectionClosed, InvalidHandshake, OSError):
@@ -104,7 +103,7 @@ class Attack:
         return connect(address, origin=origin, max_queue=256)
 
     async def _batch(self, page: ClientConnection, size: int) -> int:
-        """Sends a few, reads their answers; how many went out."""
+        """Sends a batch and reads the answers; returns the number sent."""
         owed = 0
         for k in range(size):
             kind, text = self.message()
@@ -123,7 +122,7 @@ class Attack:
         return size
 
     def _is_whole(self, text: str | bytes) -> bool:
-        """A held message that broke into another whole one is taken without a word."""
+        """Whether a broken message is still a valid held message, which gets no answer."""
         from cdpr.console.commands import Held, LetGo, NotAMessage, parse_message
 
         with suppress(NotAMessage):
@@ -131,7 +130,7 @@ class Attack:
         return False
 
     async def requests(self, count: int) -> None:
-        """Sends so many HTTP requests."""
+        """Sends HTTP requests."""
         left = count
         while left > 0:
             with suppress(OSError, asyncio.IncompleteReadError, ValueError):
@@ -160,7 +159,7 @@ class Attack:
             raise ConnectionError
 
     def request(self) -> tuple[str, bytes]:
-        """Its kind, and what is sent."""
+        """A random kind and content."""
         path = self._random.choice(["/", "/scene", "/api/files", "/runs/x", "/camera/x", "/ws"])
         token = f"?token={self.token}"
         kinds = {
@@ -182,39 +181,39 @@ class Attack:
 
 
 class Watched:
-    """The server's process, from outside."""
+    """Resource use of the server's process."""
 
     def __init__(self, process: int) -> None:
-        """Looked at now."""
+        """Takes a first sample."""
         self._process = Path(f"/proc/{process}")
-        self.looks = [self._look()]
+        self.samples = [self._sample()]
 
-    def _look(self) -> tuple[float, int, int]:
+    def _sample(self) -> tuple[float, int, int]:
         """Memory [MB], threads, descriptors."""
         lines = (self._process / "status").read_text().splitlines()
         values = dict(line.split(":", 1) for line in lines)
         memory = int(values["VmRSS"].split()[0]) / 1024.0
         return memory, int(values["Threads"]), len(os.listdir(self._process / "fd"))
 
-    async def look(self, every: float) -> None:
-        """Again and again."""
+    async def sample(self, every: float) -> None:
+        """Samples periodically."""
         while True:
             await asyncio.sleep(every)
-            self.looks.append(self._look())
+            self.samples.append(self._sample())
 
 
 class Holder:
-    """The page that has control and holds nothing; nothing may move meanwhile."""
+    """A page that has control and holds nothing; nothing may move meanwhile."""
 
     def __init__(self, address: str) -> None:
-        """Not connected yet."""
+        """Starts unconnected."""
         self.host, _, self.token = address.removeprefix("http://").partition("/?token=")
         self.wrong: list[str] = []
         self.states = self.moments = 0
-        self._stood: dict[int, list[int]] = {}
+        self._targets: dict[int, list[int]] = {}
 
     async def watch(self) -> None:
-        """Takes control and looks; a session that ends for want of a press is begun again."""
+        """Takes control and monitors; starts a session again when it ends without a press."""
         origin: Any = f"http://{self.host}"
         address = f"ws://{self.host}/ws?token={self.token}"
         async with connect(address, origin=origin, max_queue=256) as page:
@@ -222,9 +221,9 @@ class Holder:
             while True:
                 said = json.loads(await page.recv())
                 if said["kind"] == "state":
-                    await self._look(page, said)
+                    await self._check(page, said)
 
-    async def _look(self, page: ClientConnection, state: dict[str, Any]) -> None:
+    async def _check(self, page: ClientConnection, state: dict[str, Any]) -> None:
         self.states += 1
         if (state["busy"] or {"verb": "jog"})["verb"] != "jog":
             self.wrong.append(f"`cdpr {state['busy']['verb']}` was started")
@@ -236,18 +235,18 @@ class Holder:
         if motion["state"] != "moving":
             return
         self.moments += 1
-        stands = [drive["set_counts"] for drive in motion["drives"]]
-        before = self._stood.setdefault(motion["process"], stands)
-        if stands != before and len(self.wrong) < 9:
-            self.wrong.append(f"set-points moved: {before} to {stands}")
+        targets = [drive["set_counts"] for drive in motion["drives"]]
+        before = self._targets.setdefault(motion["process"], targets)
+        if targets != before and len(self.wrong) < 9:
+            self.wrong.append(f"set-points moved: {before} to {targets}")
 
     async def _say(self, page: ClientConnection, command: str) -> None:
         await page.send(json.dumps({"kind": "command", "id": 1, "command": command}))
 
 
 async def attacked(attack: Attack, count: int, watched: Watched, holder: Holder) -> None:
-    """All of it; an eighth first, after which memory must stay."""
-    looking = asyncio.create_task(watched.look(5.0))
+    """The whole attack; memory must not grow after the first eighth."""
+    looking = asyncio.create_task(watched.sample(5.0))
     holding = asyncio.create_task(holder.watch())
     while not holder.moments:
         await asyncio.sleep(0.1)
@@ -256,9 +255,9 @@ async def attacked(attack: Attack, count: int, watched: Watched, holder: Holder)
         each, pages = web // CONNECTIONS, (part - web) // SOCKETS
         rest = [attack.requests(each) for _ in range(CONNECTIONS)]
         await asyncio.gather(*rest, *(attack.sockets(pages) for _ in range(SOCKETS)))
-        watched.looks.append(watched._look())
+        watched.samples.append(watched._sample())
         if part == count // 8:
-            watched.looks = watched.looks[-1:]
+            watched.samples = watched.samples[-1:]
     if holding.done():
         holder.wrong.append(f"the page in control was lost: {holding.exception()}")
     looking.cancel()
@@ -266,7 +265,7 @@ async def attacked(attack: Attack, count: int, watched: Watched, holder: Holder)
 
 
 def enabled(me: Operator) -> list[str]:
-    """Enables the drives and jogs a little; what the page said of it."""
+    """Enables the drives and jogs briefly; returns the page's messages."""
     heard: list[str] = []
     send = me._page.send
     me._page.send = lambda text: (heard.append(text), send(text))[1]  # type: ignore[method-assign]
@@ -274,7 +273,7 @@ def enabled(me: Operator) -> list[str]:
     me.until(lambda state: state["jog"]["ready"])
     me.jog(2, 2.0)
     me._page.send = send  # type: ignore[method-assign]
-    # STOP is for everybody: it is no attack.
+    # STOP is accepted from every page, so it is not an attack.
     return [text for text in heard if "held" in text or "let_go" in text]
 
 
@@ -300,12 +299,12 @@ def main() -> int:
             me.until(lambda state: state["busy"] is None)
     total = sum(attack.sent.values())
     print(f"{total} in {seconds:.0f} s: {dict(sorted(attack.sent.items()))}")
-    print(f"the drives stood in all of {holder.moments} states with a session enabled")
+    print(f"the drives were at rest in all of {holder.moments} states with a session enabled")
     print(f"answered: {dict(sorted(attack.answers.items()))}")
-    first, last = watched.looks[0], watched.looks[-1]
+    first, last = watched.samples[0], watched.samples[-1]
     for name, a, b in zip(("memory [MB]", "threads", "descriptors"), first, last, strict=True):
         print(f"{name:12} {a:.0f} after an eighth, {b:.0f} at the end")
-    print(f"memory between {min(watched.looks)[0]:.1f} and {max(watched.looks)[0]:.1f} MB")
+    print(f"memory between {min(watched.samples)[0]:.1f} and {max(watched.samples)[0]:.1f} MB")
     wrong += [] if last[0] < 1.1 * first[0] + 5.0 else ["memory grew"]
     wrong += [] if last[2] <= first[2] + 8 else ["descriptors are left"]
     wrong += [] if not attack.answers["done"] else [f"{attack.answers['done']} were obeyed"]

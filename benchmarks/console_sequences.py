@@ -1,8 +1,8 @@
-"""Random sequences of what happens at consoles, against a session of jogs in simulated time.
+"""Random sequences of console events against a session of jogs in simulated time.
 
     python benchmarks/console_sequences.py [--count 100000] [--seed 1] [--cables]
 
-What happens, and how each cycle is judged, is in `tests/console/sequences.py`. Prints what was done
+`tests/console/sequences.py` defines the events and the checks of each cycle. Prints what was done
 and what was wrong; exit code 1 if anything was. 100 000 sequences take hours.
 """
 

@@ -1,11 +1,10 @@
-"""How soon the console's page says that what it shows is old, in a real browser.
+"""How soon the console's page reports stale data, in a real browser.
 
     python benchmarks/console_stale.py [--times 10]
 
-The server is stopped (SIGSTOP), a session of jogs is, and the connection falls silent, by turns;
-drives are simulated over UDP in real time. Measured from the signal, or the moment at which the
-connection falls silent, to the frame of the page that shows the banner. Not a test: it takes
-minutes.
+The server is stopped (SIGSTOP), a session of jogs is stopped, or the connection falls silent, in
+turn; drives are simulated over UDP in real time. The time is measured from the signal, or from the
+start of the silence, to the page's frame with the banner. Not a test: it takes minutes.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from tests.console.browsing import browser_at, chromium  # noqa: E402
 from tests.console.cut import CutConnection  # noqa: E402
 from tests.scenarios.test_console import console, drives  # noqa: E402
 
-#: Keeps when the banner was shown, in the time of the day.
+#: Records when the banner was shown, in wall-clock time.
 WATCH = """() => {
   globalThis.shown = null;
   addEventListener("DOMContentLoaded", () => {
@@ -81,7 +80,7 @@ def main() -> int:
         expect(page.locator("#jog-state")).to_contain_text("Ready", timeout=90_000)
         with find_runs() as runs:
             (session,) = [run.process for run in runs]
-        # A supervisor that is silent for 2 s ends the session: it goes on before that.
+        # A supervisor that is silent for 2 s ends the session: it continues before that.
         for _ in range(options.times):
             found["session"].append(once(page, *stopped(session)))
         time.sleep(1.0)
@@ -95,7 +94,7 @@ def main() -> int:
 
 
 def stopped(process: int) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Stops a process, and continues it."""
+    """Functions that stop and continue a process."""
     return (
         lambda: os.kill(process, signal.SIGSTOP),
         lambda: os.kill(process, signal.SIGCONT),

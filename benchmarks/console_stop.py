@@ -2,12 +2,12 @@
 
     python benchmarks/console_stop.py [--presses 1000] [--seed 1]
 
-An operator jogs the platform, drives are simulated over UDP in real time, and by turns another
-page is clicked on STOP and a program sends the same command on a socket of its own. A listener on
-the bus takes the moment, by the kernel's time stamp, of the first SYNC with a set-point that is
-slower than the jog. Counted are milliseconds from the click (the browser's time stamp of the event)
-and from just before the command is sent, which is what the server's side of the socket takes at
-most. Each press ends a session, and the next one enables the drives again: a press takes seconds.
+An operator jogs the platform, drives are simulated over UDP in real time, and alternately another
+page's STOP is clicked or a program sends the same command on its own socket. A listener on the bus
+records the kernel's time stamp of the first SYNC with a set-point slower than the jog. The times
+are measured from the click (the browser's event time stamp) and from just before the command is
+sent, an upper bound for the server's side of the socket. Each press ends a session, and the next
+one enables the drives again: a press takes seconds.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from tests.cli.plans import RIG  # noqa: E402
 from tests.console.browsing import browser_at, chromium  # noqa: E402
 from tests.scenarios.test_console import Operator, console, drives, operator, page_at  # noqa: E402
 
-#: What the listener keeps, [frames]: some seconds.
+#: Length of the listener's buffer, [frames]: some seconds.
 KEPT = 10_000
-#: A press of STOP comes so long after the platform began to move, [s].
+#: Delay of a press of STOP after the platform began to move, [s].
 EARLIEST, LATEST = 0.4, 1.2
-#: Programs that the benchmark left are ended after this, [s].
+#: Programs left over by the benchmark are ended after this, [s].
 ENDS_WITHIN_S = 6.0 * 3600.0
 WATCH = """() => addEventListener("pointerdown", (event) => {
   globalThis.pressed = performance.timeOrigin + event.timeStamp;
@@ -53,7 +53,7 @@ class Listener:
     """The newest SYNC and set-points of one drive on the bus, with the kernel's time stamps."""
 
     def __init__(self, options: tuple[str, ...]) -> None:
-        """Takes the options of the command line for the bus."""
+        """Opens the bus given by command-line options."""
         group, _, port = options[-1].partition(":")
         filters: Any = [
             {"can_id": number, "can_mask": 0x7FF} for number in (SYNC_ID, RPDO1_BASE + 1)
@@ -75,7 +75,7 @@ class Listener:
         self._bus.shutdown()
 
     def sync_after(self, target: int) -> float:
-        """The moment of the SYNC by which a set-point [counts] of drive 1 was taken last."""
+        """Time of the SYNC with which drive 1 last received a set-point [counts]."""
         found, sync = 0.0, 0.0
         for at, count in reversed(self._frames):
             if count is None:
@@ -99,7 +99,7 @@ class Listener:
 
 
 class Holder(threading.Thread):
-    """Holds a jog control until the session is over; towards the middle of the workspace."""
+    """Holds a jog control, towards the middle of the workspace, until the session ends."""
 
     def __init__(self, me: Operator) -> None:
         super().__init__()
@@ -107,7 +107,7 @@ class Holder(threading.Thread):
         self.moving, self.error = threading.Event(), ""
 
     def run(self) -> None:
-        """Until the session slows down, or something is wrong."""
+        """Holds until the session slows down or an error occurs."""
         me = self._me
         me.press()
         x = me.state["platform"]["position_mm"][0]
@@ -123,7 +123,7 @@ class Holder(threading.Thread):
 
         try:
             me.until(over)
-        except Exception as error:  # told by the main thread
+        except Exception as error:  # reported by the main thread
             self.error = repr(error)
         self.moving.set()
 
@@ -138,18 +138,18 @@ def first_slower(log: Path) -> int:
 
 
 def newest_log() -> Path:
-    """Of the sessions."""
+    """The newest log of a session."""
     return max(Path("runs").glob("*/winches.csv"), key=lambda path: path.stat().st_mtime)
 
 
 def by_click(page: Page) -> float:
-    """Clicks on STOP; the moment of the event in the browser, [s]."""
+    """Clicks on STOP; returns the time of the event in the browser, [s]."""
     page.locator("#stop").click()
     return float(page.evaluate("() => globalThis.pressed")) / 1000.0
 
 
 def by_socket(socket: ClientConnection) -> float:
-    """Sends STOP; the moment just before it, [s]."""
+    """Sends STOP; returns the time just before, [s]."""
     began = time.time()
     socket.send(json.dumps({"kind": "command", "id": 1, "command": "stop"}))
     return began
@@ -200,13 +200,13 @@ def main() -> int:
             found["socket" if number % 2 else "click"].append(1000.0 * (slower - pressed))
             if number % 50 == 49:
                 report(found)
-    print("in all:")
+    print("in total:")
     report(found)
     return 0
 
 
 def report(found: dict[str, list[float]]) -> None:
-    """The table so far."""
+    """Prints the table so far."""
     for name, values in found.items():
         if values:
             middle, high = np.percentile(values, [50.0, 99.0])

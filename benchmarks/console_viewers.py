@@ -1,11 +1,11 @@
-"""What viewers of the console cost a run: how late cycles begin with them and without.
+"""Effect of console viewers on a run: lateness of cycles with and without them.
 
     python benchmarks/console_viewers.py [--viewers 20] [--phases 6] [--seconds 40]
 
 A plan is run slowly over UDP in real time. In every second phase an operator has the page open in a
-browser, which draws as fast as it can, and viewers take every state on sockets of their own; in the
-other phases the console is suspended. Prints by how much cycles were late in both, over all phases
-of the one run, and how many replies of the simulated drives were lost. Not a test.
+browser, which draws as fast as it can, and viewers receive every state on their own sockets; in the
+other phases the console is suspended. Prints the lateness of cycles in both, over all phases of one
+run, and the number of lost replies of the simulated drives. Not a test.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tests.console.browsing import browser_at, chromium  # noqa: E402
 from tests.scenarios.test_console import console, drives, page_at  # noqa: E402
 from tests.scenarios.test_processes import program  # noqa: E402
 
-#: After a change nothing is counted for so long, [s]: a page is loaded, the console catches up.
+#: Settling time after a change, [s]: a page loads, the console catches up.
 SETTLES = 5.0
 WITHIN_S = 3600.0
 FRAMES = """() => {
@@ -48,7 +48,7 @@ FRAMES = """() => {
 
 @contextmanager
 def viewers(address: str, count: int) -> Iterator[list[int]]:
-    """So many sockets that take every state; how many each took."""
+    """Sockets that receive every state; yields how many each received."""
     taken, over = [0] * count, threading.Event()
 
     def view(number: int) -> None:
@@ -69,7 +69,7 @@ def viewers(address: str, count: int) -> Iterator[list[int]]:
 
 
 def watched(browser: Browser, address: str, count: int, seconds: float) -> str:
-    """One phase with viewers; frames and states that were seen."""
+    """Runs one phase with viewers; returns rates of frames and states."""
     page = browser.new_page()
     try:
         page.goto(address)
@@ -84,7 +84,7 @@ def watched(browser: Browser, address: str, count: int, seconds: float) -> str:
 
 
 def seconds_now() -> float:
-    """How long the run has lasted, [s]."""
+    """Elapsed time of the run, [s]."""
     return float(request_run("status")["elapsed_s"])
 
 
@@ -97,12 +97,12 @@ def main() -> int:
     options = parser.parse_args()
     phases: list[tuple[bool, float, float]] = []
     with ExitStack() as stack:
-        place = stack.enter_context(alone())
-        plan = write_short_plan(place / "plan.json")
+        folder = stack.enter_context(alone())
+        plan = write_short_plan(folder / "plan.json")
         bus = stack.enter_context(drives(RIG, 6, within=WITHIN_S))
         server, address = stack.enter_context(console(RIG, bus, within=WITHIN_S))
         browser = stack.enter_context(browser_at(chromium()))
-        start = ("--no-camera", "--yes", "--without-real-time", "-o", place / "run")
+        start = ("--no-camera", "--yes", "--without-real-time", "-o", folder / "run")
         run = stack.enter_context(program("run", plan, "--rig", RIG, *bus, *start, within=WITHIN_S))
         until_it_moves()
         request_run("speed", percent=1)
@@ -122,12 +122,12 @@ def main() -> int:
         os.kill(server.pid, signal.SIGCONT)
         request_run("stop")
         run.communicate()
-        report(place / "run", phases)
+        report(folder / "run", phases)
     return 0
 
 
 def until_it_moves() -> None:
-    """Until the run is on its path."""
+    """Waits until the run moves."""
     for _ in range(600):
         time.sleep(0.1)
         try:
@@ -139,7 +139,7 @@ def until_it_moves() -> None:
 
 
 def report(folder: Path, phases: list[tuple[bool, float, float]]) -> None:
-    """The table."""
+    """Prints the table."""
     with (folder / "cycles.csv").open() as stream:
         rows = [(float(row["time_s"]), float(row["lateness_ms"])) for row in csv.DictReader(stream)]
     cycles = np.array(rows)

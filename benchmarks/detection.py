@@ -1,9 +1,9 @@
-"""How exactly and how often tags are found, beside plain OpenCV and pyapriltags.
+"""Accuracy and rate of tag detection, compared with plain OpenCV and pyapriltags.
 
     python benchmarks/detection.py [--pictures 60] [--family tag36h11]
 
-Every column holds one condition: size, tilt, motion blur, lens blur, contrast. All detectors get
-the same rendered images, whose corners are known exactly. The peers are
+Every table varies one condition: size, tilt, motion blur, lens blur, contrast, noise. All detectors
+get the same rendered images, whose corners are known exactly. The references are
 `cv2.aruco.ArucoDetector` without refinement, with sub-pixel refinement and with its AprilTag
 refinement, and, where it is installed (extra `apriltag`), pyapriltags without decimation.
 """
@@ -28,16 +28,16 @@ from model.rig import load_rig
 from model.scene import load_scene
 from simulation.camera.camera import SyntheticCamera
 from tests.tracking.hard_pictures import Condition, HardPicture, HardPrinter
-from tracking.camera_model import Image, pixels_from_ideal
+from tracking.camera_model import Image, distort_pixels
 from tracking.detection.detector import TagDetector
 from tracking.detection.tags import dictionary, modules_across, upright_corners
 from tracking.edges.refine import refine
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-#: Corners farther off than this share of a module are of something else, not a tag found.
+#: Detections with corners farther off than this share of a module count as false.
 NEAR = 0.7
-#: Number to corners, shape (4, 2), of one image; the number that is in it helps nobody but us,
-#: as it stands in the rig file.
+#: From an image and its tag number to corners by number, shape (4, 2) each; only ours uses the
+#: number, as a rig file gives it.
 Finder = Callable[[Image, int], Mapping[int, Array]]
 
 COLUMNS: dict[str, list[tuple[str, Condition]]] = {
@@ -48,7 +48,7 @@ COLUMNS: dict[str, list[tuple[str, Condition]]] = {
         (f"{tilt}", Condition(side_px=60, tilt=np.radians(tilt)))
         for tilt in (0, 30, 45, 60, 70, 75, 80)
     ],
-    "motion, px": [(f"{way}", Condition(side_px=60, motion_px=way)) for way in (2, 4, 6, 8, 10)],
+    "motion, px": [(f"{blur}", Condition(side_px=60, motion_px=blur)) for blur in (2, 4, 6, 8, 10)],
     "lens blur, px": [
         (f"{blur:g}", Condition(side_px=48, blur_px=blur)) for blur in (0.7, 1.5, 2, 2.5, 3)
     ],
@@ -61,17 +61,17 @@ COLUMNS: dict[str, list[tuple[str, Condition]]] = {
 
 
 def ours(family: str, printer: HardPrinter) -> Finder:
-    """What `cdpr` does: the detector, then the edges."""
+    """As in `cdpr`: detection, then edge refinement."""
     detector, modules = TagDetector(family), modules_across(family)
 
     def find(image: Image, number: int) -> Mapping[int, Array]:
         seen = detector.detect(image)
         if number not in {d.id for d in seen}:
-            seen = detector.detect(image, thorough=True)
+            seen = detector.detect(image, exhaustive=True)
         rough = np.array([d.corners for d in seen]).reshape(-1, 4, 2)
         squares = refine(image, printer.camera, rough, modules)
         return {
-            d.id: pixels_from_ideal(printer.camera, s.corners) if s is not None else d.corners
+            d.id: distort_pixels(printer.camera, s.corners) if s is not None else d.corners
             for d, s in zip(seen, squares, strict=True)
         }
 
@@ -97,7 +97,7 @@ def plain(family: str, refinement: int) -> Finder:
 
 
 def apriltag_library(family: str) -> Finder | None:
-    """Pyapriltags without decimation, its pixel centres and corner order mended."""
+    """Pyapriltags without decimation, with corrected pixel centres and corner order."""
     try:
         from pyapriltags import Detector
     except ImportError:
@@ -115,7 +115,7 @@ def apriltag_library(family: str) -> Finder | None:
 
 @dataclass
 class Score:
-    """What a finder made of the images of one condition."""
+    """Results of a detector under one condition."""
 
     pictures: int = 0
     found: int = 0
@@ -139,12 +139,12 @@ class Score:
 
     @property
     def rms(self) -> float:
-        """Of the corners of the tags found, [px]."""
+        """RMS error of the corners of detected tags, [px]."""
         return float(np.sqrt(self.square / self.found)) if self.found else float("nan")
 
 
 def finders_of(family: str, printer: HardPrinter) -> dict[str, Finder]:
-    """Who takes part."""
+    """The detectors to compare."""
     library = apriltag_library(family) if family.startswith("tag") else None
     if library is None:
         print("pyapriltags is left out: it is not installed (pip install 'cdpr[apriltag]')")
@@ -157,7 +157,7 @@ def finders_of(family: str, printer: HardPrinter) -> dict[str, Finder]:
 
 
 def table(family: str, count: int, seed: int) -> bool:
-    """Prints all columns; whether no peer finds more in any of them."""
+    """Prints all tables; returns whether no other detector finds more in any row."""
     printer = HardPrinter(family, tags_in(family))
     finders = finders_of(family, printer)
     best = True
@@ -176,7 +176,7 @@ def table(family: str, count: int, seed: int) -> bool:
             mine = scores.pop("ours")
             less = any(mine.found < s.found for s in scores.values())
             best &= not less
-            print(f"{label:>14s}{line}" + ("   fewer than a peer" if less else ""), flush=True)
+            print(f"{label:>14s}{line}" + ("   fewer than another" if less else ""), flush=True)
     return best
 
 
@@ -194,7 +194,7 @@ def times(rounds: int) -> None:
         "ours": lambda: detector.detect(image),
         "cv2 NONE": lambda: peer(image, 0),
         "cv2 SUBPIX": lambda: sub_pixel(image, 0),
-        "ours, thorough": lambda: detector.detect(image, thorough=True),
+        "ours, exhaustive": lambda: detector.detect(image, exhaustive=True),
     }
     if library is not None:
         who["pyapriltags"] = lambda: library(image, 0)
@@ -222,7 +222,7 @@ def main() -> int:
     cv2.setNumThreads(1)
     best = table(arguments.family, arguments.pictures, arguments.seed)
     times(arguments.rounds)
-    print("\nno peer finds more in any row" if best else "\na peer finds more in some row")
+    print("\nno other finds more in any row" if best else "\nanother finds more in some row")
     return 0 if best else 3
 
 

@@ -3,14 +3,14 @@
     python benchmarks/faults.py -o DIR [--transport virtual,udp] [--seeds 200] [--minutes 10]
         [--hours 0] [--jobs 2] [--drive-behaviour NAME[=VALUE] ...] [--only TEXT]
 
-writes `faults.json` and `faults.md` (a row a fault and transport), and `soak.csv` with a line for
-every random run: seed, faults, how it ended, violated invariants, memory of its process. The soak
-lasts until there are N runs, it took N minutes, and N hours were simulated; processes share it, and
-a seed gives the same run in each of them. In all of it the drives do what `--drive-behaviour` says
-(`cdpr sim RIG --drive-behaviour list`), beside what their row of the table says. The rows of `vcan`
-come from the tests on a CAN bus of the kernel: `--vcan FILE` names the `faults.json` that they left
-(`make hil`, then ~/.cache/cdpr/hil/last/table/faults.json). The exit code
-is 1 when anything is not as it must be. Not a test: it takes minutes.
+writes `faults.json` and `faults.md` (one row per fault and transport), and `soak.csv` with a line
+for every random run: seed, faults, how it ended, violated invariants, memory of its process. It
+lasts until all of its minimum numbers of runs, minutes and simulated hours are reached; processes
+share it, and a seed gives the same run in each of them. All drives have the behaviours of
+`--drive-behaviour` (`cdpr sim RIG --drive-behaviour list`) beside those of their row. The rows of
+`vcan` come from the tests on a CAN bus of the kernel: `--vcan FILE` names their `faults.json`
+(`make hil`, then ~/.cache/cdpr/hil/last/table/faults.json). The exit code is 1 on any violation.
+Not a test: it takes minutes.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def on_virtual(
             cycle = prepared.checked.table.cycle
             found = complaints(fault, bench, ended, bench.cause, cycle)
             rows.append(row(name, fault, "virtual", bench, ended, bench.cause, found))
-        told(rows[-1])
+        print_row(rows[-1])
     return rows
 
 
@@ -98,14 +98,14 @@ def on_udp(
     faults: dict[str, Fault],
     base: DriveBehaviour,
 ) -> list[dict[str, Any]]:
-    """Those that are possible between two processes, in real time."""
+    """Faults that are possible between two processes, in real time."""
     channel = f"239.74.163.26:{20000 + os.getpid() % 20000}"
     settings = BusSettings("udp_multicast", channel)
     rows = []
     for name, fault in faults.items():
         if fault.live:
             rows.append(_one_on_udp(prepared, folder, masters, settings, name, fault, base))
-            told(rows[-1])
+            print_row(rows[-1])
     return rows
 
 
@@ -118,7 +118,7 @@ def _one_on_udp(
     fault: Fault,
     base: DriveBehaviour,
 ) -> dict[str, Any]:
-    """Again where this computer held the simulated drives up."""
+    """One fault; repeated if this computer delayed the simulated drives."""
     for attempt in range(ATTEMPTS):
         path = folder / f"udp {name.replace('/', ' ')} {attempt}"
         behaviour = fault.drives(base)
@@ -135,19 +135,19 @@ def _one_on_udp(
     raise AssertionError("the last attempt returned")
 
 
-def told(entry: dict[str, Any]) -> None:
-    """As soon as it is known."""
+def print_row(entry: dict[str, Any]) -> None:
+    """Prints a row as soon as it is measured."""
     print(json.dumps(entry, ensure_ascii=False), flush=True)
 
 
 _soaked: PreparedRun
-"""What a process of the soak runs."""
+"""The run of a process of the soak."""
 _behaviour: DriveBehaviour
-"""And what its drives do."""
+"""The behaviour of its drives."""
 
 
 def soak(plan: Path, output: Path, options: argparse.Namespace) -> int:
-    """Random faults, at least as many and as long as asked; the number of runs with a violation."""
+    """Runs random faults up to all minimums; returns the number of runs with a violation."""
     begin, bad, passed, number = time.monotonic(), 0, 0.0, 0
     with (
         (output / "soak.csv").open("w", newline="") as file,
@@ -193,7 +193,7 @@ def _soak_line(runs: int, passed: float, took: float, bad: int) -> str:
 
 
 def _get_ready(plan: Path, behaviour: list[str]) -> None:
-    """Of a process of the soak."""
+    """Initializes a process of the soak."""
     global _soaked, _behaviour
     _soaked, _behaviour = (
         prepare(verify(load_plan(plan)), load_rig(RIG)),
@@ -202,7 +202,7 @@ def _get_ready(plan: Path, behaviour: list[str]) -> None:
 
 
 def _one(seed: int) -> tuple[RandomRun, float, int]:
-    """A random run; its process's memory [MB], and its objects."""
+    """A random run, with its process's memory [MB] and number of objects."""
     with tempfile.TemporaryDirectory() as folder:
         done = random_run(_soaked, Path(folder) / "run", seed, _behaviour)
     if seed % 50 == 0:
@@ -212,7 +212,7 @@ def _one(seed: int) -> tuple[RandomRun, float, int]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """As Markdown."""
+    """The rows as a Markdown table."""
     lines = [
         "| fault | transport | ended | stopped after | spread | worst step | travel | as it must |",
         "|---|---|---|---|---|---|---|---|",
@@ -224,13 +224,13 @@ def table(rows: list[dict[str, Any]]) -> str:
             for key, unit in numbers
         ]
         good = "yes" if not entry["violations"] else "; ".join(entry["violations"])
-        name, way = entry["fault"], entry["transport"]
-        lines.append(f"| {name} | {way} | {entry.get('ended')} | {' | '.join(cells)} | {good} |")
+        name, transport = entry["fault"], entry["transport"]
+        lines.append(f"| {' | '.join([name, transport, str(entry.get('ended')), *cells, good])} |")
     return "\n".join(lines) + "\n"
 
 
 def main() -> int:
-    """Does what the options ask for."""
+    """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(description="measure the fault table")
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--transport", default="virtual,udp", help="virtual, udp, or none")

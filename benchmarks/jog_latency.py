@@ -1,12 +1,12 @@
-"""Jogging by hold-to-run in real time over UDP: from a press to the first set-point, and to rest.
+"""Latency of hold-to-run jogs in real time over UDP: press to first set-point, release to rest.
 
     python benchmarks/jog_latency.py [--presses 60] [--scene configs/environment_1.yaml]
     python benchmarks/jog_latency.py --one-cable [--presses 60]
 
-Presses go by turns along both directions of each axis, held for 0.6 s; or they wind each cable in
-and pay it out again, on the taut platform. Measured on the loop's clock
-are the time from the first word of a press to the first cycle that sends other targets, and from
-the release to the last one, which includes the ramp from 20 mm/s. Not a test: it takes minutes.
+Presses of 0.6 s alternate between both directions of each axis; or they wind each cable in and pay
+it out again, on the taut platform. Two times are measured on the loop's clock: from the first
+message of a press to the first cycle with changed targets, and from the release to the last such
+cycle, which includes the ramp from 20 mm/s. Not a test: it takes minutes.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from model.scene import load_scene  # noqa: E402
 from tests.cli.plans import RIG  # noqa: E402
 
 HELD, PAUSE, SAID = 0.6, 0.9, 0.05
-#: Of this process alone: another one may measure, too.
+#: Unique to this process, as another may measure at the same time.
 CHANNEL = f"239.74.163.91:{20000 + os.getpid() % 20000}"
 
 
 @dataclass
 class Operator:
-    """Holds a control by turns, in a thread of its own, and keeps when."""
+    """Presses and releases a control in a thread and records the times."""
 
     presses: int
     one_cable: bool
@@ -54,7 +54,7 @@ class Operator:
     _thread: threading.Thread | None = None
 
     def on_cycle(self, record: CycleRecord, board: PressBoard, _: object) -> None:
-        """Begins when the drives are ready; keeps the times of cycles with other targets."""
+        """Starts when the drives are ready; records the times of cycles with changed targets."""
         if record.state is not State.MOVING:
             return
         self.lateness.append(record.lateness)
@@ -79,7 +79,7 @@ class Operator:
         board.end()
 
     def _say(self, board: PressBoard, number: int) -> bool:
-        """One word of a press: odd ones go forth or wind in, even ones back or pay out."""
+        """Sends one message of a press: odd ones forward or in, even ones backward or out."""
         turn, is_even = (number - 1) // 2, number % 2 == 0
         if self.one_cable:
             cable = 1 + turn % 8
@@ -91,7 +91,7 @@ class Operator:
 
 @contextmanager
 def drives() -> Iterator[None]:
-    """Simulated drives in a process of their own."""
+    """Simulated drives in their own process."""
     verb = "from cdpr.cli import main; main()"
     bus = ["--interface", "udp_multicast", "--channel", CHANNEL]
     process = subprocess.Popen(
@@ -117,9 +117,9 @@ def main() -> int:
     options = parser.parse_args()
     rig: Rig = load_rig(RIG).with_bus("udp_multicast", CHANNEL)
     operator = Operator(options.presses, options.one_cable)
-    with tempfile.TemporaryDirectory() as place:
-        os.environ["XDG_STATE_HOME"] = place
-        os.chdir(place)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_STATE_HOME"] = folder
+        os.chdir(folder)
         with drives():
             if options.one_cable:
                 cable_session(rig, need_real_time_rights=False, on_cycle=operator.on_cycle)
@@ -147,7 +147,7 @@ def main() -> int:
         f"{'lateness of cycles':26} median {late[0]:.3f}  p99.9 {late[1]:.3f}  most {late[2]:.3f}"
     )
     print(f"{len(operator.spans)} presses, {lost} without a motion;", end=" ")
-    print(f"{operator.silent} words came too late to be taken")
+    print(f"{operator.silent} messages came too late")
     return 1 if lost else 0
 
 

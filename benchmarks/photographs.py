@@ -1,12 +1,12 @@
-"""How many tags are found in photographs that nobody rendered, beside plain OpenCV and pyapriltags.
+"""Tag detection in real photographs, compared with plain OpenCV and pyapriltags.
 
     python benchmarks/photographs.py [--family tag36h11] [PICTURE ...]
 
-Without images those of the AprilTag library's own test, which lie in the repository. Where a
-listing of what that library finds lies beside an image (``NAME.txt``), the last columns tell how
-many of its tags are found, and how far their corners lie from its own.
+Without arguments it uses the images of the AprilTag library's own test, in this repository. Where
+``NAME.txt`` beside an image lists that library's detections, the last columns show how many of its
+tags are found, and the distance of their corners from its own.
 
-Other images that fit are in Debian's package `visp-images-data` (GPL-2, hence not here):
+Other suitable images are in Debian's package `visp-images-data` (GPL-2, hence not here):
 ``apt-get download visp-images-data && dpkg -x visp-images-data*.deb visp`` and then the files of
 ``visp/usr/share/visp-images-data/ViSP-images/AprilTag``.
 """
@@ -32,18 +32,18 @@ from tracking.detection.tags import dictionary, modules_across
 from tracking.edges.refine import refine
 
 ROOT = Path(__file__).parents[1]
-#: Corners farther off than this are of another tag, [px].
+#: Corners farther off than this belong to another tag, [px].
 NEAR = 2.0
 #: Corners of every tag in an image, each of shape (4, 2), [px].
 Finder = Callable[[Image], Sequence[Array]]
 
 
-def ours(family: str, thorough: bool) -> Finder:
-    """What `cdpr` does: the detector, then the edges of those whose edges can be measured."""
+def ours(family: str, exhaustive: bool) -> Finder:
+    """As in `cdpr`: detection, then edge refinement where possible."""
     detector, modules = TagDetector(family), modules_across(family)
 
     def find(image: Image) -> Sequence[Array]:
-        rough = np.array([d.corners for d in detector.detect_all(image, thorough=thorough)])
+        rough = np.array([d.corners for d in detector.detect_all(image, exhaustive=exhaustive)])
         squares = refine(image, _some_camera(image), rough.reshape(-1, 4, 2), modules)
         return [
             s.corners if s is not None and s.whole else corners
@@ -54,7 +54,7 @@ def ours(family: str, thorough: bool) -> Finder:
 
 
 def _some_camera(image: Image) -> Camera:
-    """A camera without lens distortion, whose ideal pixels are the image's."""
+    """A camera without lens distortion for the image's size."""
     camera = load_rig(ROOT / "configs" / "gachon_8_6.yaml").cameras[0]
     height, width = image.shape
     matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
@@ -76,7 +76,7 @@ def opencv(family: str) -> Finder:
 
 
 def apriltag_library(family: str) -> Finder | None:
-    """Pyapriltags without decimation, where it is installed; it tells pixel centres as 0.5."""
+    """Pyapriltags without decimation, if installed; its pixel centres are at 0.5."""
     try:
         from pyapriltags import Detector
     except ImportError:
@@ -88,8 +88,8 @@ def apriltag_library(family: str) -> Finder | None:
     ]
 
 
-def told(found: Sequence[Array], listing: Path) -> str:
-    """How many tags, and how they agree with a listing where there is one."""
+def summary(found: Sequence[Array], listing: Path) -> str:
+    """Number of tags, and their agreement with a listing if there is one."""
     if not listing.exists():
         return f"{len(found):6d}"
     reference = tags_found_by_apriltag(listing)
@@ -100,15 +100,15 @@ def told(found: Sequence[Array], listing: Path) -> str:
 
 
 def main() -> int:
-    """Prints a line for each image and finder."""
+    """Prints a line for each image and detector."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("pictures", nargs="*", type=Path)
     parser.add_argument("--family", default="tag36h11")
     arguments = parser.parse_args()
     shipped = sorted((ROOT / "tests" / "tracking" / "photographs").glob("*.jpg"))
     finders = {
-        "ours": ours(arguments.family, thorough=False),
-        "ours, thorough": ours(arguments.family, thorough=True),
+        "ours": ours(arguments.family, exhaustive=False),
+        "ours, exhaustive": ours(arguments.family, exhaustive=True),
         "cv2": opencv(arguments.family),
     }
     library = apriltag_library(arguments.family)
@@ -121,7 +121,8 @@ def main() -> int:
             print(f"{picture} cannot be read as an image", file=sys.stderr)
             return 2
         for name, find in finders.items():
-            print(f"{picture.name:28s}{name:16s}{told(find(image), picture.with_suffix('.txt'))}")
+            cells = summary(find(image), picture.with_suffix(".txt"))
+            print(f"{picture.name:28s}{name:16s}{cells}")
     return 0
 
 

@@ -1,6 +1,6 @@
-"""Random robots of 6 to 12 cables, and random scenes with little room for them.
+"""Random robots with 6 to 12 cables, and random scenes with little room for them.
 
-Everything follows from a seed and a number; the same two give the same robot or scene again.
+A seed and a number determine a robot or a scene.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ PULLEYS = 0.15
 """Share of the robots whose cables leave over pulleys."""
 _BASE = Path(__file__).parents[1] / "configs" / "gachon_8_6.yaml"
 _ENOUGH = 0.3
-"""Share of the workspace in which a drawn robot must hold its platform."""
+"""Minimum share of the workspace in which a random robot can hold its platform."""
 HELD_WELL = 5.0
-"""Margin at start and goal, times the planner's reserve: nearer to what the cables can hold at all
-a search asks for long proofs."""
+"""Margin at start and goal, as a multiple of the planner's reserve: near the limits of feasibility
+a search needs long proofs."""
 _TRIED, _ENDS = 60, 6
-"""Positions drawn for start and goal, and how many usable ones are enough."""
+"""Random positions tried for start and goal, and number of usable ones required."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A rig with what its scenes have in common.
+    """A rig with the common properties of its scenes.
 
     Attributes:
         rig: The robot.
         wxyz: Orientation of the platform in all its scenes.
         load: The ``load`` of a scene file.
-        self_mm: Self clearances of its scenes are drawn up to this.
+        self_mm: Largest self clearance of its scenes.
     """
 
     rig: Rig
@@ -97,7 +97,7 @@ def _drawn_rig(rng: np.random.Generator, count: int) -> Rig:
     size = rng.uniform(60.0, 200.0, 3)
     around = 2.0 * np.pi * (np.arange(count) + rng.uniform(-0.25, 0.25, count)) / count
     upper = np.ones(count, dtype=bool) if count < 8 else np.arange(count) % 2 == 0
-    alike = 1 if count < 8 else 2  # cables that hang from above hold turns in pairs
+    alike = 1 if count < 8 else 2  # suspended cables resist rotations in pairs
     twist = rng.uniform(0.2, 0.9) * np.where(np.arange(count) % (2 * alike) < alike, 1.0, -1.0)
     crossed = count >= 8 and rng.random() < 0.5
     outlets = np.column_stack(
@@ -151,7 +151,7 @@ def _square(angles: Array) -> Array:
 
 
 def random_scene(robot: Robot, seed: int, number: int) -> Scene | None:
-    """A scene for a robot; None where start and goal find no room."""
+    """A scene for a robot; None if there is no room for start and goal."""
     rng = np.random.default_rng([seed, number, 2])
     rig = robot.rig
     reach = float((rig.workspace_upper - rig.workspace_lower).min()) * 1e3
@@ -165,15 +165,15 @@ def random_scene(robot: Robot, seed: int, number: int) -> Scene | None:
     free = _usable(rng, robot, scene)
     if len(free) < 2:
         return None
-    ways = np.linalg.norm(free[:, None, :] - free[None, :, :], axis=-1)
-    first, second = np.unravel_index(int(np.argmax(ways)), ways.shape)
+    distances = np.linalg.norm(free[:, None, :] - free[None, :, :], axis=-1)
+    first, second = np.unravel_index(int(np.argmax(distances)), distances.shape)
     if rng.random() < 0.5:
         second = (first + 1) % len(free)
     return _scene(*fixed, free[first], free[second])
 
 
 def _usable(rng: np.random.Generator, robot: Robot, scene: Scene) -> Array:
-    """Some positions at which a plan may begin or end, shape (k, 3), [m]."""
+    """Positions where a plan can begin or end, shape (k, 3), [m]."""
     rig, found = robot.rig, []
     nearest = Nearness(rig, scene)
     for position in rng.uniform(rig.workspace_lower, rig.workspace_upper, (_TRIED, 3)):
@@ -205,11 +205,11 @@ def _scene(
 
 
 def _obstacle(rng: np.random.Generator, rig: Rig, name: str, reach_mm: float) -> dict[str, Any]:
-    """An obstacle of any shape in or about the workspace, where cables and platform meet it."""
+    """An obstacle of random shape in or around the workspace, near cables and platform."""
     size = rig.workspace_upper - rig.workspace_lower
-    place = rng.uniform(rig.workspace_lower - 0.4 * size, rig.workspace_upper + 0.4 * size)
+    position = rng.uniform(rig.workspace_lower - 0.4 * size, rig.workspace_upper + 0.4 * size)
     kind = str(rng.choice(SHAPES))
-    entry: dict[str, Any] = {"name": f"{kind}, {name}", "position_mm": (1e3 * place).tolist()}
+    entry: dict[str, Any] = {"name": f"{kind}, {name}", "position_mm": (1e3 * position).tolist()}
     if kind != "box":
         entry["rotation_wxyz"] = Rotation.random(rng=rng).as_quat(scalar_first=True).tolist()
     return entry | _shape(rng, kind, reach_mm)

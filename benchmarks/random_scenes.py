@@ -1,15 +1,15 @@
-"""Ten thousand random robots' scenes: plan each, and put every path to a second opinion.
+"""Ten thousand random scenes: plan each, and verify every path by a second opinion.
 
-    python benchmarks/random_scenes.py -o scenes --workers 2      # all of it; goes on where it was
+    python benchmarks/random_scenes.py -o scenes --workers 2      # everything; can be continued
     python benchmarks/random_scenes.py --scenes 200 -o scenes
     python benchmarks/random_scenes.py --repeat scenes/failure_17.json
 
-Robots of 6 to 12 cables, some over pulleys, tilted or loaded; 1 to 8 obstacles of all shapes;
-clearances near what the robot can keep. Plans get ``--budget-ms`` each and take turns with the
-objectives. No rule of the planner or of the check is used to judge a path (`second_opinion.py`);
-`cdpr check` is asked as well for every twentieth. Where the planner says that it is proved that
-there is no path, a search of a hundred rounds must not find one. A scene that fails is written as
-JSON with what repeats it. Exits with 1 when one does.
+Robots have 6 to 12 cables, some over pulleys, tilted or loaded; scenes have 1 to 8 obstacles of all
+shapes and clearances near the robot's limits. Each plan has ``--budget-ms``, with alternating
+objectives. The second opinion shares no code with planner and check (`second_opinion.py`); every
+twentieth path also goes through `cdpr check`. Where the planner proves that there is no path, a
+search of a hundred rounds must not find one. A failed scene is written as JSON to repeat it. Exits
+with 1 if one fails.
 """
 
 from __future__ import annotations
@@ -51,16 +51,16 @@ _LONGER = 100
 
 @dataclass(frozen=True)
 class Result:
-    """One scene.
+    """Result of one scene.
 
     Attributes:
         number: Of the scene.
         outcome: One of `OUTCOMES`.
-        problems: What the path does not keep, or why the outcome is wrong.
-        slack_mm: Smallest distance over what is needed; None without a path.
-        distances: How many were computed for the second opinion.
-        checked: Whether `cdpr check` was asked too.
-        again: What repeats a scene that failed; empty for all others.
+        problems: Violations of the path, or why the outcome is wrong.
+        slack_mm: Smallest distance beyond the required one; None without a path.
+        distances: Number of distances computed for the second opinion.
+        checked: Whether `cdpr check` was run too.
+        again: Data to repeat a failed scene; empty for all others.
     """
 
     number: int
@@ -73,7 +73,7 @@ class Result:
 
 
 def scenes_of(seed: int, robot_number: int, numbers: Sequence[int], budget: float) -> list[Result]:
-    """Some scenes of one robot."""
+    """Results of some scenes of one robot."""
     robot = random_robot(seed, robot_number)
     kinematic = KinematicCost(robot.rig, matrix_from_quaternion(robot.wxyz))
     return [scene_result(robot, kinematic, seed, number, budget) for number in numbers]
@@ -82,7 +82,7 @@ def scenes_of(seed: int, robot_number: int, numbers: Sequence[int], budget: floa
 def scene_result(
     robot: Robot, kinematic: KinematicCost, seed: int, number: int, budget: float
 ) -> Result:
-    """Draws a scene, plans in it and judges what comes of it."""
+    """Draws a scene, plans in it and verifies the result."""
     scene = random_scene(robot, seed, number)
     if scene is None:
         return Result(number, NO_ROOM)
@@ -99,7 +99,7 @@ def judged(
     objective: str,
     number: int,
 ) -> Result:
-    """Plans in a scene and judges what comes of it."""
+    """Plans in a scene and verifies the result."""
     again = {
         "rig": rig.document.model_dump(mode="json"),
         "scene": scene.document.model_dump(mode="json"),
@@ -130,17 +130,17 @@ def judged(
 def _refuted(
     rig: Rig, scene: Scene, kinematic: KinematicCost, settings: OptimalSettings
 ) -> list[str]:
-    """Whether a longer search finds what was proved not to be."""
+    """A problem if a longer search finds a path despite the proof."""
     longer = OptimalSettings(seed=settings.seed + 1, budget=settings.budget, rounds=_LONGER)
     try:
         optimal_route(rig, scene, longer, kinematic)
     except NoSolution:
         return []
-    return ["a path was found where it was proved that there is none"]
+    return ["a path was found despite a proof that there is none"]
 
 
 def run(seed: int, numbers: Sequence[int], budget: float, workers: int) -> Iterator[list[Result]]:
-    """All scenes, robot by robot, here or in some processes."""
+    """Runs all scenes, robot by robot, in this process or several."""
     tasks: dict[int, list[int]] = {}
     for number in numbers:
         tasks.setdefault(number // SCENES_OF_A_ROBOT, []).append(number)
@@ -155,7 +155,7 @@ def run(seed: int, numbers: Sequence[int], budget: float, workers: int) -> Itera
 
 
 def repeated(path: Path) -> Result:
-    """A scene that failed, from its file."""
+    """Repeats a failed scene from its file."""
     again = json.loads(path.read_text(encoding="utf-8"))
     rig = rig_from_document(RigDocument.model_validate(again["rig"]))
     scene = scene_from_document(SceneDocument.model_validate(again["scene"]))
@@ -166,7 +166,7 @@ def repeated(path: Path) -> Result:
 
 
 def summary(results: Sequence[Result]) -> str:
-    """The counts, as lines of Markdown."""
+    """The counts as Markdown."""
     outcomes = Counter(result.outcome for result in results)
     failed = [result for result in results if result.problems]
     slacks = [result.slack_mm for result in results if result.slack_mm is not None]
@@ -176,7 +176,7 @@ def summary(results: Sequence[Result]) -> str:
     counts += [sum(result.checked for result in results), len(failed)]
     lines.append("| " + " | ".join(str(count) for count in counts) + " |")
     distances = sum(result.distances for result in results)
-    lines.append(f"\n{distances} distances; least room left over what is asked for:")
+    lines.append(f"\n{distances} distances; smallest distance beyond the required one:")
     if slacks:
         least, middle = min(slacks), float(np.median(slacks))
         tight = float(np.mean([slack < 1.0 for slack in slacks]))
@@ -186,7 +186,7 @@ def summary(results: Sequence[Result]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs it from the shell; returns the exit code."""
+    """Command line; returns the exit code."""
     asked = _asked(arguments)
     if asked.repeat is not None:
         print(summary([result := repeated(asked.repeat)]))
@@ -233,7 +233,7 @@ def _asked(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--budget-ms", type=float, default=20.0, help="of each plan")
     parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--repeat", type=Path, help="only this scene that failed")
+    parser.add_argument("--repeat", type=Path, help="only this failed scene")
     parser.add_argument("-o", "--output", type=Path, default=Path("scenes"), help="folder")
     return parser.parse_args(arguments)
 

@@ -1,13 +1,13 @@
-"""Lateness of the real-time process beside a plain `time.sleep` loop, idle and with all cores busy.
+"""Lateness of the real-time process and of a plain `time.sleep` loop, idle and with busy cores.
 
     python benchmarks/realtime.py                       # 4 cases of 15 s: under 2 minutes
     python benchmarks/realtime.py --seconds 120 --rates 100 250
 
-The real-time process is the one of `cdpr run`, with all it does in a cycle: wishes, gate,
-set-points, simulated drives and platform in the same process, replies, watch, status ring. The
-plain loop runs at the same time in a process of its own: a thread that sleeps with `time.sleep`
-until its next cycle, beside another that writes JSON fifty times a second, as a program does that
-logs and serves. Lateness is how long after its deadline a cycle begins.
+The real-time process is that of `cdpr run`, with all work of a cycle: requests, gate, set-points,
+simulated drives and platform in the same process, replies, monitor, status ring. The plain loop
+runs at the same time in its own process: a thread sleeps with `time.sleep` until its next cycle,
+beside another that writes JSON fifty times a second, as a logging server does. Lateness is the
+delay of a cycle's start after its deadline.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ ENVIRONMENT = "environment_3.yaml"
 
 
 def prepared_at(rate: float, folder: Path) -> PreparedRun:
-    """The third environment of the paper, a path of half a minute, with cycles at a rate [Hz]."""
+    """A run in the paper's third environment, half a minute long, at a cycle rate [Hz]."""
     rig, scene = load_rig(ready_folder() / PAPER_RIG), load_scene(ready_folder() / ENVIRONMENT)
     plan = folder / f"plan-{rate:g}.json"
     save_plan(make_plan(rig, scene, OptimalSettings(seed=0)), plan)
@@ -59,13 +59,13 @@ def prepared_at(rate: float, folder: Path) -> PreparedRun:
 
 
 def with_cycle(rig: Rig, cycle_ms: float) -> Rig:
-    """The same rig at another rate."""
+    """The same rig at another cycle time."""
     bus = rig.document.bus.model_copy(update={"cycle_ms": cycle_ms})
     return rig_from_document(rig.document.model_copy(update={"bus": bus}))
 
 
 def process_lateness(prepared: PreparedRun, folder: Path, seconds: float) -> Array:
-    """Of every cycle of a run that is stopped after a time, [ms]."""
+    """Lateness of every cycle of a run that is stopped after a time, [ms]."""
     board = SharedRequests()
     run = RunFolder.create(folder)
     status = RunStatus(prepared, folder, board, simulated_time=False)
@@ -101,7 +101,7 @@ def process_lateness(prepared: PreparedRun, folder: Path, seconds: float) -> Arr
 
 
 def plain_loop(cycle: float, link: Connection) -> None:
-    """Another process: cycles by `time.sleep` in a thread until it is told to end."""
+    """The reference process: cycles by `time.sleep` in a thread until a message ends it."""
     late: list[float] = []
     over = threading.Event()
 
@@ -125,7 +125,7 @@ def plain_loop(cycle: float, link: Connection) -> None:
 
 
 def burn() -> None:
-    """Keeps a core busy until it is killed."""
+    """Keeps a core busy until killed."""
     while True:
         sum(range(100_000))
 
@@ -156,7 +156,7 @@ def row(rate: float, load: str, loop: str, late: Array) -> str:
 
 
 def measured(rate: float, busy: bool, seconds: float, folder: Path) -> list[str]:
-    """Both loops side by side."""
+    """Table rows of both loops, measured at the same time."""
     load = "all cores busy" if busy else "idle"
     print(f"  {rate:g} Hz, {load} ...", flush=True)
     context = multiprocessing.get_context("spawn")
@@ -184,10 +184,10 @@ SLOWEST_HZ = 10_000.0 / SLOWEST_TENTHS_MS
 
 
 def require_measurable(rates: Sequence[float], seconds: float) -> None:
-    """Nothing is planned and no core is kept busy for a case that arming would refuse.
+    """Refuses cases that arming would refuse, before planning and load.
 
     Raises:
-        BadInput: A rate is outside what a rig may have, or there is no time to measure in.
+        BadInput: A rate is outside the allowed range, or the time is not above 0 s.
         Refused: The bus has no room for the rate.
     """
     for rate in rates:
@@ -196,23 +196,23 @@ def require_measurable(rates: Sequence[float], seconds: float) -> None:
                 f"{rate:g} Hz is outside {SLOWEST_HZ:g} to {TESTED_HZ:g} Hz",
                 where="--rates",
                 why="arming refuses shorter cycles than were tested, the rig file longer ones",
-                next_step="name rates in that range",
+                next_step="use rates in that range",
             )
         check_bus_load(with_cycle(load_rig(ready_folder() / PAPER_RIG), 1000.0 / rate))
     if not (math.isfinite(seconds) and seconds > 0.0):
-        what = f"{seconds:g} s leave no time to measure in"
+        what = f"the measuring time is {seconds:g} s"
         raise BadInput(what, where="--seconds", next_step="give a time above 0 s")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 0, or 2 where something was asked that cannot be measured."""
+    """Command line; returns 0, or 2 for a case that cannot be measured."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=15.0, help="of motion, each case")
     parser.add_argument("--rates", type=float, nargs="+", default=[100.0, 250.0], help="[Hz]")
-    wishes = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
-        require_measurable(wishes.rates, wishes.seconds)
-        show_measured(wishes.rates, wishes.seconds)
+        require_measurable(options.rates, options.seconds)
+        show_measured(options.rates, options.seconds)
     except CdprError as error:
         print(error, file=sys.stderr)
         return 2
@@ -220,7 +220,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def show_measured(rates: Sequence[float], seconds: float) -> None:
-    """The whole table."""
+    """Measures and prints the table."""
     began = os.getloadavg()[0]
     rows: list[str] = []
     with TemporaryDirectory(prefix="cdpr-realtime-") as folder:

@@ -1,17 +1,17 @@
-"""A rig that is not built as its file says, calibrated by its own measurements: the whole round.
+"""Calibration of a simulated rig that differs from its file, from planning to verification.
 
     python benchmarks/rig_calibration.py [--count 60] [-o FOLDER]
     python benchmarks/rig_calibration.py --plants 12
     python benchmarks/rig_calibration.py --sensors 60
 
-With the program itself, on configs/gachon_8_6_rehearsal.yaml: plans where to measure, runs it with
-the synthetic camera, calibrates, and runs environment 3 before and after. Then, with the truth that
-only the simulation knows: how far off places are that were never measured, and what is told of the
-rig when the platform is never turned. Measured faster than the rig file says (50 mm/s, 4 images
-a second), which changes nothing at rest. With --plants only: how often the 95 % intervals hold the
-truth of so many other rigs, when the rig file tells the right stiffness and wrong ones, and when
-cables differ. With --sensors only: the same of rigs over pulleys, whose cables differ by 20 %, with
-swivel angles and an IMU beside lengths and poses, and how wide the intervals of the geometry are.
+With the program itself, on configs/gachon_8_6_rehearsal.yaml: plans measurement poses, runs it with
+the synthetic camera, calibrates, and runs environment 3 before and after. Then, against the
+ground truth: errors at unmeasured poses, and the result without rotations of the platform. The run
+is faster than the rig file (50 mm/s, 4 Hz images), which changes nothing at rest. With --plants
+only: coverage of the 95 % intervals over N other rigs, with right and wrong stiffness in the rig
+file, and with cables that differ. With --sensors only: the same for rigs with pulleys, whose cables
+differ by 20 %, with swivel angles and an IMU beside lengths and poses, and the widths of the
+geometry's intervals.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from model.rig import Rig, load_rig
 from model.winches import WinchMap
 from tests.calibration.rig_places import (
     Truth,
-    built_otherwise,
-    drawn_with,
-    places,
+    rig_with_errors,
+    samples,
     share_inside,
     true_numbers,
+    with_nominal_stiffness,
 )
 from tests.calibration.synthetic_rig import LENGTH_NOISE, built_rig, measured, only
 
@@ -61,7 +61,7 @@ goal: {position_mm: [0, 0, 445]}
 
 
 def cdpr(*arguments: object, allowed: tuple[int, ...] = (0,)) -> dict[str, Any]:
-    """What the program answers with --json."""
+    """The program's JSON output."""
     command = [sys.executable, "-c", "from cdpr.cli import main; main()", *map(str, arguments)]
     done = subprocess.run(
         [*command, "--json"], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False
@@ -73,7 +73,7 @@ def cdpr(*arguments: object, allowed: tuple[int, ...] = (0,)) -> dict[str, Any]:
 
 
 def fast_rig(folder: Path) -> Path:
-    """The same rig, moving faster and looked at less often."""
+    """The same rig with faster motion and fewer images."""
     text = RIG.read_text(encoding="utf-8")
     text = text.replace("speed_mm_s: 20\n", "speed_mm_s: 50\n", 1)
     text = text.replace("acceleration_mm_s2: 100\n", "acceleration_mm_s2: 300\n", 1)
@@ -83,8 +83,8 @@ def fast_rig(folder: Path) -> Path:
     return path
 
 
-def told_wrong(rig: Rig, truth: Truth) -> float:
-    """How far off forward kinematics of a rig puts the platform, RMS, [mm]."""
+def position_error(rig: Rig, truth: Truth) -> float:
+    """Error of the platform position by forward kinematics of a rig, RMS, [mm]."""
     winches, data = WinchMap(rig), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
     found, _ = poses_near(rig, lengths, truth.positions, truth.rotations, steps=20)
@@ -93,7 +93,7 @@ def told_wrong(rig: Rig, truth: Truth) -> float:
 
 
 def run_of_environment_3(folder: Path, name: str, *calibration: object) -> dict[str, Any]:
-    """The summary of a run, whether its checks pass or not."""
+    """The summary of a run, passed or not."""
     plan = folder / f"{name}.json"
     cdpr("plan", RIG, ENVIRONMENT, "-o", plan, "--rounds", 300, *calibration)
     run = ("run", plan, "--rig", RIG, "-o", folder / name, "--fast", *calibration)
@@ -101,55 +101,55 @@ def run_of_environment_3(folder: Path, name: str, *calibration: object) -> dict[
 
 
 def show(name: str, value: str) -> None:
-    """A line."""
+    """Prints a line."""
     print(f"{name:58s} {value}", flush=True)
 
 
 def whole_round(folder: Path, count: int) -> None:
-    """Before, measuring, calibrating, after."""
+    """Run before, measurement, calibration, run after."""
     free, fast = folder / "free.yaml", fast_rig(folder)
     free.write_text(FREE, encoding="utf-8")
     before = run_of_environment_3(folder, "before")
-    show("environment 3 before, by tag", in_words(before))
+    show("environment 3 before, by tag", tracking_error(before))
     plan = folder / "measure.json"
     planned = cdpr("calibrate", "poses", RIG, free, "-o", plan, "--count", count)
-    turned = max(planned["turned_deg"])
-    show("poses for measuring", f"{count}, turned by up to {turned:.1f} deg")
+    rotated = max(planned["turned_deg"])
+    show("poses for measuring", f"{count}, rotated by up to {rotated:.1f} deg")
     cdpr("run", plan, "--rig", fast, "-o", folder / "measuring", "--fast", allowed=(0, 1))
     out = folder / "calibration"
-    told = cdpr("calibrate", "rig", RIG, folder / "measuring", "-o", out, allowed=(0, 3))
-    show("verdict", told["verdict"])
+    result = cdpr("calibrate", "rig", RIG, folder / "measuring", "-o", out, allowed=(0, 3))
+    show("verdict", result["verdict"])
     show(
         "held out, by tag (RMS)",
-        f"{told['held_out_mm']:.3f} mm, by the rig file {told['before_mm']:.3f} mm",
+        f"{result['held_out_mm']:.3f} mm, by the rig file {result['before_mm']:.3f} mm",
     )
-    for line in told["not_identified"]:
+    for line in result["not_identified"]:
         show("not identified", line)
     (file,) = out.glob("*.yaml")
     rig = load_rig(RIG)
     corrected = rig.with_calibration(load_result(file))
-    for name, tilt in (("level", 0.0), ("turned by up to 8 deg", math.radians(8.0))):
-        truth = places(rig, 100, tilt=tilt, seed=77, noise=0.0)
-        errors = (told_wrong(rig, truth), told_wrong(corrected, truth))
+    for name, tilt in (("level", 0.0), ("rotated by up to 8 deg", math.radians(8.0))):
+        truth = samples(rig, 100, tilt=tilt, seed=77, noise=0.0)
+        errors = (position_error(rig, truth), position_error(corrected, truth))
         show(
-            f"100 places never measured, {name}, against the truth",
+            f"100 unmeasured poses, {name}, against the truth",
             f"{errors[0]:.3f} mm before, {errors[1]:.3f} mm after (RMS)",
         )
     after = run_of_environment_3(folder, "after", "--calibration", file)
-    show("environment 3 after, by tag", in_words(after))
+    show("environment 3 after, by tag", tracking_error(after))
 
 
-def in_words(summary: dict[str, Any]) -> str:
-    """How well a run was followed, as the camera saw it."""
+def tracking_error(summary: dict[str, Any]) -> str:
+    """Tracking error of a run by the camera, and its verdict."""
     error = summary["tag_error_mm"]
     return f"{error['rms']:.3f} mm RMS, at most {error['max']:.3f} mm; {summary['verdict']}"
 
 
-def never_turned(count: int) -> None:
-    """What level places tell, with poses and by lengths alone."""
+def without_rotation(count: int) -> None:
+    """Results of level samples, with poses and from lengths alone."""
     rig = load_rig(RIG)
-    level = places(rig, count, tilt=0.0, seed=5).measured
-    for name, data in (("poses, never turned", level), ("lengths alone", level.without_poses())):
+    level = samples(rig, count, tilt=0.0, seed=5).measured
+    for name, data in (("poses, never rotated", level), ("lengths alone", level.without_poses())):
         result = fit_rig(rig, data, DEFAULT_DEVIATIONS, 1e-4)
         quality = judge_rig(result, 1e-3, math.radians(5.0))
         unknown = result.observability.unknown
@@ -158,20 +158,20 @@ def never_turned(count: int) -> None:
         for line in result.not_identified:
             show("  not identified", line)
         show(
-            f"  {unknown.shape[1]} directions left as drawn, moved by",
+            f"  {unknown.shape[1]} directions left as in the rig file, moved by",
             f"{np.abs(moved).max(initial=0.0):.1e} deviations",
         )
 
 
 def coverage(plants: int, count: int) -> None:
-    """Outlets, anchors, drums and stiffness of rigs that are each built otherwise."""
+    """Coverage for outlets, anchors, drums and stiffness of random rigs."""
     rig = load_rig(RIG)
     for share in (1.0, 0.5, 2.0, 4.0, 100.0):
         inside, good, false = [], 0, 0
         for seed in range(plants):
-            built = built_otherwise(rig, seed)
-            data = places(built, count, tilt=math.radians(8.0), seed=1000 + seed).measured
-            drawn = drawn_with(built, share * rig.document.cables.stiffness_n)
+            built = rig_with_errors(rig, seed)
+            data = samples(built, count, tilt=math.radians(8.0), seed=1000 + seed).measured
+            drawn = with_nominal_stiffness(built, share * rig.document.cables.stiffness_n)
             result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, 1e-4)
             verdict = judge_rig(result, 1e-3, math.radians(5.0)).verdict
             inside.append(share_inside(result.intervals, true_numbers(built)))
@@ -185,7 +185,7 @@ def coverage(plants: int, count: int) -> None:
 
 
 def cables_that_differ(plants: int, count: int) -> None:
-    """One stiffness for all cables, and one for each, of cables that differ."""
+    """Coverage with one stiffness for all cables, and one for each, of cables that differ."""
     rig = load_rig(RIG)
     each = {"cable_stiffness" if g == "stiffness" else g: d for g, d in DEFAULT_DEVIATIONS.items()}
     for spread in (0.1, 0.2, 0.3):
@@ -194,8 +194,8 @@ def cables_that_differ(plants: int, count: int) -> None:
             for seed in range(plants):
                 shares = np.exp(spread * np.random.default_rng(seed).standard_normal(8))
                 stiffness = rig.document.cables.stiffness_n * shares
-                built = built_otherwise(rig, seed, stiffness.tolist())
-                data = places(built, count, tilt=math.radians(8.0), seed=1000 + seed).measured
+                built = rig_with_errors(rig, seed, stiffness.tolist())
+                data = samples(built, count, tilt=math.radians(8.0), seed=1000 + seed).measured
                 result = fit_rig(built, data, deviations, 1e-4)
                 true = true_numbers(built)
                 del true["stiffness_n"]
@@ -218,7 +218,7 @@ KINDS: dict[str, tuple[str, ...]] = {
 
 
 def sensors(plants: int, count: int) -> None:
-    """Coverage by group, and the geometry's intervals beside those without a sensor."""
+    """Coverage by group, and interval widths relative to those without sensors."""
     rig, degree = load_rig(HALL), math.radians(1.0)
     for poses in (True, False):
         shares: dict[tuple[str, str], list[float]] = {}
@@ -228,14 +228,14 @@ def sensors(plants: int, count: int) -> None:
             data = measured(built, count, 1000 + seed)
             alone: dict[str, float] = {}
             for kind, which in KINDS.items():
-                sought = {g: d for g, d in DEFAULT_DEVIATIONS.items() if g != "stiffness"}
-                sought |= {"cable_stiffness": 0.2, "imu_mounting": degree}
-                sought = {
+                estimated = {g: d for g, d in DEFAULT_DEVIATIONS.items() if g != "stiffness"}
+                estimated |= {"cable_stiffness": 0.2, "imu_mounting": degree}
+                estimated = {
                     g: d
-                    for g, d in sought.items()
+                    for g, d in estimated.items()
                     if SENSOR_OF.get(g) is None or SENSOR_OF[g] in which
                 }
-                parameters = Parameters.of(rig, sought)
+                parameters = Parameters.of(rig, estimated)
                 part = only(data if poses else data.without_poses(), *which)
                 fit, observability = identified(parameters, part, LENGTH_NOISE)
                 found = uncertainty_of_rig(parameters, part, fit, observability)
@@ -259,12 +259,12 @@ def sensors(plants: int, count: int) -> None:
 
 
 def main() -> None:
-    """Prints a line a figure."""
+    """Prints one line per figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("-o", "--output", type=Path, help="keep the files in this new folder")
-    parser.add_argument("--plants", type=int, help="only how often intervals hold the truth")
-    parser.add_argument("--sensors", type=int, help="only further sensors, with so many rigs")
+    parser.add_argument("--plants", type=int, help="only coverage, over this many rigs")
+    parser.add_argument("--sensors", type=int, help="only further sensors, over this many rigs")
     options = parser.parse_args()
     if options.sensors is not None:
         sensors(options.sensors, options.count)
@@ -279,7 +279,7 @@ def main() -> None:
     else:
         with tempfile.TemporaryDirectory() as folder:
             whole_round(Path(folder), options.count)
-    never_turned(options.count)
+    without_rotation(options.count)
 
 
 if __name__ == "__main__":

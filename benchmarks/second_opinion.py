@@ -1,11 +1,11 @@
-"""What a path keeps, found by another route than the planner's and the check's.
+"""Verification of a path, independent of planner and check.
 
-Distances are coal's, of primitive shapes (cables are threads, hulls are hulls, meshes are their
-triangles), at places 40 mm apart and at every corner. A distance changes by no more than the motion
-(twice as fast between cables over pulleys), so neighbours that differ by more show a wrong one, and
-two neighbours bound what is between them: where the bound is too low, there is another place in the
-middle, until every pair is proved or two places are 20 µm apart. Tensions are found by a quadratic
-program at the first places; each solution is put into the equations again.
+Distances are coal's, between primitive shapes (cables are threads, hulls are hulls, meshes are
+their triangles), at samples 40 mm apart and at every corner. A distance changes at most by the
+motion (twice that between cables over pulleys): larger differences between neighbours reveal an
+error, and two neighbours bound the distance between them. Where the bound is too low, the interval
+is bisected until every pair is proved or samples are 20 µm apart. Tensions are found by a quadratic
+program at the first samples; each solution is verified in the equations.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ Part = tuple[int, float, float]
 
 @dataclass
 class Opinion:
-    """What was found along one path.
+    """Result for one path.
 
     Attributes:
-        problems: What it does not keep, a line each.
-        slack: Smallest distance over what is needed, of obstacles and of the robot itself, [m].
-        distances: How many were computed.
+        problems: Violations, one line each.
+        slack: Smallest distance beyond the required one, to obstacles and between bodies, [m].
+        distances: Number of distances computed.
     """
 
     problems: list[str] = field(default_factory=list)
@@ -47,7 +47,7 @@ class Opinion:
 
 
 def second_opinion(rig: Rig, scene: Scene, path: Array) -> Opinion:
-    """Everything a path under translation must keep.
+    """Verifies all requirements of a path under pure translation.
 
     Args:
         rig: The robot.
@@ -55,22 +55,22 @@ def second_opinion(rig: Rig, scene: Scene, path: Array) -> Opinion:
         path: Corners, shape (k, 3), [m].
     """
     found = Opinion()
-    _look_at_ends(rig, scene, path, found)
+    _check_ends(rig, scene, path, found)
     robot = _Robot(rig, scene, path)
-    places = robot.first_places()
+    samples = robot.first_samples()
     for pair in _pairs(rig, scene):
-        _prove(robot, pair, places, found)
-    for place in places.tolist():
-        problem = tension_problem(rig, scene, robot.position(place))
+        _prove(robot, pair, samples, found)
+    for s in samples.tolist():
+        problem = tension_problem(rig, scene, robot.position(s))
         if problem:
-            found.problems.append(f"{problem} at {place * 1e3:.1f} mm")
+            found.problems.append(f"{problem} at {s * 1e3:.1f} mm")
             break
     return found
 
 
-def _look_at_ends(rig: Rig, scene: Scene, path: Array, found: Opinion) -> None:
+def _check_ends(rig: Rig, scene: Scene, path: Array, found: Opinion) -> None:
     if not np.isfinite(path).all():
-        found.problems.append("a corner is no number")
+        found.problems.append("a corner is not finite")
     outside = np.maximum(rig.workspace_lower - path, path - rig.workspace_upper).max()
     if not outside <= 1e-8:
         found.problems.append(f"{outside * 1e3:.6f} mm outside the workspace")
@@ -82,11 +82,11 @@ def _look_at_ends(rig: Rig, scene: Scene, path: Array, found: Opinion) -> None:
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two bodies, and what they need.
+    """Two bodies and their required distance.
 
-    A part of the robot is a cable's number and lengths left out at its anchor and at its exit, or
-    the number after the last cable's for the platform. The other body is a part too,
-    or fixed, and then the second part stands for nothing.
+    A part of the robot is a cable's number with the lengths left out at its anchor and at its exit,
+    or the number after the last cable's for the platform. The other body is a part too, or fixed;
+    then the second part is unused.
     """
 
     name: str
@@ -123,21 +123,21 @@ def _pairs(rig: Rig, scene: Scene) -> Iterator[_Pair]:
 
 
 class Nearness:
-    """Whether single positions keep what is asked for."""
+    """Whether single positions meet the required distances."""
 
     def __init__(self, rig: Rig, scene: Scene) -> None:
-        """Makes the obstacles once."""
+        """Builds the obstacles once."""
         self._rig, self._scene = rig, scene
         self._all = list(_pairs(rig, scene))
 
     def is_usable(self, position: Array, reserve: float) -> bool:
-        """Whether all distances at a position, shape (3,), [m], are what is needed and more."""
+        """Whether all distances at a position, (3,), [m], exceed the required ones by a reserve."""
         robot = _Robot(self._rig, self._scene, position[None, :])
         return all(_room(robot, pair, 0.0) >= reserve for pair in self._all)
 
 
 class _Robot:
-    """The robot's bodies along a path, made when they are asked for."""
+    """The robot's bodies along a path, built on demand."""
 
     def __init__(self, rig: Rig, scene: Scene, path: Array) -> None:
         self.rig = rig
@@ -150,46 +150,46 @@ class _Robot:
         self._cables: dict[float, tuple[Array, Array]] = {}
         self._made: dict[tuple[float, Part], Body] = {}
 
-    def first_places(self) -> Array:
-        """Every corner, and places between, as ways from the start, [m]."""
-        places = [0.0]
+    def first_samples(self) -> Array:
+        """Every corner and samples between them, as path lengths from the start, [m]."""
+        samples = [0.0]
         for low, high in zip(self._marks[:-1], self._marks[1:], strict=True):
             if high > low:
                 count = int(np.ceil((high - low) / SPACING))
-                places += np.linspace(low, high, count + 1)[1:].tolist()
-        return np.array(places)
+                samples += np.linspace(low, high, count + 1)[1:].tolist()
+        return np.array(samples)
 
-    def position(self, place: float) -> Array:
-        """Of the platform, shape (3,), [m]."""
-        return np.array([np.interp(place, self._marks, axis) for axis in self._path.T])
+    def position(self, s: float) -> Array:
+        """Position of the platform at path length ``s``, shape (3,), [m]."""
+        return np.array([np.interp(s, self._marks, axis) for axis in self._path.T])
 
-    def body(self, part: Part, place: float) -> Body:
-        """A part of a cable, or the platform, with the platform at a place."""
-        key = (place, part)
+    def body(self, part: Part, s: float) -> Body:
+        """A part of a cable, or the platform, at path length ``s``."""
+        key = (s, part)
         if key not in self._made:
-            self._made[key] = self._body(part, place)
+            self._made[key] = self._body(part, s)
         return self._made[key]
 
-    def _body(self, part: Part, place: float) -> Body:
+    def _body(self, part: Part, s: float) -> Body:
         number, at_anchor, at_exit = part
         if number == self.rig.cable_count:
-            return self._box, coal.Transform3s(self._rotation, self.position(place))
-        if place not in self._cables:
-            cables = cables_to(self.rig, self._arms + self.position(place))
-            self._cables[place] = (np.array(cables.exits), np.array(cables.anchors))
-        exits, anchors = self._cables[place]
+            return self._box, coal.Transform3s(self._rotation, self.position(s))
+        if s not in self._cables:
+            cables = cables_to(self.rig, self._arms + self.position(s))
+            self._cables[s] = (np.array(cables.exits), np.array(cables.anchors))
+        exits, anchors = self._cables[s]
         return thread(exits[number], anchors[number], at_exit, at_anchor)
 
 
-def _prove(robot: _Robot, pair: _Pair, places: Array, found: Opinion) -> None:
-    """One pair along the whole path, finer and finer where it is not proved."""
+def _prove(robot: _Robot, pair: _Pair, samples: Array, found: Opinion) -> None:
+    """Proves one pair along the whole path, bisecting intervals that are not proved."""
 
-    def room(place: float) -> float:
+    def room(s: float) -> float:
         found.distances += 1
-        return _room(robot, pair, place)
+        return _room(robot, pair, s)
 
-    values = [room(place) for place in places.tolist()]
-    open_parts = list(zip(places[:-1], values[:-1], places[1:], values[1:], strict=True))
+    values = [room(s) for s in samples.tolist()]
+    open_parts = list(zip(samples[:-1], values[:-1], samples[1:], values[1:], strict=True))
     least = min(values)
     while open_parts:
         low, at_low, high, at_high = open_parts.pop()
@@ -209,10 +209,10 @@ def _prove(robot: _Robot, pair: _Pair, places: Array, found: Opinion) -> None:
         found.slack = min(found.slack, least)
         return
     found.slack = min(found.slack, least)
-    found.problems.append(f"{pair.name}: {least * 1e3:+.5f} mm over what is needed, not proved")
+    found.problems.append(f"{pair.name}: {least * 1e3:+.5f} mm beyond the required, not proved")
 
 
-def _room(robot: _Robot, pair: _Pair, place: float) -> float:
-    """Distance of the surfaces of a pair over what it needs, [m]; below 0 it is too little."""
-    second = pair.fixed or robot.body(pair.second, place)
-    return distance(robot.body(pair.first, place), second) - pair.needed
+def _room(robot: _Robot, pair: _Pair, s: float) -> float:
+    """Distance of a pair's surfaces minus the required one, [m]."""
+    second = pair.fixed or robot.body(pair.second, s)
+    return distance(robot.body(pair.first, s), second) - pair.needed

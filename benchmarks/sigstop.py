@@ -2,7 +2,7 @@
 
     python benchmarks/sigstop.py [--from 5] [--to 60] [--step 1] [--seed 0] [-o FILE]
 
-prints a row for each duration: where in the cycle it began, how late the next cycle was, how the
+prints a row for each duration: its start within the cycle, the lateness of the next cycle, how the
 run ended, "enable operation" frames that reached a drive after it had stopped, and drives that such
 a frame enabled again, of which there must be none (exit code 1 otherwise). States and frames are
 those on the drives' side. Not a test: it takes about five minutes.
@@ -51,7 +51,7 @@ HEAD = "|   ms | from SYNC | late by | ended    | 0Fh after | again | EMCY befor
 def one(
     prepared: PreparedRun, folder: Path, masters: Masters, milliseconds: int, after: float
 ) -> tuple[Seen, str, float, int]:
-    """One run; what the drives saw, how it ended, its worst lateness, and EMCY before."""
+    """One run: observations by the drives, how it ended, worst lateness, EMCY before."""
     settings = BusSettings("udp_multicast", f"239.74.163.37:{20000 + os.getpid() % 20000}")
     suspension = Suspension(lambda: running[0].process, milliseconds, after)
     running: list[LiveBench] = []
@@ -74,7 +74,7 @@ def one(
 
 
 def main() -> int:
-    """All durations; 1 when a drive was enabled again."""
+    """Runs all durations; returns 1 if a drive was enabled again."""
     parser = argparse.ArgumentParser(description="SIGSTOP of the executor while it moves drives")
     parser.add_argument("--from", dest="first", type=int, default=5)
     parser.add_argument("--to", dest="last", type=int, default=60)

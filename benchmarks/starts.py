@@ -1,14 +1,14 @@
-"""Starts and releases over UDP in real time, with the machine loaded: how many fail by a gap.
+"""Starts and releases over UDP in real time on a loaded machine: failures from a gap.
 
     python benchmarks/starts.py [--pairs 500] [--minutes 60] [--busy 2] [-o FILE]
 
 Each pair is `cdpr run` of a short plan and then `cdpr release`, through the real command line, with
-strict simulated drives in a process of their own that report a missed SYNC, set-point or heartbeat
-in any NMT-operational state. Counted are, apart from each other: starts and releases that came to
-their end; those that failed before a drive was enabled, or with an EMCY 8130h, 8250h or 8700h
-before it (a gap of the program's); those that failed before it for all eight simulated drives,
-which are one process, fell silent; and those that failed while the drives moved, because a cycle
-came late or the simulated drives were held up. The exit code is 1 when a gap was seen. Not a test.
+strict simulated drives in their own process that report a missed SYNC, set-point or heartbeat in
+any NMT-operational state. Separate counts: starts and releases that finished; those that failed
+before a drive was enabled, or with an EMCY 8130h, 8250h or 8700h before that (a gap of the
+program); those that failed before that because all eight simulated drives, which are one process,
+fell silent; and those that failed while the drives moved, because a cycle was late or the simulated
+drives were delayed. The exit code is 1 if there was a gap. Not a test.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ GOAL_MM = (0.0, 5.0, 455.0)
 
 
 def drives(prepared: PreparedRun, settings: BusSettings, link: Connection) -> None:
-    """A process of drives; at each word from the link it says what they reported since the last."""
+    """A process of drives; answers each message on the link with their new reports."""
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(40))
     document = prepared.rig.document.bus.model_copy(
@@ -87,7 +87,7 @@ def drives(prepared: PreparedRun, settings: BusSettings, link: Connection) -> No
 
 @contextmanager
 def drives_apart(prepared: PreparedRun, settings: BusSettings) -> Iterator[Connection]:
-    """The link to them."""
+    """Drives in their own process; yields the link to them."""
     context = multiprocessing.get_context("fork")
     near, far = context.Pipe()
     process = context.Process(target=drives, args=(prepared, settings, far))
@@ -101,22 +101,22 @@ def drives_apart(prepared: PreparedRun, settings: BusSettings) -> Iterator[Conne
 
 
 def busy() -> None:
-    """Holds a processor."""
+    """Keeps a processor busy."""
     while True:
         pass
 
 
 def outcome(what: str, code: int, early: list[int], followed: bool, said: str) -> str:
-    """Which count it belongs to."""
+    """The category of a result."""
     if early:
         return f"{what}: GAP, EMCY {early[0]:04X}h before enabling"
     if code == 0:
-        return f"{what}: came to its end"
+        return f"{what}: finished"
     if not followed and "all 8 drives stopped answering" in said:
-        return f"{what}: not begun, the simulated drives were held up"
+        return f"{what}: not begun, the simulated drives were delayed"
     if not followed:
         return f"{what}: GAP, failed before enabling"
-    late = "a cycle came late" if "cycles late" in said else "drives or replies held up"
+    late = "a cycle was late" if "cycles late" in said else "drives or replies delayed"
     return f"{what}: stopped in motion, {late}"
 
 
@@ -134,19 +134,19 @@ def pair(prepared: PreparedRun, rig: Path, plan: Path, folder: Path, number: int
             link.send(True)
             early, followed = link.recv()
             found.append(outcome(what, answer.code, early, followed, answer.said))
-            if "GAP" in found[-1] or "held up" in found[-1]:
+            if "GAP" in found[-1] or "delayed" in found[-1]:
                 print(number, found[-1], answer.said[-400:], flush=True)
             if answer.code:
-                return found  # a fault is latched; the next pair has a bus of its own
+                return found  # a fault is latched; the next pair has its own bus
     return found
 
 
 def main() -> int:
-    """As many pairs as asked, or as fit into the time."""
+    """Runs pairs up to the number or the time given."""
     parser = argparse.ArgumentParser(description="starts and releases with the machine loaded")
     parser.add_argument("--pairs", type=int, default=500)
     parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--busy", type=int, default=os.cpu_count() or 1, help="busy loops beside")
+    parser.add_argument("--busy", type=int, default=os.cpu_count() or 1, help="busy loops")
     parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
     begin, counts = time.monotonic(), Counter[str]()

@@ -1,13 +1,13 @@
-"""How exactly the platform's pose is tracked, beside plain OpenCV and pyapriltags.
+"""Accuracy of pose tracking, compared with plain OpenCV and pyapriltags.
 
     python benchmarks/tag_tracking.py [--frames 1000] [--peer-every 5] [--heights 720 1080]
 
-The ready rig's cube (96 mm tags on 130 mm faces) flies a smooth curve with turns of up to 10°,
-about 1.6 m before the camera, which sees three faces, at 1280 x 720 and at 1920 x 1080 px. Peers
-get every fifth of the same images: their corners of all platform tags go through
+The ready rig's cube (96 mm tags on 130 mm faces) moves along a smooth curve with rotations of up to
+10°, about 1.6 m in front of the camera, which sees three faces, at 1280 x 720 and 1920 x 1080 px.
+The references get every fifth of the same images: their corners of all platform tags go through
 `cv2.solvePnP` (SQPnP, then Levenberg-Marquardt). NEES is the squared error in units of the stated
-covariance; its mean is 6 when that covariance is exact. A picture of a bare wall, in which there is
-nothing to find, is timed beside plain OpenCV. A height of 2598 px makes 12 megapixels.
+covariance; its mean is 6 for an exact covariance. An image of a bare wall, without anything to
+detect, is timed beside plain OpenCV. A height of 2598 px makes 12 megapixels.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-#: A pose turned farther from the truth than this is a flip, [rad].
+#: A pose rotated farther from the truth than this is a flip, [rad].
 FLIP = np.radians(5.0)
 #: Targets of position [m] and rotation [rad], RMS, from an image height on.
 TARGETS = {720: (0.8e-3, np.radians(0.1)), 1080: (0.3e-3, np.radians(0.03))}
-#: Pictures of a bare wall.
+#: Number of images of a bare wall.
 WALLS = 15
 
 
@@ -64,18 +64,18 @@ class Score:
     def line(self) -> str:
         """One line of the table."""
         errors = np.array(self.errors).reshape(-1, 6)
-        place, turn = self.rms
+        position, turn = self.rms
         flips = int(np.sum(np.linalg.norm(errors[:, 3:], axis=1) > FLIP))
         worst = float(np.linalg.norm(errors[:, :3], axis=1).max()) * 1e3
         middle = float(np.median(self.seconds)) * 1e3
         return (
-            f"{len(errors):7d}{self.missed:8d}{place * 1e3:9.3f}{worst:9.2f}"
+            f"{len(errors):7d}{self.missed:8d}{position * 1e3:9.3f}{worst:9.2f}"
             f"{np.degrees(turn):9.4f}{flips:7d}{middle:9.1f}"
         )
 
     @property
     def rms(self) -> tuple[float, float]:
-        """Of position [m] and of rotation [rad]."""
+        """RMS errors of position [m] and rotation [rad]."""
         errors = np.array(self.errors)
         return (
             float(np.sqrt(np.mean(np.sum(errors[:, :3] ** 2, axis=1)))),
@@ -87,17 +87,17 @@ def curve(count: int) -> Iterator[Pose]:
     """Smooth motion through the workspace at 20 images a second and up to 0.1 m/s."""
     for k in range(count):
         s = k / 20.0
-        place = [
+        position = [
             0.12 * np.sin(0.41 * s),
             0.12 * np.sin(0.53 * s + 1),
             0.42 + 0.1 * np.sin(0.37 * s),
         ]
         turn = np.radians(10.0) * np.sin(np.array([0.31, 0.43, 0.29]) * s + [0, 1, 2]) / np.sqrt(3)
-        yield Pose(np.array(place), matrix_from_rotation_vector(turn))
+        yield Pose(np.array(position), matrix_from_rotation_vector(turn))
 
 
 def scaled(camera: Camera, height: int) -> Camera:
-    """The same lens before a sensor with other pixels."""
+    """The same lens on a sensor with other pixels."""
     share = height / camera.height
     matrix = camera.matrix.copy()
     matrix[:2] *= share
@@ -107,7 +107,7 @@ def scaled(camera: Camera, height: int) -> Camera:
 
 
 def by_corners(rig: Rig, camera: Camera, find: Finder) -> Callable[[np.ndarray], Pose | None]:
-    """A pose from the corners that a peer finds."""
+    """A pose from the corners of a reference detector."""
     tags = {tag.id: tag for tag in rig.platform_tags}
 
     def pose(image: np.ndarray) -> Pose | None:
@@ -134,7 +134,7 @@ def by_corners(rig: Rig, camera: Camera, find: Finder) -> Callable[[np.ndarray],
 def fly(
     rig: Rig, scene: Scene, camera: Camera, frames: int, peer_every: int, seed: int, optics: Optics
 ) -> bool:
-    """Prints the table of one camera; whether all targets are met."""
+    """Prints the table of one camera; returns whether all targets are met."""
     eye = SyntheticCamera(rig, scene, camera, seed=seed, optics=optics)
     tracker, mine = Tracker(rig, camera), Score()
     peers: dict[str, Callable[[np.ndarray], Pose | None]] = {
@@ -168,12 +168,12 @@ def fly(
                 there = peer(image)
                 scores[name].add(there, truth, time.process_time() - start)
     good = report(camera, mine, scores, states, faces)
-    look_at_a_wall(rig, camera, optics.noise)
+    time_bare_wall(rig, camera, optics.noise)
     return good
 
 
-def look_at_a_wall(rig: Rig, camera: Camera, noise: float) -> None:
-    """Prints the CPU time of a picture with nothing in it, beside OpenCV's detector as it comes."""
+def time_bare_wall(rig: Rig, camera: Camera, noise: float) -> None:
+    """Prints the CPU time of an image without tags, and that of OpenCV's default detector."""
     grey = np.random.default_rng(0).normal(120.0, noise, (camera.height, camera.width))
     wall = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
     tracker, peer = Tracker(rig, camera), cv2.aruco.ArucoDetector(dictionary(rig.tag_family))
@@ -186,17 +186,15 @@ def look_at_a_wall(rig: Rig, camera: Camera, noise: float) -> None:
         took[0].append(between - start)
         took[1].append(time.process_time() - between)
     ours, theirs = (float(np.median(each)) for each in took)
-    print(
-        f"nothing in it: {ours * 1e3:.1f} ms CPU, {ours / theirs:.2f} of cv2's {theirs * 1e3:.1f}"
-    )
+    print(f"no tags: {ours * 1e3:.1f} ms CPU, {ours / theirs:.2f} of cv2's {theirs * 1e3:.1f}")
 
 
 def report(
     camera: Camera, mine: Score, scores: Mapping[str, Score], states: Mapping[str, int], faces: int
 ) -> bool:
-    """Prints what came out; whether the targets are met."""
+    """Prints the results; returns whether the targets are met."""
     print(
-        f"\n{camera.width} x {camera.height} px, {faces / len(mine.errors):.2f} faces a pose;",
+        f"\n{camera.width} x {camera.height} px, {faces / len(mine.errors):.2f} faces per pose;",
         end="",
     )
     print(f" {', '.join(f'{n} {status}' for status, n in sorted(states.items()))}")
@@ -209,22 +207,24 @@ def report(
     beyond = float(np.mean(np.array(mine.nees) > chi2.ppf(0.99, 6)))
     print(f"NEES {mean:.2f} (exact: 6, 99 % band {low:.2f} to {high:.2f}); ", end="")
     print(f"{beyond:.1%} of poses beyond the 99 % ellipsoid")
-    place, turn = mine.rms
-    limit_place, limit_turn = TARGETS[max(h for h in TARGETS if h <= camera.height)]
+    position, turn = mine.rms
+    limit_position, limit_turn = TARGETS[max(h for h in TARGETS if h <= camera.height)]
     flips = sum(np.linalg.norm(e[3:]) > FLIP for e in mine.errors)
-    return place <= limit_place and turn <= limit_turn and not flips and not mine.missed
+    return position <= limit_position and turn <= limit_turn and not flips and not mine.missed
 
 
 def main() -> int:
-    """Prints both tables."""
+    """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--peer-every", type=int, default=5)
-    parser.add_argument("--heights", type=int, nargs="+", default=[720, 1080])
+    parser.add_argument("--heights", type=int, nargs="+", default=[720, 1080], help="[px]")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--noise", type=float, default=1.5, help="of 255")
     parser.add_argument("--blur", type=float, default=0.6, help="of the lens, px")
     arguments = parser.parse_args()
+    if (lowest := min(arguments.heights)) < min(TARGETS):
+        parser.error(f"--heights: {lowest} px is below {min(TARGETS)} px, the lowest with targets")
     cv2.setNumThreads(1)
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     scene = replace(load_scene(CONFIGS / "environment_1.yaml"), obstacles=())

@@ -1,4 +1,4 @@
-"""Whether tensions hold a load, by a quadratic program whose solution is put into the equations."""
+"""Feasibility of a load by a quadratic program, with its solution verified in the equations."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from model.scene import Scene
 
 GRAVITY = 9.80665
 _BALANCED = 1e-6
-"""What tensions may leave of the wrench, [N] and [N m]."""
+"""Largest wrench residual, [N] and [N m]."""
 _RELEASED = 1e-4
-"""How far the program's tensions may miss their limits, [N]."""
+"""Largest violation of the tension limits, [N]."""
 
 
 def tension_problem(rig: Rig, scene: Scene, position: Array) -> str:
-    """Empty where tensions hold weight, payload and every corner of the box of disturbances.
+    """A problem if tensions cannot hold weight, payload and all corner disturbances; else empty.
 
     Args:
         rig: The robot.

@@ -1,4 +1,4 @@
-"""Calibrations of cameras, tags and rig: dated results beside the rig file."""
+"""Calibration of cameras, tags and rig: dated result files beside the rig file."""
 
 from __future__ import annotations
 

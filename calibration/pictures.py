@@ -1,7 +1,7 @@
-"""Images that a calibration is made from: of a folder, a video, or a camera.
+"""Images for a calibration, from a folder, a video or a camera.
 
-Before a live camera an image is taken when the board stands still and shows something new: a part
-of the image or a tilt that no image shows yet, or a place far from all others.
+A live camera captures an image when the board is at rest and adds something new: an image region
+or a tilt not covered yet, or a position far from all others.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.targets.boards import Board, Seen, plain_camera
+from calibration.targets.boards import Board, DetectedBoard, generic_camera
 from drivers.cameras.files import ImageFolder, OneCamerasPictures
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from executor.cameras.sources import require_camera_source
@@ -29,28 +29,28 @@ from tracking.camera_model import Image
 STILL_PX = 0.7
 """RMS motion of the corners from one image to the next, for images of 1000 px."""
 ENOUGH_TILT = 18.0
-"""Degrees to each side that must be seen."""
+"""Required tilt to each side, [deg]."""
 _FAR, _FAR_TILT = 0.12, 12.0
-"""It is new at this distance from all others, as share of the image width, or rotation [deg]."""
+"""A view is new this far from all others: share of the image width, or rotation [deg]."""
 _PARTS = (("left", "middle", "right"), ("top", "middle", "bottom"))
 _AWAY = ("lower", "upper", "right", "left")
-"""Edges of the board, as seen in the image, that are away from the camera by tilt: − and + about
+"""Edge of the board, as seen in the image, that a tilt moves away from the camera: − and + about
 the image's x axis, then about its y axis."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A board as it was seen.
+    """One detection of the board.
 
     Attributes:
         seen: Its corners.
         middle: Mean of the corners, shape (2,), [px].
-        tilt: Roughly, of the board's normal, away from the camera, towards the image's y and x
-            axes, shape (2,), [deg].
-        parts: Parts of the image that it covers, (column, row) of 3 x 3.
+        tilt: Approximate tilt of the board's normal from the optical axis, towards the image's y
+            and x axes, shape (2,), [deg].
+        parts: Cells of a 3 x 3 grid over the image that it covers, (column, row).
     """
 
-    seen: Seen
+    seen: DetectedBoard
     middle: Array
     tilt: Array
     parts: frozenset[tuple[int, int]]
@@ -61,9 +61,9 @@ class Advice:
     """What to do next.
 
     Attributes:
-        taken: Whether this image is to be kept.
-        text: One sentence for the person who moves the board.
-        done: Whether enough was taken.
+        taken: Whether to keep this image.
+        text: One sentence for the operator who moves the board.
+        done: Whether there are enough images.
     """
 
     taken: bool
@@ -73,21 +73,21 @@ class Advice:
 
 @dataclass(slots=True)
 class CaptureGuide:
-    """Judges one image after the other.
+    """Decides for each image whether to keep it.
 
     Attributes:
-        board: What is shown.
-        wanted: How many images at least.
-        views: Those that were taken.
+        board: The target to detect.
+        wanted: Minimum number of images.
+        views: Views kept so far.
     """
 
     board: Board
     wanted: int
     views: list[View] = field(default_factory=list)
-    _last: Seen | None = None
+    _last: DetectedBoard | None = None
 
-    def look(self, image: Image) -> Advice:
-        """Judges the next image.
+    def judge(self, image: Image) -> Advice:
+        """Decides whether to keep the next image.
 
         Args:
             image: Grey, all of one size.
@@ -104,11 +104,11 @@ class CaptureGuide:
         self.views.append(view)
         return self._advice(True, self.missing() or "move it to another position and tilt it")
 
-    def drawn(self) -> str:
-        """What images show so far, in plain characters, as a terminal far away shows it too.
+    def coverage_map(self) -> str:
+        """Coverage so far in ASCII, for any terminal.
 
-        Parts of the image with the board are ``#``, others ``.``; beside them the tilts that were
-        seen: the edge of the board that was away.
+        Image regions where the board was seen are ``#``, others ``.``; beside them the tilts
+        covered, by the edge of the board that was farther from the camera.
         """
         covered = {part for view in self.views for part in view.parts}
         rows = [" ".join("#" if (x, y) in covered else "." for x in range(3)) for y in range(3)]
@@ -118,12 +118,12 @@ class CaptureGuide:
         return "\n".join(f"  {row}   {text}" for row, text in zip(rows, beside, strict=True))
 
     def _is_tilted(self, which: int) -> bool:
-        """Whether an image shows the edge of `_AWAY` away from the camera."""
+        """Whether an image shows the edge of index ``which`` in `_AWAY` tilted away."""
         axis, sign = which // 2, (-1.0, 1.0)[which % 2]
         return any(sign * view.tilt[axis] > ENOUGH_TILT for view in self.views)
 
     def missing(self) -> str:
-        """The first thing that no image shows yet; empty when all is there."""
+        """The first coverage still missing, as an instruction; empty when complete."""
         covered = {part for view in self.views for part in view.parts}
         for part in sorted(product(range(3), range(3)), key=lambda p: (p == (1, 1), p[1], p[0])):
             if part not in covered:
@@ -156,8 +156,8 @@ def _name(part: tuple[int, int]) -> str:
     return " ".join(words) or "middle"
 
 
-def _still(before: Seen, now: Seen, size: tuple[int, int]) -> bool:
-    """Whether corners that both images show have not moved."""
+def _still(before: DetectedBoard, now: DetectedBoard, size: tuple[int, int]) -> bool:
+    """Whether the corners common to both images are at rest."""
     earlier = {tuple(p): c for p, c in zip(before.points.tolist(), before.corners, strict=True)}
     pairs = [
         corner - earlier[tuple(point)]
@@ -170,7 +170,7 @@ def _still(before: Seen, now: Seen, size: tuple[int, int]) -> bool:
     return motion < STILL_PX * size[0] / 1000.0
 
 
-def _view(seen: Seen, size: tuple[int, int]) -> View:
+def _view(seen: DetectedBoard, size: tuple[int, int]) -> View:
     cells = np.clip((seen.corners / size * 3.0).astype(int), 0, 2)
     return View(
         seen,
@@ -180,26 +180,26 @@ def _view(seen: Seen, size: tuple[int, int]) -> View:
     )
 
 
-def _tilt(seen: Seen, size: tuple[int, int]) -> Array:
-    """Tilt by a camera as most are: it need not be known well, shape (2,), [deg]."""
-    camera = plain_camera(size)
+def _tilt(seen: DetectedBoard, size: tuple[int, int]) -> Array:
+    """Approximate tilt, assuming a typical lens, shape (2,), [deg]."""
+    camera = generic_camera(size)
     _, turn, _ = cv2.solvePnP(seen.points, seen.corners, camera.matrix, camera.distortion)
     normal = cv2.Rodrigues(turn)[0][:, 2]
     normal = normal * (-1.0 if normal[2] < 0.0 else 1.0)
     return np.asarray(np.degrees(np.arctan2(normal[[1, 0]], normal[2])), dtype=np.float64)
 
 
-# Where images come from.
+# Image sources.
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
-    """Images of one size.
+class ImageSet:
+    """Images of one size, opened but not read yet.
 
     Attributes:
         images: Names and grey images.
-        count: How many there will be.
-        unused: Why files are not used, by name.
+        count: Number of images.
+        unused: Reason for each file left out, by name.
     """
 
     images: Iterable[tuple[str, Image]]
@@ -208,7 +208,7 @@ class Pictures:
 
     @contextmanager
     def reported(self, text: str, listener: Listener) -> Iterator[Iterator[tuple[str, Image]]]:
-        """The images, each reported when it was used."""
+        """Iterates over the images and reports progress after each."""
         with listener.progress(text, self.count) as advance:
             yield self._advancing(advance)
 
@@ -218,39 +218,37 @@ class Pictures:
             advance(number)
 
 
-PicturesFrom = Pictures | str | Path | Callable[[], Pictures]
-"""Images, what opens them, or where they are: a folder, a video, a camera's index or address."""
-USUAL_PICTURES, USUAL_TAG_PICTURES = 20, 40
-"""Taken of a camera or a video to find where the camera is, and where tags are on the platform."""
+ImageSource = ImageSet | str | Path | Callable[[], ImageSet]
+"""Images, a function that opens them, or a folder, video, camera index or camera address."""
+DEFAULT_IMAGES, DEFAULT_TAG_IMAGES = 20, 40
+"""Default number of images for camera extrinsics, and for the tag layout."""
+VIDEO_IMAGES = 80
+"""Frames sampled evenly from a video for a lens calibration."""
 
 
-VIDEO_PICTURES = 80
-"""Taken of a video that a camera is calibrated from, spread over it."""
-
-
-def pictures_in(folder: Path) -> Pictures:
-    """The pictures of a folder, all of one size, or of a video, spread over it.
+def open_images(folder: Path) -> ImageSet:
+    """The images of a folder, all of one size, or frames sampled evenly from a video.
 
     Raises:
-        BadInput: The folder is missing or has no pictures, or the file is no video.
+        BadInput: The folder is missing or has no images, or the file is not a video.
     """
     if folder.is_file():
-        return _spread_over(VideoFile(folder, plain_camera(video_size(folder))), VIDEO_PICTURES)
+        return _sampled(VideoFile(folder, generic_camera(video_size(folder))), VIDEO_IMAGES)
     images = OneCamerasPictures(folder)
-    return Pictures(images, len(images.names), images.unused)
+    return ImageSet(images, len(images.names), images.unused)
 
 
-def pictures_of(source: str | Path, camera: Camera, wanted: int | None, usual: int) -> Pictures:
+def open_source(source: str | Path, camera: Camera, wanted: int | None, usual: int) -> ImageSet:
     """The images of a source.
 
     Args:
         source: A folder, a video file, a camera's index or its address.
         camera: The rig's camera that took them.
-        wanted: How many to take of a camera, or of a video, spread over it.
-        usual: How many where that is left out.
+        wanted: Number of images to take from a camera, or to sample evenly from a video.
+        usual: Default for ``wanted``.
 
     Raises:
-        BadInput: It is none of these, its images are of another size, or a number is wanted of
+        BadInput: The source is unknown, its images are of another size, or a number is given for
             a folder.
         HardwareMissing: The camera does not open.
     """
@@ -263,29 +261,29 @@ def pictures_of(source: str | Path, camera: Camera, wanted: int | None, usual: i
                 next_step="leave it out: all images of a folder are used",
             )
         folder = OneCamerasPictures(path, (camera.width, camera.height))
-        return Pictures(folder, len(folder.names), folder.unused)
+        return ImageSet(folder, len(folder.names), folder.unused)
     if path.is_file():
-        return _spread_over(VideoFile(path, camera), most)
+        return _sampled(VideoFile(path, camera), most)
     require_camera_source(str(source))
-    return Pictures(_live(str(source), camera, most), most)
+    return ImageSet(_live(str(source), camera, most), most)
 
 
-def opened_pictures(pictures: PicturesFrom, camera: Camera, usual: int) -> Pictures:
-    """The images of a source; ``usual`` of a camera or a video."""
-    if isinstance(pictures, Pictures):
+def open_image_source(pictures: ImageSource, camera: Camera, usual: int) -> ImageSet:
+    """The images of a source; ``usual`` many from a camera or a video."""
+    if isinstance(pictures, ImageSet):
         return pictures
     if callable(pictures):
         return pictures()
-    return pictures_of(pictures, camera, None, usual)
+    return open_source(pictures, camera, None, usual)
 
 
-def timed_pictures(source: Path, camera: Camera, rate: float | None) -> Pictures:
-    """All images of a folder or a video, which know when they were taken.
+def open_timed_images(source: Path, camera: Camera, rate: float | None) -> ImageSet:
+    """All images of a folder or a video, named by their capture time.
 
     Args:
         source: The folder, or the file.
         camera: The rig's camera that took them.
-        rate: Images a second of a folder; the camera's when left out.
+        rate: Frame rate of a folder, [Hz]; the camera's when left out.
 
     Returns:
         The images; their names are times in seconds since the first, such as ``0.100 s a.png``.
@@ -295,7 +293,7 @@ def timed_pictures(source: Path, camera: Camera, rate: float | None) -> Pictures
     """
     if source.is_dir():
         folder = ImageFolder(source, camera, rate)
-        return Pictures(_named_by_time(folder), len(folder), folder.unused)
+        return ImageSet(_named_by_time(folder), len(folder), folder.unused)
     if rate is not None:
         raise BadInput(
             "--rate-hz is for a folder of images",
@@ -303,17 +301,17 @@ def timed_pictures(source: Path, camera: Camera, rate: float | None) -> Pictures
             next_step="leave it out: a video states its rate",
         )
     video = VideoFile(source, camera)
-    return Pictures(_named_by_time(video), len(video))
+    return ImageSet(_named_by_time(video), len(video))
 
 
 def _named_by_time(frames: Iterable[Frame]) -> Iterator[tuple[str, Image]]:
     return ((f"{frame.time:.6f} s {frame.name}", frame.image) for frame in frames)
 
 
-def _spread_over(video: VideoFile, most: int) -> Pictures:
+def _sampled(video: VideoFile, most: int) -> ImageSet:
     every = max(1, -(-len(video) // most))
     frames = (frame for number, frame in enumerate(video) if number % every == 0)
-    return Pictures(((f.name, f.image) for f in frames), -(-len(video) // every))
+    return ImageSet(((f.name, f.image) for f in frames), -(-len(video) // every))
 
 
 def _live(source: str, camera: Camera, most: int) -> Iterable[tuple[str, Image]]:
@@ -323,7 +321,7 @@ def _live(source: str, camera: Camera, most: int) -> Iterable[tuple[str, Image]]
             yield frame.name, frame.image
 
 
-def take_pictures(
+def capture_images(
     source: str,
     folder: Path,
     board: Board,
@@ -333,34 +331,34 @@ def take_pictures(
     on_advice: Callable[[str], None] = SILENT.note,
     stopped: Callable[[], bool] = lambda: False,
 ) -> int:
-    """Takes images of a board that is moved, until enough are there or the video ends.
+    """Captures images of a moving board until there are enough or the video ends.
 
     Args:
         source: A camera's index, device or address, or a video file.
-        folder: Where images go, which exists.
-        board: What is shown.
-        wanted: How many images at least.
+        folder: Existing folder for the images.
+        board: The target to detect.
+        wanted: Minimum number of images.
         size: Width and height of the camera's images, [px]; a video has its own.
-        on_advice: Receives what the person who moves the board should do, when that changes.
-        stopped: Whether to take no more; asked after each image.
+        on_advice: Receives the next instruction for the operator whenever it changes.
+        stopped: Ends the capture when true; called after each image.
 
     Returns:
-        How many were taken.
+        Number of images captured.
 
     Raises:
         HardwareMissing: The camera does not open.
-        BadInput: The source is none, its images are of another size, or none was taken.
+        BadInput: The source is unknown, its images are of another size, or none was captured.
     """
     guide, last = CaptureGuide(board, wanted), ""
     with _frames(source, size) as frames:
         for image in frames:
             if stopped():
                 break
-            advice = guide.look(image)
+            advice = guide.judge(image)
             if advice.taken:
                 data = cv2.imencode(".png", image)[1].tobytes()
                 write_bytes_atomic(folder / f"live_{len(guide.views):03}.png", data)
-                on_advice(guide.drawn())
+                on_advice(guide.coverage_map())
             if advice.text != last:
                 last = advice.text
                 on_advice(last)
@@ -378,10 +376,10 @@ def take_pictures(
 
 @contextmanager
 def _frames(source: str, size: tuple[int, int]) -> Iterator[Iterator[Image]]:
-    """Grey images of a camera or a video."""
+    """Grey images from a camera or a video."""
     path = Path(source)
     if path.is_file():
-        yield (frame.image for frame in VideoFile(path, plain_camera(video_size(path), source)))
+        yield (frame.image for frame in VideoFile(path, generic_camera(video_size(path), source)))
         return
-    with LiveCamera(source, plain_camera(size, source)) as live:
+    with LiveCamera(source, generic_camera(size, source)) as live:
         yield (frame.image for frame in live)

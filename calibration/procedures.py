@@ -1,4 +1,4 @@
-"""Whole calibrations: from images or runs to a judged result and its report."""
+"""Complete calibrations: from images or runs to a result with verdict and report."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from calibration.extrinsics.hand_eye import locate_by_motion
 from calibration.extrinsics.result import (
     ExtrinsicCalibration,
     ExtrinsicsResult,
+    extrinsics_facts,
     extrinsics_page,
     extrinsics_result,
     judge_extrinsics,
-    place_facts,
 )
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
 from calibration.geometry.calibrate import RigCalibration, fit_rig
@@ -37,13 +37,13 @@ from calibration.intrinsics.readout import (
 )
 from calibration.intrinsics.result import CameraResult, camera_page, camera_result
 from calibration.pictures import (
-    USUAL_PICTURES,
-    USUAL_TAG_PICTURES,
-    Pictures,
-    PicturesFrom,
-    opened_pictures,
-    pictures_in,
-    timed_pictures,
+    DEFAULT_IMAGES,
+    DEFAULT_TAG_IMAGES,
+    ImageSet,
+    ImageSource,
+    open_image_source,
+    open_images,
+    open_timed_images,
 )
 from calibration.results import (
     Calibration,
@@ -53,7 +53,7 @@ from calibration.results import (
 )
 from calibration.run_data import poses_by_picture, rig_measurements
 from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
-from calibration.tag_map.observations import sights_of
+from calibration.tag_map.observations import observe_tags
 from calibration.tag_map.result import (
     TagsResult,
     judge_layout,
@@ -77,7 +77,7 @@ RigOutcome = Calibration[RigResult, RigCalibration, RigQuality]
 
 
 def calibrate_camera(
-    folder: Pictures | str | Path,
+    folder: ImageSet | str | Path,
     board: Board,
     *,
     name: str = "camera",
@@ -87,24 +87,24 @@ def calibrate_camera(
     output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> CameraOutcome:
-    """Finds a camera's matrix and lens distortion from images of a board.
+    """Calibrates a camera's matrix and lens distortion from images of a board.
 
     Args:
-        folder: Of the images, all of one size; or the images.
-        board: What they show: `Chessboard`, `Charuco`, `CircleGrid` or `TagGrid`.
+        folder: Folder of images of one size, or the images themselves.
+        board: `Chessboard`, `Charuco`, `CircleGrid` or `TagGrid` in the images.
         name: Of the camera in the rig file.
-        wanted: What is good enough, 95 %, [m].
-        distance: From which the camera measures, [m]; that of the boards when left out.
+        wanted: Required error, 95 %, [m].
+        distance: Working distance of the camera, [m]; that of the boards when left out.
         lens: ``five`` coefficients, ``rational``, ``thin-prism`` or ``fisheye``; ``auto`` takes the
             one that fits held-out images best.
         output: Folder for the result file and its report; nothing is written when left out.
-        listener: Receives how far it is.
+        listener: Receives the progress.
 
     Raises:
-        BadInput: Images of different sizes, or too few that show the board.
+        BadInput: Image sizes differ, or too few images show the board.
     """
     require_file_name(name, "--name")
-    source = folder if isinstance(folder, Pictures) else pictures_in(Path(folder))
+    source = folder if isinstance(folder, ImageSet) else open_images(Path(folder))
     to = Destination.of(output)
     to.require_free("camera", name)
     with source.reported("detecting the board", listener) as images:
@@ -122,19 +122,19 @@ def calibrate_camera_from_corners(
     lens: str = AUTO,
     output: Destination | str | Path | None = None,
 ) -> CameraOutcome:
-    """Finds a camera's matrix and lens distortion from corners that another program detected.
+    """Calibrates a camera's matrix and lens distortion from corners another program detected.
 
     Args:
         corners: A CSV file (docs/data-formats.md).
         size: Width and height of the images, [px].
         name: Of the camera.
-        wanted: What is good enough, 95 %, [m].
-        distance: From which the camera measures, [m].
+        wanted: Required error, 95 %, [m].
+        distance: Working distance of the camera, [m].
         lens: One of `calibration.intrinsics.lens.LENSES`, or `AUTO`.
         output: Folder for the result.
 
     Raises:
-        BadInput: The file cannot be read, or as of `fit_corners`.
+        BadInput: The file cannot be read, or as in `fit_corners`.
     """
     require_file_name(name, "--name")
     to = Destination.of(output)
@@ -154,7 +154,7 @@ def _judged_camera(
 
 def locate_camera(
     rig: Rig,
-    source: PicturesFrom,
+    source: ImageSource,
     *,
     camera: str | None = None,
     poses: Mapping[str, Pose] | str | Path | None = None,
@@ -163,20 +163,20 @@ def locate_camera(
     output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> ExtrinsicsOutcome:
-    """Finds where a camera is, by surveyed tags on the frame or by the rig's own motion.
+    """Finds a camera's pose in the world, from surveyed frame tags or from the rig's motion.
 
     Args:
         rig: The robot, with its tags.
         source: A folder of images, a video file, or the index or address of a live
             camera; taken while the camera does not move.
         camera: Which of the rig's cameras took them; the first when left out. Its matrix and
-            distortion hold.
-        poses: The platform's by image, or a CSV file of them, or a run folder: go by the rig's
-            motion. Left out, by the tags on the frame.
+            distortion are taken as known.
+        poses: Platform poses by image, a CSV file of them, or a run folder, to use the rig's
+            motion; the frame tags are used when left out.
         survey: How well the frame tags were surveyed; each corner to 0.5 mm when left out.
-        wanted: What is good enough in the work space, 95 %, [m].
+        wanted: Required error in the work space, 95 %, [m].
         output: Folder for the result file and its report; nothing is written when left out.
-        listener: Receives how far it is.
+        listener: Receives the progress.
 
     Raises:
         BadInput: There are no tags, or too few images that show them.
@@ -187,25 +187,26 @@ def locate_camera(
     if known is None:
         require_frame_tags(rig)
     tags = rig.frame_tags if known is None else rig.platform_tags
-    pictures, to = opened_pictures(source, taken_by, USUAL_PICTURES), Destination.of(output)
+    pictures, to = open_image_source(source, taken_by, DEFAULT_IMAGES), Destination.of(output)
     to.require_free("extrinsics", taken_by.name)
     ready_to_measure(listener)
     with pictures.reported("detecting tags", listener) as images:
-        sights = sights_of(images, rig, taken_by, [tag.id for tag in tags], pictures.unused)
+        numbers = [tag.id for tag in tags]
+        observations = observe_tags(images, rig, taken_by, numbers, pictures.unused)
     if known is None:
-        found = locate_by_frame_tags(rig, taken_by, sights, survey or Survey(0.5e-3, None))
+        found = locate_by_frame_tags(rig, taken_by, observations, survey or Survey(0.5e-3, None))
     else:
-        found = locate_by_motion(rig, taken_by, sights, known)
+        found = locate_by_motion(rig, taken_by, observations, known)
     verdict = judge_extrinsics(found, wanted)
     result = extrinsics_result(found, verdict, rig.document, to.on)
     page = extrinsics_page(found, result, verdict, taken_by.world_from_camera)
-    facts = place_facts(found, taken_by.world_from_camera)
+    facts = extrinsics_facts(found, taken_by.world_from_camera)
     return Calibration(result, page, found, verdict, facts).saved_in(to.folder)
 
 
 def locate_tags(
     rig: Rig,
-    source: PicturesFrom,
+    source: ImageSource,
     *,
     camera: str | None = None,
     fixed_tag: int | None = None,
@@ -213,18 +214,18 @@ def locate_tags(
     output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> TagsOutcome:
-    """Finds where the tags are on the platform, from images that show two or more at once.
+    """Finds the tags' poses on the platform, from images that show two or more at once.
 
     Args:
         rig: The robot, with its tags.
         source: A folder of images, a video file, or the index or address of a live
             camera; taken from anywhere.
         camera: Which of the rig's cameras took them; the first when left out. Its matrix and
-            distortion hold.
-        fixed_tag: Is as in the rig file; all fit it best when left out.
-        wanted: What is good enough for corners of tags, 95 %, [m].
+            distortion are taken as known.
+        fixed_tag: Tag kept as in the rig file; when left out, the best fit of all tags is.
+        wanted: Required error of tag corners, 95 %, [m].
         output: Folder for the result file and its report; nothing is written when left out.
-        listener: Receives how far it is.
+        listener: Receives the progress.
 
     Raises:
         BadInput: There are no tags, or too few images that show them.
@@ -232,13 +233,13 @@ def locate_tags(
     taken_by = rig.camera(camera)
     require_file_name(rig.name, "name")
     require_tags(rig, fixed_tag)
-    pictures, to = opened_pictures(source, taken_by, USUAL_TAG_PICTURES), Destination.of(output)
+    pictures, to = open_image_source(source, taken_by, DEFAULT_TAG_IMAGES), Destination.of(output)
     to.require_free("tags", rig.name)
     ready_to_measure(listener)
     with pictures.reported("detecting tags", listener) as images:
         numbers = [tag.id for tag in rig.platform_tags]
-        sights = sights_of(images, rig, taken_by, numbers, pictures.unused)
-    found = measure_layout(rig, taken_by, sights, fixed_tag)
+        observations = observe_tags(images, rig, taken_by, numbers, pictures.unused)
+    found = measure_layout(rig, taken_by, observations, fixed_tag)
     verdict = judge_layout(found, wanted)
     result = tags_result(found, verdict, rig.document, to.on)
     page = tags_page(found, result, verdict)
@@ -256,31 +257,31 @@ def measure_readout(
     output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> ReadoutOutcome:
-    """Finds how long a camera takes from its top row to its bottom row (rolling shutter).
+    """Measures a camera's readout time from top row to bottom row (rolling shutter).
 
     Args:
         rig: The robot; its platform moves in the images and carries tags.
-        camera: Its matrix and distortion hold; it stands still.
-        source: A video, or a folder of images one after the other.
-        rate: Images a second of a folder; the camera's when left out.
-        speed: Of the platform, for which the error is stated, [m/s]; the rig's when left out.
-        wanted: What is good enough, 95 %, [m].
+        camera: At rest; its matrix and distortion are taken as known.
+        source: A video, or a folder of consecutive images.
+        rate: Frame rate of a folder, [Hz]; the camera's when left out.
+        speed: Platform speed for which the error is stated, [m/s]; the rig's when left out.
+        wanted: Required error, 95 %, [m].
         output: Folder for the result file and its report; nothing is written when left out.
-        listener: Receives how far it is.
+        listener: Receives the progress.
 
     Raises:
         BadInput: There are no tags, or the images do not determine the readout.
     """
     require_file_name(camera.name, "cameras")
     require_tags(rig, None)
-    pictures, to = timed_pictures(source, camera, rate), Destination.of(output)
+    pictures, to = open_timed_images(source, camera, rate), Destination.of(output)
     to.require_free("readout", camera.name)
     ready_to_measure(listener)
     with pictures.reported("detecting tags", listener) as images:
         numbers = [tag.id for tag in rig.platform_tags]
-        sights = sights_of(images, rig, camera, numbers, pictures.unused)
-    times = {name: float(name.split(" s ")[0]) for name in sights.squares}
-    found = fit_readout(rig, camera, sights, times)
+        observations = observe_tags(images, rig, camera, numbers, pictures.unused)
+    times = {name: float(name.split(" s ")[0]) for name in observations.squares}
+    found = fit_readout(rig, camera, observations, times)
     speed = rig.motion.speed if speed is None else speed
     verdict = judge_readout(found, wanted, speed)
     result = readout_result(found, verdict, speed, to.on)
@@ -306,35 +307,35 @@ def calibrate_rig(
     output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
 ) -> RigOutcome:
-    """Finds outlets, anchors, pulleys, drum scales, references and the cables' stiffness.
+    """Calibrates outlets, anchors, pulleys, drum scales, references and cable stiffness.
 
     Args:
         rig: As in its file.
         data: Run folders, and CSV files (docs/data-formats.md).
-        deviations: How far off the rig file may be by group of numbers, one standard deviation;
-            groups left out are taken as known. ``cable_stiffness`` in place of ``stiffness`` finds
-            that of each cable, and ``imu_mounting`` that of an IMU.
+        deviations: Standard deviation of the rig file by parameter group; groups left out are
+            taken as known. ``cable_stiffness`` instead of ``stiffness`` fits each cable, and
+            ``imu_mounting`` the mounting of an IMU.
         length_deviation: Of a cable's length from the encoders, [m].
-        pose_deviations: Of poses, added to that of their file, [m] and [rad].
-        without_poses: Drive positions alone, as without a camera.
-        reflector: The point of positions without rotations, platform frame, [m].
+        pose_deviations: Of poses, added to those of their file, [m] and [rad].
+        without_poses: Use drive positions only, as without a camera.
+        reflector: Measured point of positions without rotations, platform frame, [m].
         swivel_deviation: Of measured swivel angles, [rad].
         imu_deviation: Of the vertical by an IMU about any axis, [rad].
-        tilt: How far the platform will be rotated, [rad].
-        wanted: What is good enough, 95 %, [m].
-        name: Of the result.
-        rig_file: Named in messages.
+        tilt: Largest rotation of the platform in use, [rad].
+        wanted: Required error, 95 %, [m].
+        name: Name of the result.
+        rig_file: For messages.
         output: Folder for the result file and its report; nothing is written when left out.
-        listener: Receives how far it is.
+        listener: Receives the progress.
 
     Raises:
-        BadInput: Data cannot be read, are too few, or do not fit the rig file.
+        BadInput: The data cannot be read, are too few, or do not fit the rig file.
     """
     require_file_name(name, "--name")
     counted, measured = rig_measurements(rig, [Path(path) for path in data])
     length, turn = pose_deviations
     measured = replace(
-        measured.with_doubt(np.array([length] * 3 + [turn] * 3)),
+        measured.with_added_deviation(np.array([length] * 3 + [turn] * 3)),
         reflector=read_only(reflector),
         swivel_deviation=swivel_deviation,
         imu_deviation=imu_deviation,

@@ -1,4 +1,4 @@
-"""The report of a calibration: one page that needs neither a server nor a network."""
+"""Calibration report: one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from model.pages.page import bullets, list_table, page, paragraph, section, tabl
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of a report.
+    """A section of a report.
 
     Attributes:
         heading: Plain text.
-        body: HTML, such as of `table_of`.
-        note: Plain text between both.
+        body: HTML, such as from `table_of`.
+        note: Plain text between heading and body.
     """
 
     heading: str
@@ -36,16 +36,16 @@ def page_of(
     scripts: Sequence[str] = (),
     data: Mapping[str, object] | None = None,
 ) -> str:
-    """The whole page: verdict and next steps first, then the sections.
+    """The report page: verdict and next steps first, then the sections.
 
     Args:
         title: Plain text.
-        lead: Plain text below it.
-        verdict: What the calibration is good for.
+        lead: Plain text below the title.
+        verdict: Of the calibration.
         sections: In order.
-        tiles: Key figures, HTML of `model.pages.page.tiles`.
-        scripts: As of `model.pages.page.page`.
-        data: What they read.
+        tiles: Key figures, HTML from `model.pages.page.tiles`.
+        scripts: As in `model.pages.page.page`.
+        data: Read by the scripts.
     """
     mark = "pass" if verdict.good else "fail"
     banner = (
@@ -63,7 +63,7 @@ def _section(number: int, part: Section) -> str:
 
 
 def table_of(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
-    """A table of plain texts, with a head line or with names first; "none" without rows."""
+    """A table of plain text, with a header row or names first; "none" without rows."""
     found = [tuple(row) for row in rows]
     if not found:
         return paragraph("none")
@@ -74,9 +74,9 @@ def drawing(shapes: str, size: tuple[float, float], label: str, kind: str = "med
     """A figure of SVG shapes.
 
     Args:
-        shapes: SVG elements, in colours of the page's variables.
+        shapes: SVG elements that use the page's colour variables.
         size: Width and height of their coordinates.
-        label: What a reader who does not see it should know; plain text.
+        label: Text alternative for readers who cannot see the figure.
         kind: CSS class of its size, ``small`` or ``medium``.
     """
     text = escape(label, quote=True)
@@ -87,5 +87,5 @@ def drawing(shapes: str, size: tuple[float, float], label: str, kind: str = "med
 
 
 def interval_rows(intervals: dict[str, Interval]) -> list[tuple[str, str]]:
-    """Rows of numbers and how far off they may be."""
+    """Table rows: name, and value with its half width."""
     return [(name, str(interval)) for name, interval in intervals.items()]

@@ -1,4 +1,4 @@
-"""What becomes of calibration results: read by their kind, put into a rig, compared."""
+"""Calibration result files: read by kind, applied to a rig, compared."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def load_result(path: Path) -> ResultDocument:
     """Reads a result file.
 
     Raises:
-        BadInput: The file cannot be read, is no calibration result, or was edited.
-        InvalidFile: With every problem and its place.
+        BadInput: The file cannot be read, is not a calibration result, or was edited.
+        InvalidFile: With every problem, its line and column.
     """
     result = load_yaml(path, _kind_of(path))
     if result.hash != result.sealed().hash:
@@ -62,13 +62,13 @@ def _kind_of(path: Path) -> type[ResultDocument]:
 
 
 def write_calibrated_rig(path: Path, rig: Rig, results: Sequence[ResultDocument]) -> Rig:
-    """Writes a new rig file with results in place of a rig's numbers; returns what it describes.
+    """Writes a new rig file with results applied to a rig; returns the new rig.
 
     Comments of the rig's own file are not copied; a comment at its top names the results.
 
     Args:
-        path: The file to write; one that exists is never replaced.
-        rig: As its file describes it.
+        path: The file to write; an existing file is never replaced.
+        rig: As in its own file.
         results: In any order.
 
     Raises:
@@ -90,19 +90,19 @@ def write_calibrated_rig(path: Path, rig: Rig, results: Sequence[ResultDocument]
     return better
 
 
-# Two calibration results of one thing: what changed, and whether their intervals explain it.
+# Comparison of two results: what changed, and whether their intervals explain it.
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterChange:
-    """What became of a number.
+    """Change of one parameter between two results.
 
     Attributes:
         name: With unit.
         first: In the first result.
         second: In the second.
-        by: How much larger it is in the second.
-        allowed: How far both may lie apart by chance, 95 %.
+        by: Second value minus the first.
+        allowed: Difference explained by chance, 95 %.
     """
 
     name: str
@@ -113,19 +113,19 @@ class ParameterChange:
 
     @property
     def beyond(self) -> bool:
-        """Whether chance does not explain it."""
+        """Whether the change exceeds chance."""
         return abs(self.by) > self.allowed
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two results side by side.
+    """Comparison of two results.
 
     Attributes:
-        changes: Number by number.
-        only_in_one: Names of numbers that just one of the results has.
-        apart_mm: How far apart the same thing is measured with either, RMS, [mm].
-        stated_mm: How far both may lie apart by what they state, 95 %, [mm].
+        changes: By parameter.
+        only_in_one: Names of parameters that only one of the results has.
+        apart_mm: RMS distance between measurements made with either result, [mm].
+        stated_mm: Distance that both stated errors allow, 95 %, [mm].
     """
 
     changes: tuple[ParameterChange, ...]
@@ -135,18 +135,18 @@ class Comparison:
 
     @property
     def agree(self) -> bool:
-        """Whether both measure alike within what they state."""
+        """Whether both agree within their stated errors."""
         return self.apart_mm <= self.stated_mm
 
     @property
     def next_step(self) -> str:
-        """What to do now."""
+        """The recommended action."""
         if self.agree:
             return "use the newer one, or the one with the smaller intervals"
         return "find what was changed, moved or refocused in between, then calibrate again"
 
     def facts(self) -> list[tuple[str, str]]:
-        """For people: the verdict, the next step, and every number."""
+        """Human-readable verdict, next step and parameters."""
         numbers = [
             (
                 change.name,
@@ -159,7 +159,7 @@ class Comparison:
         return [("verdict", str(self)), ("next", self.next_step), *numbers, *alone]
 
     def as_dict(self) -> dict[str, object]:
-        """For programs."""
+        """Machine-readable comparison."""
         return {
             "verdict": str(self),
             "agree": self.agree,
@@ -197,7 +197,7 @@ def compare(first: ResultDocument, second: ResultDocument) -> Comparison:
     """Compares two results of one kind and name.
 
     Raises:
-        BadInput: They are of different kinds or things.
+        BadInput: They differ in kind or name.
     """
     if (first.kind, first.name) != (second.kind, second.name):
         raise BadInput(

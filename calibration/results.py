@@ -1,7 +1,7 @@
 """Calibration results as dated YAML files, beside the rig file and never written into it.
 
-Every kind of result has the keys of `ResultDocument` and its own, which are those of the rig file,
-and a verdict: what it is good for in one sentence, and what to do where it is not.
+Every kind of result has the keys of `ResultDocument`, its own keys as in the rig file, and a
+verdict: one sentence on what it is good for, and the next steps where it is not.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ USE = (
     "use it: pass the result's file with --calibration, or write a new rig file with"
     " `cdpr calibrate apply`"
 )
-"""What to do with a result that is good enough."""
+"""Next step for a result that is good enough."""
 
 
 @dataclass(frozen=True, slots=True)
 class Issue:
-    """Something that a calibration lacks.
+    """A reason why a calibration is not good enough.
 
     Attributes:
-        reason: Why it is not good enough.
-        next_step: What to do about it.
+        reason: What is wrong, with the measured value and its limit.
+        next_step: How to fix it.
     """
 
     reason: str
@@ -56,11 +56,11 @@ class CalibrationVerdict:
     """What a calibration is good for.
 
     Attributes:
-        error: How far off what is measured with it may be, 95 %, [m].
-        wanted: What is good enough, [m].
-        where: The place or the conditions of that, such as ``at 0.6 m``.
-        reasons: Why it is not good enough; empty if it is.
-        next_steps: What to do about each, or with a good result.
+        error: Error of measurements made with it, 95 %, [m].
+        wanted: Required error, [m].
+        where: Location or conditions for that error, such as ``at 0.6 m``.
+        reasons: Why it is not good enough; empty when it is.
+        next_steps: How to fix each reason, or how to use a good result.
     """
 
     error: float
@@ -70,10 +70,10 @@ class CalibrationVerdict:
     next_steps: tuple[str, ...]
 
     @classmethod
-    def of(cls, error: float, wanted: float, where: str, lacks: Sequence[Issue]) -> Self:
-        """The verdict of what was found to be lacking; each next step once."""
-        reasons = tuple(lack.reason for lack in lacks)
-        steps = tuple(dict.fromkeys(lack.next_step for lack in lacks)) or (USE,)
+    def of(cls, error: float, wanted: float, where: str, issues: Sequence[Issue]) -> Self:
+        """The verdict from a list of issues, each next step listed once."""
+        reasons = tuple(issue.reason for issue in issues)
+        steps = tuple(dict.fromkeys(issue.next_step for issue in issues)) or (USE,)
         return cls(error, wanted, where, reasons, steps)
 
     @property
@@ -101,10 +101,10 @@ Bounds = Annotated[list[AnyNumber], Field(min_length=2, max_length=2)]
 
 
 class ResultDocument(Document, ABC):
-    """What every calibration result has."""
+    """Keys common to all calibration results."""
 
     order: ClassVar[int]
-    """Results of lower order are applied first: those of higher order rest on them."""
+    """Results of lower order are applied first: those of higher order depend on them."""
     added: ClassVar[tuple[str, ...]] = ()
     """Keys that older files lack: left at their defaults they are not part of the hash."""
 
@@ -127,50 +127,50 @@ class ResultDocument(Document, ABC):
 
     @property
     def file_name(self) -> str:
-        """What its file is called."""
+        """Name of its file."""
         return result_file_name(self.kind, self.name, self.date)
 
     def sealed(self) -> Self:
-        """The result with its hash, which reveals an edited one."""
+        """The result with its hash, which detects later edits."""
         fields = type(self).model_fields
         unset = {key for key in self.added if getattr(self, key) == fields[key].default}
         return self.model_copy(update={"hash": document_hash(self, {"hash"} | unset)})
 
     @property
     def stated(self) -> dict[str, Interval]:
-        """What was found, by name with unit."""
+        """Estimates, by name with unit."""
         return {name: Interval.between(*ends) for name, ends in self.intervals.items()}
 
     def in_words(self) -> list[tuple[str, str]]:
-        """What was found, for people: names with unit, and values with their half widths."""
+        """Human-readable estimates: names with unit, and values with their half widths."""
         return [(name, str(interval)) for name, interval in self.stated.items()]
 
     def changes_to(self, other: Self) -> dict[str, float]:
-        """By how much another result's numbers are larger, by name with unit."""
+        """Values of another result minus these, by name with unit."""
         mine, others = self.stated, other.stated
         return {name: others[name].value - mine[name].value for name in mine if name in others}
 
     @abstractmethod
     def apart_mm(self, other: Self) -> float:
-        """How far apart the same thing is measured with either result, RMS, [mm]."""
+        """RMS distance between measurements made with either result, [mm]."""
 
     @abstractmethod
     def corrected(self, rig: RigDocument) -> RigDocument:
-        """The rig file's content with this result in place.
+        """The rig file's content with this result applied.
 
         Raises:
             BadInput: The result is not about this rig.
         """
 
     def require_basis(self, parts: object, what: str) -> None:
-        """Refuses a rig whose parts are others than those that this result rests on.
+        """Refuses a rig whose parts differ from those this result depends on.
 
         Args:
-            parts: The JSON-like parts of the rig file, as when the result was made.
+            parts: The JSON-like parts of the rig file that the result takes as known.
             what: Their names, for the message.
 
         Raises:
-            BadInput: They are others.
+            BadInput: They differ.
         """
         if content_hash(parts) != self.rests_on:
             raise BadInput(
@@ -192,14 +192,14 @@ def common_keys(
     unused: Mapping[str, str],
     rests_on: object = None,
 ) -> dict[str, Any]:
-    """The keys of every result.
+    """The keys common to every result.
 
     Args:
-        name: Of what was calibrated.
+        name: Name of what was calibrated.
         on: The date.
         data_hash: Of the measurements.
-        intervals: What was found, by name with unit.
-        verdict: What it is good for.
+        intervals: Estimates with their intervals, by name with unit.
+        verdict: Of the calibration.
         unused: Why data were left out, by name.
         rests_on: The JSON-like parts of the rig file that were taken as known; None for none.
     """
@@ -219,15 +219,15 @@ def common_keys(
 
 
 def result_file_name(kind: str, name: str, day: str) -> str:
-    """What the file of a result is called."""
+    """File name of a result."""
     return f"calibration_{kind}_{name}_{day}.yaml"
 
 
 def require_file_name(name: str, where: str) -> None:
-    """The name becomes part of a file's; reported before the long work, not after it.
+    """Refuses a name that cannot be part of a file name, before the long computation.
 
     Raises:
-        BadInput: It cannot.
+        BadInput: The name is empty, or has a slash or a null character.
     """
     if not name or "/" in name or "\0" in name:
         raise BadInput(
@@ -238,7 +238,7 @@ def require_file_name(name: str, where: str) -> None:
 
 
 def write_result(folder: Path, result: ResultDocument) -> Path:
-    """Writes a result into a folder, sealed, whole or not at all; returns the file.
+    """Writes a sealed result into a folder, atomically; returns the file's path.
 
     Raises:
         BadInput: The folder cannot be written to.
@@ -254,18 +254,18 @@ def in_order(results: Sequence[ResultDocument]) -> list[ResultDocument]:
     return sorted(results, key=lambda result: result.order)
 
 
-# The hash of the measurements that a result rests on, in one form for all kinds.
+# Hash of the measurements behind a result, in one form for all kinds.
 
 
 def data_hash(pieces: Iterable[bytes]) -> str:
-    """``sha256:`` and the hash of all pieces in their order."""
+    """``sha256:`` and the hash of all pieces in order."""
     digest = hashlib.sha256()
     for piece in pieces:
         digest.update(piece)
     return f"sha256:{digest.hexdigest()}"
 
 
-# A finished calibration, and where it is written.
+# A finished calibration, and where to write it.
 
 
 Result = TypeVar("Result", bound=ResultDocument, covariant=True)
@@ -278,12 +278,12 @@ class Calibration(Generic[Result, Found, Quality]):
     """A finished calibration.
 
     Attributes:
-        result: As it is written to a file: numbers, intervals, verdict.
+        result: As written to the file: estimates, intervals, verdict.
         page: The report, HTML.
-        found: What it rests on.
-        quality: What it is good for.
-        facts: What was found beside the numbers, for people.
-        files: Result and report, where they were written.
+        found: The fit behind the result.
+        quality: Its assessed quality.
+        facts: Human-readable details beside the estimates.
+        files: Paths of result and report, where written.
     """
 
     result: Result
@@ -295,26 +295,26 @@ class Calibration(Generic[Result, Found, Quality]):
 
     @property
     def order(self) -> int:
-        """When it is applied; with what follows, what `Rig.with_calibration` takes."""
+        """Its rank among applied results, as `Rig.with_calibration` needs it."""
         return self.result.order
 
     @property
     def kind(self) -> str:
-        """What was calibrated, such as ``camera``."""
+        """Kind of calibration, such as ``camera``."""
         return self.result.kind
 
     @property
     def name(self) -> str:
-        """Which of its kind."""
+        """Name of what was calibrated."""
         return self.result.name
 
     @property
     def date(self) -> str:
-        """When, ISO 8601."""
+        """Date, ISO 8601."""
         return self.result.date
 
     def corrected(self, rig: RigDocument) -> RigDocument:
-        """The rig file's content with this result in place.
+        """The rig file's content with this result applied.
 
         Raises:
             BadInput: The result is not about this rig.
@@ -322,16 +322,16 @@ class Calibration(Generic[Result, Found, Quality]):
         return self.result.corrected(rig)
 
     def __repr__(self) -> str:
-        """What was calibrated, and what it is good for."""
+        """Kind, name, date and verdict."""
         return f"<Calibration {self.kind} {self.name}, {self.date}: {self.result.verdict}>"
 
     def _repr_html_(self) -> str:
-        """For notebooks."""
+        """Table of results for notebooks."""
         rows = [*self.result.in_words(), ("verdict", self.result.verdict)]
         return html_table(f"Calibration {self.kind} {self.name}", rows)
 
     def saved_in(self, folder: Path | None) -> Self:
-        """The calibration with its result and report written into a folder; None writes nothing.
+        """Writes result and report into a folder, if any; returns the calibration with their paths.
 
         Raises:
             BadInput: The folder cannot be written to.
@@ -346,7 +346,7 @@ class Calibration(Generic[Result, Found, Quality]):
 
 @dataclass(frozen=True, slots=True)
 class Destination:
-    """Where a result goes.
+    """Where to write a result.
 
     Attributes:
         folder: For the result file and its report; None writes nothing.
@@ -360,16 +360,16 @@ class Destination:
 
     @classmethod
     def of(cls, output: Destination | str | Path | None) -> Destination:
-        """A destination as it is; of a folder, what a result there replaces is refused."""
+        """A destination; for a folder, one that does not replace files of the same day."""
         if isinstance(output, Destination):
             return output
         return cls(None if output is None else Path(output))
 
     def require_free(self, kind: str, name: str) -> None:
-        """Makes the folder before the work, so that no work is lost.
+        """Creates the folder before the computation, so that no work is lost.
 
         Raises:
-            BadInput: It cannot be made or written to, or holds such a result or report.
+            BadInput: It cannot be created or written to, or holds such a result or report.
         """
         if self.folder is None:
             return

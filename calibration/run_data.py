@@ -1,4 +1,4 @@
-"""Data of runs for a calibration: encoder poses and stationary samples."""
+"""Run data for calibration: encoder poses and stationary samples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from calibration.geometry.measurements import (
     joined,
     read_rig_data,
 )
-from calibration.geometry.result import require_one_drawing
+from calibration.geometry.result import require_same_nominal
 from executor.recording.run_folder import RunFolder
 from model.errors import BadInput
 from model.pose import Pose, interpolate, matrix_from_quaternion
@@ -23,7 +23,7 @@ from model.rig import Rig
 
 
 def poses_by_picture(path: Path, camera: str) -> Mapping[str, Pose]:
-    """The platform's poses by image, from a CSV file or the encoders of a run folder.
+    """Platform poses by image, from a CSV file or the encoders of a run folder.
 
     Raises:
         BadInput: It cannot be read, or the camera took no images in the run.
@@ -32,10 +32,10 @@ def poses_by_picture(path: Path, camera: str) -> Mapping[str, Pose]:
 
 
 def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
-    """Poses from the encoders when a camera's kept images of a run were taken.
+    """Encoder poses at the times when a run's saved camera images were taken.
 
     Raises:
-        BadInput: The camera took none.
+        BadInput: The camera took no images in this run.
     """
     run = RunFolder.open(folder)
     cycles, alone = run.cycles(), run.poses_by_camera()
@@ -46,10 +46,10 @@ def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
             where=str(folder),
             next_step=f"name one of its cameras with --camera: {', '.join(names)}",
         )
-    looks = alone[camera] if alone else run.poses()
+    samples = alone[camera] if alone else run.poses()
     times = cycles.time
     poses = {}
-    for time, picture in zip(looks.time, looks.picture, strict=True):
+    for time, picture in zip(samples.time, samples.picture, strict=True):
         after = int(np.searchsorted(times, time))
         if not picture or not 0 < after < len(times):
             continue
@@ -64,7 +64,7 @@ def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
 
 
 def rig_measurements(rig: Rig, data: Sequence[Path]) -> tuple[Rig, RigMeasurements]:
-    """The rig as its drives counted, and where the platform was at rest.
+    """The rig with the counts of its drives, and its stationary samples.
 
     Args:
         rig: As in its file.
@@ -75,7 +75,7 @@ def rig_measurements(rig: Rig, data: Sequence[Path]) -> tuple[Rig, RigMeasuremen
     """
     _require_once(data)
     runs = [(str(path), RunFolder.open(path).rig()) for path in data if path.is_dir()]
-    counted = require_one_drawing(rig, runs)
+    counted = require_same_nominal(rig, runs)
     parts = [
         _at_rest(path) if path.is_dir() else read_rig_data(path, rig.cable_count) for path in data
     ]
@@ -83,7 +83,7 @@ def rig_measurements(rig: Rig, data: Sequence[Path]) -> tuple[Rig, RigMeasuremen
 
 
 def _require_once(data: Sequence[Path]) -> None:
-    """Samples count once."""
+    """Refuses a file given twice: each sample must count once."""
     named: dict[Path, Path] = {}
     for path in data:
         if path.resolve() in named:
@@ -97,21 +97,21 @@ def _require_once(data: Sequence[Path]) -> None:
 
 
 def _at_rest(run: Path) -> RigMeasurements:
-    """Where the platform of a run was at rest."""
+    """Stationary samples of a run."""
     folder = RunFolder.open(run)
     cycles, poses = folder.cycles(), folder.poses()
     good = poses.ok
-    turned = [matrix_from_quaternion(q) for q in poses.rotation[good]]
+    rotations = [matrix_from_quaternion(q) for q in poses.rotation[good]]
     return at_rest(
         str(run),
         Recording(
             time=cycles.time,
-            asked=cycles.set_counts.astype(np.float64),
+            setpoints=cycles.set_counts.astype(np.float64),
             counts=cycles.actual_counts.astype(np.float64),
             tensions=cycles.tensions,
-            seen=poses.time[good],
+            pose_times=poses.time[good],
             positions=poses.position[good],
-            rotations=np.array(turned).reshape(-1, 3, 3),
+            rotations=np.array(rotations).reshape(-1, 3, 3),
             covariances=poses.covariance[good],
         ),
     )

@@ -1,4 +1,4 @@
-"""A number and how far off it may be; a few of many things, spread over all of them."""
+"""Confidence intervals, jackknife, robust loss, even sampling and duplicate views."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from model.pose import Array
 
 CONFIDENCE = 0.95
-"""Of every interval that a calibration states."""
+"""Confidence of every interval that a calibration states."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +20,8 @@ class Interval:
     """The range that holds a number with 95 % confidence.
 
     Attributes:
-        value: What was found.
-        half_width: How far off it may be, in the same unit.
+        value: The estimate.
+        half_width: Half width of the interval, in the same unit.
     """
 
     value: float
@@ -29,23 +29,23 @@ class Interval:
 
     @classmethod
     def between(cls, low: float, high: float) -> Interval:
-        """The interval with these ends."""
+        """The interval with these bounds."""
         return cls((low + high) / 2.0, (high - low) / 2.0)
 
     @property
     def bounds(self) -> list[float]:
-        """Its ends."""
+        """Lower and upper bound."""
         return [self.value - self.half_width, self.value + self.half_width]
 
     def __str__(self) -> str:
         """Value and half width, to two digits of the half width."""
         if not 0.0 < self.half_width < math.inf:
-            return f"{self.value:.6g} {self.doubt}"
-        return f"{self.value:z.{self._decimals}f} {self.doubt}"
+            return f"{self.value:.6g} {self.half_width_text}"
+        return f"{self.value:z.{self._decimals}f} {self.half_width_text}"
 
     @property
-    def doubt(self) -> str:
-        """The half width alone, where the value is 0 by its meaning."""
+    def half_width_text(self) -> str:
+        """The half width alone, for values that are 0 by definition."""
         if not 0.0 < self.half_width < math.inf:
             return f"± {self.half_width:g}"
         return f"± {self.half_width:.{self._decimals}f}"
@@ -55,14 +55,14 @@ class Interval:
         return max(0, 1 - math.floor(math.log10(self.half_width)))
 
 
-# The jackknife: what leaving a part of the data out changes shows scatter that a model does not.
+# Jackknife: leaving out parts of the data shows scatter that the noise model misses.
 
 
 def jackknife(without: Array) -> Array:
-    """Covariance by the changes of n numbers when each of p parts is left out, shape (n, n).
+    """Covariance from the changes of n numbers when each of p parts is left out, shape (n, n).
 
     Args:
-        without: Shape (p, n).
+        without: Estimates without each part, shape (p, n).
 
     Source: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11.
     """
@@ -71,115 +71,115 @@ def jackknife(without: Array) -> Array:
 
 
 def widened(covariance: Array, without: Array) -> Array:
-    """A covariance as much wider as the jackknife's is, in the mean of all directions.
+    """A covariance scaled up to the jackknife's, averaged over all directions.
 
-    It stays as it is where the jackknife's is wider by no more than chance makes it: by two
-    deviations of a mean of as many squares.
+    It is unchanged where the excess of the jackknife's is within chance: two standard deviations
+    of a mean of that many squares.
 
     Args:
-        covariance: By the scatter, shape (n, n).
-        without: As `jackknife` takes it.
+        covariance: From the residuals' scatter, shape (n, n).
+        without: As in `jackknife`.
     """
     count, size = without.shape
     ratio = float(np.trace(np.linalg.solve(covariance, jackknife(without)))) / size
-    ratio *= kept_share(count, size)
+    ratio *= leverage_factor(count, size)
     by_chance = 2.0 * float(np.sqrt(2.0 / (size * (count - 1))))
     return np.asarray(covariance * (ratio if ratio > 1.0 + by_chance else 1.0))
 
 
-def kept_share(parts: int, numbers: int) -> float:
-    """Share of a jackknife's variance that is the numbers': parts that weigh much make it too wide.
+def leverage_factor(parts: int, numbers: int) -> float:
+    """Correction factor for a jackknife's variance, which is too wide with influential parts.
 
-    Half of their usual weight, numbers by parts, is taken off.
+    It takes off half of their mean leverage, numbers by parts.
     """
     return max(0.0, 1.0 - numbers / (2.0 * parts))
 
 
-# How large several numbers together are by chance, which is not how large each of them is.
+# Chance bound on the RMS of several quantities, which differs from that of each alone.
 
 
 def rms_bound(covariance: Array, slopes: Array) -> float:
-    """What the RMS of quantities exceeds in one case of twenty, by normal errors they depend on.
+    """95 % bound on the RMS of quantities that depend linearly on normal errors.
 
-    Their squares' sum is taken as a multiple of a chi-squared one with the same mean and variance.
-    Of one quantity it is 1.96 deviations; of many independent ones hardly more than their RMS.
+    The sum of squares is approximated by a scaled chi-squared variable of equal mean and variance.
+    For one quantity the bound is 1.96 deviations; for many independent ones little above their RMS.
 
     Args:
-        covariance: Of n errors, shape (n, n).
-        slopes: Of k quantities by them, shape (k, n).
+        covariance: Of the n errors, shape (n, n).
+        slopes: Derivatives of k quantities by them, shape (k, n).
 
     Source: Satterthwaite, Biometrics Bulletin 2(6), 1946.
     """
     spread = covariance @ (slopes.T @ slopes) / len(slopes)
     mean, square = float(np.trace(spread)), float(np.trace(spread @ spread))
     if not 0.0 < square < np.inf:
-        return max(mean, 0.0)  # exactly known, or not at all
+        return max(mean, 0.0)  # known exactly, or unknown
     return float(np.sqrt(square / mean * chi2.ppf(CONFIDENCE, mean**2 / square)))
 
 
-# Huber's loss: what is far off counts by its distance, not by its square.
+# Huber's loss: outliers count linearly, not quadratically.
 
 
 def huber(distances: Array, bend: float) -> Array:
-    """The loss of distances, which are not negative; their square up to ``bend``."""
+    """Huber's loss of non-negative distances: quadratic up to ``bend``."""
     cost: Array = np.where(distances <= bend, distances**2, 2.0 * bend * distances - bend**2)
     return cost
 
 
-def share_of(distances: Array, bend: float) -> Array:
-    """The weight that makes a square of what counts less."""
+def huber_weight(distances: Array, bend: float) -> Array:
+    """The IRLS weight of Huber's loss, for the square of each distance."""
     share: Array = bend / np.maximum(distances, bend)
     return share
 
 
-# A few of many things that come one after the other, spread over all of them.
+# Evenly spaced samples from a stream of unknown length.
 
 
 T = TypeVar("T")
 
 
 class EvenSample(Generic[T]):
-    """Keeps up to twice as many things as are wanted, at equal distances."""
+    """Keeps up to twice the wanted number of items, evenly spaced."""
 
     def __init__(self, wanted: int) -> None:
-        """Nothing was added yet.
+        """Starts empty.
 
         Args:
-            wanted: How many to choose in the end, at most.
+            wanted: Maximum number of items to choose.
         """
         self._wanted, self._every, self._count = wanted, 1, 0
         self._kept: list[T] = []
 
-    def add(self, thing: T) -> None:
-        """The next one."""
+    def add(self, item: T) -> None:
+        """Adds the next item."""
         if self._count % self._every == 0:
-            self._kept.append(thing)
+            self._kept.append(item)
         self._count += 1
         if len(self._kept) == 2 * self._wanted:
             self._kept, self._every = self._kept[::2], 2 * self._every
 
     def chosen(self) -> list[T]:
-        """The wanted number, in their order; all where there were no more."""
+        """At most the wanted number of items, in order."""
         last, wanted = len(self._kept) - 1, min(self._wanted, len(self._kept))
-        places = [round(k * last / max(wanted - 1, 1)) for k in range(wanted)]
-        return [self._kept[place] for place in places]
+        indices = [round(k * last / max(wanted - 1, 1)) for k in range(wanted)]
+        return [self._kept[index] for index in indices]
 
 
-# Images between which nothing moved: copies, or images of what stood still.
+# Duplicate views: copies of an image, or images of a scene at rest.
 #
-# They err alike, and together they show no more than one. A copy that was saved again as JPEG has
-# its corners elsewhere by as much as noise moves them, so one limit finds both.
+# Their errors are correlated, so a duplicate adds no information. Saving a copy again as JPEG moves
+# its corners about as much as noise does, so one limit finds both.
 
 
 SAME_VIEW = 0.1
-"""Corners that nothing moved are nearer than that to each other in two images, RMS, [px]."""
+"""Two images whose corners differ by less than this, RMS, show the same view, [px]."""
 
 
 def is_duplicate_view(corners: Array, before: Array) -> bool:
-    """Whether the same corners are in the same places, shape (..., 2) both, [px]."""
+    """Whether corners have not moved between two images, shape (..., 2) both, [px]."""
     return bool(np.mean(np.sum((corners - before) ** 2, axis=-1)) < SAME_VIEW**2)
 
 
-def as_in(first: str) -> str:
-    """Why an image is not used that shows the same as another, named ``first``."""
+def duplicate_reason(first: str) -> str:
+    """Why an image that shows the same view as image ``first`` is not used."""
     return f"duplicates {first}: nothing moved in between"

@@ -31,12 +31,12 @@ from tracking.measurement import PoseMeasurement
 from tracking.pose_log import LoggedPicture, write_pose_log
 from tracking.track import (
     FrameRate,
+    MultiCameraCount,
     Picture,
-    TogetherCount,
     TrackCount,
-    drawn_over,
+    draw_measurement,
     track,
-    track_together,
+    track_cameras,
 )
 from tracking.tracker import Tracker
 
@@ -62,7 +62,7 @@ class TrackResult:
     pictures: list[LoggedPicture] = field(default_factory=list)
     by_camera: dict[str, list[LoggedPicture]] = field(default_factory=dict)
     count: TrackCount = field(default_factory=TrackCount)
-    together: TogetherCount | None = None
+    together: MultiCameraCount | None = None
     unused: dict[str, dict[str, str]] = field(default_factory=dict)
     with_clearance: bool = False
     began: int = field(default_factory=time.time_ns)
@@ -192,7 +192,7 @@ def track_sources(
     model = ClearanceModel(rig, the_scene) if the_scene and the_scene.obstacles else None
     result = TrackResult(
         by_camera={camera.name: [] for camera in sources} if several else {},
-        together=TogetherCount() if several else None,
+        together=MultiCameraCount() if several else None,
         unused={camera.name: {} for camera in sources},
         with_clearance=model is not None,
     )
@@ -243,12 +243,12 @@ def _measure(
 def _together(
     streams: dict[str, Iterator[LoggedPicture]],
     within: float,
-    count: TogetherCount | None,
+    count: MultiCameraCount | None,
     model: ClearanceModel | None,
 ) -> Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]]:
     """What is measured together and by each camera alone."""
     if count is not None:
-        yield from track_together(streams, within, count, model)
+        yield from track_cameras(streams, within, count, model)
         return
     for name, stream in streams.items():
         for found in stream:
@@ -267,7 +267,9 @@ def _overlay(
 
         def draw(picture: Picture, logged: LoggedPicture) -> None:
             found = logged.observation
-            out.write(drawn_over(picture.image, rig, camera, found, logged.clearance), picture.name)
+            out.write(
+                draw_measurement(picture.image, rig, camera, found, logged.clearance), picture.name
+            )
 
         yield draw
 

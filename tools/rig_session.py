@@ -20,7 +20,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
-from calibration.geometry.pose_selection import Wish, chosen_poses
+from calibration.geometry.pose_selection import PoseRequirements, choose_poses
 from model.files.scene_file import SceneDocument
 from model.kinematics import cables_at
 from model.pose import Pose
@@ -55,8 +55,8 @@ def free_scene(rig: Rig) -> Scene:
 def poses_to_measure(rig: Rig, scene: Scene, count: int) -> list[Pose]:
     """As `cdpr calibrate poses` chooses them."""
     doubts = (0.3e-3,) * 3 + (radians(0.05),) * 3
-    wish = Wish(count, radians(15.0), radians(15.0), 300, 7.125, 0.1e-3, doubts)
-    return chosen_poses(rig, scene, wish, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=0)
+    requirements = PoseRequirements(count, radians(15.0), radians(15.0), 300, 7.125, 0.1e-3, doubts)
+    return choose_poses(rig, scene, requirements, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=0)
 
 
 def header(cables: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""From a camera image to the platform's pose with a covariance, and on to measured clearance."""
+"""From camera images to the platform's pose with covariance, and to measured clearance."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The camera as straight lines: pixels without lens distortion ("ideal" pixels) and back.
+"""Camera model: lens distortion, undistorted pixels, rays and their derivatives.
 
-Lines of the world are straight in ideal pixels, so lines are fitted and poses are solved there. A
-pixel's centre has whole coordinates, as in OpenCV.
+Straight lines of the world are straight in undistorted pixels, so lines are fitted and poses are
+solved there. Pixel centres have integer coordinates, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from model.rig import Camera
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
 _CONVERGES = 5
-"""OpenCV's iteration reaches its limit with that number of coefficients."""
+"""OpenCV's iteration converges up to this number of coefficients."""
 _NEWTON_STEPS, _LONGEST_STEP, _AT_ONCE = 30, 0.3, 100_000
-"""Of the rays of other lenses: iterations, length of a step, and how many at once."""
+"""For rays of other lenses: iterations, largest step, and rays per batch."""
 WIDEST = 1.5
-"""Rays farther off the axis are put there: beyond 90° none meets the plane before it, [rad]."""
+"""Rays farther off the axis are clamped to this angle, below 90°, [rad]."""
 
 
-def ideal_from_pixels(camera: Camera, pixels: Array) -> Array:
-    """Removes the lens distortion of points, shape (..., 2), [px]; same shape."""
+def undistort_pixels(camera: Camera, pixels: Array) -> Array:
+    """Removes the lens distortion from points, shape (..., 2), [px]; same shape."""
     flat = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
     if not camera.distortion.size:
         return flat.reshape(pixels.shape)
     rays = rays_of(camera.lens, camera.matrix, camera.distortion, flat)
     matrix = camera.matrix
-    ideal = rays * [matrix[0, 0], matrix[1, 1]] + matrix[:2, 2]
-    return np.asarray(ideal).reshape(pixels.shape)
+    undistorted = rays * [matrix[0, 0], matrix[1, 1]] + matrix[:2, 2]
+    return np.asarray(undistorted).reshape(pixels.shape)
 
 
 def rays_of(lens: str, matrix: Array, distortion: Array, pixels: Array) -> Array:
-    """Where rays through pixels meet the plane a metre before the camera.
+    """Intersections of rays through pixels with the plane 1 m in front of the camera.
 
     Args:
         lens: One of `model.files.documents.LENSES`.
@@ -47,11 +47,11 @@ def rays_of(lens: str, matrix: Array, distortion: Array, pixels: Array) -> Array
         pixels: Shape (..., 2), [px].
 
     Returns:
-        Its x and y, shape (n, 2), [m].
+        x and y, shape (n, 2), [m].
     """
     flat = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
     if lens == FISHEYE:
-        inside = _before_the_camera(matrix, distortion, flat)
+        inside = _clamped_pixels(matrix, distortion, flat)
         near = cv2.fisheye.undistortPoints(inside, matrix, distortion, criteria=_CRITERIA)
         return np.asarray(near, dtype=np.float64).reshape(-1, 2)
     near = cv2.undistortPoints(flat, matrix, distortion, criteria=_CRITERIA)
@@ -59,12 +59,12 @@ def rays_of(lens: str, matrix: Array, distortion: Array, pixels: Array) -> Array
     if np.size(distortion) > _CONVERGES:
         parts = range(0, len(flat), _AT_ONCE)
         for part in (slice(start, start + _AT_ONCE) for start in parts):
-            rays[part] = _polished_rays(matrix, distortion, flat[part], rays[part])
+            rays[part] = _refined_rays(matrix, distortion, flat[part], rays[part])
     return rays.reshape(-1, 2)
 
 
-def _before_the_camera(matrix: Array, distortion: Array, pixels: Array) -> Array:
-    """Pixels of a fisheye, those of rays beyond `WIDEST` moved inward to it."""
+def _clamped_pixels(matrix: Array, distortion: Array, pixels: Array) -> Array:
+    """Pixels of a fisheye, with rays beyond `WIDEST` clamped to it."""
     turns = WIDEST ** np.arange(2, 10, 2)
     widest = WIDEST * (1.0 + float(np.ravel(distortion)[:4] @ turns))
     scale, middle = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2]
@@ -73,8 +73,8 @@ def _before_the_camera(matrix: Array, distortion: Array, pixels: Array) -> Array
     return np.asarray(middle + away * scale * np.minimum(1.0, widest / np.maximum(radius, 1e-12)))
 
 
-def _polished_rays(matrix: Array, distortion: Array, pixels: Array, rays: Array) -> Array:
-    """Rays whose pixels are right, by Newton; OpenCV's iteration is pixels off in wide lenses."""
+def _refined_rays(matrix: Array, distortion: Array, pixels: Array, rays: Array) -> Array:
+    """Rays refined by Newton's method; OpenCV's iteration is off by pixels in wide lenses."""
     zero = np.zeros(3)
     for _ in range(_NEWTON_STEPS):
         points = np.concatenate([rays, np.ones((len(rays), 1, 1))], axis=2)
@@ -102,7 +102,7 @@ def _polished_rays(matrix: Array, distortion: Array, pixels: Array, rays: Array)
 
 
 def project(lens: str, matrix: Array, distortion: Array, points: Array) -> Array:
-    """Pixels of points in front of the camera; the arguments are those of `rays_of`.
+    """Pixels of points in front of the camera; arguments as in `rays_of`.
 
     Args:
         lens: One of `model.files.documents.LENSES`.
@@ -123,14 +123,14 @@ def project(lens: str, matrix: Array, distortion: Array, points: Array) -> Array
 
 
 def ray_slopes(camera: Camera, rays: Array) -> Array:
-    """How rays through given pixels move with the camera's n numbers (fx, fy, cx, cy, distortion).
+    """Derivatives of rays through given pixels by fx, fy, cx, cy and the distortion.
 
     Args:
         camera: The camera.
-        rays: Where they meet the plane a metre before it, shape (p, 2), [m].
+        rays: Their intersections with the plane 1 m in front of it, shape (p, 2), [m].
 
     Returns:
-        Shape (p, 2, n), [m] for each unit of a number.
+        Shape (p, 2, n), [m] per unit of each of the n parameters.
     """
     zero, count = np.zeros(3), 4 + camera.distortion.size
     points = np.column_stack([rays, np.ones(len(rays))]).reshape(-1, 1, 3)
@@ -145,25 +145,25 @@ def ray_slopes(camera: Camera, rays: Array) -> Array:
     return np.asarray(-np.linalg.solve(by_ray, by_lens))
 
 
-def ideal_slopes(camera: Camera, ideal: Array) -> Array:
-    """How ideal pixels of given pixels move with the camera's n numbers, as `ray_slopes`.
+def undistorted_slopes(camera: Camera, undistorted: Array) -> Array:
+    """Derivatives of undistorted pixels by the lens parameters, as in `ray_slopes`.
 
     Args:
         camera: The camera.
-        ideal: Pixels without distortion, shape (p, 2), [px].
+        undistorted: Pixels without distortion, shape (p, 2), [px].
 
     Returns:
-        Shape (p, 2, n), [px] for each unit of a number.
+        Shape (p, 2, n), [px] per unit of each of the n parameters.
     """
     focal, middle = camera.matrix[[0, 1], [0, 1]], camera.matrix[:2, 2]
-    return np.asarray(ray_slopes(camera, (ideal - middle) / focal) * focal[:, None])
+    return np.asarray(ray_slopes(camera, (undistorted - middle) / focal) * focal[:, None])
 
 
-def pixels_from_ideal(camera: Camera, ideal: Array) -> Array:
-    """Puts the lens distortion back on points, shape (..., 2), [px]; same shape."""
-    flat = np.asarray(ideal, dtype=np.float64).reshape(-1, 2)
+def distort_pixels(camera: Camera, undistorted: Array) -> Array:
+    """Applies the lens distortion to points, shape (..., 2), [px]; same shape."""
+    flat = np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
     rays = np.column_stack([flat, np.ones(len(flat))]) @ np.linalg.inv(camera.matrix).T
-    return pixels_of(camera, rays).reshape(ideal.shape)
+    return pixels_of(camera, rays).reshape(undistorted.shape)
 
 
 def pixels_of(camera: Camera, points_in_camera: Array) -> Array:
@@ -172,7 +172,7 @@ def pixels_of(camera: Camera, points_in_camera: Array) -> Array:
 
 
 def project_undistorted(camera: Camera, points_in_camera: Array) -> Array:
-    """Ideal pixels of points, shape (..., 3), [m]; shape (..., 2)."""
+    """Undistorted pixels of points, shape (..., 3), [m]; shape (..., 2)."""
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
     scaled = points_in_camera[..., :2] / points_in_camera[..., 2:]
     return np.asarray(scaled * [fx, fy] + camera.matrix[:2, 2])
@@ -195,15 +195,15 @@ class Region:
 
 
 def require_image_format(image: Image, camera: Camera, rig: str) -> None:
-    """An image of another kind than the camera was calibrated for would measure wrongly.
+    """Refuses an image of another format than the camera's.
 
     Args:
         image: The image.
-        camera: Whose it should be.
-        rig: Name of the rig that has it.
+        camera: The camera it should be from.
+        rig: Name of the rig.
 
     Raises:
-        BadInput: It is not a grey one of 8 bits, or not of the camera's size.
+        BadInput: It is not grey with 8 bits, or not of the camera's size.
     """
     wanted = (camera.height, camera.width)
     if image.shape != wanted or image.dtype != np.uint8:

@@ -1,4 +1,4 @@
-"""Clearance at measured poses, with what it may be off by."""
+"""Clearance at measured poses, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tracking.measurement import PoseMeasurement
 COVERAGE = 0.95
 """Share of true distances that lie within the stated uncertainty."""
 INTERVAL = f"{100.0 * COVERAGE:.0f} % interval"
-"""How verdict, report and messages name it."""
+"""Its name in verdict, report and messages."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,8 +25,8 @@ class MeasuredClearance:
 
     Attributes:
         nearest: In the order of the scene's obstacles.
-        uncertainties: Half width of the interval that holds each distance with `COVERAGE`: by the
-            measured pose and by outlets and anchors; shape (k,), [m].
+        uncertainties: Half widths of each distance's interval with `COVERAGE`, from the measured
+            pose, outlets and anchors; shape (k,), [m].
     """
 
     nearest: tuple[Nearest, ...]
@@ -39,24 +39,24 @@ class MeasuredClearance:
 
     @property
     def uncertainty(self) -> float:
-        """How much less than `distance` the smallest true distance may be, [m].
+        """`distance` minus the lower bound of the smallest true distance, [m].
 
-        More than the nearest obstacle's own uncertainty where one slightly farther away is known
-        less well.
+        It exceeds the nearest obstacle's own uncertainty if one slightly farther away is less
+        certain.
         """
         lows = [n.distance - u for n, u in zip(self.nearest, self.uncertainties, strict=True)]
         return self.distance - float(min(lows))
 
     @property
     def worst_case_obstacle(self) -> int:
-        """Number of the obstacle that `at_most` is of."""
+        """Index of the obstacle that determines `at_most`."""
         return int(np.argmin(self._highs))
 
     @property
     def at_most(self) -> float:
-        """The smallest true distance is no more than this, [m].
+        """Upper bound of the smallest true distance, [m].
 
-        Each obstacle counts with its own uncertainty: one that is known badly hides no other.
+        Each obstacle counts with its own uncertainty.
         """
         return float(np.min(self._highs))
 
@@ -66,17 +66,17 @@ class MeasuredClearance:
 
 
 def clearance_of(model: ClearanceModel, measurement: PoseMeasurement) -> MeasuredClearance | None:
-    """Clearance to every obstacle as a camera sees it; None in a scene without obstacles.
+    """Clearance to every obstacle at a measurement; None in a scene without obstacles.
 
-    What lens, camera's place, tags, outlets and anchors may be off by counts by its covariance,
-    carried to each distance with that of the pose.
+    Covariances of lens, extrinsics, tags, outlets, anchors and pose are propagated to each
+    distance.
 
     Raises:
-        BadInput: A part of that is not stated.
+        BadInput: A part of these is not stated.
     """
     if measurement.unstated:
         raise BadInput(
-            "it is unknown how far off this pose may be, so it gives no interval of the clearance",
+            "the error of this pose is unknown, so the clearance has no interval",
             next_step="calibrate, or state `error_mm` of the camera in the rig file",
         )
     covariance = measurement.covariance + measurement.shared
@@ -92,18 +92,18 @@ def clearance_at(
 ) -> MeasuredClearance | None:
     """Clearance to every obstacle at a measured pose; None in a scene without obstacles.
 
-    The pose's covariance is carried to the distance by its gradient: the nearest point of the robot
-    moves with the platform (wholly on it, in proportion along a cable), and the distance changes by
-    that motion along the line to the obstacle; that both nearest points slide changes nothing to
-    first order.
+    The pose's covariance is propagated to the distance by its gradient: the robot's nearest point
+    moves with the platform (fully on it, in proportion along a cable), and the distance changes by
+    that motion along the line to the obstacle; sliding of the nearest points has no first-order
+    effect.
 
     Args:
         model: Robot and scene.
         pose: ``world_from_platform``.
         covariance: Of position and rotation vector about world axes, shape (6, 6), [m, rad].
-        allowance: What the covariance does not know, [m].
-        cable_error: How far off exits of cables are, 95 %, [m]; 0 where the rig's `outlet_error`
-            and `anchor_error` say so of both ends.
+        allowance: Added for errors outside the covariance, [m].
+        cable_error: Error of cable exits, 95 %, [m]; 0 to use the rig's `outlet_error` and
+            `anchor_error`.
     """
     nearest = model.obstacles(pose)
     if not nearest:
@@ -137,7 +137,7 @@ def _variance(
     covariance = by_pose @ spread @ by_pose.T
     line = nearest.first_point - nearest.second_point
     length = float(np.linalg.norm(line))
-    if length < 1e-9:  # they touch, so the line is unknown: any direction may be the worst
+    if length < 1e-9:  # contact: the direction is unknown, so the worst counts
         return own + float(np.linalg.eigvalsh(covariance)[-1])
     direction = line / length
     return own + float(direction @ covariance @ direction)

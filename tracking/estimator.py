@@ -1,9 +1,8 @@
-"""The platform in one image, by the squares of its tags, and when its pose is believed.
+"""Platform pose in one image from the squares of its tags, and its acceptance tests.
 
-Which of the squares belong to the platform is decided by geometry. A tag of the same family and
-number may hang on a wall, lie on a table or stand on a screen. Every square allows two poses of the
-body; the pose that most squares agree on is the body's, and of a tag that is seen twice the square
-that fits it.
+Geometry decides which squares belong to the platform: another print of a tag may be on a wall, a
+table or a screen. Every square allows two poses of the body; the pose that most squares agree on is
+the body's, and of a tag detected twice the square that fits it is used.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 
 from model.pose import Array, Pose, read_only
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import Image, pixels_from_ideal, pixels_of, project_undistorted
+from tracking.camera_model import Image, distort_pixels, pixels_of, project_undistorted
 from tracking.detection.detector import Detection
 from tracking.detection.diagnostics import edge_faults
 from tracking.detection.tags import carries_tag, modules_across, tag_corners
@@ -28,19 +27,19 @@ from tracking.shared_errors import SharedErrors
 
 @dataclass(frozen=True, slots=True)
 class TrackerSettings:
-    """When a pose is believed.
+    """Acceptance limits of a pose, and the camera check.
 
     Attributes:
         reprojection_px: Largest RMS error of the corners.
-        view_angle: Tags seen more aslant than this are left out, [rad].
+        view_angle: Largest angle between line of sight and a tag's normal, [rad].
         position_deviation: Largest standard deviation of the position along any direction, [m].
-        jump: Largest way from the last pose beside what speed allows, [m].
-        jump_angle: Largest turn from the last pose, [rad].
-        speed: Fastest the platform is expected to go, [m/s].
-        turn: Largest turn from the home pose; no cable robot turns by a right angle, [rad].
-        single_tag_margin: By how much, in variances, a single tag's pose must fit better than its
-            mirror pose.
-        camera_moved_px: Frame tags farther off than this mean that the camera was moved.
+        jump: Largest distance from the last pose beyond what `speed` allows, [m].
+        jump_angle: Largest rotation from the last pose, [rad].
+        speed: Largest expected speed of the platform, [m/s].
+        turn: Largest rotation from the home pose, [rad]; no cable robot rotates by a right angle.
+        single_tag_margin: Required cost difference of a single tag's pose to its mirror pose, in
+            variances.
+        camera_moved_px: Error of frame tags above which the camera counts as moved.
         camera_check_period: Images between checks of the camera.
     """
 
@@ -56,38 +55,38 @@ class TrackerSettings:
     camera_check_period: int = 10
 
 
-# Which of the squares that were seen belong to the body.
+# Consensus: which detected squares belong to the body.
 
 
-#: A square agrees with a pose when its corners are this near, as a share of its own side, and [px].
+#: A square agrees with a pose if its corners are this near, as a share of its side, and [px].
 AGREEMENT, LEAST_AGREEMENT = 0.15, 3.0
-#: Poses that differ less are one and the same, [m].
+#: Poses closer than this are the same, [m].
 SAME = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
-    """The squares that agree.
+    """The squares that agree on one pose.
 
     Attributes:
-        views: Of each tag at most one.
-        ambiguous: Numbers of tags that are seen more than once while it is unknown which is the
-            body's; then there are no views.
+        views: At most one per tag.
+        ambiguous: Numbers of tags detected more than once, if it is unknown which is the body's;
+            then there are no views.
     """
 
     views: list[TagView]
     ambiguous: tuple[int, ...] = ()
 
 
-def agreeing(
+def find_consensus(
     camera: Camera, views: Sequence[TagView], possible: Callable[[Pose], bool]
 ) -> Consensus:
     """The largest set of squares that agree on one possible pose of the body.
 
     Args:
-        camera: The camera that saw them.
-        views: Squares with the tags whose numbers they carry; a tag may be there more than once.
-        possible: Whether the body can be at ``camera_from_body``.
+        camera: The camera.
+        views: Squares with the tags of their numbers; a tag may appear more than once.
+        possible: Whether ``camera_from_body`` is a possible pose.
     """
     found: list[tuple[int, float, Pose, list[TagView]]] = []
     for view in views:
@@ -112,7 +111,7 @@ def agreeing(
 def _fitting(
     camera: Camera, views: Sequence[TagView], pose: Pose
 ) -> dict[int, tuple[float, TagView]]:
-    """Of each tag the square that fits a pose best, with its misfit, where one fits at all."""
+    """The best-fitting square of each tag with its misfit, where one fits a pose."""
     best: dict[int, tuple[float, TagView]] = {}
     for view in views:
         points = pose.apply(tag_corners(view.tag))
@@ -129,26 +128,26 @@ def _fitting(
     return best
 
 
-# Why a pose that was found is not believed.
+# Acceptance tests of a pose.
 
 
 UNCERTAIN = "the position's uncertainty is"
-"""What is said of a pose by edges that are too soft, too few or too far away."""
+"""Message about a pose from edges that are too soft, too few or too far away."""
 UNSHARP = "are too blurred to be measured"
-"""What is said of tags that are read, but whose edges are not found."""
+"""Message about tags that are decoded, but whose edges are not found."""
 
 
-def doubt(
+def rejection_reason(
     limits: TrackerSettings, views: Sequence[TagView], bundle: BundlePose, prior: Pose | None
 ) -> str:
-    """Why a pose is not believed, empty when it is.
+    """Why a pose is rejected; empty when it is accepted.
 
     Args:
-        limits: When poses are.
-        views: The tags that it rests on.
-        bundle: The pose, in the camera's frame.
-        prior: Where a camera has led to expect it, in the same frame; of the two poses that a
-            single tag allows the one near it is believed.
+        limits: Acceptance limits.
+        views: The tags used.
+        bundle: The pose, in the camera frame.
+        prior: Pose expected from camera measurements, in the same frame; it resolves the ambiguity
+            of a single tag.
     """
     if bundle.reprojection > limits.reprojection_px:
         return (
@@ -168,18 +167,18 @@ def doubt(
     return ""
 
 
-# Edges that do not belong to a pose that the others agree on.
+# Outlier edges.
 
 
-#: An edge farther off than this many times the usual error is left out.
+#: An edge is an outlier if its error exceeds this many times the median error.
 FAR = 4.5
 
 
 def without_outliers(views: list[TagView], bundle: BundlePose) -> list[TagView] | None:
-    """Views without edges that lie far off beside the others, or None when all belong."""
+    """Views without outlier edges, or None if there are no outliers."""
     errors = bundle.edge_errors
     measured = np.array([view.seen.edges for view in views])
-    usual = max(1.0, float(np.median(errors[measured])) / 1.18)  # of two normal errors
+    usual = max(1.0, float(np.median(errors[measured])) / 1.18)  # median of Rayleigh's distribution
     off = measured & (errors > FAR * usual)
     if not off.any():
         return None
@@ -200,13 +199,13 @@ def without_outliers(views: list[TagView], bundle: BundlePose) -> list[TagView] 
 
 
 class PlatformEstimator:
-    """Measures the platform in an image by what is seen in it, whatever images came before.
+    """Measures the platform in a single image, independent of earlier images.
 
     Args:
         rig: Its tags and platform.
-        camera: The camera that took the images.
-        settings: When a pose is believed.
-        recent: The platform's motion, for cameras whose rows are exposed one after the other.
+        camera: The camera that takes the images.
+        settings: Acceptance limits.
+        recent: The platform's motion, for cameras with a rolling shutter.
     """
 
     def __init__(
@@ -217,7 +216,7 @@ class PlatformEstimator:
         self._modules = modules_across(rig.tag_family)
         self._platform = {tag.id: tag for tag in rig.platform_tags}
         self._frame = frozenset(tag.id for tag in rig.frame_tags)
-        # Cables pull: no platform leaves the box around the outlets by more than its own size.
+        # Cables only pull: the platform stays in the box around the outlets plus its own size.
         size = float(np.linalg.norm(rig.half_size))
         self._lower, self._upper = rig.outlets.min(axis=0) - size, rig.outlets.max(axis=0) + size
         self._camera_from_world = camera.world_from_camera.inverse()
@@ -241,23 +240,23 @@ class PlatformEstimator:
         expected: Pose | None,
         status: str,
     ) -> Observation:
-        """The pose by tags that the detector found, and by those that it missed.
+        """The pose from detected tags, and from tags that the detector missed.
 
         Args:
             image: The image.
-            time: When it was taken, [s].
-            detections: What the detector found; nothing when it was not asked.
-            expected: Expected pose, ``world_from_platform``, to separate a pose from
-                its mirror pose and to start from when nothing was detected.
-            status: Of the measurement.
+            time: Capture time, [s].
+            detections: Of the detector; empty if it was not run.
+            expected: Expected pose, ``world_from_platform``, to resolve mirror poses, and to start
+                from without detections.
+            status: Status of the measurement.
         """
         views = self.views(image, detections, self._platform)
         seen = tuple(d.id for d in detections)
         return self._measured(image, time, views, seen, expected, status)
 
-    def measured_at(self, image: Image, time: float, place: Pose, status: str) -> Observation:
-        """The pose by tags that are seen where ``place`` puts them; it has no other part in it."""
-        views = self._looked_for(image, self._camera_from_world.compose(place), set())
+    def measured_at(self, image: Image, time: float, pose: Pose, status: str) -> Observation:
+        """The pose from tags found where ``pose`` predicts them; otherwise independent of it."""
+        views = self._find_predicted(image, self._camera_from_world.compose(pose), set())
         seen = tuple(view.tag.id for view in views)
         return self._measured(image, time, views, seen, None, status)
 
@@ -279,8 +278,8 @@ class PlatformEstimator:
         first = solve_pnp(self._camera, views, prior) if views else None
         start = prior if first is None else first.camera_from_body
         if start is None:
-            return NoPose(time, self._why_nothing(seen, measured), seen)
-        views = views + self._looked_for(image, start, {v.tag.id for v in views})
+            return NoPose(time, self._no_pose_reason(seen, measured), seen)
+        views = views + self._find_predicted(image, start, {v.tag.id for v in views})
         by_rows: FitByRows | None = None
         if self._camera.readout == 0.0:
             fitted = self._fitted(views, start)
@@ -290,7 +289,7 @@ class PlatformEstimator:
         if fitted is None:
             return NoPose(time, "no tag of the platform fits a pose", seen)
         views, bundle = fitted
-        reason = doubt(self._settings, views, bundle, prior)
+        reason = rejection_reason(self._settings, views, bundle, prior)
         faults = edge_faults(image, self._camera, [view.seen for view in views], self._modules)
         if reason or faults.unusable:
             return NoPose(time, "; ".join(filter(None, (reason, str(faults)))), seen)
@@ -301,7 +300,7 @@ class PlatformEstimator:
         return replace(found, covariance=covariance, at_rest=by_rows.at_rest)
 
     def _agreed(self, views: Sequence[TagView]) -> Consensus:
-        """The views that agree on a pose of the platform within its frame."""
+        """The views that agree on a possible pose of the platform."""
         world_from_camera = self._camera.world_from_camera
 
         def possible(camera_from_platform: Pose) -> bool:
@@ -309,9 +308,9 @@ class PlatformEstimator:
             inside = np.all((pose.position >= self._lower) & (pose.position <= self._upper))
             return bool(inside) and pose.angle_to(self._rig.home) < self._settings.turn
 
-        return agreeing(self._camera, views, possible)
+        return find_consensus(self._camera, views, possible)
 
-    def _why_nothing(self, seen: tuple[int, ...], measured: bool) -> str:
+    def _no_pose_reason(self, seen: tuple[int, ...], measured: bool) -> str:
         if mine := [str(number) for number in seen if number in self._platform]:
             tags = ", ".join(mine)
             if measured:
@@ -322,10 +321,10 @@ class PlatformEstimator:
         also = f"; detected instead: {', '.join(map(str, others))}" if others else ""
         return f"no platform tag ({self._rig.tag_family} {wanted}) detected{also}"
 
-    def _looked_for(self, image: Image, pose: Pose, known: set[int]) -> list[TagView]:
-        """Tags that the detector missed, looked for where a pose puts them.
+    def _find_predicted(self, image: Image, pose: Pose, known: set[int]) -> list[TagView]:
+        """Tags that the detector missed, searched at their positions predicted by a pose.
 
-        A cable across the white border breaks the detector's outline, not the square's edges.
+        A cable across the white border breaks the outline for the detector, but not the edges.
         """
         missed = [t for t in self._rig.platform_tags if t.id not in known and self._faces(t, pose)]
         rough = [pixels_of(self._camera, pose.apply(tag_corners(tag))) for tag in missed]
@@ -334,22 +333,22 @@ class PlatformEstimator:
         for tag, square in zip(missed, squares, strict=True):
             if square is None:
                 continue
-            corners = pixels_from_ideal(self._camera, square.corners)
+            corners = distort_pixels(self._camera, square.corners)
             if carries_tag(image, corners, self._rig.tag_family, tag.id):
                 views.append(TagView(tag, square))
         return views
 
     def _faces(self, tag: Tag, camera_from_platform: Pose) -> bool:
-        """Whether the camera sees a tag's front, not too much aslant."""
+        """Whether the camera sees a tag's front within the view angle."""
         camera_from_tag = camera_from_platform.compose(tag.pose)
         away = camera_from_tag.position / np.linalg.norm(camera_from_tag.position)
         return bool(-camera_from_tag.rotation[:, 2] @ away > np.cos(self._settings.view_angle))
 
     def _fitted(self, views: list[TagView], start: Pose) -> tuple[list[TagView], BundlePose] | None:
-        """The pose of all views, without tags seen aslant and edges that do not belong."""
+        """The pose from all views, without oblique tags and outlier edges."""
         views = [view for view in views if self._faces(view.tag, start)]
         for _ in range(4):
-            solve = solve_pnp if len(views) == 1 else refine_pnp  # one tag alone has a rival
+            solve = solve_pnp if len(views) == 1 else refine_pnp  # a single tag has a mirror pose
             bundle = solve(self._camera, views, start) if views else None
             if bundle is None:
                 return None
@@ -360,7 +359,7 @@ class PlatformEstimator:
         return None
 
     def _covariance(self, bundle: BundlePose, views: Sequence[TagView]) -> Array:
-        """Of a pose by the scatter of its edges, along the world's axes, shape (6, 6), [m, rad]."""
+        """Covariance of a pose from edge scatter, world axes, shape (6, 6), [m, rad]."""
         turn = np.kron(np.eye(2), self._camera.world_from_camera.rotation)
         return read_only(turn @ self._shared.scatter(bundle, views) @ turn.T)
 
@@ -377,5 +376,5 @@ class PlatformEstimator:
             status,
             self._shared.of(pose, views),
             self._shared.unstated,
-            cable_error=self._shared.whole or 0.0,
+            cable_error=self._shared.operator_error or 0.0,
         )

@@ -1,4 +1,4 @@
-"""What a tracker says about one image."""
+"""Measurement of the platform in one image, and its extrapolation in time."""
 
 from __future__ import annotations
 
@@ -23,17 +23,16 @@ class PoseMeasurement:
         time: Of the image, [s].
         pose: ``world_from_platform``.
         covariance: Of position [m] and rotation vector [rad] along the world's axes, shape (6, 6).
-            It holds the scatter of the corners, not errors of the camera's place or of the tags'.
-        tags: Numbers of the tags it rests on.
+            From the scatter of the corners, without errors of extrinsics and tags.
+        tags: Numbers of the tags used.
         reprojection: RMS error of their corners, [px].
-        status: ``found`` (searched in the whole image), ``tracked`` (where it was expected) or
-            ``guided`` (where the drives' positions put it).
-        shared: As `covariance`, of the errors that all pictures have in common: of the camera's
-            place and of the tags, as far as calibrations or the rig file state them.
+        status: ``found`` (in the whole image), ``tracked`` (near the last pose) or ``guided`` (at
+            the encoder pose).
+        shared: As `covariance`, of the errors common to all images, from extrinsics and tags, as
+            far as calibrations or the rig file state them.
         unstated: Whether a part of these is not stated.
-        at_rest: ``world_from_platform`` as if all rows of the image had been exposed at once; None
-            where they were.
-        cable_error: How far off cables are, 95 %, where the operator's number stands for that, [m].
+        at_rest: ``world_from_platform`` as for a global shutter; None if the camera has one.
+        cable_error: Error of cables, 95 %, if the operator's value replaces stated errors, [m].
     """
 
     time: float
@@ -49,7 +48,7 @@ class PoseMeasurement:
 
     @property
     def uncorrected(self) -> Pose:
-        """The pose as if all rows of the image had been exposed at once."""
+        """The pose without rolling-shutter correction."""
         return self.at_rest or self.pose
 
     @property
@@ -65,12 +64,12 @@ class PoseMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class NoPose:
-    """An image that gives no pose.
+    """An image without a pose.
 
     Attributes:
         time: Of the image, [s].
-        reason: Why.
-        seen: Numbers of the tags of the rig's family that were seen.
+        reason: Why there is none.
+        seen: Numbers of the detected tags of the rig's family.
     """
 
     time: float
@@ -81,15 +80,15 @@ class NoPose:
 Observation = PoseMeasurement | NoPose
 
 
-# Where the platform will be: it goes on as it went.
+# Extrapolation at constant velocity.
 
 
-#: Older motion says nothing about the present one, [s].
+#: Longest time over which motion is extrapolated, [s].
 MEMORY = 0.5
 
 
-def predicted(last: PoseMeasurement, before: PoseMeasurement | None, time: float) -> Pose:
-    """The pose at a time if the platform goes on with the speed between two measurements.
+def predict(last: PoseMeasurement, before: PoseMeasurement | None, time: float) -> Pose:
+    """The pose at a time, extrapolated with the velocity between two measurements.
 
     Args:
         last: The newest measurement.
@@ -110,19 +109,19 @@ def predicted(last: PoseMeasurement, before: PoseMeasurement | None, time: float
 def extrapolate(
     last: PoseMeasurement, before: PoseMeasurement | None, time: float
 ) -> PoseMeasurement | None:
-    """A measurement as it would have been a little later, with what that adds to its covariance.
+    """A measurement extrapolated to a later time, with its covariance.
 
     Args:
         last: The measurement.
         before: The one before it by the same camera, if there is one.
-        time: Of the later one, [s]; not before the measurement's own.
+        time: Of the result, [s]; not before the measurement's own.
 
     Returns:
-        None where `predicted` knows no speed: the pose is unknown then.
+        None if the velocity is unknown.
     """
     if time == last.time:
         return last
-    pose = predicted(last, before, time)
+    pose = predict(last, before, time)
     if before is None or pose is last.pose:
         return None
     share = (time - last.time) / (last.time - before.time)
@@ -131,7 +130,7 @@ def extrapolate(
 
 
 def rates(pictures_per_second: float | None, measuring_ms: float | None, tags: int) -> str:
-    """Live figures: how fast, how long an image takes, how many tags are seen."""
+    """Live figures: frame rate, measuring time, number of detected tags."""
     fast = "–" if pictures_per_second is None else f"{pictures_per_second:.1f}"
     long = "–" if measuring_ms is None else f"{measuring_ms:.1f}"
     return f"{fast} images/s, {long} ms, {tags} tag{'' if tags == 1 else 's'}"

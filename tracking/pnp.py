@@ -1,8 +1,8 @@
-"""One rigid pose from all tags of a body at once.
+"""Rigid pose of a body from all its tags at once.
 
-The squares of all tags are fitted together: from both poses that each single square allows, the
-best ones are improved by Levenberg–Marquardt on the edges of all squares with Huber's loss. So no
-tag's mirror pose (a single square's usual trap) survives when more than one is seen.
+Each square alone allows two poses. The best of all these are refined by Levenberg–Marquardt on the
+edges of all squares with Huber's loss, so a single square's mirror pose is rejected as soon as more
+than one tag is visible.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from tracking.edges.refine import RefinedTag
 
 #: Edge errors beyond this many deviations count linearly (Huber).
 HUBER = 3.0
-#: The edges' stated deviations weigh as this many residuals when the covariance is scaled by
-#: how well all edges fit: few edges fit well by chance.
+#: Weight of the edges' stated deviations, in residuals, when the covariance is scaled by their
+#: misfit: few edges fit well by chance.
 PRIOR_WEIGHT = 12.0
-#: A cost larger by this factor than it should be is not taken for chance, and fewer degrees of
-#: freedom than these are not counted as fewer.
+#: A cost above the expected one by this factor is significant; lower limit on the degrees of
+#: freedom of Student's factor.
 CHANCE, FEWEST = 1.3, 4
-#: Of the intervals, [share].
+#: Coverage of the intervals.
 COVERAGE = 0.95
 #: Two results closer than this are the same, [m] and [rad].
 SAME = (2e-3, 0.02)
@@ -37,7 +37,7 @@ SAME = (2e-3, 0.02)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagView:
-    """A tag of a body and how it was seen."""
+    """A tag of a body and its detection in an image."""
 
     tag: Tag
     seen: RefinedTag
@@ -45,17 +45,17 @@ class TagView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundlePose:
-    """The pose of a body that fits all its tags.
+    """The fitted pose of a body.
 
     Attributes:
         camera_from_body: The pose.
         covariance: Of position [m] and rotation vector [rad] along the camera's axes, shape (6, 6).
         cost: Huber cost of the edges, in variances.
-        second_best_cost: Cost of the best other pose, infinite without one.
-        freedom: Errors of edges beyond the pose's six numbers.
-        edge_errors: Of each tag's edges in deviations, 0 where hidden, shape (t, 4).
-        corner_errors: Of each tag's corners, RMS, shape (t,), [px]; of whole tags their corners,
-            else of the edges that were measured.
+        second_best_cost: Cost of the second-best pose; infinite without one.
+        freedom: Degrees of freedom: edge errors minus six.
+        edge_errors: Of each tag's edges, in deviations, 0 where hidden, shape (t, 4).
+        corner_errors: RMS error of each tag's corners, shape (t,), [px]; of partly hidden tags, of
+            the measured edges.
         certainties: Information of each tag's edges, shape (t,), [1/px²].
     """
 
@@ -69,14 +69,13 @@ class BundlePose:
     certainties: Array
 
     def misfit(self, expected: float) -> float:
-        """How much larger the variances of the edges are than they state, by how well they fit.
+        """Ratio of the edges' actual variance to the stated one, from their misfit.
 
-        Where they fit worse than chance explains, their noise is not what it was taken to be, and
-        what they state counts no more: their disagreement alone does, with Student's factor for how
-        few they are.
+        If the misfit is significant, the stated noise is wrong and only the residuals count, with
+        Student's factor for their number.
 
         Args:
-            expected: The cost that they should have, such as `freedom`.
+            expected: The expected cost, such as `freedom`.
         """
         usual = (PRIOR_WEIGHT + self.cost) / (PRIOR_WEIGHT + expected)
         if self.cost <= CHANCE * expected:
@@ -91,7 +90,7 @@ class BundlePose:
 
 
 def pose_slopes(camera: Camera, points: Array, pose: Pose) -> Array:
-    """Change of ideal pixels with a shift [m] and a turn [rad] about the camera's axes.
+    """Derivatives of undistorted pixels by shift [m] and rotation [rad], camera axes.
 
     Args:
         camera: The camera.
@@ -115,7 +114,7 @@ def pose_slopes(camera: Camera, points: Array, pose: Pose) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Squares:
-    """All tags' corners on the body, and their measured edges, stacked."""
+    """Corners of all tags on the body and their measured edges, stacked."""
 
     camera: Camera
     corners: Array  # (t, 4, 3)
@@ -140,7 +139,7 @@ class _Squares:
         return np.asarray(np.einsum("tij,tj->ti", self.whitening, flat))
 
     def jacobian(self, pose: Pose) -> Array:
-        """Change of the errors with a shift [m] and a turn [rad] about the camera's axes."""
+        """Derivatives of the errors by shift [m] and rotation [rad] about the camera's axes."""
         slopes = pose_slopes(self.camera, self.corners, pose)
         return np.asarray(self.whitening @ slopes.reshape(len(self.corners), 8, 6))
 
@@ -148,15 +147,15 @@ class _Squares:
 def solve_pnp(
     camera: Camera, views: Sequence[TagView], prior: Pose | None = None
 ) -> BundlePose | None:
-    """The pose of a body whose tags were seen.
+    """The pose of a body from its detected tags.
 
     Args:
-        camera: The camera that saw them (its own place does not matter here).
+        camera: The camera; its pose is not used.
         views: One or more tags.
-        prior: A guess of ``camera_from_body``, one more start of the search.
+        prior: A guess of ``camera_from_body``, used as a further start.
 
     Returns:
-        The best pose, or None when no start led to one in front of the camera.
+        The best pose, or None if no start leads to one in front of the camera.
     """
     squares = _Squares.of(camera, views)
     starts = [pose for view in views for pose in square_poses(camera, view)]
@@ -166,7 +165,7 @@ def solve_pnp(
     found: list[tuple[float, Pose]] = []
     rivals = _different(ranked[1:], ranked[:1])[:1]
     for start in ranked[:1] + rivals:
-        pose = _improved(squares, start)
+        pose = _refined(squares, start)
         found.append((_huber(squares.errors(pose)), pose))
     if not found:
         return None
@@ -177,51 +176,51 @@ def solve_pnp(
 
 
 def refine_pnp(camera: Camera, views: Sequence[TagView], start: Pose) -> BundlePose | None:
-    """The pose nearest to a start that is known to be the right one; knows of no rival."""
+    """Refines a pose known to be the right one; considers no alternative."""
     squares = _Squares.of(camera, views)
     if not _in_front(squares, start):
         return None
-    pose = _improved(squares, start)
+    pose = _refined(squares, start)
     return _result(squares, views, pose, _huber(squares.errors(pose)), float("inf"))
 
 
 def moved_by_pixels(camera: Camera, views: Sequence[TagView], pose: Pose, shifts: Array) -> Array:
-    """How a fitted pose moves when the corners that were seen do, to first order.
+    """Change of a fitted pose with shifts of its corners, to first order.
 
     Args:
-        camera: The camera that saw them.
+        camera: The camera.
         views: The tags.
         pose: ``camera_from_body`` that fits them.
-        shifts: Of each tag's ideal corners, by each of k causes, shape (t, 8, k), [px].
+        shifts: Of each tag's undistorted corners by each of k causes, shape (t, 8, k), [px].
 
     Returns:
-        Shift [m] and turn [rad] along the camera's axes, shape (6, k).
+        Shift [m] and rotation [rad] along the camera's axes, shape (6, k).
     """
     return _by_pixels(_Squares.of(camera, views), pose, shifts)[0]
 
 
 def expected_cost(camera: Camera, views: Sequence[TagView], pose: Pose, shifts: Array) -> float:
-    """The mean cost of a fitted pose whose corners are off by known causes beside their scatter.
+    """Expected cost of a fitted pose whose corners have known errors beside their scatter.
 
     Args:
-        camera: The camera that saw them.
+        camera: The camera.
         views: The tags.
         pose: ``camera_from_body`` that fits them.
-        shifts: Of each tag's ideal corners, by each of k independent causes of size 1, shape
-            (t, 8, k), [px].
+        shifts: Of each tag's undistorted corners by each of k independent causes of unit variance,
+            shape (t, 8, k), [px].
     """
     left = _by_pixels(_Squares.of(camera, views), pose, shifts)[1]
     measured = np.array([view.seen.edges for view in views])
-    scatter = max(1.0 - 3.0 / np.count_nonzero(measured), 0.0)  # the pose takes six errors off
+    scatter = max(1.0 - 3.0 / np.count_nonzero(measured), 0.0)  # the pose absorbs six errors
     variances = scatter + np.mean(np.sum(left**2, axis=1).reshape(-1, 4, 2), axis=2)[measured]
-    # Of a pair of normal errors of one variance, by parts: its size has Rayleigh's distribution.
+    # Mean Huber cost of a pair of normal errors of equal variance: Rayleigh's distribution.
     near = 2.0 * variances * -np.expm1(-0.5 * HUBER**2 / np.maximum(variances, 1e-12))
     beyond = 2.0 * HUBER * np.sqrt(2.0 * np.pi * variances)
     return float(np.sum(near + beyond * ndtr(-HUBER / np.sqrt(np.maximum(variances, 1e-12)))))
 
 
 def _by_pixels(squares: _Squares, pose: Pose, shifts: Array) -> tuple[Array, Array]:
-    """How a pose moves with its corners, (6, k), and what errors of edges that leaves, (8 t, k)."""
+    """Change of a pose with its corners, (6, k), and remaining edge errors, (8 t, k)."""
     slopes = squares.jacobian(pose).reshape(-1, 6)
     causes = (squares.whitening @ shifts).reshape(len(slopes), -1)
     weighted = slopes * _weights(squares.errors(pose))[:, None]
@@ -230,7 +229,7 @@ def _by_pixels(squares: _Squares, pose: Pose, shifts: Array) -> tuple[Array, Arr
 
 
 def square_poses(camera: Camera, view: TagView) -> list[Pose]:
-    """Both poses ``camera_from_body`` that a single square allows."""
+    """Both candidates of ``camera_from_body`` from a single square."""
     half = view.tag.size / 2.0
     square = np.column_stack([CORNER_SIGNS * half, np.zeros(4)])
     count, turns, shifts, _ = cv2.solvePnPGeneric(
@@ -271,7 +270,7 @@ def _same(a: Pose, b: Pose) -> bool:
 
 
 def _different(poses: Sequence[Pose], from_: Sequence[Pose]) -> list[Pose]:
-    """Those that turn or lie clearly otherwise: starts that may lead elsewhere."""
+    """Poses whose rotation clearly differs from all of ``from_``."""
     return [p for p in poses if all(p.angle_to(q) > 0.05 for q in from_)]
 
 
@@ -292,8 +291,8 @@ def _weights(errors: Array) -> Array:
     return np.repeat(np.minimum(1.0, HUBER / size).reshape(-1), 2)
 
 
-def _improved(squares: _Squares, pose: Pose) -> Pose:
-    """Levenberg–Marquardt from a start."""
+def _refined(squares: _Squares, pose: Pose) -> Pose:
+    """Levenberg–Marquardt from an initial pose."""
     errors = squares.errors(pose)
     cost, damping = _huber(errors), 1e-4
     for _ in range(40):
@@ -320,7 +319,7 @@ def _improved(squares: _Squares, pose: Pose) -> Pose:
 
 
 def moved(pose: Pose, step: Array) -> Pose:
-    """The pose after a shift [m] and a turn [rad] along the outer frame's axes, shape (6,)."""
+    """The pose after a shift [m] and rotation [rad] along the outer frame's axes, shape (6,)."""
     return Pose(pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation)
 
 
@@ -333,7 +332,7 @@ def _result(
     freedom = 2 * sum(int(v.seen.edges.sum()) for v in views) - 6
     try:
         covariance: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-    except np.linalg.LinAlgError:  # too few edges to fix all six
+    except np.linalg.LinAlgError:  # too few edges for six parameters
         covariance = np.full((6, 6), np.inf)
     found = BundlePose(
         pose,
@@ -349,7 +348,7 @@ def _result(
 
 
 def _certainty(seen: RefinedTag) -> float:
-    """One over the variance that offsets and tilts of a tag's edges leave its corners, [1/px²]."""
+    """Inverse variance of a tag's corners from its edges' offsets and tilts, [1/px²]."""
     rows = np.sum(seen.whitening**2, axis=1)[np.repeat(seen.edges, 2)]
     return float(1.0 / np.mean(1.0 / rows))
 
@@ -363,7 +362,7 @@ def _corner_errors(squares: _Squares, views: Sequence[TagView], pose: Pose) -> A
             gap = corners - view.seen.corners
             result.append(float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))))
             continue
-        # Of a partly hidden square the offsets of its visible edges, in pixels.
+        # For a partly hidden square: offsets of its visible edges, in pixels.
         rows = np.linalg.norm(view.seen.whitening[::2], axis=1)[view.seen.edges]
         result.append(float(np.sqrt(np.mean((errors[::2][view.seen.edges] / rows) ** 2))))
     return np.array(result)

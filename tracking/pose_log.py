@@ -39,7 +39,7 @@ POSE_COLUMNS = (
 )
 
 
-#: Further columns where obstacles are known.
+#: Further columns if the scene has obstacles.
 CLEARANCE_COLUMNS = (
     "clearance_mm",
     "clearance_uncertainty_mm",
@@ -51,12 +51,12 @@ CLEARANCE_COLUMNS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoggedPicture:
-    """One image's name and what was measured in it.
+    """Name and measurement of one image.
 
     Attributes:
         name: Of the image.
-        observation: The pose, or why there is none.
-        clearance: At the pose, where obstacles are known.
+        observation: The pose, or the reason why there is none.
+        clearance: At the pose, if the scene has obstacles.
     """
 
     name: str
@@ -65,7 +65,7 @@ class LoggedPicture:
 
 
 def pose_row(frame: int, logged: LoggedPicture) -> tuple[str, ...]:
-    """The values of one row, in the order of `POSE_COLUMNS`; empty where there is no pose."""
+    """Values of one row, in the order of `POSE_COLUMNS`; empty without a pose."""
     found = logged.observation
     head = (str(frame), f"{found.time:.6f}")
     if isinstance(found, NoPose):
@@ -88,12 +88,12 @@ def pose_row(frame: int, logged: LoggedPicture) -> tuple[str, ...]:
 def write_pose_log(
     path: Path, pictures: Sequence[LoggedPicture], with_clearance: bool = False
 ) -> None:
-    """Writes ``poses.csv`` whole or not at all.
+    """Writes ``poses.csv`` atomically.
 
     Args:
         path: The file.
         pictures: Its rows.
-        with_clearance: Whether it has the `CLEARANCE_COLUMNS`.
+        with_clearance: Whether to write the `CLEARANCE_COLUMNS`.
 
     Raises:
         BadInput: The folder cannot be written to.
@@ -108,7 +108,7 @@ def write_pose_log(
 
 
 def _clearance_values(clearance: MeasuredClearance | None) -> tuple[str, ...]:
-    """The values of the `CLEARANCE_COLUMNS`; empty where there is no pose."""
+    """Values of the `CLEARANCE_COLUMNS`; empty without a pose."""
     if clearance is None:
         return ("",) * len(CLEARANCE_COLUMNS)
     nearest = min(clearance.nearest, key=lambda n: n.distance)

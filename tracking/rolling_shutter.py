@@ -1,8 +1,8 @@
-"""Rolling shutters: what rows that are exposed one after the other would show all at once.
+"""Rolling-shutter correction: edges as a global shutter at the middle row's time would show them.
 
-An image is stamped with the time of its middle row. What a moving platform's tags show in another
-row is where they were a little earlier or later; with the platform's motion the edges are put where
-the middle row's time has them, and the pose follows as from any image.
+An image is stamped with the time of its middle row; other rows show a moving platform's tags a
+little earlier or later. With the platform's motion the edges are shifted to the middle row's time,
+and the pose follows as from any image.
 
 Source: Hedborg, Forssén, Felsberg & Ringaby, "Rolling shutter bundle adjustment", CVPR 2012.
 """
@@ -30,25 +30,24 @@ from tracking.detection.tags import tag_corners
 from tracking.measurement import MEMORY, PoseMeasurement
 from tracking.pnp import BundlePose, TagView, refine_pnp
 
-#: Poses that a speed is taken from are this many readouts apart, where there are such: farther
-#: apart, acceleration that changes meanwhile counts for more than the poses' scatter.
+#: Poses for a velocity are at least this many readouts apart, if possible; much farther apart,
+#: changes of acceleration matter more than the poses' scatter.
 APART = 2.0
-#: Times that the motion is taken from the pose that was found with it.
+#: Iterations of motion and pose.
 PASSES = 2
-#: Of the motion that a pose's dependence on it is found with, [m/s] and [rad/s].
+#: Step of the motion for finite differences, [m/s] and [rad/s].
 _STEP = 0.02
 
 
 class RecentMotion:
-    """How a platform moves, by its poses of the last half second.
+    """Motion of the platform from its poses of the last half second.
 
-    The poses are those that fit as if all rows had been exposed at once. They are off by nearly the
-    same, so that their differences are those of the true ones; true ones would carry errors of the
-    motion from image to image.
+    It uses uncorrected poses: their errors are nearly equal, so that their differences are those of
+    the true poses. Corrected poses would carry errors of the motion from image to image.
     """
 
     def __init__(self, readout: float) -> None:
-        """Nothing was measured yet.
+        """Starts without measurements.
 
         Args:
             readout: Of the camera, [s].
@@ -57,19 +56,19 @@ class RecentMotion:
         self._past: deque[PoseMeasurement] = deque()
 
     def add(self, measurement: PoseMeasurement) -> None:
-        """The next one in time; what is too old is forgotten."""
+        """Adds the next measurement in time and drops old ones."""
         self._past.append(measurement)
         while len(self._past) > 2 and self._past[1].time < measurement.time - 2.0 * MEMORY:
             self._past.popleft()
 
     def at(self, time: float, pose: Pose) -> PlatformMotion | None:
-        """The motion at a time, None where it is not known.
+        """The motion at a time, None if unknown.
 
-        Through a pose and two before it, as if acceleration were steady.
+        Through a pose and two earlier ones, at constant acceleration.
 
         Args:
             time: Of the pose, [s]; not before the measurements.
-            pose: ``world_from_platform`` that fits as if all rows had been exposed at once.
+            pose: ``world_from_platform`` without correction.
         """
         last, first = self._bases(time)
         if last is None:
@@ -85,7 +84,7 @@ class RecentMotion:
         )
 
     def covariance(self, time: float) -> Array | None:
-        """What the poses' scatter leaves open of velocity and turning, shape (6, 6), or None."""
+        """Covariance of velocity and angular velocity, shape (6, 6), or None."""
         last, first = self._bases(time)
         if last is None:
             return None
@@ -98,27 +97,27 @@ class RecentMotion:
         return squares * last.covariance
 
     def _bases(self, time: float) -> tuple[PoseMeasurement | None, PoseMeasurement | None]:
-        """The measurement that a motion is taken from, and the one before it."""
+        """The measurement that a velocity is computed from, and the one before it."""
         last = self._before(time)
         return last, None if last is None else self._before(last.time)
 
     def _before(self, time: float) -> PoseMeasurement | None:
-        """The newest measurement long enough before a time, else the oldest; none too old."""
+        """The newest measurement long enough before a time, else the oldest recent one."""
         old = [one for one in self._past if 0.0 < time - one.time <= MEMORY]
         far = [one for one in old if time - one.time >= self._apart]
         return far[-1] if far else old[0] if old else None
 
 
-def rows_at_once(
+def correct_rolling_shutter(
     camera: Camera, views: Sequence[TagView], pose: Pose, motion: PlatformMotion
 ) -> list[TagView]:
-    """Views as they would be if all rows had been exposed with the middle one.
+    """Views as with a global shutter at the middle row's time.
 
     Args:
         camera: The camera.
-        views: As they were seen.
-        pose: ``world_from_platform`` at the middle row's time; roughly will do.
-        motion: Of the platform meanwhile.
+        views: As detected.
+        pose: Approximate ``world_from_platform`` at the middle row's time.
+        motion: Of the platform during the exposure.
     """
     corrected = []
     for view in views:
@@ -133,11 +132,11 @@ def rows_at_once(
 
 
 def _shift(camera: Camera, points: Array, pose: Pose, motion: PlatformMotion) -> Array:
-    """How far points are seen from where the middle row's time has them, ideal, shape (4, 2)."""
+    """Undistorted shift of points from their position at the middle row's time, (4, 2)."""
     camera_from_world = camera.world_from_camera.inverse()
     speeds = motion.velocity + np.cross(motion.turning, points - pose.position)
     there = points
-    for _ in range(3):  # the row decides on the time, and the time on the row
+    for _ in range(3):  # row and time depend on each other
         times = camera.row_times(pixels_of(camera, camera_from_world.apply(there)))
         there = points + times[:, None] * speeds
     seen, middle = (
@@ -147,18 +146,18 @@ def _shift(camera: Camera, points: Array, pose: Pose, motion: PlatformMotion) ->
 
 
 def pose_by_motion(camera: Camera, views: Sequence[TagView], camera_from_body: Pose) -> Array:
-    """How the pose that fits views depends on the motion that they are corrected by.
+    """Derivative of the fitted pose by the motion used for correction.
 
     Returns:
-        Change of position and rotation vector along the world's axes by velocity and turning, shape
-        (6, 6).
+        Of position and rotation vector along the world's axes, by velocity and angular velocity,
+        shape (6, 6).
     """
     pose = camera.world_from_camera.compose(camera_from_body)
     slopes = np.zeros((6, 6))
     for k in range(6):
         step = np.zeros(6)
         step[k] = _STEP
-        corrected = rows_at_once(camera, views, pose, PlatformMotion(step[:3], step[3:]))
+        corrected = correct_rolling_shutter(camera, views, pose, PlatformMotion(step[:3], step[3:]))
         fitted = refine_pnp(camera, corrected, camera_from_body)
         if fitted is None:
             return np.full((6, 6), np.inf)
@@ -170,13 +169,13 @@ def pose_by_motion(camera: Camera, views: Sequence[TagView], camera_from_body: P
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitByRows:
-    """A pose at the middle row's time.
+    """A rolling-shutter corrected pose, at the middle row's time.
 
     Attributes:
-        views: What it rests on, as if all rows had been exposed then.
-        bundle: The pose, in the camera's frame.
-        covariance: What the motion leaves open, along the world's axes, shape (6, 6), [m, rad].
-        at_rest: ``world_from_platform`` that fits as if all rows had been exposed at once.
+        views: The views used, corrected.
+        bundle: The pose, in the camera frame.
+        covariance: From the uncertain motion, along the world's axes, shape (6, 6), [m, rad].
+        at_rest: ``world_from_platform`` without correction.
     """
 
     views: list[TagView]
@@ -186,19 +185,19 @@ class FitByRows:
 
 
 Fit = Callable[[list[TagView], Pose], tuple[list[TagView], BundlePose] | None]
-"""Finds the pose of views in the camera's frame, near another, and which views it rests on."""
+"""Finds the pose of views in the camera frame, near another, and the views used."""
 
 
 class RollingShutter:
-    """Poses at one time by a camera whose rows are exposed one after the other."""
+    """Rolling-shutter correction of a camera's poses."""
 
     def __init__(self, rig: Rig, camera: Camera, recent: RecentMotion) -> None:
-        """Takes the camera.
+        """Sets up the correction for a camera.
 
         Args:
-            rig: Says how fast the platform may go.
+            rig: Gives the platform's largest speed.
             camera: The camera.
-            recent: How the platform moved.
+            recent: Recent motion of the platform.
         """
         self._camera, self._recent = camera, recent
         speed = rig.motion.speed / SURE
@@ -206,14 +205,14 @@ class RollingShutter:
         self._unknown = np.diag([speed**2] * 3 + [turning**2] * 3)
 
     def fitted(self, time: float, views: list[TagView], start: Pose, fit: Fit) -> FitByRows | None:
-        """The pose at the middle row's time, or None when nothing fits.
+        """The pose at the middle row's time, or None if nothing fits.
 
-        Where the motion is not known, the platform is taken to stand still, and the covariance says
-        what the speed that it is commanded with would change.
+        If the motion is unknown, the platform is assumed at rest, and the covariance covers its
+        commanded speed.
 
         Args:
             time: Of the middle row, [s].
-            views: As they were seen.
+            views: As detected.
             start: A guess of ``camera_from_platform``.
             fit: Finds the pose of views.
         """
@@ -226,7 +225,7 @@ class RollingShutter:
             motion = self._recent.at(time, at_rest)
             if motion is None:
                 break
-            corrected = rows_at_once(self._camera, views, pose, motion)
+            corrected = correct_rolling_shutter(self._camera, views, pose, motion)
             found = fit(corrected, first.camera_from_body)
             if found is None:
                 break

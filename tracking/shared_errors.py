@@ -1,9 +1,9 @@
-"""What is wrong in all pictures of a camera alike: its lens, its place, the tags.
+"""Errors common to all images of a camera: lens, extrinsics, tags.
 
-Such errors do not average away over pictures, so their covariance is kept beside that of the
-corners' scatter. A camera's place that was found by pictures moves with the errors of its lens: a
-focal length that is too long puts the camera too far away, and what it measures near the tags that
-located it hardly moves. So a lens error counts by what it does to place and pose together.
+They do not average out over images, so their covariance is kept beside that of the corners'
+scatter. Extrinsics found from images depend on the lens errors: too long a focal length puts the
+camera too far away, but hardly moves what it measures near the tags that located it. So lens
+errors are propagated through extrinsics and pose together.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from model.cameras import SURE
 from model.errors import BadInput, Fault
 from model.pose import Array, Pose, carried, read_only, skew
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import ideal_slopes, project_undistorted, ray_slopes, rays_of
+from tracking.camera_model import project_undistorted, ray_slopes, rays_of, undistorted_slopes
 from tracking.detection.tags import tag_corners
 from tracking.pnp import BundlePose, TagView, expected_cost, moved_by_pixels, solve_pnp
 
 _GRID = 7
-"""Points along each side of the picture at which a rotation is fitted to lens errors."""
+"""Points along each side of the image at which a rotation is fitted to lens errors."""
 
 
 def missing_errors(rig: Rig, camera: Camera) -> tuple[str, ...]:
-    """What of the chain from lens to cables says nothing about how far off it is.
+    """Parts of the chain from lens to cables whose errors are not stated.
 
     Returns:
-        Keys of the rig file, and what finds them; empty where all of them are there.
+        Keys of the rig file, and the verbs that calibrate them; empty if all are stated.
     """
     stated = {
         "lens_covariance (`cdpr calibrate camera`)": camera.lens_covariance,
@@ -42,68 +42,68 @@ def missing_errors(rig: Rig, camera: Camera) -> tuple[str, ...]:
 
 
 def require_stated_errors(rig: Rig, cameras: Sequence[Camera]) -> None:
-    """Refuses to measure clearance where nothing says how far off it may be.
+    """Refuses to measure clearance with unknown errors.
 
     Raises:
-        BadInput: For a camera that is so; it asks for one number.
+        BadInput: For a camera with unknown errors; it asks for one number.
     """
     for camera in cameras:
         missing = missing_errors(rig, camera)
         if missing and camera.error is None:
             raise BadInput(
-                f"it is unknown how far off camera {camera.name!r} measures, so it cannot measure"
+                f"the measuring error of camera {camera.name!r} is unknown, so it cannot measure"
                 " clearance",
                 where=f"rig {rig.name}",
                 why=f"calibrations have not stated {', '.join(missing)}",
-                next_step=f"add `error_mm` to camera {camera.name!r} in the rig file: by how many"
-                " mm the measured platform and cables may be off, 95 %; or run these calibrations",
+                next_step=f"add `error_mm` to camera {camera.name!r} in the rig file: the error of"
+                " the measured platform and cables, 95 %; or run these calibrations",
                 values={"camera": camera.name},
             )
 
 
 class SharedErrors:
-    """The covariance of what is wrong in all pictures of a camera alike.
+    """Covariance of the errors common to all images of a camera.
 
-    Calibrations state it, or, where one of them is missing, one number of the operator.
+    Calibrations state them, or, if one is missing, a single value by the operator.
 
     Args:
         rig: Its tags.
-        camera: Its lens and place.
+        camera: Its lens and extrinsics.
     """
 
     def __init__(self, rig: Rig, camera: Camera) -> None:
         missing = missing_errors(rig, camera)
         self.unstated = bool(missing) and camera.error is None
-        """Whether a part of it is not stated."""
-        self.whole = camera.error if missing else None
-        """The operator's number, where it stands for all of it, cables included, [m]."""
+        """Whether a part of the errors is not stated."""
+        self.operator_error = camera.error if missing else None
+        """The operator's value, if it replaces all other errors, cables included, [m]."""
         self._camera, self._tag_error = camera, rig.tag_error or 0.0
         count = 4 + camera.distortion.size
-        self._place = np.zeros((6, 6))
-        self._lens, self._place_by_lens = np.zeros((count, count)), np.zeros((6, count))
+        self._extrinsics = np.zeros((6, 6))
+        self._lens, self._extrinsics_by_lens = np.zeros((count, count)), np.zeros((6, count))
         if camera.place_covariance is not None:
-            self._place = camera.place_covariance
+            self._extrinsics = camera.place_covariance
         if camera.lens_covariance is None:
             return
         self._lens = camera.lens_covariance
         if camera.place_by_lens is None:
-            self._place_by_lens[3:] = implied_rotation(camera)
+            self._extrinsics_by_lens[3:] = implied_rotation(camera)
         else:
-            by_lens = self._place_by_lens = camera.place_by_lens
-            self._place = _positive(self._place - by_lens @ self._lens @ by_lens.T)
+            by_lens = self._extrinsics_by_lens = camera.place_by_lens
+            self._extrinsics = _positive(self._extrinsics - by_lens @ self._lens @ by_lens.T)
 
     def of(self, pose: Pose, views: Sequence[TagView]) -> Array:
         """Covariance of position [m] and rotation vector [rad], world axes, shape (6, 6).
 
         Args:
-            pose: The measured one, ``world_from_platform``.
-            views: The tags that it rests on.
+            pose: The measured pose, ``world_from_platform``.
+            views: The tags used.
         """
-        if self.whole is not None:
-            return read_only(np.diag([(self.whole / SURE) ** 2] * 3 + [0.0] * 3))
+        if self.operator_error is not None:
+            return read_only(np.diag([(self.operator_error / SURE) ** 2] * 3 + [0.0] * 3))
         world_from_camera = self._camera.world_from_camera
         camera_from_body = world_from_camera.inverse().compose(pose)
-        by_place = carried(pose.position - world_from_camera.position)
+        by_extrinsics = carried(pose.position - world_from_camera.position)
         steps = moved_by_pixels(
             self._camera,
             views,
@@ -114,38 +114,38 @@ class SharedErrors:
         )
         steps = np.kron(np.eye(2), world_from_camera.rotation) @ steps
         count = len(self._lens)
-        by_lens = steps[:, :count] + by_place @ self._place_by_lens
+        by_lens = steps[:, :count] + by_extrinsics @ self._extrinsics_by_lens
         by_tags = steps[:, count:]
         return read_only(
-            by_place @ self._place @ by_place.T
+            by_extrinsics @ self._extrinsics @ by_extrinsics.T
             + by_lens @ self._lens @ by_lens.T
             + by_tags @ by_tags.T
         )
 
     def scatter(self, bundle: BundlePose, views: Sequence[TagView]) -> Array:
-        """Covariance of a pose by the scatter of its edges alone, camera's axes, shape (6, 6).
+        """Covariance of a pose from the scatter of its edges, camera axes, shape (6, 6).
 
-        Edges that fit badly widen it. Where tags are off as stated, edges fit worse by that much,
-        and it is in `of` already: counted here once more, intervals would be too wide.
+        A misfit of edges widens it, except for the part that stated tag errors explain: `of`
+        includes them already.
 
         Args:
-            bundle: The pose in the camera's frame.
-            views: The tags that it rests on.
+            bundle: The pose in the camera frame.
+            views: The tags used.
         """
         misfit, pose = bundle.misfit(bundle.freedom), bundle.camera_from_body
-        if self.whole is not None or not self._tag_error or misfit <= 1.0:
+        if self.operator_error is not None or not self._tag_error or misfit <= 1.0:
             return bundle.covariance
         by_tags = self._pixels_by_tags(views, pose)
         left = bundle.misfit(expected_cost(self._camera, views, pose, by_tags))
         return read_only(bundle.covariance * (max(left, 1.0) / misfit))
 
     def _pixels_by_lens(self, views: Sequence[TagView]) -> Array:
-        """Slopes of the ideal pixels of all corners, shape (t, 8, n)."""
-        ideal = np.concatenate([view.seen.corners for view in views])
-        return ideal_slopes(self._camera, ideal).reshape(len(views), 8, -1)
+        """Derivatives of the undistorted corners by the lens parameters, shape (t, 8, n)."""
+        undistorted = np.concatenate([view.seen.corners for view in views])
+        return undistorted_slopes(self._camera, undistorted).reshape(len(views), 8, -1)
 
     def _pixels_by_tags(self, views: Sequence[TagView], camera_from_body: Pose) -> Array:
-        """Slopes of the same by each tag's errors of size 1, where they look to be, (t, 8, 6 t)."""
+        """Derivatives of the same by unit errors of each tag's pose, shape (t, 8, 6 t)."""
         matrix = self._camera.matrix
         slopes = np.zeros((len(views), 8, 6 * len(views)))
         for k, view in enumerate(views):
@@ -160,9 +160,9 @@ class SharedErrors:
 
 
 def tag_error_slopes(tag: Tag, error: float) -> Array:
-    """How independent errors of size 1 of a tag's place shift its corners, shape (4, 3, 6), [m].
+    """Corner shifts by independent unit errors of a tag's pose, shape (4, 3, 6), [m].
 
-    Half of the square of the corners' error is the tag's shift, half its turn.
+    The tag's shift and its rotation each contribute half of the squared corner error.
 
     Args:
         tag: The tag.
@@ -176,9 +176,9 @@ def tag_error_slopes(tag: Tag, error: float) -> Array:
 
 
 def implied_rotation(camera: Camera) -> Array:
-    """The rotation of a camera that best undoes errors of its lens, world axes, shape (3, n).
+    """The camera rotation that best compensates lens errors, world axes, shape (3, n).
 
-    A camera's rotation that is found by pictures of that lens is found turned by this.
+    Extrinsics found from images with these lens errors are rotated by this.
     """
     across = np.linspace(0.0, camera.width - 1.0, _GRID)
     down = np.linspace(0.0, camera.height - 1.0, _GRID)
@@ -195,30 +195,30 @@ def implied_rotation(camera: Camera) -> Array:
 
 
 def _positive(matrix: Array) -> Array:
-    """The nearest covariance: what rounding makes negative is 0."""
+    """The nearest covariance: negative eigenvalues from rounding become 0."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    alike = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return np.asarray(alike * np.outer(scale, scale))
+    positive = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return np.asarray(positive * np.outer(scale, scale))
 
 
-# Whether the camera stands where the rig file says, by tags of known place in the world.
+# Check of the camera's pose against frame tags.
 
 
 class CameraMoved(Fault):
-    """The tags on the frame are not where the camera should see them."""
+    """The frame tags are not at their expected positions in the image."""
 
     code = "camera_moved"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCheck:
-    """How far frame tags lie from where the rig file puts them in the image.
+    """Reprojection errors of the frame tags.
 
     Attributes:
-        tags: Numbers of the tags seen whole.
+        tags: Numbers of the completely visible tags.
         errors: RMS error of each tag's corners, shape (t,), [px].
-        distances: The same at each tag's place, shape (t,), [m].
+        distances: The same at each tag's distance, shape (t,), [m].
     """
 
     tags: tuple[int, ...]
@@ -227,17 +227,17 @@ class CameraCheck:
 
     @property
     def error(self) -> float:
-        """Median of the tags' errors: one knocked tag among several does not count, [px]."""
+        """Median of the tags' errors, robust against one displaced tag, [px]."""
         return float(np.median(self.errors)) if len(self.errors) else 0.0
 
     @property
     def distance(self) -> float:
-        """Median of the tags' errors at their places, [m]."""
+        """Median of the tags' errors at their distances, [m]."""
         return float(np.median(self.distances)) if len(self.distances) else 0.0
 
 
 def check_camera(camera: Camera, views: Sequence[TagView]) -> CameraCheck:
-    """Compares frame tags with where they should be seen; tags seen in part are left out."""
+    """Reprojection errors of frame tags; partly visible tags are left out."""
     camera_from_world = camera.world_from_camera.inverse()
     whole = [view for view in views if view.seen.whole]
     errors, distances = [], []
@@ -251,11 +251,11 @@ def check_camera(camera: Camera, views: Sequence[TagView]) -> CameraCheck:
 
 
 def measured_camera(camera: Camera, views: Sequence[TagView]) -> tuple[Pose, Array] | None:
-    """Where the camera stands by the frame tags it sees.
+    """The camera's pose from visible frame tags.
 
     Returns:
         ``world_from_camera`` and the covariance of position [m] and rotation vector [rad] along the
-        world's axes, shape (6, 6); None when the tags do not give one.
+        world's axes, shape (6, 6); None if the tags do not determine it.
     """
     found = solve_pnp(camera, views, camera.world_from_camera.inverse())
     if found is None or not np.all(np.isfinite(found.covariance)):
@@ -265,10 +265,11 @@ def measured_camera(camera: Camera, views: Sequence[TagView]) -> tuple[Pose, Arr
 
 
 def change_of_inverse(pose: Pose) -> Array:
-    """How the inverse of a pose shifts and turns when the pose does, shape (6, 6).
+    """Derivative of the inverse of a pose by the pose, shape (6, 6).
 
-    Each shifts [m] and turns [rad] along the axes of its own outer frame: when (R, p) does, its
-    inverse turns by −Rᵀ turn, and its position −Rᵀ p shifts by −Rᵀ shift − Rᵀ (p × turn).
+    Shifts [m] and rotations [rad] are along the axes of each pose's outer frame: for a change of
+    (R, p) the inverse rotates by −Rᵀ turn, and its position −Rᵀ p shifts by −Rᵀ shift − Rᵀ (p ×
+    turn).
     """
     back = pose.rotation.T
     change = np.zeros((6, 6))
@@ -277,16 +278,16 @@ def change_of_inverse(pose: Pose) -> Array:
     return change
 
 
-def refuse_moved_camera(
+def require_unmoved_camera(
     camera: Camera, views: Sequence[TagView], limit_px: float
 ) -> CameraCheck | None:
-    """Checks the camera when frame tags are seen.
+    """Checks the camera's pose if frame tags are visible.
 
     Returns:
-        The check, or None when no frame tag is seen whole.
+        The check, or None if no frame tag is completely visible.
 
     Raises:
-        CameraMoved: Most tags lie farther than ``limit_px`` from where they should be.
+        CameraMoved: The median error of the tags exceeds ``limit_px``.
     """
     check = check_camera(camera, views)
     if not check.tags:

@@ -1,4 +1,4 @@
-"""Measuring a whole source of images, as ``cdpr track`` does."""
+"""Measures a whole source of images, for ``cdpr track``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
 from tracking.detection.tags import tag_corners
 from tracking.estimator import UNCERTAIN, UNSHARP
-from tracking.fusion import MultiCameraFusion, moments
+from tracking.fusion import MultiCameraFusion, synchronize_frames
 from tracking.measurement import NoPose, Observation, PoseMeasurement, rates
 from tracking.pose_log import LoggedPicture
 from tracking.shared_errors import require_stated_errors
@@ -30,11 +30,11 @@ from tracking.tracker import Tracker
 
 
 class Picture(Protocol):
-    """An image of a source, such as a `drivers.cameras.live.live.Frame`."""
+    """An image of a source, such as a `drivers.cameras.live.Frame`."""
 
     @property
     def time(self) -> float:
-        """When it was taken, [s]."""
+        """Capture time, [s]."""
         ...
 
     @property
@@ -44,19 +44,19 @@ class Picture(Protocol):
 
     @property
     def name(self) -> str:
-        """File or number."""
+        """File name or number."""
         ...
 
 
 class NoPlatformSeen(BadInput):
-    """Not one image of a source gave a pose."""
+    """No image of a source gave a pose."""
 
     code = "no_platform_seen"
 
 
 @dataclass(slots=True)
 class TrackCount:
-    """What came of a source so far, and how long each image took to measure, [s]."""
+    """Images and poses of a source so far, and the measuring time of each image, [s]."""
 
     pictures: int = 0
     poses: int = 0
@@ -71,20 +71,20 @@ def track(
     model: ClearanceModel | None = None,
     on_picture: Callable[[Picture, LoggedPicture], None] | None = None,
 ) -> Iterator[LoggedPicture]:
-    """Measures image after image.
+    """Measures the images of a source one by one.
 
     Args:
         source: Images in order of time.
         tracker: Keeps the last pose between images.
-        count: Kept up to date while images are measured.
-        give_up_after: Ends a source without an end after this many images without any pose.
-        model: Where obstacles are; the clearance is measured too.
-        on_picture: Called with every image and its measurement.
+        count: Updated with each image.
+        give_up_after: Ends an endless source after this many images without any pose.
+        model: Of the obstacles, to measure the clearance as well.
+        on_picture: Called with each image and its measurement.
 
     Raises:
-        NoPlatformSeen: At the end, when no image gave a pose.
-        BadInput: An image is not of the camera's size.
-        CameraMoved: The frame tags are not where they should be.
+        NoPlatformSeen: At the end, if no image gave a pose.
+        BadInput: An image has another size than the camera's.
+        CameraMoved: The frame tags are not at their expected positions.
     """
     if model is not None and model.obstacle_names:
         require_stated_errors(tracker.rig, [tracker.camera])
@@ -134,9 +134,9 @@ def _nothing_seen(
     reason = reasons.most_common(1)[0][0]
     soft = edge_width(last.image) > SOFT
     if UNCERTAIN in reason and not soft:
-        next_step = "focus the camera, bring it nearer, or let it see more tags of the platform"
+        next_step = "focus the camera, bring it nearer, or make more tags of the platform visible"
     elif UNSHARP in reason or soft:
-        next_step = "focus the camera on the platform, and light it so that nothing blurs in motion"
+        next_step = "focus the camera on the platform, and add light to shorten the exposure"
     elif len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
     return NoPlatformSeen(
@@ -149,17 +149,17 @@ def _nothing_seen(
     )
 
 
-# Measuring the sources of several cameras at once, as ``cdpr track`` does with more than one.
+# Several cameras at once.
 
 
 @dataclass(slots=True)
-class TogetherCount:
-    """What was not taken together so far.
+class MultiCameraCount:
+    """Poses that could not be fused so far.
 
     Attributes:
-        without_partner: Images to which no other camera has one of about the same time.
-        apart: Moments in which a pose was left out as its image is too far from the others.
-        without_speed: Moments in which one was left out as it could not be carried on.
+        without_partner: Images without an image of another camera at about the same time.
+        apart: Frame sets with a pose dropped because its image is too far from the others in time.
+        without_speed: Frame sets with a pose dropped because its velocity is unknown.
     """
 
     without_partner: int = 0
@@ -167,32 +167,32 @@ class TogetherCount:
     without_speed: int = 0
 
 
-def track_together(
+def track_cameras(
     streams: Mapping[str, Iterator[LoggedPicture]],
     within: float,
-    count: TogetherCount,
+    count: MultiCameraCount,
     model: ClearanceModel | None = None,
 ) -> Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]]:
-    """The pose of all cameras, moment by moment, until the last source ends.
+    """The fused pose of all cameras, by frame set, until the last source ends.
 
     Args:
-        streams: What `tracking.track.track` gives for each camera, by the camera's name.
-        within: Images taken farther than this from the median time of a moment's images are
-            not taken together with the others, [s].
-        count: Kept up to date.
-        model: Where obstacles are; the clearance is measured too.
+        streams: Output of `track` for each camera, by the camera's name.
+        within: Images farther than this from the median time of a frame set are not fused with the
+            others, [s].
+        count: Updated with each frame set.
+        model: Of the obstacles, to measure the clearance as well.
 
     Returns:
-        What all cameras say together, and what each alone that has an image of the moment.
+        The fused measurement, and that of each camera with an image in the frame set.
 
     Raises:
-        NoPlatformSeen: At the end, when no camera gave a pose.
-        BadInput: An image is not of its camera's size.
-        CameraMoved: Frame tags are not where they should be.
+        NoPlatformSeen: At the end, if no camera gave a pose.
+        BadInput: An image has another size than its camera's.
+        CameraMoved: Frame tags are not at their expected positions.
     """
     poses, reason, common = 0, "the sources have no images", MultiCameraFusion(within)
-    running = {name: _without_end(stream) for name, stream in streams.items()}
-    for alone in moments(running, 2.0 * within):
+    running = {name: _ignoring_no_platform(stream) for name, stream in streams.items()}
+    for alone in synchronize_frames(running, 2.0 * within):
         found = common.of({name: one.observation for name, one in alone.items()})
         count.without_partner += len(alone) == 1
         count.apart, count.without_speed = common.apart, common.without_speed
@@ -207,98 +207,98 @@ def track_together(
         raise NoPlatformSeen(
             f"no camera gives a platform pose: {reason}",
             where=f"cameras {', '.join(streams)}",
-            next_step="check that the cameras see the platform; `cdpr track` with one source alone"
+            next_step="check that the cameras see the platform; `cdpr track` with a single source"
             " gives details",
         )
 
 
-def _without_end(stream: Iterator[LoggedPicture]) -> Iterator[LoggedPicture]:
-    """A camera that sees nothing at all ends without an error: the others may see."""
+def _ignoring_no_platform(stream: Iterator[LoggedPicture]) -> Iterator[LoggedPicture]:
+    """Ends the stream of a camera without any pose silently: the others may have poses."""
     try:
         yield from stream
     except NoPlatformSeen:
         return
 
 
-# How fast images are measured now.
+# Frame rate and measuring time.
 
 
-#: Live figures are those of this many of the newest images.
+#: Number of the newest images for live figures.
 NEWEST = 10
 
 
 class FrameRate:
-    """Of the newest images: how many a second, and how long one takes."""
+    """Frame rate and measuring time of the newest images."""
 
     def __init__(self) -> None:
-        """None was measured yet."""
+        """Starts without images."""
         self._times: deque[float] = deque(maxlen=NEWEST)
         self._seconds: deque[float] = deque(maxlen=NEWEST)
 
     def take(self, time: float, seconds: float) -> None:
-        """One more image.
+        """Adds an image.
 
         Args:
-            time: On a clock that only goes forward, [s].
-            seconds: How long it took to measure, [s]; NaN where nothing was measured.
+            time: On a monotonic clock, [s].
+            seconds: Measuring time, [s]; NaN if nothing was measured.
         """
         self._times.append(time)
         self._seconds.append(seconds)
 
     @property
     def pictures_per_second(self) -> float | None:
-        """None before there are two."""
+        """Frame rate, [Hz]; None before there are two images."""
         took = self._times[-1] - self._times[0] if self._times else 0.0
         return round((len(self._times) - 1) / took, 1) if took > 0.0 else None
 
     @property
     def measuring_ms(self) -> float | None:
-        """Median time for one; None where none was measured."""
+        """Median measuring time, [ms]; None if nothing was measured."""
         known = [one for one in self._seconds if np.isfinite(one)]
         return round(float(np.median(known)) * 1e3, 2) if known else None
 
     def text(self, tags: int) -> str:
-        """See `rates`."""
+        """As in `rates`."""
         return rates(self.pictures_per_second, self.measuring_ms, tags)
 
 
-# What was measured, drawn into the image.
+# Drawing of measurements into images.
 
 
 #: Colours, blue green red.
 USED, BOX, TEXT = (80, 220, 60), (230, 160, 40), (255, 255, 255)
 AXES = ((60, 60, 235), (60, 200, 60), (235, 120, 40))
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-#: Drawing takes whole sixteenths of pixels.
+#: Drawing takes coordinates in sixteenths of a pixel.
 _SHIFT = 4
 
 
-def drawn_over(
+def draw_measurement(
     image: Image,
     rig: Rig,
     camera: Camera,
     found: Observation,
     clearance: MeasuredClearance | None = None,
 ) -> NDArray[np.uint8]:
-    """The image in colour with the platform's box and axes, its tags, and the numbers.
+    """The image in colour with the platform's box, axes, tags and measured values.
 
     Args:
         image: Grey image of the camera.
-        rig: Whose platform it is.
-        camera: Its place and lens.
-        found: What was measured in the image.
-        clearance: At the measured pose, if there are obstacles.
+        rig: The robot.
+        camera: The camera.
+        found: The measurement in the image.
+        clearance: At the measured pose, if the scene has obstacles.
 
     Returns:
         Shape (height, width, 3), blue green red.
     """
-    canvas = outlined(image, rig, camera, found)
+    canvas = draw_outline(image, rig, camera, found)
     _draw_text(canvas, _lines(found, clearance))
     return canvas
 
 
-def outlined(image: Image, rig: Rig, camera: Camera, found: Observation) -> NDArray[np.uint8]:
-    """The image in colour with the platform's box and axes and its tags; as for `drawn_over`."""
+def draw_outline(image: Image, rig: Rig, camera: Camera, found: Observation) -> NDArray[np.uint8]:
+    """The image in colour with the platform's box, axes and tags; see `draw_measurement`."""
     canvas = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     if isinstance(found, PoseMeasurement):
         camera_from_platform = camera.world_from_camera.inverse().compose(found.pose)
@@ -333,16 +333,16 @@ def _draw_line(
 
 
 def _lines(found: Observation, clearance: MeasuredClearance | None) -> list[str]:
-    """What the image says, line by line; plain ASCII, as OpenCV's letters are."""
+    """Lines of text for the image, in ASCII, as OpenCV's fonts require."""
     head = f"t {found.time:.3f} s"
     if not isinstance(found, PoseMeasurement):
         return [head, f"no pose: {found.reason}"]
-    place, spread = found.pose.position * 1e3, found.position_deviation * 1e3
+    position, spread = found.pose.position * 1e3, found.position_deviation * 1e3
     text = [
         f"{head}  tags {' '.join(map(str, found.tags))}  {found.reprojection:.3f} px",
         *(
             f"{axis} {value:9.2f} +- {deviation:.2f} mm"
-            for axis, value, deviation in zip("xyz", place, spread, strict=True)
+            for axis, value, deviation in zip("xyz", position, spread, strict=True)
         ),
     ]
     if clearance is not None:

@@ -1,4 +1,4 @@
-"""From images to poses of the platform."""
+"""Tracks the platform's pose through the images of one camera."""
 
 from __future__ import annotations
 
@@ -12,68 +12,68 @@ from model.rig import Camera, Rig
 from tracking.camera_model import Image, require_image_format
 from tracking.detection.detector import (
     Detection,
+    detect_expected,
     make_detector,
-    near_places,
-    nearest_to,
+    nearest_to_expected,
     region_around,
 )
 from tracking.estimator import PlatformEstimator, TrackerSettings
-from tracking.measurement import NoPose, Observation, PoseMeasurement, predicted
+from tracking.measurement import NoPose, Observation, PoseMeasurement, predict
 from tracking.rolling_shutter import RecentMotion
-from tracking.shared_errors import CameraCheck, refuse_moved_camera
+from tracking.shared_errors import CameraCheck, require_unmoved_camera
 
-# Where the platform should be seen, by the positions of its drives.
+# Encoder prior: where to search for the platform.
 #
-# Drives are off by whatever cable lengths are off, so a camera's last pose shows by how much; from
-# there on they show the platform's motion, however fast and however long no tag was detected.
-# This sets only where to look: what is found there is judged without it.
+# Encoder poses have the errors of the cable lengths, which the last camera pose reveals; from then
+# on they show the platform's motion, however fast it moves and however long no tag is detected.
+# The prior only sets the search region: what is found there is assessed without it.
 
 
-#: Drives' poses farther apart in time than this do not predict the platform's motion, [s].
+#: Encoder poses farther apart in time do not predict the platform's motion, [s].
 MEMORY = 0.5
 
 
 class EncoderPrior:
-    """Keeps by how much the drives were off when the camera saw the platform last."""
+    """Expected pose from the encoders, corrected by the last camera measurement."""
 
     def __init__(self) -> None:
-        """It never did: the drives are taken at their word."""
+        """Starts without a correction."""
         self._shift: Array = np.zeros(3)
         self._turn: Array = np.eye(3)
 
     def expected(self, by_drives: Pose) -> Pose:
-        """Where the platform should be, ``world_from_platform``.
+        """The expected pose, ``world_from_platform``.
 
         Args:
-            by_drives: Where the drives' positions put it.
+            by_drives: Pose from the encoders.
         """
         return Pose(by_drives.position + self._shift, self._turn @ by_drives.rotation)
 
     def learn(self, measured: Pose, by_drives: Pose) -> None:
-        """The camera saw the platform.
+        """Updates the correction from a camera measurement.
 
         Args:
-            measured: Where.
-            by_drives: Where the drives' positions put it at the same time.
+            measured: Pose measured by the camera.
+            by_drives: Pose from the encoders at the same time.
         """
         self._shift = measured.position - by_drives.position
         self._turn = measured.rotation @ by_drives.rotation.T
 
 
-class DrivesAhead:
-    """The drives' pose at the time of an image, a little after they were heard or before."""
+class EncoderExtrapolator:
+    """Extrapolates the encoder pose to the time of an image."""
 
     def __init__(self) -> None:
-        """They were not heard yet."""
+        """Starts without a pose."""
         self._last: tuple[float, Pose] | None = None
 
     def at(self, picture: float, heard: float, pose: Pose | None) -> Pose | None:
-        """The pose when the image was taken, if the drives go as they went.
+        """The encoder pose at the image's time, at constant velocity.
 
         Args:
-            picture: When it was taken, [s].
-            heard: When the drives stood at ``pose``, [s].
-            pose: ``world_from_platform`` by the drives; None when it is not known.
+            picture: Time of the image, [s].
+            heard: Time of ``pose``, [s].
+            pose: ``world_from_platform`` from the encoders; None if unknown.
         """
         before, self._last = self._last, None if pose is None else (heard, pose)
         if before is None or pose is None:
@@ -85,16 +85,16 @@ class DrivesAhead:
 
 
 class Tracker:
-    """Measures the platform's pose in one camera's images, one after the other.
+    """Measures the platform's pose in consecutive images of one camera.
 
-    The last pose says where to look next, then the drives' positions where they are known; without
-    these, or when that fails, the whole image is searched. Tags on the frame show whether the
-    camera still stands where the rig file says.
+    The search starts at the pose predicted from the last ones, then at the encoder pose if given;
+    without these, or if that fails, it covers the whole image. Frame tags show whether the camera
+    is still at its pose in the rig file.
 
     Args:
         rig: Its tags and platform.
-        camera: The camera that took the images.
-        settings: When a pose is believed.
+        camera: The camera that takes the images.
+        settings: Acceptance limits.
 
     Raises:
         BadInput: The rig has no tags.
@@ -113,10 +113,10 @@ class Tracker:
         self._detector = make_detector(rig.tag_detector, rig.tag_family)
         self._frame = {tag.id: tag for tag in rig.frame_tags}
         self._recent = RecentMotion(camera.readout)
-        self._sight = PlatformEstimator(rig, camera, self.settings, self._recent)
+        self._estimator = PlatformEstimator(rig, camera, self.settings, self._recent)
         self._last: PoseMeasurement | None = None
         self._before: PoseMeasurement | None = None
-        self._guidance = EncoderPrior()
+        self._prior = EncoderPrior()
         self._pictures = 0
 
     @property
@@ -125,7 +125,7 @@ class Tracker:
         return tuple(tag.id for tag in self.rig.platform_tags)
 
     def forget(self) -> None:
-        """Searches the whole of the next image."""
+        """Forgets the last pose: the next image is searched completely."""
         self._last = None
 
     def observe(self, image: Image, time: float, by_drives: Pose | None = None) -> Observation:
@@ -133,13 +133,13 @@ class Tracker:
 
         Args:
             image: Grey image of the camera's size.
-            time: When it was taken, [s].
-            by_drives: Where the drives' positions put the platform then; it says where to look, and
-                has no part in the pose.
+            time: Capture time, [s].
+            by_drives: Encoder pose of the platform at that time; it guides the search, but does not
+                enter the measured pose.
 
         Raises:
-            BadInput: The image is not a grey one of the camera's size.
-            CameraMoved: The frame tags are not where they should be.
+            BadInput: The image is not grey, or not of the camera's size.
+            CameraMoved: The frame tags are not at their expected positions.
         """
         require_image_format(image, self.camera, self.rig.name)
         self._pictures += 1
@@ -147,66 +147,70 @@ class Tracker:
         if self._last is not None:
             result = self._follow(image, time, self._last)
         if result is None and by_drives is not None:
-            result = self._guided(image, time, self._guidance.expected(by_drives))
+            result = self._guided(image, time, self._prior.expected(by_drives))
         if result is None and self._last is not None:
-            result = self._seek_around(image, time, self._last)
+            result = self._search_around(image, time, self._last)
         if result is None:
             result = self._search(image, time)
         elif self._pictures % self.settings.camera_check_period == 0:
-            self._check_camera(image, near_places(self.camera, self._frame, self._detector, image))
+            self._check_camera(
+                image, detect_expected(self.camera, self._frame, self._detector, image)
+            )
         self._before, self._last = self._last, None
         if isinstance(result, PoseMeasurement):
             self._last = result
             self._recent.add(result)
             if by_drives is not None:
-                self._guidance.learn(result.pose, by_drives)
+                self._prior.learn(result.pose, by_drives)
         return result
 
     def _follow(self, image: Image, time: float, last: PoseMeasurement) -> Observation | None:
-        """The pose where it is expected, or None when it is not there.
+        """The pose near the predicted one, or None if it is not there.
 
-        The edges of all tags that should be seen are looked for where they should be, which needs
-        no detector and finds tags that are hidden in part.
+        Searches the edges of all tags at their predicted positions, which needs no detector and
+        finds partly hidden tags.
         """
-        expected = predicted(last, self._before, time)
-        found = self._sight.measured(image, time, [], expected, "tracked")
-        return found if self._goes_on(found, last) else None
+        expected = predict(last, self._before, time)
+        found = self._estimator.measured(image, time, [], expected, "tracked")
+        return found if self._is_plausible(found, last) else None
 
     def _guided(self, image: Image, time: float, expected: Pose) -> Observation | None:
-        """As `_follow`, at a pose without a camera measurement.
+        """As `_follow`, at a pose from the encoders.
 
-        So it cannot exclude the mirror pose, and a tag alone is not enough: where drives are
-        wrong, that may be another print of it.
+        It cannot exclude the mirror pose, and a single tag is not enough: if the encoders are
+        wrong, it may be another print.
         """
-        found = self._sight.measured_at(image, time, expected, "guided")
+        found = self._estimator.measured_at(image, time, expected, "guided")
         return found if isinstance(found, PoseMeasurement) and len(found.tags) > 1 else None
 
-    def _seek_around(self, image: Image, time: float, last: PoseMeasurement) -> Observation | None:
-        """The pose by the tags around the platform, or None when there is none to go on with."""
-        expected = predicted(last, self._before, time)
+    def _search_around(
+        self, image: Image, time: float, last: PoseMeasurement
+    ) -> Observation | None:
+        """The pose from tags detected around the platform, or None if it is not plausible."""
+        expected = predict(last, self._before, time)
         region = region_around(self.camera, expected.apply(self.rig.platform_corners), slack=0.2)
         if region is None:
             return None
         detections = self._detector.detect_all(image, region)
-        found = self._sight.measured(image, time, detections, expected, "tracked")
-        return found if self._goes_on(found, last) else None
+        found = self._estimator.measured(image, time, detections, expected, "tracked")
+        return found if self._is_plausible(found, last) else None
 
     def _search(self, image: Image, time: float) -> Observation:
-        """The pose by a search of the whole image, more thorough when that finds none."""
-        plain = self._detector.detect_all(image)
-        found = self._judged(image, time, plain)
+        """The pose by detection in the whole image, exhaustive if standard detection fails."""
+        standard = self._detector.detect_all(image)
+        found = self._checked(image, time, standard)
         if isinstance(found, NoPose):
-            thorough = self._detector.look_again(image, plain)
-            if len(thorough) > len(plain):
-                return self._judged(image, time, thorough)
+            exhaustive = self._detector.detect_exhaustively(image, standard)
+            if len(exhaustive) > len(standard):
+                return self._checked(image, time, exhaustive)
         return found
 
-    def _judged(self, image: Image, time: float, detections: Sequence[Detection]) -> Observation:
+    def _checked(self, image: Image, time: float, detections: Sequence[Detection]) -> Observation:
         self._check_camera(image, detections)
-        return self._sight.measured(image, time, detections, None, "found")
+        return self._estimator.measured(image, time, detections, None, "found")
 
-    def _goes_on(self, found: Observation, last: PoseMeasurement) -> bool:
-        """Whether a pose was found that the platform can have reached."""
+    def _is_plausible(self, found: Observation, last: PoseMeasurement) -> bool:
+        """Whether a pose was found that the platform can have reached since the last one."""
         if isinstance(found, NoPose):
             return False
         limit = self.settings.jump + self.settings.speed * abs(found.time - last.time)
@@ -215,9 +219,9 @@ class Tracker:
         return found.pose.angle_to(last.pose) <= self.settings.jump_angle
 
     def _check_camera(self, image: Image, detections: Sequence[Detection]) -> None:
-        views = self._sight.views(
-            image, nearest_to(self.camera, self._frame, detections), self._frame
+        views = self._estimator.views(
+            image, nearest_to_expected(self.camera, self._frame, detections), self._frame
         )
         limit = self.settings.camera_moved_px
-        check = refuse_moved_camera(self.camera, views, limit)
+        check = require_unmoved_camera(self.camera, views, limit)
         self.camera_check = check or self.camera_check

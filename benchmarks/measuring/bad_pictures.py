@@ -1,11 +1,11 @@
-"""How often 95 % intervals of the platform's pose hold the truth, by kind of picture.
+"""Coverage of the 95 % intervals of the platform's pose, by kind of image degradation.
 
     python benchmarks/measuring/bad_pictures.py [--pictures 200] [--kind jpeg ...] [--seed 1]
 
-The synthetic camera takes pictures of the ready rig's cube at poses drawn by chance, with lamps,
-shadows, blur and a camera's own processing. Told for each kind: poses, refusals by their commonest
-reason, RMS error, the share of the six numbers' intervals that hold the truth, and NEES (6 when the
-covariance is exact). The tracker starts anew with each picture.
+The synthetic camera takes images of the ready rig's cube at random poses, with lamps, shadows, blur
+and in-camera processing. The output for each kind: poses, refusals by their commonest reason, RMS
+error, coverage of the six intervals, and NEES (6 for an exact covariance). The tracker is reset for
+each image.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ EXPOSURE = 0.01
 
 @dataclass(frozen=True)
 class Kind:
-    """Pictures of one kind: optics, motion in the picture [px], and whether one face is seen."""
+    """One kind of images: optics, motion in the image [px], and whether only one face is seen."""
 
     optics: Optics
     smear: float = 0.0
@@ -55,7 +55,7 @@ KINDS = {
 
 
 def in_front(rig: Rig) -> Rig:
-    """The rig with its camera before the +x face, which alone has a tag."""
+    """The rig with its camera in front of the +x face, the only one with a tag."""
     camera = rig.cameras[0]
     rotation = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     there = replace(camera, world_from_camera=Pose(np.array([1.25, 0.0, 0.45]), rotation))
@@ -63,8 +63,8 @@ def in_front(rig: Rig) -> Rig:
     return replace(rig, cameras=(there,), platform_tags=tags)
 
 
-def drawn(kind: Kind, rng: np.random.Generator) -> Pose:
-    """A pose in the workspace."""
+def random_pose(kind: Kind, rng: np.random.Generator) -> Pose:
+    """A random pose in the workspace."""
     middle, wide = np.array([0.02, 0.0, 0.45]), np.array([0.12, 0.1, 0.1])
     turn = matrix_from_rotation_vector(np.radians(6.0) * rng.standard_normal(3))
     return Pose(middle + wide * rng.uniform(-1.0, 1.0, 3), turn)
@@ -73,14 +73,14 @@ def drawn(kind: Kind, rng: np.random.Generator) -> Pose:
 def errors_of(
     rig: Rig, kind: Kind, count: int, seed: int
 ) -> tuple[list[Array], list[Array], Counter[str]]:
-    """Errors and covariances of the poses, and why there is none."""
+    """Errors and covariances of the poses, and reasons of refusals."""
     rig = in_front(rig) if kind.frontal else rig
     camera, scene = rig.cameras[0], load_scene(CONFIGS / "environment_1.yaml")
     source = SyntheticCamera(rig, replace(scene, obstacles=()), camera, seed, kind.optics)
     rng = np.random.default_rng([seed, 7])
     errors, covariances, refused = [], [], Counter[str]()
     for number in range(count):
-        pose = drawn(kind, rng)
+        pose = random_pose(kind, rng)
         direction = rng.standard_normal(3)
         direction /= np.linalg.norm(direction)
         away = float(np.linalg.norm(pose.position - camera.world_from_camera.position))
@@ -97,7 +97,7 @@ def errors_of(
 
 
 def main() -> int:
-    """Prints a line for each kind; 1 when an interval holds the truth too rarely."""
+    """Prints a line for each kind; returns 1 if a coverage is too low."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pictures", type=int, default=200)
     parser.add_argument("--kind", nargs="*", choices=KINDS, default=list(KINDS))

@@ -1,12 +1,12 @@
-"""How many boards are found in pictures that nobody here made, beside OpenCV in the same run.
+"""Board detection in third-party images, compared with OpenCV in the same run.
 
     python benchmarks/measuring/boards.py [--board chessboard --columns 9 --rows 6] [PICTURE ...]
 
-Without pictures the chessboards of Debian's `opencv-doc` that lie in the repository. The last
-column is the RMS reprojection error of pictures that the fit has not seen: every other picture
-calibrates, the others are held against it, in both directions, on the pictures that ours and the
-finder of the line both find. Only the corners differ: camera model and fit are OpenCV's, five
-coefficients (`--rational`: eight).
+Without arguments it uses the chessboards of Debian's `opencv-doc` in this repository. The last
+column is the RMS reprojection error of held-out images: every other image calibrates, the others
+are held out, in both directions, over the images in which both our detector and the row's find the
+board. Only the corners differ: camera model and fit are OpenCV's, five coefficients (`--rational`:
+eight).
 
 Other sets: `apt-get download opencv-doc && dpkg -x opencv-doc*.deb doc` (26 chessboards of two
 cameras), github.com/sourishg/fisheye-stereo-calibration (58, fisheye, 9 x 6),
@@ -27,18 +27,18 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from calibration.targets.boards import Board, Charuco, Chessboard, Seen
+from calibration.targets.boards import Board, Charuco, Chessboard, DetectedBoard
 from calibration.targets.grids import CircleGrid, TagGrid
 from tracking.camera_model import Image
 from tracking.detection.tags import dictionary, upright_corners
 
 ROOT = Path(__file__).parents[2]
-Finder = Callable[[Image], Seen | None]
+Finder = Callable[[Image], DetectedBoard | None]
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
 
 
 def made_board(arguments: argparse.Namespace) -> Board:
-    """The board that the options describe; its size does not matter here."""
+    """The board described by the options; its size does not matter here."""
     count, tag, gap = (arguments.columns, arguments.rows), 0.05, 0.05 * arguments.gap
     match arguments.board:
         case "chessboard":
@@ -52,7 +52,7 @@ def made_board(arguments: argparse.Namespace) -> Board:
 
 
 def peers_of(board: Board) -> dict[str, Finder]:
-    """What OpenCV offers for the same board."""
+    """OpenCV's detectors for the same board."""
     match board:
         case Chessboard():
             return {
@@ -69,13 +69,13 @@ def peers_of(board: Board) -> dict[str, Finder]:
 
 
 def _chessboard(board: Chessboard, find: Callable[..., object], refined: bool = True) -> Finder:
-    def finder(image: Image) -> Seen | None:
+    def finder(image: Image) -> DetectedBoard | None:
         good, corners = find(image, (board.columns, board.rows))
         if not good:
             return None
         if refined:
             corners = cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), _STOP)
-        return Seen(board.points(), np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+        return DetectedBoard(board.points(), np.asarray(corners, dtype=np.float64).reshape(-1, 2))
 
     return finder
 
@@ -83,11 +83,11 @@ def _chessboard(board: Chessboard, find: Callable[..., object], refined: bool = 
 def _circles(board: CircleGrid) -> Finder:
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
 
-    def finder(image: Image) -> Seen | None:
+    def finder(image: Image) -> DetectedBoard | None:
         good, centres = cv2.findCirclesGrid(image, (board.columns, board.rows), flags=kind)
         if not good:
             return None
-        return Seen(board.points(), np.asarray(centres, dtype=np.float64).reshape(-1, 2))
+        return DetectedBoard(board.points(), np.asarray(centres, dtype=np.float64).reshape(-1, 2))
 
     return finder
 
@@ -97,12 +97,12 @@ def _charuco(board: Charuco) -> Finder:
     drawn = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, named)
     detector = cv2.aruco.CharucoDetector(drawn)
 
-    def finder(image: Image) -> Seen | None:
+    def finder(image: Image) -> DetectedBoard | None:
         corners, numbers, _, _ = detector.detectBoard(image)
         if np.size(numbers) < 8:
             return None
         points = np.asarray(drawn.getChessboardCorners(), dtype=np.float64)[np.ravel(numbers)]
-        return Seen(points, np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+        return DetectedBoard(points, np.asarray(corners, dtype=np.float64).reshape(-1, 2))
 
     return finder
 
@@ -114,7 +114,7 @@ def _tags(board: TagGrid) -> Finder:
     detector = cv2.aruco.ArucoDetector(dictionary(board.family), parameters)
     numbers_of = range(board.first, board.first + board.columns * board.rows)
 
-    def finder(image: Image) -> Seen | None:
+    def finder(image: Image) -> DetectedBoard | None:
         squares, ids, _ = detector.detectMarkers(image)
         pairs = zip([] if ids is None else np.ravel(ids).tolist(), squares, strict=True)
         found = {
@@ -124,13 +124,13 @@ def _tags(board: TagGrid) -> Finder:
         }
         if len(found) < 2:
             return None
-        return Seen(board.points_of(found), np.concatenate(list(found.values())))
+        return DetectedBoard(board.points_of(found), np.concatenate(list(found.values())))
 
     return finder
 
 
-def held_out(views: Mapping[str, Seen], size: tuple[int, int], flags: int) -> float:
-    """RMS error of pictures that the fit has not seen, [px]; nan where there are too few."""
+def held_out(views: Mapping[str, DetectedBoard], size: tuple[int, int], flags: int) -> float:
+    """RMS error of held-out images, [px]; NaN if there are too few."""
     names, squares, count = list(views), 0.0, 0
     for which in (0, 1):
         used, rest = names[which::2], names[1 - which :: 2]
@@ -143,8 +143,8 @@ def held_out(views: Mapping[str, Seen], size: tuple[int, int], flags: int) -> fl
         )
         for name in rest:
             seen = views[name]
-            _, turn, place = cv2.solvePnP(seen.points, seen.corners, matrix, lens)
-            there = cv2.projectPoints(seen.points, turn, place, matrix, lens)[0].reshape(-1, 2)
+            _, turn, shift = cv2.solvePnP(seen.points, seen.corners, matrix, lens)
+            there = cv2.projectPoints(seen.points, turn, shift, matrix, lens)[0].reshape(-1, 2)
             squares += float(np.sum((there - seen.corners) ** 2))
             count += len(there)
     return float(np.sqrt(squares / count))
@@ -170,19 +170,19 @@ def options() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """Prints a line for each finder."""
+    """Prints a line for each detector."""
     arguments = options().parse_args()
     shipped = sorted((ROOT / "tests" / "calibration" / "photographs").glob("left*.jpg"))
     pictures = {path.name: cv2.imread(str(path), 0) for path in arguments.pictures or shipped}
     if unread := [name for name, image in pictures.items() if image is None]:
-        print(f"not pictures that can be read: {', '.join(unread)}", file=sys.stderr)
+        print(f"not readable as images: {', '.join(unread)}", file=sys.stderr)
         return 2
     board = made_board(arguments)
     flags = cv2.CALIB_RATIONAL_MODEL if arguments.rational else 0
     size = next(iter(pictures.values())).shape[::-1]
-    print(f"{board} in {len(pictures)} pictures; times are CPU")
+    print(f"{board} in {len(pictures)} images; times are CPU")
     print(f"{'finder':14s}{'found':>6s}{'ms each':>9s}{'found by both':>15s}{'held out, px':>22s}")
-    ours: dict[str, Seen] = {}
+    ours: dict[str, DetectedBoard] = {}
     for name, find in {"ours": board.find, **peers_of(board)}.items():
         start = time.process_time()
         seen = {key: find(image) for key, image in pictures.items()}

@@ -1,14 +1,14 @@
-"""Held-out errors of our fit beside OpenCV's and mrcal's, on the same corners in the same run.
+"""Held-out errors of our fit, OpenCV's and mrcal's, on the same corners in the same run.
 
     python benchmarks/measuring/calibrations.py [--columns 9 --rows 6] [PICTURE ...]
 
-Without pictures the chessboards of Debian's `opencv-doc` that lie in the repository. Our finder
-finds the corners; every other picture calibrates, the others are held against it, in both
-directions. Only camera and lens of each fit are taken: the pose of a held-out board is found in the
-same way for all. mrcal is Debian's (`apt-get install mrcal python3-mrcal`), with its defaults (it
-leaves out outliers and finds the board's warp); without it its lines are left out. Exit code 1
-where ours is more than 2 % worse than OpenCV's of the same model, or the model that we choose than
-the best of OpenCV's and mrcal's.
+Without arguments it uses the chessboards of Debian's `opencv-doc` in this repository. Our detector
+finds the corners; every other image calibrates, the others are held out, in both directions. Only
+camera and lens of each fit are used: the pose of a held-out board is estimated by the same method
+for all. mrcal is Debian's (`apt-get install mrcal python3-mrcal`), with its defaults (it rejects
+outliers and estimates the board's warp); without it its lines are omitted. Exit code 1 if ours is
+more than 2 % worse than OpenCV's with the same model, or our selected model than the best of
+OpenCV's and mrcal's.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from calibration.intrinsics.lens import LENSES, LensFit, LensModel, choose_lens, error_of, fit_lens
-from calibration.targets.boards import Chessboard, Seen
+from calibration.targets.boards import Chessboard, DetectedBoard
 
 ROOT = Path(__file__).parents[2]
-Views = Mapping[str, Seen]
+Views = Mapping[str, DetectedBoard]
 Size = tuple[int, int]
 Fitter = Callable[[Views, Size], LensFit]
 WORSE = 1.02
-"""Of ours against a referee."""
+"""Allowed ratio of our error to a reference."""
 MRCAL = {"five": "LENSMODEL_OPENCV5", "rational": "LENSMODEL_OPENCV8"}
 
 
@@ -64,7 +64,7 @@ def by_opencv(lens: LensModel) -> Fitter:
 
 
 def by_mrcal(lens: LensModel, board: Chessboard) -> Fitter:
-    """The fit of a lens model by mrcal, by its own program in a folder of its own."""
+    """Mrcal's fit of a lens model, by its program in a temporary folder."""
 
     def fit(views: Views, size: Size) -> LensFit:
         with tempfile.TemporaryDirectory() as name:
@@ -98,7 +98,7 @@ def by_mrcal(lens: LensModel, board: Chessboard) -> Fitter:
 
 
 def held_out(views: Views, size: Size, fit: Fitter) -> tuple[float, str]:
-    """RMS error of pictures that a fit has not seen, [px], and the models of both halves."""
+    """RMS error of held-out images, [px], and the models of both halves."""
     names, squares, count, models = list(views), 0.0, 0, []
     for which in (0, 1):
         found = fit({name: views[name] for name in names[which::2]}, size)
@@ -116,17 +116,17 @@ def main() -> int:
     parser.add_argument("pictures", nargs="*", type=Path)
     parser.add_argument("--columns", type=int, default=9)
     parser.add_argument("--rows", type=int, default=6)
-    told = parser.parse_args()
+    arguments = parser.parse_args()
     shipped = sorted((ROOT / "tests" / "calibration" / "photographs").glob("left*.jpg"))
-    board = Chessboard(told.columns, told.rows, 0.025)
-    images = {str(path): cv2.imread(str(path), 0) for path in told.pictures or shipped}
+    board = Chessboard(arguments.columns, arguments.rows, 0.025)
+    images = {str(path): cv2.imread(str(path), 0) for path in arguments.pictures or shipped}
     if unread := [name for name, image in images.items() if image is None]:
-        print(f"not pictures that can be read: {', '.join(unread)}", file=sys.stderr)
+        print(f"not readable as images: {', '.join(unread)}", file=sys.stderr)
         return 2
     size = next(iter(images.values())).shape[::-1]
     seen = {name: board.find(image) for name, image in images.items()}
     views = {name: one for name, one in seen.items() if one is not None}
-    print(f"{board} in {len(views)} of {len(images)} pictures of {size[0]} x {size[1]} px")
+    print(f"{board} in {len(views)} of {len(images)} images of {size[0]} x {size[1]} px")
     fits: dict[tuple[str, str], Fitter] = {("ours", "auto"): choose_lens}
     for lens in LENSES.values():
         fits[("ours", lens.name)] = lambda v, s, lens=lens: fit_lens(lens, v, s)
@@ -146,9 +146,9 @@ def main() -> int:
         for (who, lens), theirs in errors.items()
         if who == "cv2" and (ours := errors.get(("ours", lens), np.inf)) > WORSE * theirs
     ]
-    referee = min((e for (who, _), e in errors.items() if who != "ours"), default=np.inf)
-    if errors.get(("ours", "auto"), np.inf) > WORSE * referee:
-        worse.append(f"auto: {errors[('ours', 'auto')]:.4f} px, best referee {referee:.4f} px")
+    reference = min((e for (who, _), e in errors.items() if who != "ours"), default=np.inf)
+    if errors.get(("ours", "auto"), np.inf) > WORSE * reference:
+        worse.append(f"auto: {errors[('ours', 'auto')]:.4f} px, best reference {reference:.4f} px")
     print("more than 2 % worse: " + ("; ".join(worse) or "none"))
     return 1 if worse else 0
 

@@ -1,16 +1,16 @@
-"""How often 95 % intervals hold the truth, from the lens to the clearance, and verdicts are right.
+"""Coverage of 95 % intervals from lens to clearance, and rate of correct verdicts.
 
     python benchmarks/measuring/coverage.py [--labs 200] [--kind "careful, 4 tags"] [--seed 1]
 
-A lab draws a lens, pictures of a board, a camera's place, a survey of floor tags, tags on the
-platform, outlets and anchors, each off by chance as it is told. It calibrates camera and place,
-measures the platform in five pictures and the clearance of cables and platform. The truth is drawn
-and projected here, with OpenCV's projection and nothing of the estimators that are judged.
+A lab draws a lens, images of a board, a camera pose, a survey of floor tags, tags on the platform,
+outlets and anchors, each with random errors as stated. It calibrates camera and extrinsics,
+measures the platform in five images and the clearance of cables and platform. The truth is drawn
+and projected here, with OpenCV's projection and none of the code under test.
 
-NEES is the squared error of a pose in units of its covariance, 6 when that is exact. A verdict is
-right when it says good in labs of a kind whose errors, 95 %, are below what is wanted, and not good
-in those whose errors are above: the errors that were made, over all labs of that kind. It is asked
-for the limits of each kind, and near the level of the errors: for 1.5 times and two thirds of that.
+NEES is the squared error of a pose in units of its covariance, 6 if that is exact. A verdict is
+correct if it is good in kinds of labs whose 95 % error level, over all labs of that kind, is below
+the required one, and not good otherwise. It is tested for the limits of each kind and near the
+error level: for 1.5 times and two thirds of it.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from calibration.extrinsics.result import judge_extrinsics
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags
 from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views
 from calibration.intrinsics.quality import judge_camera
-from calibration.tag_map.observations import TagSights
-from calibration.targets.boards import Seen
+from calibration.tag_map.observations import TagObservations
+from calibration.targets.boards import DetectedBoard
 from model.clearance import ClearanceModel
 from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, Tag, load_rig
 from model.scene import Scene, load_scene
-from tracking.camera_model import ideal_from_pixels
+from tracking.camera_model import undistort_pixels
 from tracking.clearance import clearance_of
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
@@ -50,21 +50,21 @@ CORNER_PX, TAG_PX = 0.1, 0.03
 """Noise of corners of boards and of tags."""
 DISTANCE, PICTURES = 1.6, 5
 NEAR = 1.5
-"""How far from the level of the errors verdicts near it are asked for, as a factor."""
+"""Factor between the error level and the limits tested near it."""
 BOARD = np.array([[0.03 * x, 0.03 * y, 0.0] for y in range(6) for x in range(9)])
 
 
 @dataclass(frozen=True)
 class Kind:
-    """Labs that take the same care.
+    """A kind of labs.
 
     Attributes:
-        views: Pictures of the board.
-        tilt: Of the board, most, [deg].
-        tags: On the floor.
-        survey: Of them, one standard deviation, [m].
-        lens_wanted: Of the camera's verdict, [m].
-        place_wanted: Of the verdict of its place, [m].
+        views: Images of the board.
+        tilt: Largest tilt of the board, [deg].
+        tags: Number of tags on the floor.
+        survey: Standard deviation of their survey, [m].
+        lens_wanted: Limit of the camera's verdict, [m].
+        pose_wanted: Limit of the verdict on its pose, [m].
     """
 
     views: int
@@ -72,11 +72,11 @@ class Kind:
     tags: int
     survey: float
     lens_wanted: float = 1e-3
-    place_wanted: float = 4e-3
+    pose_wanted: float = 4e-3
 
     def wanted(self, name: str) -> float:
-        """Of the verdict on ``camera`` or ``place``, [m]."""
-        return self.lens_wanted if name == "camera" else self.place_wanted
+        """Limit of the verdict on ``camera`` or ``pose``, [m]."""
+        return self.lens_wanted if name == "camera" else self.pose_wanted
 
 
 KINDS = {
@@ -87,12 +87,12 @@ KINDS = {
 
 
 Judge = Callable[[float], bool]
-"""Whether a lab's verdict says good, by what is wanted, [m]."""
+"""Whether a lab's verdict is good, by the limit, [m]."""
 
 
 @dataclass
 class Tally:
-    """What came of labs, by what was asked."""
+    """Results of labs, by quantity."""
 
     inside: dict[str, list[bool]] = field(default_factory=lambda: defaultdict(list))
     nees: list[float] = field(default_factory=list)
@@ -100,8 +100,8 @@ class Tally:
     errors: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
 
 
-def turned(size: float, rng: np.random.Generator) -> Array:
-    """A rotation by chance, one deviation about any axis, [rad]."""
+def random_rotation(size: float, rng: np.random.Generator) -> Array:
+    """A random rotation of a standard deviation about any axis, [rad]."""
     return matrix_from_rotation_vector(size * rng.standard_normal(3))
 
 
@@ -113,8 +113,9 @@ def true_lens(camera: Camera, rng: np.random.Generator) -> Camera:
     matrix[:2, 2] += 8.0 * rng.standard_normal(2)
     wide = np.array([0.02, 0.02, 5e-4, 5e-4, 0.01])
     distortion = np.array([-0.08, 0.03, 0.0, 0.0, 0.0]) + wide * rng.standard_normal(5)
-    place = camera.world_from_camera
-    moved = Pose(place.position + 0.02 * rng.standard_normal(3), turned(0.01, rng) @ place.rotation)
+    pose = camera.world_from_camera
+    rotation = random_rotation(0.01, rng) @ pose.rotation
+    moved = Pose(pose.position + 0.02 * rng.standard_normal(3), rotation)
     return replace(camera, matrix=matrix, distortion=distortion, world_from_camera=moved)
 
 
@@ -125,9 +126,9 @@ def seen_by(camera: Camera, points: Array) -> Array:
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
-def board_views(camera: Camera, kind: Kind, rng: np.random.Generator) -> dict[str, Seen]:
-    """The board all over the picture."""
-    views: dict[str, Seen] = {}
+def board_views(camera: Camera, kind: Kind, rng: np.random.Generator) -> dict[str, DetectedBoard]:
+    """Random views of the board all over the image."""
+    views: dict[str, DetectedBoard] = {}
     size = np.array([camera.width, camera.height])
     middle = BOARD.mean(axis=0)
     while len(views) < kind.views:
@@ -140,47 +141,47 @@ def board_views(camera: Camera, kind: Kind, rng: np.random.Generator) -> dict[st
         if (pixels < 5).any() or (pixels > size - 5).any():
             continue
         noisy = pixels + CORNER_PX * rng.standard_normal(pixels.shape)
-        views[str(len(views))] = Seen(BOARD, noisy)
+        views[str(len(views))] = DetectedBoard(BOARD, noisy)
     return views
 
 
 def floor_tags(count: int) -> tuple[Tag, ...]:
-    """On a ring around the rig."""
+    """Tags on a ring around the rig."""
     angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-    places = [[0.42 * np.cos(a), 0.42 * np.sin(a), 0.0] for a in angles]
-    return tuple(Tag(401 + k, 0.12, Pose.level(place)) for k, place in enumerate(places))
+    positions = [[0.42 * np.cos(a), 0.42 * np.sin(a), 0.0] for a in angles]
+    return tuple(Tag(401 + k, 0.12, Pose.level(position)) for k, position in enumerate(positions))
 
 
 def moved_tag(tag: Tag, shift: float, turn: float, rng: np.random.Generator) -> Tag:
-    """The tag where it truly is: off by so much along and about any axis."""
-    place = tag.pose.position + shift * rng.standard_normal(3)
-    return replace(tag, pose=Pose(place, turned(turn, rng) @ tag.pose.rotation))
+    """The true tag, with random errors along and about any axis."""
+    position = tag.pose.position + shift * rng.standard_normal(3)
+    return replace(tag, pose=Pose(position, random_rotation(turn, rng) @ tag.pose.rotation))
 
 
-def square_of(truth: Camera, told: Camera, points: Array, rng: np.random.Generator) -> RefinedTag:
-    """Corners in the camera's frame as they are seen, freed of the told lens."""
+def square_of(truth: Camera, known: Camera, points: Array, rng: np.random.Generator) -> RefinedTag:
+    """Observed corners of points in the camera frame, undistorted with the known lens."""
     pixels = seen_by(truth, points) + TAG_PX * rng.standard_normal((4, 2))
-    ideal = ideal_from_pixels(told, pixels)
+    undistorted = undistort_pixels(known, pixels)
     whitening = np.eye(8) / TAG_PX
-    return RefinedTag(ideal, whitening, whitening @ ideal.ravel(), np.ones(4, bool))
+    return RefinedTag(undistorted, whitening, whitening @ undistorted.ravel(), np.ones(4, bool))
 
 
 def poses(rng: np.random.Generator) -> Iterator[Pose]:
-    """Of the platform, anywhere in the workspace."""
+    """Random poses of the platform in the workspace."""
     for _ in range(PICTURES):
-        place = rng.uniform([-0.1, -0.1, 0.35], [0.15, 0.1, 0.55])
-        yield Pose(place, turned(np.radians(5.0), rng))
+        position = rng.uniform([-0.1, -0.1, 0.35], [0.15, 0.1, 0.55])
+        yield Pose(position, random_rotation(np.radians(5.0), rng))
 
 
-def step_between(told: Pose, truth: Pose) -> Array:
-    """Shift [m] and turn [rad] from the truth, world axes."""
-    turn = rotation_vector_from_matrix(told.rotation @ truth.rotation.T)
-    return np.concatenate([told.position - truth.position, turn])
+def step_between(found: Pose, truth: Pose) -> Array:
+    """Shift [m] and rotation [rad] from the truth, world axes."""
+    turn = rotation_vector_from_matrix(found.rotation @ truth.rotation.T)
+    return np.concatenate([found.position - truth.position, turn])
 
 
 def lens_error(found: CameraCalibration, truth: Camera) -> float:
-    """How far off points of the picture are at the distance, RMS, turned to fit best, [m]."""
-    # The middles of cells: ends of the picture would count twice as much as the rest.
+    """RMS error of points at the distance over the image, after the best rotation, [m]."""
+    # Centres of cells: the image border would count twice as much as the rest.
     across, down = np.meshgrid(np.arange(39.5, 1280.0, 80.0), np.arange(29.5, 720.0, 60.0))
     pixels = np.column_stack([across.ravel(), down.ravel()]).reshape(-1, 1, 2)
     rays = [
@@ -195,13 +196,13 @@ def lens_error(found: CameraCalibration, truth: Camera) -> float:
 
 
 class Lab:
-    """One lab: what is true, and what it finds.
+    """One lab with its ground truth.
 
     Args:
         rig: As in its file.
-        scene: Obstacles, where they are.
-        kind: How careful it is.
-        rng: Of everything that happens by chance.
+        scene: The obstacles.
+        kind: Of the lab.
+        rng: Source of all randomness.
     """
 
     def __init__(self, rig: Rig, scene: Scene, kind: Kind, rng: np.random.Generator) -> None:
@@ -209,9 +210,9 @@ class Lab:
         self._truth = true_lens(rig.cameras[0], rng)
 
     def into(self, tally: Tally) -> None:
-        """Calibrates and measures, and counts what came of it."""
+        """Calibrates and measures, and adds the results to the tally."""
         camera = self._lens(tally)
-        camera = self._place(camera, tally)
+        camera = self._extrinsics(camera, tally)
         self._platform(camera, tally)
 
     def _lens(self, tally: Tally) -> Camera:
@@ -221,7 +222,7 @@ class Lab:
         m = self._truth.matrix
         numbers = [m[0, 0], m[1, 1], m[0, 2], m[1, 2], *self._truth.distortion]
         stated = list(found.intervals.values())
-        tally.inside["camera numbers"] += [
+        tally.inside["camera parameters"] += [
             abs(one.value - true) <= one.half_width
             for one, true in zip(stated, numbers, strict=True)
         ]
@@ -238,7 +239,7 @@ class Lab:
             error=None,
         )
 
-    def _place(self, camera: Camera, tally: Tally) -> Camera:
+    def _extrinsics(self, camera: Camera, tally: Tally) -> Camera:
         kind, rng = self._kind, self._rng
         turn = 2.0 * kind.survey / 0.12
         tags = floor_tags(kind.tags)
@@ -248,15 +249,15 @@ class Lab:
             true = moved_tag(tag, kind.survey, turn, rng)
             squares[tag.id] = square_of(self._truth, camera, there.apply(tag_corners(true)), rng)
         rig = replace(self._rig, frame_tags=tags)
-        sights = TagSights({"picture": squares}, {})
-        found = locate_by_frame_tags(rig, camera, sights, Survey(kind.survey, turn))
+        observations = TagObservations({"picture": squares}, {})
+        found = locate_by_frame_tags(rig, camera, observations, Survey(kind.survey, turn))
         off = step_between(found.world_from_camera, self._truth.world_from_camera)
         tally.inside["extrinsics"] += (np.abs(off) <= found.half_widths).tolist()
         back = found.world_from_camera.apply(there.apply(found.points)) - found.points
         error = float(np.sqrt(np.mean(np.sum(back**2, axis=1))))
-        tally.inside["place's stated error"].append(error <= found.error)
-        tally.errors["place"].append(error)
-        tally.judges["place"].append(lambda w: judge_extrinsics(found, w).good)
+        tally.inside["pose's stated error"].append(error <= found.error)
+        tally.errors["pose"].append(error)
+        tally.judges["pose"].append(lambda w: judge_extrinsics(found, w).good)
         return replace(
             camera,
             world_from_camera=found.world_from_camera,
@@ -266,7 +267,7 @@ class Lab:
 
     def _platform(self, camera: Camera, tally: Tally) -> None:
         rig, rng = self._rig, self._rng
-        # A told error of corners, 95 %, is half of a shift and half of a turn of each tag.
+        # The stated corner error, 95 %, is half from a shift and half from a rotation of each tag.
         tag_error, ends = rng.uniform(0.1e-3, 0.4e-3), rng.uniform(0.2e-3, 1.5e-3, 2)
         deviation = tag_error / 1.96
         tags = [
@@ -278,11 +279,11 @@ class Lab:
             outlets=rig.outlets + ends[0] / 1.96 * rng.standard_normal(rig.outlets.shape),
             anchors=rig.anchors + ends[1] / 1.96 * rng.standard_normal(rig.anchors.shape),
         )
-        told = replace(
+        stated = replace(
             rig, tag_error=tag_error, outlet_error=float(ends[0]), anchor_error=float(ends[1])
         )
-        models = ClearanceModel(told, self._scene), ClearanceModel(built, self._scene)
-        shared = SharedErrors(told, camera)
+        models = ClearanceModel(stated, self._scene), ClearanceModel(built, self._scene)
+        shared = SharedErrors(stated, camera)
         for pose in poses(rng):
             views = self._views(camera, tags, pose)
             bundle = solve_pnp(camera, views) if views else None
@@ -327,7 +328,7 @@ class Lab:
 
 
 def verdict_line(name: str, tally: Tally, wanted: float) -> tuple[str, float]:
-    """How many verdicts are right, in words and as a share."""
+    """Share of correct verdicts, as text and as a number."""
     level = float(np.quantile(tally.errors[name], 0.95))
     good = level <= wanted
     share = float(np.mean([judge(wanted) is good for judge in tally.judges[name]]))
@@ -339,13 +340,13 @@ def verdict_line(name: str, tally: Tally, wanted: float) -> tuple[str, float]:
 
 
 def wanted_of(kind: Kind, name: str, tally: Tally) -> Iterator[float]:
-    """For what verdicts are asked: the kind's own limit, and close to both sides of the level."""
+    """Limits to test: the kind's own, and close to both sides of the error level."""
     level = float(np.quantile(tally.errors[name], 0.95))
     yield from (kind.wanted(name), level * NEAR, level / NEAR)
 
 
 def main() -> int:
-    """Prints coverage by kind; 1 when something is outside its limits."""
+    """Prints coverage by kind; returns 1 if anything is outside its limits."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--labs", type=int, default=200, help="of each kind")
     parser.add_argument("--kind", nargs="*", choices=KINDS, default=list(KINDS))
@@ -370,7 +371,7 @@ def main() -> int:
         ok = 5.5 <= nees <= 6.5
         bad += not ok
         print(f"  {'NEES of the platform':22s}{nees:7.2f}{'' if ok else '  <--'}")
-        for which in ("camera", "place"):
+        for which in ("camera", "pose"):
             for wanted in wanted_of(kind, which, tally):
                 line, share = verdict_line(which, tally, wanted)
                 bad += share < 0.95

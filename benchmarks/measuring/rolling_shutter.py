@@ -1,12 +1,11 @@
-"""A moving platform before a rolling shutter, tracked with and without `readout_ms`.
+"""Tracking of a moving platform with a rolling shutter, with and without `readout_ms`.
 
     python benchmarks/measuring/rolling_shutter.py [--speed-mm-s 100] [--readout-ms 30] [--rate 30]
 
-The ready rig's cube goes back and forth (sine, so that it is faster and slower) along each axis of
-the world and turns meanwhile, before the synthetic camera, which renders by rows. Printed are the
-errors of the tracked positions: as from a camera without `readout_ms`, with it, and of a camera
-that exposes all rows at once; NEES is the squared error in units of the covariance, 3 when exact.
-Images whose motion is not known yet (the first one) are left out.
+The ready rig's cube oscillates (sine, thus at varying speed) along each axis of the world with
+small rotations, in front of the synthetic camera, which renders by rows. Prints the errors of the
+tracked positions without `readout_ms`, with it, and with a global shutter; NEES is the squared
+error in units of the covariance, 3 if exact. Images with unknown motion (the first) are left out.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ from tracking.tracker import Tracker
 
 ROOT = Path(__file__).parents[2]
 SWING = 0.04
-"""Half the way back and forth, [m]."""
+"""Amplitude of the oscillation, [m]."""
 
 
 @dataclass(frozen=True)
 class Flight:
-    """A platform that swings about home along an axis, at most at a speed [m/s]."""
+    """A platform that oscillates about home along an axis, with a peak speed [m/s]."""
 
     home: Pose
     axis: int
@@ -51,17 +50,17 @@ class Flight:
         return Pose(self.home.position + shift, turn @ self.home.rotation)
 
     def motion(self, time: float) -> PlatformMotion:
-        """Its motion there."""
+        """Its motion at a time, [s]."""
         step = 1e-4
         return PlatformMotion.between(self.at(time - step), self.at(time + step), 2.0 * step)
 
 
 def errors(
-    rig: Rig, camera: Camera, told: float, flight: Flight, images: int
+    rig: Rig, camera: Camera, readout: float, flight: Flight, images: int
 ) -> Iterator[tuple[float, float]]:
-    """Distance to the truth [m] and NEES of each pose after the first, by a stated readout [s]."""
+    """Distance to the truth [m] and NEES of each pose after the first, for a stated readout [s]."""
     eye = SyntheticCamera(rig, nothing_in_the_way(rig), camera, 3, Optics(blur=0.6, exposure=2e-3))
-    tracker = Tracker(rig, replace(camera, readout=told))
+    tracker = Tracker(rig, replace(camera, readout=readout))
     for number in range(images):
         time = number / camera.rate
         picture = eye.render(flight.at(time), number, flight.motion(time))
@@ -79,20 +78,24 @@ def main() -> int:
     parser.add_argument("--readout-ms", type=float, default=30.0)
     parser.add_argument("--rate", type=float, default=30.0, help="images a second")
     parser.add_argument("--images", type=int, default=60)
-    told = parser.parse_args()
+    options = parser.parse_args()
     rig = load_rig(ROOT / "configs" / "gachon_8_6.yaml")
-    readout = told.readout_ms / 1e3
-    print(f"{told.speed_mm_s:g} mm/s, {told.readout_ms:g} ms readout, {told.rate:g} images/s")
+    readout = options.readout_ms / 1e3
+    print(
+        f"{options.speed_mm_s:g} mm/s, {options.readout_ms:g} ms readout, {options.rate:g} images/s"
+    )
     print(f"{'axis':6s}{'camera':28s}{'poses':>6s}{'RMS mm':>9s}{'max mm':>9s}{'NEES':>9s}")
     for axis in range(3):
-        flight = Flight(rig.home, axis, told.speed_mm_s / 1e3)
+        flight = Flight(rig.home, axis, options.speed_mm_s / 1e3)
         for name, true, stated in (
             ("rolling, readout not stated", readout, 0.0),
             ("rolling, readout_ms", readout, readout),
-            ("all rows at once", 0.0, 0.0),
+            ("global shutter", 0.0, 0.0),
         ):
-            camera = replace(rig.cameras[0], readout=true, rate=told.rate)
-            found = np.array(list(errors(rig, camera, stated, flight, told.images))).reshape(-1, 2)
+            camera = replace(rig.cameras[0], readout=true, rate=options.rate)
+            found = np.array(list(errors(rig, camera, stated, flight, options.images))).reshape(
+                -1, 2
+            )
             far, nees = found.T
             rms, most = (np.sqrt(np.mean(far**2)), far.max()) if len(far) else (np.nan, np.nan)
             print(

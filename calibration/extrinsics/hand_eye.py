@@ -1,8 +1,8 @@
-"""A camera's pose from the rig's own motion: the platform's tags seen at encoder poses.
+"""A camera's pose from the rig's own motion: platform tags observed at encoder poses.
 
-With Z = world_from_camera, X = the tags' frame in the platform's, P the encoder pose
-and M the tags' pose in the camera's frame, Z M = P X at every image. X is known from the rig file
-up to a small error; motion without rotation cannot separate it from Z, and then the rig file holds.
+With Z = world_from_camera, X = platform_from_tags, P the encoder pose and M = camera_from_tags,
+Z M = P X in every image. X is known from the rig file up to a small error; motion without rotation
+cannot separate it from Z, and then the rig file's X holds.
 
 Source: Tsai & Lenz 1989; solved for both at once as in Zhuang & Shiu 1993, by least squares.
 """
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.extrinsics.result import ExtrinsicCalibration, widths_of, workspace_corners
 from calibration.results import Issue
-from calibration.tag_map.observations import TagSights, platform_pose
+from calibration.tag_map.observations import TagObservations, platform_pose
 from model.errors import BadInput, InvalidFile, Problem
 from model.files.reading import CsvFile
 from model.pose import Array, Pose, read_only
@@ -30,19 +30,19 @@ from tracking.pnp import moved
 LEAST_POSES = 8
 """Fewer poses do not show how accurate the rig's poses are."""
 _LEAST_SPAN = 0.1
-"""Along the axis of the largest, [m]."""
-DRAWING = (1e-3, np.radians(0.5))
-"""Deviation of the tags' frame from the rig file, [m] and [rad]."""
+"""Required span of the positions along their longest axis, [m]."""
+TAG_FRAME_DEVIATION = (1e-3, np.radians(0.5))
+"""Standard deviation of the tags' frame from the rig file, [m] and [rad]."""
 _FIRST = (1e-3, np.radians(0.2))
-"""Of encoder poses, to begin with; then as the residuals say."""
+"""Initial standard deviation of encoder poses, [m] and [rad]; then from the residuals."""
 _LEAST = (2e-5, np.radians(0.002))
 _HUBER = 2.0
 """Errors beyond this many deviations count linearly."""
-_PRIOR = 1.0 / np.repeat(DRAWING, 3)
+_PRIOR = 1.0 / np.repeat(TAG_FRAME_DEVIATION, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _CameraLook:
+class _PoseObservation:
     """One image: encoder pose and camera pose; covariance in the camera's frame."""
 
     world_from_platform: Pose
@@ -54,37 +54,37 @@ class _CameraLook:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stack:
-    """All looks as arrays, for n of them."""
+    """n observations as arrays."""
 
-    told: Rotation  # n rotations world_from_platform
-    told_position: Array  # (n, 3)
-    seen: Rotation  # n rotations camera_from_tags
-    seen_position: Array  # (n, 3)
+    encoder: Rotation  # n rotations world_from_platform
+    encoder_position: Array  # (n, 3)
+    camera: Rotation  # n rotations camera_from_tags
+    camera_position: Array  # (n, 3)
     covariance: Array  # (n, 6, 6)
 
     @classmethod
-    def of(cls, looks: Sequence[_CameraLook]) -> _Stack:
+    def of(cls, samples: Sequence[_PoseObservation]) -> _Stack:
         return cls(
-            Rotation.from_matrix([look.world_from_platform.rotation for look in looks]),
-            np.array([look.world_from_platform.position for look in looks]),
-            Rotation.from_matrix([look.camera_from_tags.rotation for look in looks]),
-            np.array([look.camera_from_tags.position for look in looks]),
-            np.array([look.covariance for look in looks]),
+            Rotation.from_matrix([s.world_from_platform.rotation for s in samples]),
+            np.array([s.world_from_platform.position for s in samples]),
+            Rotation.from_matrix([s.camera_from_tags.rotation for s in samples]),
+            np.array([s.camera_from_tags.position for s in samples]),
+            np.array([s.covariance for s in samples]),
         )
 
     def gaps(self, camera: Pose, tags: Pose) -> Array:
-        """From where the camera sees the tags to where the drives put them, (n, 6), [m, rad]."""
+        """Tag poses from the encoders minus those from the camera, shape (n, 6), [m, rad]."""
         turn, own = Rotation.from_matrix(camera.rotation), Rotation.from_matrix(tags.rotation)
-        there = self.told.apply(np.array(tags.position)) + self.told_position
-        here = turn.apply(self.seen_position) + camera.position
-        turns = (self.told * own) * (turn * self.seen).inv()
+        there = self.encoder.apply(np.array(tags.position)) + self.encoder_position
+        here = turn.apply(self.camera_position) + camera.position
+        turns = (self.encoder * own) * (turn * self.camera).inv()
         return np.hstack([there - here, turns.as_rotvec()])
 
     def whitening(self, camera: Pose, noise: tuple[float, float]) -> Array:
-        """Of the gaps, shape (n, 6, 6); ``noise`` is that of the drives' poses."""
+        """Whitening of the gaps, shape (n, 6, 6); ``noise`` is that of the encoder poses."""
         turn = np.kron(np.eye(2), camera.rotation)
-        told = np.diag(np.repeat(np.square(noise), 3))
-        covariance = turn @ self.covariance @ turn.T + told
+        of_encoder = np.diag(np.repeat(np.square(noise), 3))
+        covariance = turn @ self.covariance @ turn.T + of_encoder
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
@@ -93,16 +93,16 @@ class _HandEyeFit:
     world_from_camera: Pose
     platform_from_tags: Pose
     slopes: Array  # (n, 6, 12), whitened and weighted
-    errors: Array  # (n, 6), likewise
+    errors: Array  # (n, 6), whitened and weighted
 
     @property
     def information(self) -> Array:
-        """Of both unknowns, shape (12, 12)."""
+        """Information on both unknowns, shape (12, 12)."""
         flat = self.slopes.reshape(-1, 12)
         return np.asarray(flat.T @ flat + np.diag(np.concatenate([np.zeros(6), _PRIOR**2])))
 
     def without_each(self) -> list[Array]:
-        """How the camera's place changes without each look, to first order, shape (6,) each."""
+        """Changes of the camera's pose without each observation, to first order, shape (6,)."""
         whole = self.information
         return [
             np.linalg.solve(whole - slope.T @ slope, slope.T @ error)[:6]
@@ -111,34 +111,37 @@ class _HandEyeFit:
 
 
 def locate_by_motion(
-    rig: Rig, camera: Camera, sights: TagSights, poses: Mapping[str, Pose]
+    rig: Rig, camera: Camera, observations: TagObservations, poses: Mapping[str, Pose]
 ) -> ExtrinsicCalibration:
-    """Finds a camera's place from images of the platform at known poses.
+    """Finds a camera's pose from images of the platform at known poses.
 
     Args:
         rig: Its platform tags.
-        camera: Its matrix and distortion hold; its place in the rig file does not matter.
-        sights: Of platform tags.
-        poses: ``world_from_platform`` at each image, from the rig's file of poses.
+        camera: Its matrix and distortion are taken as known; its pose in the rig file is not used.
+        observations: Of platform tags.
+        poses: ``world_from_platform`` at each image.
 
     Raises:
         BadInput: Too few images have a pose.
     """
-    sights = sights.each_view_once()
-    unknown = {name: "has no pose" for name in sights.squares if name not in poses}
-    sights = sights.without(unknown)
-    found = {name: _look(rig, camera, sights, name, poses[name]) for name in sights.squares}
-    unsure = {name: "allows no unique pose" for name, look in found.items() if look is None}
-    sights = sights.without(unsure)
-    looks = [look for look in found.values() if look is not None]
-    if len(looks) < 3:
+    observations = observations.without_duplicates()
+    unknown = {name: "has no pose" for name in observations.squares if name not in poses}
+    observations = observations.without(unknown)
+    found = {
+        name: _observe(rig, camera, observations, name, poses[name])
+        for name in observations.squares
+    }
+    unsure = {name: "allows no unique pose" for name, one in found.items() if one is None}
+    observations = observations.without(unsure)
+    samples = [one for one in found.values() if one is not None]
+    if len(samples) < 3:
         raise BadInput(
-            f"{len(looks)} images show the platform at a known pose; at least 3 are required",
+            f"{len(samples)} images show the platform at a known pose; at least 3 are required",
             where=f"camera {camera.name}",
-            why="; ".join(f"{name} {why}" for name, why in list(sights.unused.items())[:4]),
+            why="; ".join(f"{name} {why}" for name, why in list(observations.unused.items())[:4]),
             next_step="take images at more poses, and list each in the pose file",
         )
-    best = _settled(looks)
+    best = _reweighted_fit(samples)
     covariance: Array = np.asarray(np.linalg.inv(best.information))[:6, :6]
     return ExtrinsicCalibration(
         camera=replace(camera, world_from_camera=best.world_from_camera),
@@ -147,30 +150,32 @@ def locate_by_motion(
         half_widths=read_only(widths_of(covariance, best.without_each())),
         by_lens=None,
         points=workspace_corners(rig),
-        tag_errors=_tag_errors(looks),
-        pictures=len(looks),
-        unused=sights.unused,
-        lacks=tuple(_lacks(looks)),
-        data_hash=sights.data_hash(),
+        tag_errors=_tag_errors(samples),
+        pictures=len(samples),
+        unused=observations.unused,
+        issues=tuple(_issues(samples)),
+        data_hash=observations.data_hash(),
     )
 
 
-def _look(rig: Rig, camera: Camera, sights: TagSights, name: str, pose: Pose) -> _CameraLook | None:
-    squares = sights.squares[name]
+def _observe(
+    rig: Rig, camera: Camera, observations: TagObservations, name: str, pose: Pose
+) -> _PoseObservation | None:
+    squares = observations.squares[name]
     found = platform_pose(rig, camera, squares)
     if found is None:
         return None
-    return _CameraLook(
+    return _PoseObservation(
         pose, found.camera_from_body, found.covariance, found.reprojection, tuple(squares)
     )
 
 
-def _settled(looks: Sequence[_CameraLook]) -> _HandEyeFit:
-    """The fit, weighted by how well the drives' poses turn out to hold."""
-    guesses = [look.world_from_platform.compose(look.camera_from_tags.inverse()) for look in looks]
+def _reweighted_fit(samples: Sequence[_PoseObservation]) -> _HandEyeFit:
+    """The fit, with the noise of the encoder poses estimated from residuals."""
+    guesses = [s.world_from_platform.compose(s.camera_from_tags.inverse()) for s in samples]
     middle = np.median([guess.position for guess in guesses], axis=0)
     start = min(guesses, key=lambda guess: float(np.linalg.norm(guess.position - middle)))
-    stack = _Stack.of(looks)
+    stack = _Stack.of(samples)
     fit = _fit(stack, start, _FIRST)
     for _ in range(4):
         gaps = np.abs(stack.gaps(fit.world_from_camera, fit.platform_from_tags))
@@ -183,12 +188,12 @@ def _settled(looks: Sequence[_CameraLook]) -> _HandEyeFit:
 
 
 def _fit(stack: _Stack, start: Pose, noise: tuple[float, float]) -> _HandEyeFit:
-    """Both unknowns; an image far off counts less (Huber)."""
+    """Fits both unknowns with Huber's loss."""
     whitening = stack.whitening(start, noise)
-    at_drawing = Pose.level(np.zeros(3))
+    nominal = Pose.level(np.zeros(3))
 
     def own(x: Array) -> Array:
-        gaps = stack.gaps(moved(start, x[:6]), moved(at_drawing, x[6:]))
+        gaps = stack.gaps(moved(start, x[:6]), moved(nominal, x[6:]))
         return np.asarray(np.einsum("nij,nj->ni", whitening, gaps))
 
     found = least_squares(
@@ -205,40 +210,38 @@ def _fit(stack: _Stack, start: Pose, noise: tuple[float, float]) -> _HandEyeFit:
     weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(np.abs(errors), 1e-12)))
     return _HandEyeFit(
         moved(start, x[:6]),
-        moved(at_drawing, x[6:]),
+        moved(nominal, x[6:]),
         slopes * weight[..., None],
         errors * weight,
     )
 
 
-def _tag_errors(looks: Sequence[_CameraLook]) -> dict[int, float]:
-    numbers = sorted({number for look in looks for number in look.numbers})
+def _tag_errors(samples: Sequence[_PoseObservation]) -> dict[int, float]:
+    numbers = sorted({number for s in samples for number in s.numbers})
     return {
-        number: float(
-            np.sqrt(np.mean([look.corner_error**2 for look in looks if number in look.numbers]))
-        )
+        number: float(np.sqrt(np.mean([s.corner_error**2 for s in samples if number in s.numbers])))
         for number in numbers
     }
 
 
-def _lacks(looks: Sequence[_CameraLook]) -> list[Issue]:
-    lacks = []
-    if len(looks) < LEAST_POSES:
-        what = f"{len(looks)} poses were seen; {LEAST_POSES} are required"
-        lacks.append(Issue(what, "take images at more poses, far apart"))
-    places = np.array([look.world_from_platform.position for look in looks])
-    span = float(np.ptp(places, axis=0).max())
+def _issues(samples: Sequence[_PoseObservation]) -> list[Issue]:
+    issues = []
+    if len(samples) < LEAST_POSES:
+        what = f"{len(samples)} poses were observed; {LEAST_POSES} are required"
+        issues.append(Issue(what, "take images at more poses, far apart"))
+    positions = np.array([s.world_from_platform.position for s in samples])
+    span = float(np.ptp(positions, axis=0).max())
     if span < _LEAST_SPAN:
         what = f"all poses lie within {span * 1e3:.0f} mm; {_LEAST_SPAN * 1e3:.0f} mm are required"
-        lacks.append(Issue(what, "take images at more poses, far apart"))
-    return lacks
+        issues.append(Issue(what, "take images at more poses, far apart"))
+    return issues
 
 
-# Poses of the platform by the names of images, from a CSV file with units in its columns.
+# CSV file of platform poses by image name, with units in its column names.
 
 
 COLUMNS = ("picture", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
-"""As in the pose log of `cdpr track`; other columns are not looked at."""
+"""As in the pose log of `cdpr track`; other columns are ignored."""
 
 
 def read_poses(path: Path) -> dict[str, Pose]:
@@ -246,7 +249,7 @@ def read_poses(path: Path) -> dict[str, Pose]:
 
     Raises:
         BadInput: The file cannot be read.
-        InvalidFile: With every row that cannot be used.
+        InvalidFile: With every invalid row.
     """
     file = CsvFile(path)
     header = file.rows[0] if file.rows else []
@@ -258,7 +261,7 @@ def read_poses(path: Path) -> dict[str, Pose]:
         texts = dict(zip(header, row, strict=False))
         picture = Path(texts.get("picture", "")).name
         values = [texts.get(name, "").strip() for name in COLUMNS[1:]]
-        if not any(values):  # as of an image that gave no pose
+        if not any(values):  # an image without a pose
             continue
         found = _pose(values)
         if isinstance(found, str):
@@ -274,7 +277,7 @@ def read_poses(path: Path) -> dict[str, Pose]:
 
 
 def _pose(values: list[str]) -> Pose | str:
-    """The pose, or what is wrong with it."""
+    """The pose, or a message about what is wrong with it."""
     try:
         numbers = np.array([float(value) for value in values])
     except ValueError:

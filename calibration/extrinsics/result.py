@@ -1,4 +1,4 @@
-"""Where a camera stands, how sure that is, what it is good for, and the result file about it."""
+"""Extrinsic calibration of a camera: pose, covariance, verdict, result file and report."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from model.rig import Camera, Rig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtrinsicCalibration:
-    """A camera's place in the world.
+    """A camera's calibrated pose in the world.
 
     Attributes:
-        camera: The camera at its new place.
+        camera: The camera at its new pose.
         by: ``frame tags``, ``rig motion`` or ``another camera``.
         covariance: Of position [m] and rotation vector [rad] along the world's axes, shape (6, 6).
         half_widths: Of the 95 % intervals of the same, shape (6,).
-        by_lens: How errors of the lens's n numbers move the place, shape (6, n), [m, rad]; None
-            where nothing is known of them.
-        points: Places in the world that matter, shape (n, 3), [m].
+        by_lens: Derivatives of the pose by the lens's n parameters, shape (6, n), [m, rad]; None
+            where their errors are unknown.
+        points: Points in the world for which the error is stated, shape (n, 3), [m].
         tag_errors: RMS corner error of each tag, by number, [px].
-        pictures: How many images it rests on.
-        unused: Why each of the others is not used, by name.
-        lacks: What it lacks, beside precision.
-        data_hash: Of what was seen.
+        pictures: Number of images used.
+        unused: Why each other image is not used, by name.
+        issues: Issues beside precision.
+        data_hash: Of the observations.
     """
 
     camera: Camera
@@ -52,42 +52,42 @@ class ExtrinsicCalibration:
     tag_errors: Mapping[int, float]
     pictures: int
     unused: Mapping[str, str]
-    lacks: tuple[Issue, ...]
+    issues: tuple[Issue, ...]
     data_hash: str
 
     @property
     def world_from_camera(self) -> Pose:
-        """The pose."""
+        """The pose of the camera in the world."""
         return self.camera.world_from_camera
 
     @property
     def stated_covariance(self) -> Array:
-        """The covariance whose 1.96 deviations are the half widths, shape (6, 6), [m, rad]."""
+        """The covariance scaled to the half widths (1.96 deviations), (6, 6), [m, rad]."""
         deviations = np.sqrt(np.diag(self.covariance))
         return np.asarray(self.covariance * np.outer(*2 * [self.half_widths / SURE / deviations]))
 
     @property
     def error(self) -> float:
-        """How far off points of the work space are seen, 95 %, RMS, [m]."""
+        """Error of measured points of the work space, 95 %, RMS, [m]."""
         arms = self.points - self.world_from_camera.position
         slopes = np.concatenate([np.hstack([np.eye(3), -skew(arm)]) for arm in arms])
         return float(np.sqrt(3.0)) * rms_bound(self.stated_covariance, slopes)  # of all axes
 
 
 def workspace_corners(rig: Rig) -> Array:
-    """Corners of the box that the platform's origin keeps to, shape (8, 3), [m]."""
+    """Corners of the workspace box of the platform's origin, shape (8, 3), [m]."""
     ends = zip(rig.workspace_lower, rig.workspace_upper, strict=True)
     return np.array(list(product(*ends)))
 
 
 def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> CalibrationVerdict:
-    """Judges a camera's place.
+    """The verdict on a camera's pose.
 
     Args:
-        result: What was found.
-        wanted: What is good enough, in the work space, [m].
+        result: The calibration.
+        wanted: Required error in the work space, [m].
     """
-    lacks, error = list(result.lacks), result.error
+    issues, error = list(result.issues), result.error
     if not error <= wanted:
         more = "survey more tags, all around the camera's view"
         if result.by == "rig motion":
@@ -98,16 +98,16 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
             f"points of the workspace are measured within {error * 1e3:.2g} mm;"
             f" {wanted * 1e3:.2g} mm are required"
         )
-        lacks.append(Issue(what, more))
-    return CalibrationVerdict.of(error, wanted, "in the workspace", lacks)
+        issues.append(Issue(what, more))
+    return CalibrationVerdict.of(error, wanted, "in the workspace", issues)
 
 
 def widths_of(covariance: Array, without: Sequence[Array]) -> Array:
-    """Half widths of 95 % intervals: by scatter, or by what leaving a part of the data out changes.
+    """Half widths of 95 % intervals, from scatter or jackknife.
 
     Args:
-        covariance: By the scatter, shape (k, k).
-        without: Changes of the k numbers when each part is left out (the jackknife over parts).
+        covariance: From the scatter, shape (k, k).
+        without: Changes of the k parameters when each part of the data is left out.
 
     Returns:
         The larger of both, shape (k,).
@@ -122,16 +122,16 @@ def widths_of(covariance: Array, without: Sequence[Array]) -> Array:
     return np.asarray(np.maximum(by_scatter, quantile * by_parts))
 
 
-# The result file of a camera's place in the world.
+# Result file.
 
 
 AXES = ("x_mm", "y_mm", "z_mm", "turn_x_deg", "turn_y_deg", "turn_z_deg")
-"""Of a pose: its position, and turns about the outer frame's axes from the stated rotation."""
+"""Pose parameters: position, and rotations about the outer frame's axes from the stated one."""
 SCALES = np.array([1e3, 1e3, 1e3, *([float(np.degrees(1.0))] * 3)])
 
 
 class ExtrinsicsResult(ResultDocument):
-    """A camera's place, in the keys of the rig file's ``cameras`` section."""
+    """A camera's pose, in the keys of the rig file's ``cameras`` section."""
 
     order: ClassVar[int] = 2
     added: ClassVar[tuple[str, ...]] = ("pose_covariance", "pose_by_lens")
@@ -152,28 +152,28 @@ class ExtrinsicsResult(ResultDocument):
     )
 
     def in_words(self) -> list[tuple[str, str]]:
-        """As of every result; rotations are about the stated one: uncertainty only."""
+        """As for every result; rotations are relative to the stated one: uncertainty only."""
         return pose_rows(self.stated)
 
     def changes_to(self, other: Self) -> dict[str, float]:
-        """How far the other camera stands off, and how it is turned about the world's axes."""
+        """Shift and rotation of the other result's camera, along the world's axes."""
         mine, theirs = self.world_from_camera.pose(), other.world_from_camera.pose()
         turn = rotation_vector_from_matrix(theirs.rotation @ mine.rotation.T)
         numbers = np.concatenate([theirs.position - mine.position, turn]) * SCALES
         return dict(zip(AXES, numbers.tolist(), strict=True))
 
     def apart_mm(self, other: Self) -> float:
-        """How far apart both put what is seen at `points_mm`, RMS, [mm]."""
+        """RMS distance between points seen at `points_mm` by both results, [mm]."""
         points = np.array(self.points_mm) / 1e3
         seen = self.world_from_camera.pose().inverse().apply(points)
         gaps = other.world_from_camera.pose().apply(seen) - points
         return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))) * 1e3
 
     def corrected(self, rig: RigDocument) -> RigDocument:
-        """The rig file's content with the camera at this place.
+        """The rig file's content with the camera at this pose.
 
         Raises:
-            BadInput: The rig has no such camera, or other tags or camera numbers.
+            BadInput: The rig has no such camera, or its tags or camera parameters differ.
         """
         camera = camera_named(rig, self.name)
         self.require_basis(
@@ -192,12 +192,12 @@ _NOT_OF_THE_LENS = (
 def extrinsics_result(
     result: ExtrinsicCalibration, verdict: CalibrationVerdict, rig: RigDocument, on: date
 ) -> ExtrinsicsResult:
-    """The result with its quality.
+    """The result file's content.
 
     Args:
-        result: What was found.
-        verdict: What it is good for.
-        rig: The rig file's content that it was found with.
+        result: The calibration.
+        verdict: Of the calibration.
+        rig: The rig file's content used for the calibration.
         on: The date.
     """
     name = result.camera.name
@@ -224,7 +224,7 @@ def extrinsics_result(
 
 
 def pose_intervals(result: ExtrinsicCalibration) -> dict[str, Interval]:
-    """The pose's numbers; turns are about the world's axes, from the stated rotation."""
+    """Intervals of the pose; rotations are about the world's axes, from the stated one."""
     values = np.concatenate([result.world_from_camera.position, np.zeros(3)]) * SCALES
     widths = result.half_widths * SCALES
     return {
@@ -234,18 +234,18 @@ def pose_intervals(result: ExtrinsicCalibration) -> dict[str, Interval]:
 
 
 def pose_rows(stated: Mapping[str, Interval]) -> list[tuple[str, str]]:
-    """Numbers of poses for people; turns from the stated rotation are 0 by their meaning."""
+    """Human-readable pose intervals; rotations from the stated one are 0 by definition."""
     return [
-        (name, interval.doubt if "turn_" in name else str(interval))
+        (name, interval.half_width_text if "turn_" in name else str(interval))
         for name, interval in stated.items()
     ]
 
 
 def _basis(rig: RigDocument, name: str, by: str) -> dict[str, Any]:
-    """What the result takes as known."""
+    """Parts of the rig file that the result takes as known."""
     camera = camera_named(rig, name).model_dump(mode="json")
     of_camera = {k: v for k, v in camera.items() if k not in _NOT_OF_THE_LENS}
-    if of_camera["lens"] == "pinhole":  # as of results before there was a choice
+    if of_camera["lens"] == "pinhole":  # as in results of versions without a choice
         del of_camera["lens"]
     tags = rig.tags.model_dump(mode="json") if rig.tags else {}
     if by == "another camera":
@@ -256,7 +256,7 @@ def _basis(rig: RigDocument, name: str, by: str) -> dict[str, Any]:
     return {"camera": of_camera, "family": tags.get("family"), "tags": tags.get(which)}
 
 
-# The report of a camera's place.
+# Report.
 
 
 def extrinsics_page(
@@ -265,12 +265,12 @@ def extrinsics_page(
     verdict: CalibrationVerdict,
     before: Pose,
 ) -> str:
-    """The whole page.
+    """The report page.
 
     Args:
-        result: What was found.
-        document: As it is written.
-        verdict: What it is good for.
+        result: The calibration.
+        document: The result file's content.
+        verdict: Of the calibration.
         before: ``world_from_camera`` of the rig file.
     """
     pose = document.world_from_camera
@@ -304,8 +304,8 @@ def extrinsics_page(
     )
 
 
-def place_facts(found: ExtrinsicCalibration, before: Pose) -> list[tuple[str, str]]:
-    """What was found beside the numbers, for people; ``before`` is the pose in the rig file."""
+def extrinsics_facts(found: ExtrinsicCalibration, before: Pose) -> list[tuple[str, str]]:
+    """Human-readable details beside the estimates; ``before`` is the rig file's pose."""
     return [
         ("by", f"{found.by}, {found.pictures} images"),
         *((f"tag {k}", f"{error:.3f} px") for k, error in found.tag_errors.items()),
@@ -314,12 +314,12 @@ def place_facts(found: ExtrinsicCalibration, before: Pose) -> list[tuple[str, st
 
 
 def moved_rows(before: Pose, after: Pose) -> list[tuple[str, str]]:
-    """How far a pose is from another, for people."""
+    """Human-readable difference between two poses."""
     shift = (after.position - before.position) * 1e3
     turn = np.degrees(rotation_vector_from_matrix(after.rotation @ before.rotation.T))
     return [
         ("moved", f"{before.distance_to(after) * 1e3:.2f} mm ({_listed(shift)})"),
-        ("turned", f"{np.degrees(before.angle_to(after)):.3f}° ({_listed(turn)})"),
+        ("rotated", f"{np.degrees(before.angle_to(after)):.3f}° ({_listed(turn)})"),
     ]
 
 

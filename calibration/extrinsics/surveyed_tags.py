@@ -1,7 +1,7 @@
-"""A camera's place from surveyed tags on the frame.
+"""A camera's pose from surveyed tags on the frame.
 
-Each tag's mean corners are fitted with the covariance that the image and the survey give them:
-the error of a survey is the same in every image and does not average out.
+The mean corners of each tag are fitted with the covariance of image and survey: survey errors are
+the same in every image and do not average out.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from scipy.stats import chi2
 from calibration.extrinsics.result import ExtrinsicCalibration, workspace_corners
 from calibration.results import Issue
 from calibration.statistics import CONFIDENCE, widened
-from calibration.tag_map.observations import TagSights
+from calibration.tag_map.observations import TagObservations
 from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import ideal_slopes, project_undistorted
+from tracking.camera_model import project_undistorted, undistorted_slopes
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, moved, solve_pnp
 from tracking.shared_errors import change_of_inverse
 
-# How far off the surveyed places of tags may be, and what that does to their pixels.
+# Survey errors and their effect on pixels.
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """How well tags were surveyed, one standard deviation along or about any axis.
+    """Standard deviations of the tags' survey, along or about any axis.
 
     Attributes:
-        shift: Of each corner by itself, or, where ``turn`` is given, of each tag as a whole, [m].
+        shift: Of each corner, or, where ``turn`` is given, of each tag as a whole, [m].
         turn: Of each tag's rotation, [rad]; 0 for tags at their nominal rotation. None where
-            every corner was surveyed by itself: then the corners give a tag's rotation.
+            corners were surveyed independently: then they determine a tag's rotation.
     """
 
     shift: float
     turn: float | None = None
 
     def slopes(self, tag: Tag) -> Array:
-        """How independent errors of size 1 shift a tag's corners, shape (12, k), [m]."""
+        """Corner shifts by independent errors of unit variance, shape (12, k), [m]."""
         if self.turn is None:
             return self.shift * np.eye(12)
         arms = tag_corners(tag) - tag.pose.position
@@ -52,14 +52,14 @@ class Survey:
         return np.concatenate([self.shift * np.tile(np.eye(3), (4, 1)), turns], axis=1)
 
     def of_pixels(self, camera: Camera, camera_from_world: Pose, tag: Tag) -> Array:
-        """Covariance of a tag's ideal pixels by errors of the survey, shape (8, 8), [px²]."""
+        """Covariance of a tag's undistorted pixels from survey errors, shape (8, 8), [px²]."""
         spread = pixel_slopes(camera, camera_from_world, tag_corners(tag)) @ self.slopes(tag)
         covariance: Array = spread @ spread.T
         return covariance
 
 
 def pixel_slopes(camera: Camera, camera_from_world: Pose, points: Array) -> Array:
-    """Derivative of ideal pixels by points in the world, shape (n, 3): (2 n, 3 n), [px/m]."""
+    """Derivative of undistorted pixels by world points (n, 3), shape (2 n, 3 n), [px/m]."""
     slopes = np.zeros((2 * len(points), 3 * len(points)))
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
     for k, (x, y, z) in enumerate(camera_from_world.apply(points)):
@@ -69,18 +69,18 @@ def pixel_slopes(camera: Camera, camera_from_world: Pose, points: Array) -> Arra
 
 
 LEAST_TAGS = 3
-"""Fewer cannot show that one of them was surveyed wrongly."""
+"""Fewer tags cannot show that one of them was surveyed wrongly."""
 MANY_TAGS = 8
-"""Of fewer, leaving one out says little of how far off all are: the stated survey counts."""
+"""With fewer, the jackknife is unreliable: the stated survey errors count."""
 MOVED_PX = 0.5
-"""Between images of a camera that stands still tags do not move farther."""
+"""Largest motion of tags between images of a camera at rest, [px]."""
 _OFF = 3.0
-"""A tag this many deviations off disagrees with the survey."""
+"""A tag with an error of this many deviations contradicts the survey."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SeenTag:
-    """A tag over all images: world corners (4, 3), mean pixels (8,), whitening of them (8, 8)."""
+    """A tag over all images: world corners (4, 3), mean pixels (8,), their whitening (8, 8)."""
 
     number: int
     corners: Array
@@ -88,7 +88,7 @@ class _SeenTag:
     whitening: Array
 
     def errors(self, camera: Camera, camera_from_world: Pose) -> Array:
-        """Of the corners, shape (8,), [px]."""
+        """Errors of the corners, shape (8,), [px]."""
         points = camera_from_world.apply(self.corners)
         return np.asarray(project_undistorted(camera, points).reshape(8) - self.pixels)
 
@@ -97,7 +97,7 @@ def require_frame_tags(rig: Rig) -> None:
     """Refuses a rig without surveyed tags.
 
     Raises:
-        BadInput: It has none.
+        BadInput: It has no frame tags.
     """
     if not rig.frame_tags:
         raise BadInput(
@@ -109,25 +109,25 @@ def require_frame_tags(rig: Rig) -> None:
 
 
 def locate_by_frame_tags(
-    rig: Rig, camera: Camera, sights: TagSights, survey: Survey
+    rig: Rig, camera: Camera, observations: TagObservations, survey: Survey
 ) -> ExtrinsicCalibration:
-    """Finds the camera's place from images taken while it stood still.
+    """Finds the camera's pose from images taken with the camera at rest.
 
     Args:
         rig: Its frame tags are the surveyed ones.
-        camera: Its matrix and distortion hold; its place in the rig file does not matter.
-        sights: Of frame tags.
-        survey: How well the tags were surveyed.
+        camera: Its matrix and distortion are taken as known; its pose in the rig file is not used.
+        observations: Of frame tags.
+        survey: Standard deviations of the survey.
 
     Raises:
-        BadInput: The tags allow no place.
+        BadInput: No camera pose fits the tags.
     """
-    sights = _still(sights)
-    start = _start(rig, camera, sights)
-    tags = _seen_tags(rig, camera, sights, start, survey)
-    tags, strangers = _agreeing(camera, tags, start)
+    observations = _without_moved_images(observations)
+    start = _initial_pose(rig, camera, observations)
+    tags = _seen_tags(rig, camera, observations, start, survey)
+    tags, outliers = _reject_outliers(camera, tags, start)
     best = _fit(camera, tags, start)
-    unused = {f"tag {tag.number}": _is_off(camera, tag, best) for tag in strangers}
+    unused = {f"tag {tag.number}": _offset_message(camera, tag, best) for tag in outliers}
     slopes = _slopes(camera, tags, best)
     by_lens = _by_lens(camera, tags, best, slopes)
     covariance = _covariance(camera, tags, best, slopes)
@@ -149,37 +149,39 @@ def locate_by_frame_tags(
         by_lens=by_lens,
         points=workspace_corners(rig),
         tag_errors={t.number: float(np.sqrt(np.mean(t.errors(camera, best) ** 2))) for t in tags},
-        pictures=len(sights.squares),
-        unused={**sights.unused, **unused},
-        lacks=tuple(_lacks(camera, tags, best)),
-        data_hash=sights.data_hash(),
+        pictures=len(observations.squares),
+        unused={**observations.unused, **unused},
+        issues=tuple(_issues(camera, tags, best)),
+        data_hash=observations.data_hash(),
     )
 
 
-def _still(sights: TagSights) -> TagSights:
-    """Without images in which all is seen elsewhere than in most."""
+def _without_moved_images(observations: TagObservations) -> TagObservations:
+    """Without images whose tags have moved relative to most images."""
     middle = {
-        number: np.median([s[number].corners for s in sights.squares.values() if number in s], 0)
-        for number in sights.numbers
+        number: np.median(
+            [s[number].corners for s in observations.squares.values() if number in s], 0
+        )
+        for number in observations.numbers
     }
     unused = {}
-    for name, squares in sights.squares.items():
+    for name, squares in observations.squares.items():
         off = [np.linalg.norm(s.corners - middle[k], axis=1).mean() for k, s in squares.items()]
-        if len(sights.squares) > 2 and np.median(off) > MOVED_PX:
+        if len(observations.squares) > 2 and np.median(off) > MOVED_PX:
             unused[name] = (
                 f"shows the tags {np.median(off):.1f} px off the other images: the camera moved"
             )
-    return sights.without(unused)
+    return observations.without(unused)
 
 
-def _start(rig: Rig, camera: Camera, sights: TagSights) -> Pose:
-    """``camera_from_world`` by the tags of one image.
+def _initial_pose(rig: Rig, camera: Camera, observations: TagObservations) -> Pose:
+    """``camera_from_world`` from the tags of one image.
 
     Raises:
-        BadInput: They allow none.
+        BadInput: No pose fits them.
     """
     tags = {tag.id: tag for tag in rig.frame_tags}
-    fullest = max(sights.squares.values(), key=len)
+    fullest = max(observations.squares.values(), key=len)
     views = [TagView(tags[number], square) for number, square in fullest.items()]
     found = solve_pnp(camera, views, camera.world_from_camera.inverse())
     if found is None:
@@ -193,22 +195,22 @@ def _start(rig: Rig, camera: Camera, sights: TagSights) -> Pose:
 
 
 def _seen_tags(
-    rig: Rig, camera: Camera, sights: TagSights, start: Pose, survey: Survey
+    rig: Rig, camera: Camera, observations: TagObservations, start: Pose, survey: Survey
 ) -> list[_SeenTag]:
     tags = {tag.id: tag for tag in rig.frame_tags}
     found = []
-    for number in sights.numbers:
-        squares = [s[number] for s in sights.squares.values() if number in s]
+    for number in observations.numbers:
+        squares = [s[number] for s in observations.squares.values() if number in s]
         corners = tag_corners(tags[number])
-        covariance = _of_picture(squares) + survey.of_pixels(camera, start, tags[number])
+        covariance = _image_covariance(squares) + survey.of_pixels(camera, start, tags[number])
         pixels = np.mean([square.corners.reshape(8) for square in squares], axis=0)
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
         found.append(_SeenTag(number, corners, pixels, whitening))
     return found
 
 
-def _of_picture(squares: Sequence[RefinedTag]) -> Array:
-    """Covariance of corners in one image; more images of a still scene err alike."""
+def _image_covariance(squares: Sequence[RefinedTag]) -> Array:
+    """Covariance of corners in one image; errors in images of a static scene correlate."""
     return np.asarray(np.mean([square.covariance for square in squares], axis=0))
 
 
@@ -217,7 +219,7 @@ def _errors(camera: Camera, tags: Sequence[_SeenTag], pose: Pose) -> Array:
 
 
 def _fit(camera: Camera, tags: Sequence[_SeenTag], start: Pose) -> Pose:
-    """``camera_from_world`` that fits best; a tag far off counts less (Huber)."""
+    """Fits ``camera_from_world`` with Huber's loss."""
     found = least_squares(
         lambda step: _errors(camera, tags, moved(start, step)),
         np.zeros(6),
@@ -231,15 +233,15 @@ def _fit(camera: Camera, tags: Sequence[_SeenTag], start: Pose) -> Pose:
 
 
 def _misfit(camera: Camera, tags: Sequence[_SeenTag], pose: Pose) -> float:
-    """Squares of the errors, in variances, for each that is free."""
+    """Sum of squared errors, in variances, per degree of freedom."""
     return float(np.sum(_errors(camera, tags, pose) ** 2)) / (8 * len(tags) - 6)
 
 
-def _agreeing(
+def _reject_outliers(
     camera: Camera, tags: list[_SeenTag], start: Pose
 ) -> tuple[list[_SeenTag], list[_SeenTag]]:
-    """Tags that agree with each other, and those that all others contradict."""
-    strangers: list[_SeenTag] = []
+    """Tags that agree with each other, and outliers."""
+    outliers: list[_SeenTag] = []
     while len(tags) > LEAST_TAGS:
         misfit = _misfit(camera, tags, _fit(camera, tags, start))
         rests = [tags[:k] + tags[k + 1 :] for k in range(len(tags))]
@@ -247,12 +249,12 @@ def _agreeing(
         k = int(np.argmin(without))
         if misfit < _OFF or without[k] > 0.5 * misfit:
             break
-        strangers.append(tags[k])
+        outliers.append(tags[k])
         tags = rests[k]
-    return tags, strangers
+    return tags, outliers
 
 
-def _is_off(camera: Camera, tag: _SeenTag, best: Pose) -> str:
+def _offset_message(camera: Camera, tag: _SeenTag, best: Pose) -> str:
     depth = float(best.apply(tag.corners)[:, 2].mean())
     pixels = float(np.sqrt(2.0 * np.mean(tag.errors(camera, best) ** 2)))
     away = pixels * depth / float(camera.matrix[0, 0])
@@ -260,7 +262,7 @@ def _is_off(camera: Camera, tag: _SeenTag, best: Pose) -> str:
 
 
 def _slopes(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
-    """Of the whitened errors by the pose, shape (8 t, 6)."""
+    """Jacobian of the whitened errors by the pose, shape (8 t, 6)."""
     step = 1e-6
     return np.column_stack(
         [
@@ -272,11 +274,11 @@ def _slopes(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
 
 
 def _by_lens(camera: Camera, tags: Sequence[_SeenTag], best: Pose, slopes: Array) -> Array | None:
-    """How ``world_from_camera`` moves with errors of the lens, shape (6, n)."""
+    """Derivatives of ``world_from_camera`` by the lens parameters, shape (6, n)."""
     if camera.lens_covariance is None:
         return None
     by_lens = [
-        tag.whitening @ ideal_slopes(camera, tag.pixels.reshape(4, 2)).reshape(8, -1)
+        tag.whitening @ undistorted_slopes(camera, tag.pixels.reshape(4, 2)).reshape(8, -1)
         for tag in tags
     ]
     steps = np.linalg.lstsq(slopes, np.concatenate(by_lens), rcond=None)[0]
@@ -284,7 +286,7 @@ def _by_lens(camera: Camera, tags: Sequence[_SeenTag], best: Pose, slopes: Array
 
 
 def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose, slopes: Array) -> Array:
-    """Of ``world_from_camera``, shape (6, 6); wider where the scatter contradicts the survey."""
+    """Covariance of ``world_from_camera``, (6, 6); wider if scatter contradicts the survey."""
     misfit, free = _misfit(camera, tags, best), 8 * len(tags) - 6
     scale = misfit if misfit > chi2.ppf(CONFIDENCE, free) / free else 1.0
     covariance = scale * np.linalg.inv(slopes.T @ slopes)
@@ -292,17 +294,17 @@ def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose, slopes: Ar
     return np.asarray(change @ covariance @ change.T)
 
 
-def _lacks(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> list[Issue]:
-    lacks = []
+def _issues(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> list[Issue]:
+    issues = []
     if len(tags) < LEAST_TAGS:
-        seen = f"{len(tags)} frame tag{'s are' if len(tags) != 1 else ' is'} seen"
+        seen = f"{len(tags)} frame tag{'s are' if len(tags) != 1 else ' is'} visible"
         what = f"{seen}; {LEAST_TAGS} are required"
         step = "survey more tags, all around the camera's view"
-        lacks.append(Issue(what, step))
+        issues.append(Issue(what, step))
     for tag in tags:
         size = np.sqrt(np.mean((tag.whitening @ tag.errors(camera, best)) ** 2))
         if len(tags) >= LEAST_TAGS and size > _OFF:
-            what = f"tag {tag.number} {_is_off(camera, tag, best)}"
+            what = f"tag {tag.number} {_offset_message(camera, tag, best)}"
             step = f"survey tag {tag.number} again, or remove it from the rig file"
-            lacks.append(Issue(what, step))
-    return lacks
+            issues.append(Issue(what, step))
+    return issues

@@ -1,4 +1,4 @@
-"""Finds a rig's numbers from drive positions at rest, and how well they are known."""
+"""Calibrates a rig's parameters from stationary samples, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from model.rig import Rig
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
-# Leaves out places that contradict the others: a drive that slipped, a pose that was mistaken.
+# Outlier rejection: samples with a cable that slipped on its drum or a wrong pose.
 
 
 FAR_OFF = 4.0
-"""A sample is left out whose error is this many times the median,"""
+"""A sample is rejected if its error is this many times the median,"""
 OFF = 2.0
 """and this many times the stated standard deviation."""
 
 
 def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> RigMeasurements:
-    """The places that agree with each other; the others are named as unused.
+    """The samples without outliers, which are listed as unused.
 
     Args:
-        measured: Places at rest.
-        fit: Of all of them, robust.
-        fewest: Nothing is left out where fewer places than that would remain.
+        measured: Stationary samples.
+        fit: Robust fit of all samples.
+        fewest: Nothing is rejected if fewer samples than this would remain.
     """
     residuals, m = fit.residuals / fit.deviations, fit.cables.shape[1]
     misfits = _misfits(fit, residuals, measured)
@@ -71,14 +71,14 @@ def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> Rig
 
 
 def _misfits(fit: RigFit, residuals: Array, measured: RigMeasurements) -> Array:
-    """How far off places are, RMS in standard deviations, shape (n,)."""
+    """Error of each sample, RMS in standard deviations, shape (n,)."""
     freedom = np.maximum(np.isfinite(fit.deviations).sum(axis=1) - measured.unmeasured, 1)
     squares = np.sum(residuals**2, axis=1) + fit.pose_misfits**2
     misfits: Array = np.sqrt(squares / freedom)
     return misfits
 
 
-# How well a rig's parameters predict held-out samples, each left out once.
+# Cross-validation: errors on held-out samples.
 
 
 FOLDS = 5
@@ -86,12 +86,12 @@ FOLDS = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
-    """Places that a fit has not seen, each left out once.
+    """Cross-validation errors of samples.
 
     Attributes:
-        before: How far off they are by the rig file, shape (n,), [m].
-        after: By the fits that did not see them, shape (n,), [m].
-        poses: Distances of positions; else of cables from any pose, for lengths alone.
+        before: Errors with the rig file, shape (n,), [m].
+        after: Errors with fits that left the sample out, shape (n,), [m].
+        poses: True for position errors; False for RMS cable residuals, without measured poses.
     """
 
     before: Array
@@ -100,18 +100,18 @@ class HeldOut:
 
 
 def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation: float) -> HeldOut:
-    """Fits without every fifth place in turn, and looks at those.
+    """Five-fold cross-validation.
 
     Args:
         parameters: The unknowns.
-        measured: Places at rest.
+        measured: Stationary samples.
         length_deviation: Of a cable's length from the encoder, [m].
 
     Raises:
         Fault: A part of the measurements cannot be fitted.
     """
     n = len(measured)
-    posed = bool(measured.posed.all())
+    posed = bool(measured.has_position.all())
     before, after = np.empty(n), np.empty(n)
     zero = np.zeros(len(parameters))
     for fold in range(FOLDS):
@@ -124,9 +124,9 @@ def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation
 
 
 def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, posed: bool) -> Array:
-    """How far off places are that a fit has not seen, shape (n,), [m]."""
+    """Errors of held-out samples, shape (n,), [m]."""
     model, geometry = RigModel(parameters, measured), parameters.geometry(values)
-    lengths, rig = model.counted.by(geometry), rig_with(parameters.rig, geometry)
+    lengths, rig = model.counted.lengths(geometry), rig_with(parameters.rig, geometry)
     if not posed:
         solutions = poses_from_lengths(rig, lengths)
         return np.array([float(np.sqrt(np.mean(one.residual**2))) for one in solutions])
@@ -137,27 +137,27 @@ def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, po
     return np.asarray(np.linalg.norm(apart, axis=1))
 
 
-FEWEST_PLACES = 10
-"""Fewer say too little to be fitted at all."""
+FEWEST_SAMPLES = 10
+"""Minimum number of samples for a fit."""
 UNKNOWN_SHARE = 0.5
-"""A number is unknown when this share of its square lies among the unknown directions."""
+"""A parameter is unknown if this share of its square lies in unknown directions."""
 DEGREE = math.degrees(1.0)
 MOST_APART = math.radians(45.0)
-"""An IMU's vertical farther from the pose's is in other axes, [rad]."""
+"""An IMU's vertical farther from that of the pose is in other axes, [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigCalibration:
-    """A rig's numbers from measurements.
+    """A rig's parameters estimated from measurements.
 
     Attributes:
         parameters: The unknowns and the rig file.
-        measured: What they are from, without places that contradict the others.
-        fit: The best fit that leaves what cannot be identified as in the rig file.
-        observability: What the data determine.
+        measured: The samples used, without outliers.
+        fit: Best fit; unidentifiable directions are left as in the rig file.
+        observability: Directions that the data determine.
         uncertainty: Of the unknowns.
-        held_out: Places left out of fits.
-        length_deviation: Of a cable's length from the encoder, its tension measured, [m].
+        held_out: Cross-validation errors.
+        length_deviation: Of a cable's length from the encoder, with measured tension, [m].
     """
 
     parameters: Parameters
@@ -175,7 +175,7 @@ class RigCalibration:
 
     @cached_property
     def geometry(self) -> RigGeometry:
-        """The rig as found."""
+        """The estimated parameters."""
         return self.parameters.geometry(self.fit.values)
 
     @cached_property
@@ -185,22 +185,22 @@ class RigCalibration:
 
     @cached_property
     def not_identified(self) -> list[str]:
-        """What the data do not determine, in words."""
+        """Sentences about what the data do not determine."""
         return sentences(self.observability, self.parameters) + self._missing_tensions()
 
     def _missing_tensions(self) -> list[str]:
-        """What measurements would determine the stiffness of each cable, where it is unknown."""
-        place = self.parameters.slices().get("cable_stiffness")
-        if place is None:
+        """Sentences about the tensions missing for the stiffness of each cable."""
+        columns = self.parameters.slices().get("cable_stiffness")
+        if columns is None:
             return []
         tensions = self.measured.tensions
-        untold = int((~np.isfinite(tensions)).any(axis=1).sum())
-        if untold:
+        missing = int((~np.isfinite(tensions)).any(axis=1).sum())
+        if missing:
             return [
-                f"for the stiffness of each cable, tensions are missing at {untold} poses: use run"
+                f"for the stiffness of each cable, tensions are missing at {missing} poses: use run"
                 " folders, or the columns tension_1_n …"
             ]
-        unknown = np.sum(self.observability.unknown[place] ** 2, axis=1) > UNKNOWN_SHARE
+        unknown = np.sum(self.observability.unknown[columns] ** 2, axis=1) > UNKNOWN_SHARE
         return [
             f"for the stiffness of cable {i + 1}, tensions that differ more are missing: they are"
             f" {tensions[:, i].min():.3g} to {tensions[:, i].max():.3g} N"
@@ -209,7 +209,7 @@ class RigCalibration:
 
     @cached_property
     def intervals(self) -> dict[str, Interval]:
-        """What was found, by name with unit, 95 %."""
+        """Estimates with 95 % intervals, by name with unit."""
         geometry, m = self.geometry, self.rig.cable_count
         found: dict[str, Interval] = {}
         drums = np.array([w.drum_mm_per_rev for w in self.rig.document.winches])
@@ -223,32 +223,32 @@ class RigCalibration:
         tables["swivel_zeros"] = (np.degrees(geometry.swivel_zeros), "_deg", np.full(m, DEGREE))
         tables["imu_mounting"] = (np.degrees(geometry.imu_mounting), "_deg", np.full(3, DEGREE))
         half_widths = self.uncertainty.half_widths
-        for group, place in self.parameters.slices().items():
-            names = self.parameters.names[place]
+        for group, columns in self.parameters.slices().items():
+            names = self.parameters.names[columns]
             if group in ("stiffness", "cable_stiffness"):
                 one = [geometry.stiffness.mean()] if group == "stiffness" else geometry.stiffness
-                rows = zip(names, one, np.exp(half_widths[place]), strict=True)
-                # Its logarithm is as uncertain to both sides, itself is not.
+                rows = zip(names, one, np.exp(half_widths[columns]), strict=True)
+                # The interval is symmetric in the logarithm of the stiffness.
                 found |= {f"{n}_n": Interval.between(s / w, s * w) for n, s, w in rows}
                 continue
             values, unit, scale = tables[group]
-            rows = zip(names, values, half_widths[place] * scale, strict=True)
+            rows = zip(names, values, half_widths[columns] * scale, strict=True)
             found |= {f"{n}{unit}": Interval(float(v), float(w)) for n, v, w in rows}
         return found
 
     def error_of(self, group: str) -> float | None:
-        """How far off the coordinates of a group are, 95 %, RMS, [m]; None if it is not fitted.
+        """Error of a group's coordinates, 95 %, RMS, [m]; None if it is not estimated.
 
         Args:
             group: ``outlets`` or ``anchors``.
         """
-        place = self.parameters.slices().get(group)
-        if place is None:
+        columns = self.parameters.slices().get(group)
+        if columns is None:
             return None
-        return float(np.sqrt(np.mean(self.uncertainty.half_widths[place] ** 2)))
+        return float(np.sqrt(np.mean(self.uncertainty.half_widths[columns] ** 2)))
 
     def position_error(self, positions: Array, rotations: Array) -> Array:
-        """How far off the platform may be from its commanded pose, 95 %.
+        """Position error of the platform at commanded poses, 95 %.
 
         Args:
             positions: World frame, shape (k, 3), [m].
@@ -263,7 +263,7 @@ class RigCalibration:
         return self.uncertainty.worst(moved[:, :3])
 
     def reached(self, positions: Array, rotations: Array) -> Array:
-        """Where the platform truly goes when the rig file's numbers are to bring it to poses.
+        """Positions that the platform reaches when the rig file's parameters command poses.
 
         Args:
             positions: World frame, shape (k, 3), [m].
@@ -273,7 +273,7 @@ class RigCalibration:
             Shape (k, 3), [m].
         """
         there = _sent_to(self.rig, positions, rotations)
-        lengths = RigModel(self.parameters, there).counted.by(self.geometry)
+        lengths = RigModel(self.parameters, there).counted.lengths(self.geometry)
         rig = rig_with(self.rig, self.geometry)
         return poses_near(rig, lengths, positions, rotations, steps=10)[0]
 
@@ -284,30 +284,30 @@ def fit_rig(
     deviations: Mapping[str, float],
     length_deviation: float,
 ) -> RigCalibration:
-    """Finds the numbers of a rig.
+    """Calibrates the parameters of a rig.
 
     Args:
         rig: As in its file.
-        measured: Places at rest.
-        deviations: How far off the rig file may be by group of numbers; groups left out are taken
-            as known.
-        length_deviation: Of a cable's length from the encoder, its tension measured, [m].
+        measured: Stationary samples.
+        deviations: Standard deviation of the rig file by parameter group; groups left out are
+            taken as known.
+        length_deviation: Of a cable's length from the encoder, with measured tension, [m].
 
     Raises:
-        BadInput: Too few places, a pose outside the rig, or nothing to look for.
+        BadInput: Too few samples, a pose outside the rig, or nothing to estimate.
         Fault: The measurements cannot be fitted.
     """
-    if len(measured) < FEWEST_PLACES:
+    if len(measured) < FEWEST_SAMPLES:
         raise BadInput(
-            f"only {len(measured)} stationary samples; {FEWEST_PLACES} required, 60 recommended",
+            f"only {len(measured)} stationary samples; {FEWEST_SAMPLES} required, 60 recommended",
             where="calibrate rig",
             next_step="measure at more poses: `cdpr calibrate poses` plans them",
         )
     _require_within(rig, measured)
     _require_sensors(rig, measured, deviations)
     swivels = np.isfinite(measured.swivels).any()
-    sought = {g: d for g, d in deviations.items() if swivels or g != "swivel_zeros"}
-    parameters = Parameters.of(rig, sought)
+    estimated = {g: d for g, d in deviations.items() if swivels or g != "swivel_zeros"}
+    parameters = Parameters.of(rig, estimated)
     if not len(parameters):
         raise BadInput(
             "there is nothing to calibrate",
@@ -316,7 +316,7 @@ def fit_rig(
             next_step="leave out --known for one of them",
         )
     fit, observability = identified(parameters, measured, length_deviation)
-    agreeing = without_outliers(measured, fit, FEWEST_PLACES)
+    agreeing = without_outliers(measured, fit, FEWEST_SAMPLES)
     if len(agreeing) < len(measured):
         measured = agreeing
         fit, observability = identified(parameters, measured, length_deviation)
@@ -332,7 +332,7 @@ def fit_rig(
 
 
 def _require_within(rig: Rig, measured: RigMeasurements) -> None:
-    """Poses are where the platform can be: numbers in another unit are not.
+    """Refuses poses that the platform cannot reach, such as in a wrong unit.
 
     Raises:
         BadInput: One is outside the box around outlets, home and workspace.
@@ -352,21 +352,21 @@ def _require_within(rig: Rig, measured: RigMeasurements) -> None:
 
 
 def _require_sensors(rig: Rig, measured: RigMeasurements, deviations: Mapping[str, float]) -> None:
-    """Sensors measure what the rig has, and an IMU's axes are about the platform's.
+    """Checks that the rig has what sensors measure, and that an IMU's axes fit the platform's.
 
     Raises:
-        BadInput: They do not.
+        BadInput: One does not fit.
     """
     if np.isfinite(measured.swivels).any() and not rig.pulley_radius:
         raise BadInput(
-            "swivel angles were measured, and the rig file has no pulleys",
+            "the data have swivel angles, but the rig file has no pulleys",
             where="calibrate rig",
             next_step="add `pulleys` to the rig file, or leave out the columns swivel_1_deg …",
         )
     known = np.isfinite(measured.verticals).all(axis=1)
     if "imu_mounting" in deviations and not known.any():
         raise BadInput(
-            "the mounting of an IMU is to be found, and no data have its columns",
+            "the IMU's mounting cannot be found: no data have its columns",
             where="calibrate rig",
             next_step="add the columns accel_x_m_s2, accel_y_m_s2, accel_z_m_s2, or leave out"
             " --imu-mounting-deg",
@@ -379,7 +379,7 @@ def _require_sensors(rig: Rig, measured: RigMeasurements, deviations: Mapping[st
         raise BadInput(
             f"the IMU's vertical is {math.degrees(apart[k]):.0f}° from that of the pose",
             where=measured.names[k],
-            why="its axes are not the platform's, or it reads gravity downward",
+            why="its axes are not the platform's, or its sign is inverted",
             next_step="give accelerations in the platform's axes; at rest, an accelerometer reads"
             " +9.81 m/s² along an axis that points up",
         )
@@ -390,7 +390,7 @@ def _mm(point: Array) -> str:
 
 
 def _sent_to(rig: Rig, positions: Array, rotations: Array) -> RigMeasurements:
-    """Places with the drive positions of poses, by the rig file and under the tensions of home."""
+    """Samples with the drive positions of poses, by the rig file and with the home tensions."""
     anchors = positions[:, None, :] + np.einsum("kij,mj->kmi", rotations, rig.anchors)
     winches, tensions = WinchMap(rig), working_tensions(rig, rig.home).tensions
     counts = winches.counts(winches.unstrained(cables_to(rig, anchors).lengths, tensions))

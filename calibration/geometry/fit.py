@@ -1,8 +1,7 @@
-"""Fits a rig's numbers and the platform's poses together: damped least squares, robust.
+"""Robust damped least-squares fit of a rig's parameters and the platform's poses.
 
-The poses are eliminated place by place (Schur complement), so that the effort grows with their
-number only in proportion. Unknowns are counted in standard deviations of the rig file, which is one
-more measurement of each.
+The pose of each sample is eliminated (Schur complement), so the cost is linear in the number of
+samples. Unknowns are in standard deviations of the rig file, which acts as a prior on each.
 """
 
 from __future__ import annotations
@@ -15,26 +14,26 @@ import numpy as np
 from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.model import RigModel
 from calibration.geometry.parameters import Parameters
-from calibration.statistics import huber, share_of
+from calibration.statistics import huber, huber_weight
 from model.errors import Fault
 from model.kinematics import ForwardSolution, NoCable, forward_kinematics
 from model.pose import Array, matrix_from_rotation_vector, read_only, rotation_vector_from_matrix
 from model.rig import Rig
 
-# The normal equations of a rig's fit, place by place, with the places' poses eliminated.
+# Normal equations, sample by sample, with the poses eliminated.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """The equations of n places for r unknowns.
+    """Normal equations of n samples for r unknowns.
 
     Attributes:
         own: Of the unknowns, shape (n, r, r).
-        prior: How far the unknowns are from the rig file, shape (r,): of all places together.
+        prior: Deviation of the unknowns from the rig file, shape (r,).
         mixed: Of unknowns and pose, shape (n, r, 6).
         poses: Of the pose, shape (n, 6, 6).
-        pull: Half the slope of the squares by the unknowns, shape (n, r).
-        pose_pull: Half the slope by the pose, shape (n, 6).
+        pull: Half the gradient of the sum of squares by the unknowns, shape (n, r).
+        pose_pull: Half the gradient by the pose, shape (n, 6).
     """
 
     own: Array
@@ -44,23 +43,23 @@ class NormalEquations:
     pull: Array
     pose_pull: Array
 
-    def by_place(self, damping: float = 0.0) -> tuple[Array, Array]:
-        """What each place says of the unknowns with its pose eliminated.
+    def reduced_by_sample(self, damping: float = 0.0) -> tuple[Array, Array]:
+        """Each sample's information on the unknowns, its pose eliminated.
 
         Returns:
-            Information, shape (n, r, r), and half the slope of the squares, shape (n, r).
+            Information, shape (n, r, r), and half the gradient of the squares, shape (n, r).
         """
         poses = self._poses(damping)
         gained = np.linalg.solve(poses, np.swapaxes(self.mixed, 1, 2))
         alone = np.asarray(np.linalg.solve(poses, self.pose_pull[..., None]))
-        reduced = self.own - self.mixed @ gained
-        symmetric: Array = (reduced + np.swapaxes(reduced, 1, 2)) / 2.0
+        schur = self.own - self.mixed @ gained
+        symmetric: Array = (schur + np.swapaxes(schur, 1, 2)) / 2.0
         slopes: Array = self.pull - (self.mixed @ alone)[..., 0]
         return symmetric, slopes
 
     def solved(self, damping: float) -> tuple[Array, Array]:
         """Steps of the unknowns, shape (r,), and twists of the poses, shape (n, 6)."""
-        informations, slopes = self.by_place(damping)
+        informations, slopes = self.reduced_by_sample(damping)
         right = self.prior + slopes.sum(axis=0)
         left = informations.sum(axis=0) + (1.0 + damping) * np.eye(len(right))
         step: Array = -np.linalg.solve(left, right)
@@ -76,35 +75,34 @@ class NormalEquations:
 
 MOST_STEPS = 200
 SETTLED = 1e-6
-"""The fit has converged where a step makes the sum of squares smaller by less, as a share."""
+"""The fit has converged when a step lowers the sum of squares by less, relative."""
 MOST_DAMPING = 1e9
-"""No smaller step is tried: what it would gain is below round-off."""
+"""No smaller step is tried: its gain would be below round-off."""
 START_TOLERANCE = 1e-5
-"""Poses to begin with need be no nearer, [m] and [rad]."""
+"""Tolerance of initial poses, [m] and [rad]."""
 RESIDUAL_BEND, POSE_BEND = 3.0, 4.0
-"""Where residuals of cables and sensors, and of poses, begin to count less than their square."""
+"""Huber thresholds of cable and sensor residuals, and of poses, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigFit:
-    """What fits the measurements best.
+    """The best fit to the measurements.
 
     Attributes:
-        values: Of the unknowns, shape (p,), [m] or share.
+        values: Of the unknowns, shape (p,).
         positions: World frame, shape (n, 3), [m].
         rotations: ``world_from_platform``, shape (n, 3, 3).
-        sensors: What was measured beside the m cable lengths at each place, k − m texts.
+        sensors: Names of the k − m values measured beside the m cable lengths of each sample.
         residuals: Of cable lengths, then of the sensors, shape (n, k), [m], [rad]; 0 where nothing
             was measured.
-        deviations: How far off each was taken to be, shape (n, k), [m], [rad]; infinite where
-            nothing was measured.
-        weights: How much of each residual's square counts, shape (n, k); less than 1 where it is
-            far off.
-        pose_misfits: Of the poses from the measured ones, in standard deviations, shape (n,); 0
-            where there is none.
-        informations: What each place alone says of the unknowns, its pose projected out, shape
+        deviations: Assumed standard deviations, shape (n, k), [m], [rad]; infinite where nothing
+            was measured.
+        weights: Huber weight of each residual, shape (n, k); below 1 for outliers.
+        pose_misfits: Distances of estimated from measured poses, in standard deviations, shape
+            (n,); 0 where no pose was measured.
+        informations: Information of each sample on the unknowns, its pose projected out, shape
             (n, p, p), per variance of the rig file.
-        scores: Half the slope of each place's squares by the unknowns in the same units, (n, p).
+        scores: Half the gradient of each sample's squares by the unknowns, same units, (n, p).
     """
 
     values: Array
@@ -125,60 +123,60 @@ class RigFit:
 
     @property
     def sensor_rms(self) -> Array:
-        """RMS of each sensor's residuals where it measured, shape (k − m,), [rad]."""
+        """RMS of each sensor's residuals where measured, shape (k − m,), [rad]."""
         m = self.cables.shape[1]
         known = np.maximum(np.isfinite(self.deviations[:, m:]).sum(axis=0), 1)
         return np.asarray(np.sqrt(np.sum(self.residuals[:, m:] ** 2, axis=0) / known))
 
     @property
     def information(self) -> Array:
-        """What the data alone say of the unknowns, shape (p, p), per variance of the rig file.
+        """Information of the data alone, shape (p, p), per variance of the rig file.
 
-        Eigenvalues above 1 are known better from the data than from the rig file.
+        Directions of eigenvalues above 1 are known better from the data than from the rig file.
         """
         total: Array = self.informations.sum(axis=0)
         return total
 
 
 class RigFitter:
-    """One set of measurements and unknowns."""
+    """Fitter for one set of measurements and unknowns."""
 
     def __init__(
         self, parameters: Parameters, measured: RigMeasurements, length_deviation: float
     ) -> None:
-        """Prepares; nothing is fitted yet.
+        """Prepares the model; `fit` runs the fit.
 
         Args:
             parameters: The unknowns.
-            measured: Places at rest.
+            measured: Stationary samples.
             length_deviation: Of a cable's length from the encoder, [m].
         """
         self._parameters, self._measured = parameters, measured
         self._model = RigModel(parameters, measured)
         self._deviations = self._model.deviations(length_deviation)
-        self._posed, self._turned = measured.posed, measured.turned
+        self._posed, self._rotated = measured.has_position, measured.has_rotation
 
     def fit(self, basis: Array | None = None) -> RigFit:
-        """The most probable values and poses.
+        """The maximum a posteriori values and poses.
 
         Args:
-            basis: Directions in which the unknowns may leave the rig file, orthonormal columns in
-                standard deviations of the rig file, shape (p, r); all when left out.
+            basis: Directions in which the unknowns may differ from the rig file, orthonormal
+                columns in standard deviations of the rig file, shape (p, r); all when left out.
 
         Raises:
-            Fault: The search does not come to an end.
+            Fault: The fit does not converge.
         """
         free = np.eye(len(self._parameters)) if basis is None else basis
         spread = self._parameters.deviations[:, None] * free
         z = np.zeros(free.shape[1])
-        positions, rotations = self._start()
+        positions, rotations = self._initial_poses()
         cost, damping = self._cost(spread @ z, z, positions, rotations), 1e-3
         for _ in range(MOST_STEPS):
             system = self._system(spread @ z, z, spread, positions, rotations)
             gain = -1.0
             while gain < 0.0 and damping < MOST_DAMPING:
                 step, twists = system.solved(damping)
-                trial = (z + step, positions + twists[:, :3], _turned(rotations, twists[:, 3:]))
+                trial = (z + step, positions + twists[:, :3], _rotated(rotations, twists[:, 3:]))
                 gain = cost - self._cost(spread @ trial[0], *trial)
                 damping *= 0.1 if gain >= 0.0 else 10.0
             if gain >= 0.0:
@@ -193,15 +191,15 @@ class RigFitter:
             next_step="check units, the order of the cables and the homing of the drives",
         )
 
-    def _start(self) -> tuple[Array, Array]:
-        """Measured poses; the others from the rig file's forward kinematics, each near the last.
+    def _initial_poses(self) -> tuple[Array, Array]:
+        """Measured poses; missing ones and missing rotations from forward kinematics.
 
-        Rotations alone that were not measured come from there as well.
+        Forward kinematics uses the rig file and starts at the previous pose.
         """
         rig, counted = self._parameters.rig, self._model.counted
-        lengths = counted.by(self._parameters.geometry(np.zeros(len(self._parameters))))
+        lengths = counted.lengths(self._parameters.geometry(np.zeros(len(self._parameters))))
         positions, rotations = self._measured.positions.copy(), self._measured.rotations.copy()
-        unknown = np.flatnonzero(~(self._posed & self._turned))
+        unknown = np.flatnonzero(~(self._posed & self._rotated))
         for k, found in zip(unknown, poses_from_lengths(rig, lengths[unknown]), strict=True):
             rotations[k] = found.pose.rotation
             positions[k] = found.pose.position
@@ -211,18 +209,18 @@ class RigFitter:
         return positions, rotations
 
     def _pose_errors(self, positions: Array, rotations: Array) -> Array:
-        """Estimated less measured poses, shape (n, 6), [m, rad]; 0 where there is none."""
+        """Estimated minus measured poses, shape (n, 6), [m, rad]; 0 where not measured."""
         errors = np.zeros((len(positions), 6))
         points = self._measured.measured_points(positions, rotations)
         errors[:, :3] = points - self._measured.positions
         turns = rotations @ np.swapaxes(self._measured.rotations, 1, 2)
-        for k in np.flatnonzero(self._posed & self._turned):
+        for k in np.flatnonzero(self._posed & self._rotated):
             errors[k, 3:] = rotation_vector_from_matrix(turns[k])
         errors[~self._posed] = 0.0
         return errors
 
     def _distances(self, errors: Array, weights: Array) -> Array:
-        """Of poses from the measured ones, in standard deviations, shape (n,)."""
+        """Distances from the measured poses, in standard deviations, shape (n,)."""
         squares = np.einsum("ni,nij,nj->n", errors, weights, errors)
         distances: Array = np.sqrt(np.maximum(squares, 0.0))
         return distances
@@ -241,10 +239,10 @@ class RigFitter:
         self, values: Array, z: Array, spread: Array, positions: Array, rotations: Array
     ) -> NormalEquations:
         line = self._model.linearised(values, positions, rotations)
-        weights = self._share(line.residuals) / self._deviations**2
+        weights = self._weights(line.residuals) / self._deviations**2
         errors = self._pose_errors(positions, rotations)
         informations = self._measured.pose_information(rotations)
-        share = share_of(self._distances(errors, informations), POSE_BEND)
+        share = huber_weight(self._distances(errors, informations), POSE_BEND)
         pose_weights = share[:, None, None] * informations
         by_z = line.by_values @ spread
         weighted = weights[..., None] * line.by_pose
@@ -258,9 +256,9 @@ class RigFitter:
             + np.einsum("nij,nj->ni", pose_weights, errors),
         )
 
-    def _share(self, residuals: Array) -> Array:
-        """How much of each residual's square counts, shape (n, k)."""
-        return share_of(np.abs(residuals) / self._deviations, RESIDUAL_BEND)
+    def _weights(self, residuals: Array) -> Array:
+        """Huber weight of each residual, shape (n, k)."""
+        return huber_weight(np.abs(residuals) / self._deviations, RESIDUAL_BEND)
 
     def _result(self, values: Array, positions: Array, rotations: Array) -> RigFit:
         spread = np.diag(self._parameters.deviations)
@@ -274,19 +272,19 @@ class RigFitter:
             tuple(name for sensor in self._model.sensors for name in sensor.names),
             residuals,
             read_only(self._deviations),
-            self._share(residuals),
+            self._weights(residuals),
             self._distances(
                 self._pose_errors(positions, rotations), self._measured.pose_information(rotations)
             ),
-            *system.by_place(),
+            *system.reduced_by_sample(),
         )
 
 
 def poses_from_lengths(rig: Rig, lengths: Array) -> list[ForwardSolution]:
-    """Forward kinematics of places, each from near the last, from home, or from anywhere.
+    """Forward kinematics of samples, each started at the last pose, at home, or anywhere.
 
     Args:
-        rig: With its numbers as they are taken to be.
+        rig: With its assumed parameters.
         lengths: From outlet to anchor, shape (n, m), [m].
 
     Raises:
@@ -304,6 +302,6 @@ def poses_from_lengths(rig: Rig, lengths: Array) -> list[ForwardSolution]:
     return found
 
 
-def _turned(rotations: Array, turns: Array) -> Array:
-    turned: Array = np.array([matrix_from_rotation_vector(t) for t in turns]) @ rotations
-    return turned
+def _rotated(rotations: Array, turns: Array) -> Array:
+    rotated: Array = np.array([matrix_from_rotation_vector(t) for t in turns]) @ rotations
+    return rotated

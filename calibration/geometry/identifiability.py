@@ -1,7 +1,7 @@
-"""Which directions of a rig's parameters the data determine, and words for the others.
+"""Which directions of a rig's parameters the data determine, and names for the others.
 
-The information of the data is compared with the rig file's: along an eigenvector with a value above
-1 the data know more. The others cannot be identified; they are left as the rig file says.
+Information of the data is relative to that of the rig file: along an eigenvector with a value above
+1 the data are more accurate. The others cannot be identified and are left as in the rig file.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from calibration.statistics import CONFIDENCE
 from model.pose import Array, read_only, skew
 
 LEAST_INFORMATION = 1.0
-"""Of a direction, in units of the rig file's own information."""
+"""Of a direction, relative to the rig file's information."""
 NAMED_SHARE = 0.85
-"""A direction with a name is unknown when this share of its square lies among the unknown ones."""
+"""A named direction is unknown if this share of its square lies in unknown directions."""
 LARGEST_PARTS = 4
-"""Number of unknowns named for a direction without a name."""
+"""Number of unknowns listed for a direction without a name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observability:
-    """What data determine about the unknowns of a rig.
+    """Identifiable and unidentifiable directions of a rig's unknowns.
 
     Attributes:
-        information: Eigenvalues, falling, shape (p,).
+        information: Eigenvalues, descending, shape (p,).
         known: Orthonormal directions the data determine, in standard deviations of the rig file,
             shape (p, r).
         unknown: The others, shape (p, p − r).
@@ -45,13 +45,13 @@ class Observability:
     def of(cls, information: Array) -> Observability:
         """From `RigFit.information`, shape (p, p)."""
         directions, values, _ = np.linalg.svd(information)
-        told = values > LEAST_INFORMATION
-        return cls(values, directions[:, told], directions[:, ~told])
+        known = values > LEAST_INFORMATION
+        return cls(values, directions[:, known], directions[:, ~known])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Named:
-    """A direction with a name; several with one name and different parts are reported together."""
+    """A named direction; parts of directions with the same name are reported together."""
 
     name: str
     part: str
@@ -59,7 +59,7 @@ class _Named:
 
 
 def sentences(observability: Observability, parameters: Parameters) -> list[str]:
-    """What cannot be identified, in words; nothing when all is."""
+    """Sentences about what cannot be identified; empty if everything can."""
     left = observability.unknown.copy()
     found: dict[str, list[str]] = {}
     for named in _named(parameters):
@@ -72,12 +72,12 @@ def sentences(observability: Observability, parameters: Parameters) -> list[str]
             continue
         found.setdefault(named.name, []).append(named.part)
         left = _without(left, left @ within)
-    told = [_sentence(name, parts, parameters.rig.cable_count) for name, parts in found.items()]
+    lines = [_sentence(name, parts, parameters.rig.cable_count) for name, parts in found.items()]
     if left.shape[1]:
-        told.append(
+        lines.append(
             f"{left.shape[1]} combinations of parameters, {_by_parts(left[:, -1], parameters)}"
         )
-    return told
+    return lines
 
 
 def _sentence(name: str, parts: list[str], cables: int) -> str:
@@ -97,20 +97,20 @@ def _without(space: Array, direction: Array) -> Array:
 
 
 def _named(parameters: Parameters) -> list[_Named]:
-    """Directions that people have a word for, those that matter most first."""
-    rig, places = parameters.rig, parameters.slices()
+    """Directions that have a name, the most important first."""
+    rig, slices = parameters.rig, parameters.slices()
     m, p = rig.cable_count, len(parameters)
     zero = np.zeros(p)
 
     def scaled(**groups: Array) -> Array:
         direction = zero.copy()
         for group, values in groups.items():
-            if group in places:
-                direction[places[group]] = values.ravel()
+            if group in slices:
+                direction[slices[group]] = values.ravel()
         return direction / parameters.deviations
 
     found: list[_Named] = []
-    if "outlets" in places and "anchors" in places:
+    if "outlets" in slices and "anchors" in slices:
         for cable in range(m):
             for axis, name in enumerate(AXES):
                 shift = np.zeros((m, 3))
@@ -122,16 +122,16 @@ def _named(parameters: Parameters) -> list[_Named]:
     found += _rigid(
         "anchors", "a common motion of all anchors on the platform", rig.anchors, scaled
     )
-    if "drum_scale" in places:
+    if "drum_scale" in slices:
         grown = scaled(
             outlets=rig.outlets - rig.outlets.mean(axis=0),
             anchors=rig.anchors,
             drum_scale=np.ones(m),
         )
         found.append(_Named("the size of the whole rig", "", grown))
-    if "stiffness" in places:
+    if "stiffness" in slices:
         found.append(_Named("the stiffness of the cables", "", scaled(stiffness=np.ones(1))))
-    if "cable_stiffness" in places:
+    if "cable_stiffness" in slices:
         for cable, own in enumerate(np.eye(m), start=1):
             what = "the stiffness of one cable"
             found.append(_Named(what, f"cable {cable}", scaled(cable_stiffness=own)))
@@ -158,11 +158,11 @@ def _by_parts(direction: Array, parameters: Parameters) -> str:
 def identified(
     parameters: Parameters, measured: RigMeasurements, length_deviation: float
 ) -> tuple[RigFit, Observability]:
-    """The fit in the directions that the data determine, and which those are.
+    """The fit restricted to the directions that the data determine, and these directions.
 
     Args:
         parameters: The unknowns.
-        measured: Places at rest.
+        measured: Stationary samples.
         length_deviation: Of a cable's length from the encoder, [m].
 
     Raises:
@@ -173,49 +173,48 @@ def identified(
     return fitter.fit(observability.known), observability
 
 
-# How well places determine a rig's numbers: by the scatter of cables, and place by place.
+# Uncertainty of a rig's parameters: from the scatter of residuals, and by the jackknife.
 #
-# The scatter alone promises too much where residuals of one place err together: a pose that is off,
-# a cable law that is not the rig file's. The spread of the fits without any one place (the
-# jackknife over places, to first order) feels that. The rig file's numbers are a measurement beside
-# the places, stated and never left out.
+# Scatter alone is too optimistic if residuals within a sample are correlated: a pose error, a cable
+# model that differs from the rig file's. The jackknife over samples, to first order, covers that.
+# The rig file acts as a prior that is never left out.
 #
 # Source: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigUncertainty:
-    """What is known about the errors of a rig's numbers, [m] or share.
+    """Uncertainty of a rig's parameters.
 
     Attributes:
-        by_scatter: Covariance, shape (p, p); what is not identified has that of the rig file.
-        by_places: The same by what leaving each place out changes.
-        scatter: By how much the residuals' variance is larger than stated; 1 where it is not.
-        quantile: Half the width of a 95 % interval in standard deviations.
+        by_scatter: Covariance, shape (p, p); of unidentified directions it is the rig file's.
+        by_jackknife: The same, from leaving out each sample.
+        scatter: Ratio of the residuals' variance to the stated one, at least 1.
+        quantile: Half width of a 95 % interval in standard deviations.
     """
 
     by_scatter: Array
-    by_places: Array
+    by_jackknife: Array
     scatter: float
     quantile: float
 
     @property
     def half_widths(self) -> Array:
-        """Of the 95 % intervals, the larger of both, shape (p,)."""
+        """Half widths of the 95 % intervals, the larger of both, shape (p,)."""
         return self.worst(np.eye(len(self.by_scatter))[:, None])
 
     def worst(self, slopes: Array) -> Array:
-        """How far off vectors that depend on the numbers may be, along their worst direction.
+        """95 % error of vectors that depend on the parameters, along their worst direction.
 
         Args:
-            slopes: Their derivatives by the numbers, shape (k, d, p).
+            slopes: Their derivatives by the parameters, shape (k, d, p).
 
         Returns:
-            95 %, shape (k,).
+            Shape (k,).
         """
         variances = [
             np.linalg.eigvalsh(slopes @ covariance @ np.swapaxes(slopes, 1, 2))[:, -1]
-            for covariance in (self.by_scatter, self.by_places)
+            for covariance in (self.by_scatter, self.by_jackknife)
         ]
         worst: Array = self.quantile * np.sqrt(np.maximum(*variances))
         return worst
@@ -231,10 +230,10 @@ def uncertainty_of_rig(
 
     Args:
         parameters: The unknowns.
-        measured: Places at rest.
-        fit: Of them, in the directions that they determine; where residuals show errors larger
-            than they were taken to be, that holds.
-        observability: Which those are.
+        measured: Stationary samples.
+        fit: In the directions that the samples determine; residuals larger than assumed widen the
+            result.
+        observability: These directions.
     """
     known, unknown = observability.known, observability.unknown
     informations = known.T @ fit.informations @ known
@@ -246,13 +245,13 @@ def uncertainty_of_rig(
     count = len(measured)
     without = np.linalg.solve(whole - informations, scores[..., None])[..., 0]
     apart = without - without.mean(axis=0)
-    by_drawing = np.linalg.inv(whole @ whole)
-    places = (count - 1) / count * apart.T @ apart + by_drawing
+    by_prior = np.linalg.inv(whole @ whole)
+    jackknifed = (count - 1) / count * apart.T @ apart + by_prior
     spread = parameters.deviations
     of_all = (
         known @ inner @ known.T + unknown @ unknown.T
-        for inner in (scatter * np.linalg.inv(whole), places)
+        for inner in (scatter * np.linalg.inv(whole), jackknifed)
     )
-    by_scatter, by_places = (read_only(inner * np.outer(spread, spread)) for inner in of_all)
+    by_scatter, by_jackknife = (read_only(inner * np.outer(spread, spread)) for inner in of_all)
     quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 1))
-    return RigUncertainty(by_scatter, by_places, scatter, quantile)
+    return RigUncertainty(by_scatter, by_jackknife, scatter, quantile)

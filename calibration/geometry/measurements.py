@@ -1,4 +1,4 @@
-"""What a rig's calibration is made from: drive positions at rest, tensions, and poses if known."""
+"""Stationary samples for a rig's calibration: drive positions, tensions, poses if known."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from model.statics.gravity import PRETENSION_SHARE, STANDARD_GRAVITY, working_te
 from model.statics.tension_distribution import TensionInfeasible
 
 SHORTEST_REST = 0.4
-"""The drives are commanded to rest for longer before it counts as rest, [s]."""
+"""Minimum time without commanded motion that counts as rest, [s]."""
 SETTLING = 0.2
-"""What comes sooner after they stopped does not count, [s]."""
+"""Settling time after a stop, left out of the sample, [s]."""
 
 _ARRAYS = ("counts", "tensions", "positions", "rotations", "covariances")
 _SENSORS = ("swivels", "verticals")
@@ -34,23 +34,23 @@ def _nothing() -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigMeasurements:
-    """The platform at rest in n places, with m cables.
+    """n stationary samples of a rig with m cables.
 
     Attributes:
-        names: Of the places, n texts.
+        names: Of the n samples.
         counts: Drive positions, shape (n, m), [counts].
-        tensions: Shape (n, m), [N]; NaN where they were not measured.
-        positions: World frame, shape (n, 3), [m]; NaN where they are not known.
-        rotations: ``world_from_platform``, shape (n, 3, 3); NaN where they are not known, as of a
-            tracker that follows one reflector.
+        tensions: Shape (n, m), [N]; NaN where not measured.
+        positions: World frame, shape (n, 3), [m]; NaN where not measured.
+        rotations: ``world_from_platform``, shape (n, 3, 3); NaN where not measured, such as with a
+            tracker of one reflector.
         covariances: Of position and rotation vector about world axes, shape (n, 6, 6).
-        unused: Why others were left out, by name.
-        reflector: The point of the platform whose positions were measured where rotations are not
-            known, platform frame, shape (3,), [m]; else it is the origin.
+        unused: Why other samples were left out, by name.
+        reflector: Measured point of samples without rotation, platform frame, shape (3,), [m]; of
+            the others it is the origin.
         swivels: Swivel angles of the pulleys about their feed directions, right-handed, 0 with the
-            rig file's platform at home, shape (n, m), [rad]; NaN where they were not measured.
-        verticals: Upward unit vectors in the axes of an IMU on the platform, by what its
-            accelerometers read at rest, shape (n, 3); NaN where they were not measured.
+            rig file's platform at home, shape (n, m), [rad]; NaN where not measured.
+        verticals: Upward unit vectors in the frame of an IMU on the platform, from its
+            accelerometers at rest, shape (n, 3); NaN where not measured.
         swivel_deviation: Of each swivel angle, [rad].
         imu_deviation: Of a vertical's direction about any axis, [rad].
     """
@@ -69,7 +69,7 @@ class RigMeasurements:
     imu_deviation: float = radians(0.1)
 
     def __post_init__(self) -> None:
-        """Sensors that were left out measured nothing."""
+        """Fills sensors that were left out with NaN."""
         for key, shape in (("swivels", self.counts.shape), ("verticals", (len(self), 3))):
             if not getattr(self, key).size:
                 object.__setattr__(self, key, read_only(np.full(shape, np.nan)))
@@ -78,67 +78,67 @@ class RigMeasurements:
         return len(self.names)
 
     @property
-    def posed(self) -> NDArray[np.bool_]:
-        """Where the position was measured, shape (n,)."""
+    def has_position(self) -> NDArray[np.bool_]:
+        """Samples with a measured position, shape (n,)."""
         return np.asarray(np.isfinite(self.positions).all(axis=1))
 
     @property
-    def turned(self) -> NDArray[np.bool_]:
-        """Where the rotation was measured, shape (n,)."""
+    def has_rotation(self) -> NDArray[np.bool_]:
+        """Samples with a measured rotation, shape (n,)."""
         return np.asarray(np.isfinite(self.rotations).all(axis=(1, 2)))
 
     @property
     def unmeasured(self) -> NDArray[np.int_]:
-        """How many of the six numbers of each pose were not measured, shape (n,)."""
-        return np.asarray(6 - 3 * self.posed.astype(int) - 3 * self.turned.astype(int))
+        """Number of unmeasured degrees of freedom of each pose, shape (n,)."""
+        return np.asarray(6 - 3 * self.has_position.astype(int) - 3 * self.has_rotation.astype(int))
 
     def measured_points(self, positions: Array, rotations: Array) -> Array:
-        """Points whose positions were measured, of platforms at poses, shape (n, 3), [m].
+        """Positions of the measured points for given poses, shape (n, 3), [m].
 
         Args:
             positions: World frame, shape (n, 3), [m].
             rotations: ``world_from_platform``, shape (n, 3, 3).
         """
-        arms = np.where(self.turned[:, None], 0.0, rotations @ self.reflector)
+        arms = np.where(self.has_rotation[:, None], 0.0, rotations @ self.reflector)
         return np.asarray(positions + arms)
 
     def pose_information(self, rotations: Array) -> Array:
-        """What the measurements say of twists of the poses, shape (n, 6, 6); 0 where nothing.
+        """Information of the measured poses on twists, shape (n, 6, 6); 0 where not measured.
 
         Args:
-            rotations: ``world_from_platform`` about which, shape (n, 3, 3).
+            rotations: ``world_from_platform`` to linearise about, shape (n, 3, 3).
         """
         information = np.zeros((len(self), 6, 6))
-        whole = self.posed & self.turned
+        whole = self.has_position & self.has_rotation
         information[whole] = np.linalg.inv(self.covariances[whole])
-        for k in np.flatnonzero(self.posed & ~self.turned):
+        for k in np.flatnonzero(self.has_position & ~self.has_rotation):
             by_twist = np.hstack([np.eye(3), -skew(rotations[k] @ self.reflector)])
             own = np.linalg.inv(self.covariances[k, :3, :3])
             information[k] = by_twist.T @ own @ by_twist
         return information
 
     def first_rotations(self, rig: Rig) -> Array:
-        """Rotations, those of home where they were not measured, shape (n, 3, 3)."""
-        known = self.turned[:, None, None]
+        """Rotations; that of home where not measured, shape (n, 3, 3)."""
+        known = self.has_rotation[:, None, None]
         return np.where(known, self.rotations, rig.home.rotation)
 
     @property
     def data_hash(self) -> str:
-        """Hash of all numbers."""
+        """Hash of all measurements."""
         sensors = (a for a in (self.swivels, self.verticals) if np.isfinite(a).any())
         numbers = (self.counts, self.tensions, self.positions, self.rotations, *sensors)
         return data_hash(np.round(values, 12).tobytes() for values in numbers)
 
     def part(self, chosen: NDArray[np.bool_]) -> RigMeasurements:
-        """Some of the places."""
+        """The selected samples."""
         arrays: dict[str, Any] = {
             key: read_only(getattr(self, key)[chosen]) for key in _ARRAYS + _SENSORS
         }
         names = tuple(n for n, yes in zip(self.names, chosen.tolist(), strict=True) if yes)
         return replace(self, names=names, **arrays)
 
-    def with_doubt(self, deviations: Array) -> RigMeasurements:
-        """The same, poses less certain: errors that all images of a place have in common.
+    def with_added_deviation(self, deviations: Array) -> RigMeasurements:
+        """The same with larger pose covariances, for errors common to all images of a sample.
 
         Args:
             deviations: Of camera and tags, shape (6,), [m, rad].
@@ -147,13 +147,13 @@ class RigMeasurements:
         return replace(self, covariances=read_only(more))
 
     def without_poses(self) -> RigMeasurements:
-        """The same drive positions, as if without a camera."""
+        """The same without measured poses."""
         positions, rotations = (np.full_like(a, np.nan) for a in (self.positions, self.rotations))
         return replace(self, positions=positions, rotations=rotations)
 
 
 def joined(parts: Sequence[RigMeasurements]) -> RigMeasurements:
-    """Several sources as one; a sample that repeats an earlier one is listed as unused."""
+    """Several sources as one; duplicate samples are listed as unused."""
     arrays: dict[str, Any] = {
         key: read_only(np.concatenate([getattr(part, key) for part in parts]))
         for key in _ARRAYS + _SENSORS
@@ -173,47 +173,47 @@ def joined(parts: Sequence[RigMeasurements]) -> RigMeasurements:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """What was recorded of one run.
+    """Recording of one run.
 
     Attributes:
         time: Of the cycles, shape (n,), [s].
-        asked: Set-points, shape (n, m), [counts].
+        setpoints: Shape (n, m), [counts].
         counts: Drive positions, shape (n, m), [counts].
         tensions: Shape (n, m), [N].
-        seen: Times of the images that gave a pose, shape (k,), [s].
-        positions: Measured there, world frame, shape (k, 3), [m].
+        pose_times: Times of the images with a pose, shape (k,), [s].
+        positions: Measured positions, world frame, shape (k, 3), [m].
         rotations: ``world_from_platform``, shape (k, 3, 3).
         covariances: Shape (k, 6, 6), [m, rad].
     """
 
     time: Array
-    asked: Array
+    setpoints: Array
     counts: Array
     tensions: Array
-    seen: Array
+    pose_times: Array
     positions: Array
     rotations: Array
     covariances: Array
 
 
 def at_rest(name: str, run: Recording) -> RigMeasurements:
-    """The places at which the platform stood still, each with the means of what was measured.
+    """Samples of a run with the platform at rest, each with the means of its measurements.
 
-    Images of one place have their errors in common: their mean is no more certain than each.
+    Images of one sample share their errors: the mean is no more certain than a single one.
 
     Args:
-        name: Of the run, for the places' names.
-        run: What was recorded.
+        name: Of the run, for the names of the samples.
+        run: The recording.
     """
     names, rows, unused = [], [], {}
     for number, (begin, end) in enumerate(_rests(run), start=1):
-        place = f"{name}, rest {number}"
+        sample = f"{name}, rest {number}"
         cycles = (run.time >= begin) & (run.time <= end)
-        pictures = (run.seen >= begin) & (run.seen <= end)
-        if len(run.seen) and not pictures.any():
-            unused[place] = "no image taken there gave a pose"
+        pictures = (run.pose_times >= begin) & (run.pose_times <= end)
+        if len(run.pose_times) and not pictures.any():
+            unused[sample] = "no image taken there gave a pose"
             continue
-        names.append(place)
+        names.append(sample)
         means = (run.counts[cycles].mean(axis=0), run.tensions[cycles].mean(axis=0))
         rows.append((*means, *_mean_pose(run, pictures)))
     m = run.counts.shape[1]
@@ -226,8 +226,8 @@ def at_rest(name: str, run: Recording) -> RigMeasurements:
 
 
 def _rests(run: Recording) -> list[tuple[float, float]]:
-    """From when to when the drives were commanded to rest, without the time of settling."""
-    still = np.all(np.diff(run.asked, axis=0) == 0.0, axis=1)
+    """Intervals of commanded rest, without the settling time."""
+    still = np.all(np.diff(run.setpoints, axis=0) == 0.0, axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
     found = [(run.time[a], run.time[b]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return [(a + SETTLING, b) for a, b in found if b - a >= SHORTEST_REST]
@@ -237,13 +237,13 @@ def _mean_pose(run: Recording, pictures: NDArray[np.bool_]) -> tuple[Array, Arra
     if not pictures.any():
         return np.full(3, np.nan), np.full((3, 3), np.nan), np.eye(6)
     mean = run.rotations[pictures].mean(axis=0)
-    left, _, right = np.linalg.svd(mean)  # the rotation nearest to the mean of some near ones
-    turned = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    left, _, right = np.linalg.svd(mean)  # rotation nearest to the mean matrix
+    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
     covariance = run.covariances[pictures].mean(axis=0)
-    return run.positions[pictures].mean(axis=0), turned, covariance
+    return run.positions[pictures].mean(axis=0), rotation, covariance
 
 
-# Reads drive positions at rest from a CSV file; its columns are in docs/data-formats.md.
+# CSV files of stationary samples; their columns are in docs/data-formats.md.
 
 
 _POSITION = ("x_mm", "y_mm", "z_mm")
@@ -253,25 +253,25 @@ _TO_SI = np.array([1e-3, 1e-3, 1e-3, *([float(np.radians(1.0))] * 3)])
 
 
 def read_rig_data(path: Path, cables: int) -> RigMeasurements:
-    """The places of a file; poses without a stated deviation are exact.
+    """Reads the samples of a CSV file; poses without a stated deviation are exact.
 
-    Positions without rotations are those of one point, as trackers with one reflector give them.
+    Positions without rotations are those of one point, as from trackers with one reflector.
 
     Args:
         path: The file.
-        cables: How many the rig has.
+        cables: Number of cables of the rig.
 
     Raises:
-        BadInput: It cannot be read, or a column is missing, too many, or not of finite numbers; the
-            times do not rise; a quaternion is none.
+        BadInput: It cannot be read, a column is missing, superfluous or not of finite numbers,
+            times do not increase, or a quaternion is not of unit length.
     """
     table = CsvTable(path)
     counts = table.of([f"actual_{i}_counts" for i in range(1, cables + 1)])
     if f"actual_{cables + 1}_counts" in table.names:
-        raise table.bad(f"the rig has {cables} cables, the file more", "pass data of this rig")
+        raise table.bad(f"the rig has {cables} cables, the file has more", "pass data of this rig")
     n = len(counts)
     if "time_s" in table.names:
-        _require_rising(table)
+        _require_increasing(table)
     tensions = np.full((n, cables), np.nan)
     if "tension_1_n" in table.names:
         tensions = table.of([f"tension_{i}_n" for i in range(1, cables + 1)])
@@ -301,11 +301,11 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
     )
 
 
-def _require_rising(table: CsvTable) -> None:
+def _require_increasing(table: CsvTable) -> None:
     times = table.of(["time_s"])[:, 0]
     falls = np.flatnonzero(np.diff(times) <= 0.0)
     if len(falls):
-        what = f"line {table.line(int(falls[0]) + 1)}: time_s does not rise"
+        what = f"line {table.line(int(falls[0]) + 1)}: time_s does not increase"
         raise table.bad(what, "sort the lines by time, or leave out the column")
 
 
@@ -323,13 +323,13 @@ def _rotations(table: CsvTable) -> Array:
 
 
 _AT_REST = {"m_s2": STANDARD_GRAVITY, "g": 1.0}
-"""What accelerometers read at rest together, by the unit in the names of their columns."""
+"""Magnitude of the acceleration read at rest, by the unit in the column names."""
 _NOT_AT_REST = 0.05
-"""A platform at rest has no acceleration that differs from it by more, as a share."""
+"""Largest relative deviation from that magnitude at rest."""
 
 
 def _verticals(table: CsvTable) -> Array:
-    """Upward directions by accelerometers, shape (n, 3); empty where there are none."""
+    """Upward directions from accelerometers, shape (n, 3); empty without them."""
     units = [unit for unit in _AT_REST if f"accel_x_{unit}" in table.names]
     if not units:
         return _nothing()
@@ -340,40 +340,40 @@ def _verticals(table: CsvTable) -> Array:
     if len(wrong):
         k = int(wrong[0])
         what = f"line {table.line(k)}: accel_x_{unit}, accel_y_{unit}, accel_z_{unit} are"
-        what += f" {sizes[k]:.3g} together; at rest it is {at_rest:.3g}"
+        what += f" {sizes[k]:.3g} in magnitude; at rest it is {at_rest:.3g}"
         raise table.bad(what, "check the unit in the names of the columns, and leave out motion")
     return np.asarray(accelerations / sizes[:, None])
 
 
-# Tensions of samples without a measurement of them, and their uncertainty.
+# Tensions of samples without measured ones, and their uncertainty.
 
 
 def tension_sigma(rig: Rig) -> float:
-    """How far off tensions may be that were not measured, one standard deviation, [N].
+    """Standard deviation of tensions that were not measured, [N].
 
-    Cables of a rig that is not built as its file says pull against each other. They were not slack,
-    so the least allowed tension is taken to be two standard deviations below the pretension.
+    In a rig that differs from its file, cables pull against each other. None was slack, so the
+    lowest allowed tension is taken to be two standard deviations below the pretension.
     """
     return PRETENSION_SHARE * (rig.max_tension - rig.min_tension) / 2.0
 
 
 def nominal_tensions(rig: Rig, measured: RigMeasurements) -> Array:
-    """Tensions as measured; else the working ones of the place, shape (n, m), [N].
+    """Measured tensions; where missing, the working tensions of the pose, shape (n, m), [N].
 
-    Where the pose is not known, or such that the rig file's cables cannot hold the platform there,
-    they are those of home: `tension_sigma` holds for both.
+    Where the pose is unknown, or infeasible for the rig file's cables, they are those of home:
+    `tension_sigma` covers both.
 
     Args:
         rig: As in its file.
-        measured: Places at rest.
+        measured: Stationary samples.
 
     Raises:
         TensionInfeasible: The rig cannot hold its platform at home.
     """
-    told = np.isfinite(measured.tensions)
+    known = np.isfinite(measured.tensions)
     likely = np.tile(working_tensions(rig, rig.home).tensions, (len(measured), 1))
-    for k in np.flatnonzero(measured.posed & ~told.all(axis=1)):
+    for k in np.flatnonzero(measured.has_position & ~known.all(axis=1)):
         with suppress(TensionInfeasible):
             pose = Pose(measured.positions[k], measured.first_rotations(rig)[k])
             likely[k] = working_tensions(rig, pose).tensions
-    return np.where(told, measured.tensions, likely)
+    return np.where(known, measured.tensions, likely)

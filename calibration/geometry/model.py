@@ -1,9 +1,8 @@
-"""How far measurements are from what estimated poses and numbers give, with derivatives.
+"""Residuals of measurements at estimated poses and parameters, with derivatives.
 
-All derivatives are analytic: moving an anchor by d shortens its cable by u · d, u the direction
-from anchor to exit, with point exits and over pulleys alike; moving outlet and pulley lengthens it.
-Every kind of measurement is a few numbers at each place: cable lengths always, then what further
-sensors measure (`Sensor`).
+All derivatives are analytic: moving an anchor by d shortens its cable by u · d, with u the unit
+vector from anchor to exit, for point exits and pulleys; moving outlet and pulley lengthens it.
+Each stationary sample has cable lengths and the values of further sensors (`Sensor`).
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ class CountedLengths:
     """Cable lengths from drive positions and tensions.
 
     Attributes:
-        paid_out: Unstrained cable since the home counts by the rig file's drums, shape (n, m), [m].
+        paid_out: Unstrained cable since the home counts, rig file's drums, shape (n, m), [m].
     """
 
     def __init__(self, rig: Rig, counts: Array, tensions: Array) -> None:
-        """Takes the rig file's winches.
+        """Uses the winches of the rig file.
 
         Args:
             rig: As in its file.
@@ -62,15 +61,15 @@ class CountedLengths:
         unstrained: Array = reaching + geometry.offsets
         return unstrained
 
-    def by(self, geometry: RigGeometry) -> Array:
-        """Lengths from outlet to anchor with other numbers of the rig, shape (n, m), [m]."""
+    def lengths(self, geometry: RigGeometry) -> Array:
+        """Lengths from outlet to anchor with these parameters, shape (n, m), [m]."""
         paid_out = self.paid_out * (1.0 + geometry.drum_scale)
         unstrained = self.at_home(geometry) + paid_out
         lengths: Array = unstrained * self.stretch(geometry) - self._behind
         return lengths
 
     def by_compliance(self, geometry: RigGeometry) -> Array:
-        """Derivative of `by` by the cables' compliance, 1 / stiffness, shape (n, m), [m N]."""
+        """Derivative of `lengths` by the cables' compliance, 1 / stiffness, shape (n, m), [m N]."""
         at_home = self.at_home(geometry)
         unstrained = at_home + self.paid_out * (1.0 + geometry.drum_scale)
         less = (at_home - geometry.offsets) * self._at_home / self.stretch_at_home(geometry)
@@ -80,10 +79,10 @@ class CountedLengths:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigAtPoses:
-    """A rig with some numbers, at n poses.
+    """A rig with given parameters, at n poses.
 
     Attributes:
-        geometry: The numbers.
+        geometry: The parameters.
         positions: World frame, shape (n, 3), [m].
         rotations: ``world_from_platform``, shape (n, 3, 3).
         cables: At the poses.
@@ -105,7 +104,7 @@ class RigAtPoses:
         return cls(geometry, positions, rotations, cables_to(rig_with(rig, geometry), anchors))
 
     def by_pose(self, slopes: Array) -> Array:
-        """Derivative by the pose's twist of numbers that depend on anchors, shape (n, m, 6).
+        """Derivative by the pose's twist of quantities that depend on anchors, shape (n, m, 6).
 
         Args:
             slopes: Derivative by the anchor in the world, shape (n, m, 3).
@@ -114,11 +113,11 @@ class RigAtPoses:
         return np.concatenate([slopes, np.cross(arms, slopes)], axis=-1)
 
     def by_points(self, slopes: Array, parameters: Parameters) -> Array:
-        """Derivative by outlets and anchors of numbers that depend on the way between them.
+        """Derivative by outlets and anchors of quantities that depend on the vector between them.
 
         Args:
-            slopes: Derivative by the anchor in the world, shape (n, m, 3); by the outlet it is the
-                opposite.
+            slopes: Derivative by the anchor in the world, shape (n, m, 3); by the outlet it has
+                the opposite sign.
             parameters: The unknowns.
 
         Returns:
@@ -127,21 +126,20 @@ class RigAtPoses:
         n, m, _ = slopes.shape
         by_values, each = np.zeros((n, m, len(parameters))), np.arange(m)
         own = {"outlets": -slopes, "anchors": slopes @ self.rotations}
-        for group, place in parameters.slices().items():
+        for group, columns in parameters.slices().items():
             if group in own:
                 for axis in range(3):
-                    by_values[:, each, place.start + 3 * each + axis] = own[group][:, :, axis]
+                    by_values[:, each, columns.start + 3 * each + axis] = own[group][:, :, axis]
         return by_values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linearised:
-    """Measurements at given values and poses, k numbers a place.
+    """Measurements linearised at given values and poses, k values per sample.
 
     Attributes:
-        residuals: What the pose gives less what was measured, shape (n, k); of cable lengths [m],
-            of angles [rad].
-        by_values: Their derivative by the unknowns, shape (n, k, p).
+        residuals: Predicted minus measured, shape (n, k); of cable lengths [m], of angles [rad].
+        by_values: Their derivatives by the unknowns, shape (n, k, p).
         by_pose: By the pose's twist (translation, rotation in the world), shape (n, k, 6).
     """
 
@@ -154,7 +152,7 @@ class Sensor(ABC):
     """A kind of measurement beside cable lengths.
 
     Attributes:
-        names: Of its numbers, k texts.
+        names: Of its k values.
         deviations: Standard deviations, shape (n, k), [rad]; infinite where nothing was measured.
     """
 
@@ -167,14 +165,14 @@ class Sensor(ABC):
 
     @abstractmethod
     def linearised(self, state: RigAtPoses) -> Linearised:
-        """With derivatives."""
+        """Residuals with derivatives."""
 
 
 class Swivels(Sensor):
-    """Swivel angles of the pulleys, which turn towards the anchors about their feed directions."""
+    """Swivel angles of the pulleys, which rotate about their feed directions to the anchors."""
 
     def __init__(self, parameters: Parameters, measured: RigMeasurements) -> None:
-        """The angles' zeros are where the rig file's platform is at home."""
+        """The angles are zero with the rig file's platform at home."""
         rig, axes = parameters.rig, parameters.rig.feed_directions
         self._parameters, self._measured = parameters, measured.swivels
         home = rig.home.apply(rig.anchors) - rig.outlets
@@ -186,13 +184,13 @@ class Swivels(Sensor):
         self.names = tuple(f"swivel {i}" for i in range(1, rig.cable_count + 1))
 
     def residuals(self, state: RigAtPoses) -> Array:
-        """Angles less measured ones, the shorter way round."""
+        """Predicted minus measured angles, wrapped to ±π."""
         x, y = self._across(state)
         apart = np.arctan2(y, x) + state.geometry.swivel_zeros - self._measured
         return np.where(self._known, np.mod(apart + np.pi, 2.0 * np.pi) - np.pi, 0.0)
 
     def linearised(self, state: RigAtPoses) -> Linearised:
-        """An anchor's motion across the pulley's plane turns it; along the plane it does not."""
+        """An anchor's motion across the pulley's plane rotates it; in the plane it does not."""
         x, y = (part[..., None] for part in self._across(state))
         slopes = (x * self._y - y * self._x) / (x**2 + y**2)
         by_values = state.by_points(slopes, self._parameters)
@@ -203,17 +201,17 @@ class Swivels(Sensor):
 
     def _across(self, state: RigAtPoses) -> tuple[Array, Array]:
         """Anchors from their outlets, across the feed directions, shape (n, m) both, [m]."""
-        way = state.cables.anchors - state.geometry.outlets
-        return np.sum(way * self._x, axis=-1), np.sum(way * self._y, axis=-1)
+        offset = state.cables.anchors - state.geometry.outlets
+        return np.sum(offset * self._x, axis=-1), np.sum(offset * self._y, axis=-1)
 
 
 class Verticals(Sensor):
-    """The vertical in the axes of an IMU on the platform: two angles, about axes across it."""
+    """The vertical in the frame of an IMU on the platform: two angles, about axes across it."""
 
     names = ("IMU 1", "IMU 2")
 
     def __init__(self, parameters: Parameters, measured: RigMeasurements) -> None:
-        """The IMU's axes are the platform's, but for its mounting."""
+        """The IMU's axes are the platform's, up to its mounting rotation."""
         known = np.asarray(np.isfinite(measured.verticals).all(axis=1))
         upwards = np.where(known[:, None], measured.verticals, np.eye(3)[2])
         self._across = np.linalg.svd(upwards[:, None, :])[2][:, 1:]
@@ -228,18 +226,18 @@ class Verticals(Sensor):
         return np.asarray((self._across @ upwards[..., None])[..., 0])
 
     def linearised(self, state: RigAtPoses) -> Linearised:
-        """Only rotations of the platform and of the IMU on it count."""
+        """Depends only on the rotations of the platform and of the IMU on it."""
         world_from_imu = self._world_from_imu(state)
         turns = np.cross(self._across, world_from_imu[:, None, 2])
         n, k, _ = turns.shape
         by_values, by_pose = np.zeros((n, k, len(self._parameters))), np.zeros((n, k, 6))
         by_pose[:, :, 3:] = turns @ np.swapaxes(world_from_imu, 1, 2)
-        place = self._parameters.slices().get("imu_mounting")
-        if place is not None:
+        columns = self._parameters.slices().get("imu_mounting")
+        if columns is not None:
             around = skew(state.geometry.imu_mounting)
             mounted = matrix_from_rotation_vector(state.geometry.imu_mounting)
             left = np.eye(3) + around / 2.0 + around @ around / 6.0  # left Jacobian of SO(3)
-            by_values[:, :, place] = turns @ mounted.T @ left
+            by_values[:, :, columns] = turns @ mounted.T @ left
         return Linearised(self.residuals(state), by_values, by_pose)
 
     def _world_from_imu(self, state: RigAtPoses) -> Array:
@@ -247,23 +245,23 @@ class Verticals(Sensor):
 
 
 class RigModel:
-    """What is measured of a rig with unknown numbers, at n poses: cable lengths first.
+    """Measurement model of a rig with unknown parameters, at n poses: cable lengths first.
 
     Attributes:
-        sensors: What else was measured.
+        sensors: Further sensors.
     """
 
     def __init__(self, parameters: Parameters, measured: RigMeasurements) -> None:
-        """Takes the measurements; tensions that were not measured are those of `nominal_tensions`.
+        """Takes the measurements; missing tensions are filled in by `nominal_tensions`.
 
-        Where some were not measured, nothing shows the cables' stiffness.
+        Where some are missing, the data do not determine the cables' stiffness.
 
         Raises:
             TensionInfeasible: The rig cannot hold its platform at home.
         """
         self.parameters = parameters
-        self._told = np.isfinite(measured.tensions)
-        self._stretch_is_told = bool(self._told.all())
+        self._tension_known = np.isfinite(measured.tensions)
+        self._stretch_is_known = bool(self._tension_known.all())
         tensions = nominal_tensions(parameters.rig, measured)
         self.counted = CountedLengths(parameters.rig, measured.counts, tensions)
         self.sensors: list[Sensor] = []
@@ -281,18 +279,19 @@ class RigModel:
         """Standard deviation of the lengths from the encoders, shape (n, m), [m].
 
         Args:
-            length_deviation: With tensions that were measured, [m]; others add what they may
-                stretch a cable of the rig file's stiffness.
+            length_deviation: With measured tensions, [m]; missing ones add the uncertainty of the
+                stretch at the rig file's stiffness.
         """
-        rig, drawn = self.parameters.rig, self.parameters.geometry(np.zeros(len(self.parameters)))
-        stretched = tension_sigma(rig) / rig.cable_stiffness * self.counted.by(drawn)
-        deviations: Array = np.hypot(length_deviation, np.where(self._told, 0.0, stretched))
+        rig, nominal = self.parameters.rig, self.parameters.geometry(np.zeros(len(self.parameters)))
+        stretched = tension_sigma(rig) / rig.cable_stiffness * self.counted.lengths(nominal)
+        added = np.where(self._tension_known, 0.0, stretched)
+        deviations: Array = np.hypot(length_deviation, added)
         return deviations
 
     def residuals(self, values: Array, positions: Array, rotations: Array) -> Array:
         """As in `Linearised`."""
         state = self._state(values, positions, rotations)
-        lengths = state.cables.lengths - self.counted.by(state.geometry)
+        lengths = state.cables.lengths - self.counted.lengths(state.geometry)
         return np.concatenate([lengths, *(one.residuals(state) for one in self.sensors)], axis=1)
 
     def linearised(self, values: Array, positions: Array, rotations: Array) -> Linearised:
@@ -315,29 +314,29 @@ class RigModel:
         )
 
     def _lengths(self, state: RigAtPoses) -> Linearised:
-        """Of the cables: that of the pose less that from the encoder."""
+        """Cable lengths: that of the pose minus that from the encoder."""
         geometry, rig = state.geometry, self.parameters.rig
         at_home = RigAtPoses.of(rig, geometry, rig.home.position[None], rig.home.rotation[None])
         stretch = self.counted.stretch(geometry)
         counted = (stretch / self.counted.stretch_at_home(geometry))[..., None]
         by_values = self._by_geometry(state)
         by_values -= counted * self._by_geometry(at_home)
-        each, places = np.arange(rig.cable_count), self.parameters.slices()
-        if "drum_scale" in places:
-            by_values[:, each, places["drum_scale"].start + each] = -self.counted.paid_out * stretch
-        if "offsets" in places:
-            by_values[:, each, places["offsets"].start + each] = -stretch
-        if self._stretch_is_told:
+        each, slices = np.arange(rig.cable_count), self.parameters.slices()
+        if "drum_scale" in slices:
+            by_values[:, each, slices["drum_scale"].start + each] = -self.counted.paid_out * stretch
+        if "offsets" in slices:
+            by_values[:, each, slices["offsets"].start + each] = -stretch
+        if self._stretch_is_known:
             by_logarithm = self.counted.by_compliance(geometry) / geometry.stiffness
-            if "stiffness" in places:
-                by_values[:, :, places["stiffness"].start] = by_logarithm
-            if "cable_stiffness" in places:
-                by_values[:, each, places["cable_stiffness"].start + each] = by_logarithm
-        residuals = state.cables.lengths - self.counted.by(geometry)
+            if "stiffness" in slices:
+                by_values[:, :, slices["stiffness"].start] = by_logarithm
+            if "cable_stiffness" in slices:
+                by_values[:, each, slices["cable_stiffness"].start + each] = by_logarithm
+        residuals = state.cables.lengths - self.counted.lengths(geometry)
         return Linearised(residuals, by_values, state.by_pose(-state.cables.directions))
 
     def _by_geometry(self, state: RigAtPoses) -> Array:
-        """Derivative of cables' lengths by the unknowns, without what drives count, (n, m, p)."""
+        """Derivative of geometric cable lengths by the unknowns, shape (n, m, p)."""
         by_values = state.by_points(-state.cables.directions, self.parameters)
         pulleys = self.parameters.slices().get("pulleys")
         if pulleys is not None:

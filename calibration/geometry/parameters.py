@@ -1,4 +1,4 @@
-"""The numbers of a rig that a calibration finds, in named groups, and what the rig file says."""
+"""Parameters of a rig that a calibration estimates, in named groups, and their priors."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from model.rig import Rig
 
 AXES = ("x", "y", "z")
 _OF_ALL_CABLES = {"pulleys": "pulley_radius", "stiffness": "stiffness"}
-"""Groups of one number, and its name."""
+"""Groups of one parameter, and its name."""
 _OF_EACH_CABLE = {
     "drum_scale": "drum",
     "offsets": "offset",
     "cable_stiffness": "stiffness",
     "swivel_zeros": "swivel_zero",
 }
-"""Groups of a number a cable, and its name."""
+"""Groups of one parameter per cable, and its name."""
 _POINTS = {"outlets": "outlet", "anchors": "anchor"}
-"""Groups of a point a cable, and its name."""
+"""Groups of one point per cable, and its name."""
 
 DEFAULT_DEVIATIONS: Mapping[str, float] = MappingProxyType(
     {
@@ -36,26 +36,24 @@ DEFAULT_DEVIATIONS: Mapping[str, float] = MappingProxyType(
         "swivel_zeros": radians(1.0),
     }
 )
-"""How far off a rig file may be, one standard deviation: [m], [rad]; drum_scale and stiffness as a
-share.
-"""
+"""Standard deviation of a rig file's values: [m], [rad]; drum_scale and stiffness are relative."""
 _GROUPS = (*DEFAULT_DEVIATIONS, "cable_stiffness", "imu_mounting")
-"""All, in order: cable_stiffness in place of stiffness, and imu_mounting, are for who asks."""
+"""All groups, in order; cable_stiffness, instead of stiffness, and imu_mounting are opt-in."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigGeometry:
-    """What decides how long cables are and what drives count, for m cables.
+    """Parameters that determine cable lengths and drive counts, for m cables.
 
     Attributes:
         outlets: World frame, shape (m, 3), [m].
         anchors: Platform frame, shape (m, 3), [m].
         pulley_radius: [m]; 0 for point exits.
-        drum_scale: Cable paid out for a count, as a share of the rig file's, less 1, shape (m,).
-        offsets: Unstrained cable at the home counts beyond what reaches the home pose, shape (m,),
-            [m]: by how much the reference was off.
+        drum_scale: Relative deviation of the cable per count from the rig file's, shape (m,).
+        offsets: Unstrained cable at the home counts minus that of the home pose, shape (m,), [m]:
+            the error of the homing reference.
         stiffness: Axial, of each cable, shape (m,), [N].
-        swivel_zeros: What swivel encoders read at angle 0, shape (m,), [rad].
+        swivel_zeros: Reading of the swivel encoders at angle 0, shape (m,), [rad].
         imu_mounting: Rotation vector of ``platform_from_imu``, shape (3,), [rad].
     """
 
@@ -71,15 +69,15 @@ class RigGeometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameters:
-    """The layout of the vector of unknowns; each is a deviation from the rig file.
+    """Layout of the vector of unknowns; each is a deviation from the rig file.
 
-    That of the stiffness is the logarithm of its share: near 0 the share less 1, never negative.
+    That of the stiffness is the logarithm of its ratio to the rig file's, so it stays positive.
 
     Attributes:
         rig: As in its file.
-        groups: Names of the groups that are looked for, in order.
-        deviations: How far off each unknown may be, standard deviation, shape (p,), [m] or share.
-        names: Of the unknowns, such as ``outlet_3_x``; p texts.
+        groups: Names of the estimated groups, in order.
+        deviations: Prior standard deviation of each unknown, shape (p,), [m], [rad] or relative.
+        names: Of the p unknowns, such as ``outlet_3_x``.
     """
 
     rig: Rig
@@ -93,7 +91,7 @@ class Parameters:
 
         Args:
             rig: As in its file.
-            deviations: How far off it may be, by group; groups left out are taken as known.
+            deviations: Standard deviations by group; groups left out are taken as known.
         """
         groups = tuple(
             group
@@ -109,7 +107,7 @@ class Parameters:
         return len(self.names)
 
     def slices(self) -> dict[str, slice]:
-        """Where each group is in the vector."""
+        """Slice of each group in the vector."""
         found, begin = {}, 0
         for group in self.groups:
             end = begin + len(_names(group, self.rig.cable_count))
@@ -117,7 +115,7 @@ class Parameters:
         return found
 
     def geometry(self, values: Array) -> RigGeometry:
-        """The rig with the unknowns having values, shape (p,), [m] or share."""
+        """The rig's parameters for values of the unknowns, shape (p,)."""
         m, found = self.rig.cable_count, self.slices()
 
         def of(group: str, size: int) -> Array:
@@ -147,7 +145,7 @@ def _names(group: str, m: int) -> list[str]:
 
 
 def rig_with(rig: Rig, geometry: RigGeometry) -> Rig:
-    """The rig file's rig with other outlets, anchors, pulleys and stiffness; its winches stay."""
+    """The rig with these outlets, anchors, pulleys and stiffness; its winches are unchanged."""
     return replace(
         rig,
         outlets=read_only(geometry.outlets),

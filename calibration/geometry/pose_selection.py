@@ -1,4 +1,4 @@
-"""Chooses the most informative poses for a rig's calibration (D-optimal, greedy)."""
+"""Selects the most informative poses for a rig's calibration (greedy D-optimal design)."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ from planner.planning import plan_path
 from planner.settings import OBJECTIVES, TurningSettings
 
 STEP_OF_TURN = float(np.radians(1.0))
-"""A turn is tried in such steps from the orientation of home: cables must not meet on the way."""
+"""Step in which rotations from the home orientation are checked for collisions, [rad]."""
 CLEARANCE_RESERVE = 1e-3
-"""More clearance than the scene asks for, so that a way in and out is left, [m]."""
+"""Clearance beyond the scene's, so that a path in and out remains, [m]."""
 TURNING_SHARE = 0.3
 """Share of the candidates rotated about the vertical; the others are tilted."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
-    """What is wanted of the poses.
+class PoseRequirements:
+    """Requirements on the poses.
 
     Attributes:
-        count: How many.
+        count: Number of poses.
         tilt: Largest tilt, [rad].
-        turn: Largest turn about the vertical, [rad].
-        candidates: How many places they are chosen from.
-        reserve: Kept between tensions and the rig's limits, [N]: one that is not calibrated pulls
-            other than stated.
+        turn: Largest rotation about the vertical, [rad].
+        candidates: Number of positions to choose from.
+        reserve: Margin of tensions to the rig's limits, [N]: those of an uncalibrated rig differ
+            from the computed ones.
         length_deviation: Of a cable's length from the encoder, [m].
         pose_deviations: Of measured poses, shape (6,), [m, rad].
     """
@@ -61,51 +61,54 @@ class Wish:
     pose_deviations: tuple[float, ...]
 
 
-def chosen_poses(
-    rig: Rig, scene: Scene, wish: Wish, parameters: Parameters, seed: int
+def choose_poses(
+    rig: Rig, scene: Scene, requirements: PoseRequirements, parameters: Parameters, seed: int
 ) -> list[Pose]:
-    """The poses, in an order with short ways between them.
+    """Selects the poses, in an order with short paths between them.
 
     Args:
         rig: The robot.
         scene: Its obstacles, clearances and load.
-        wish: What is wanted.
-        parameters: What is to be found.
-        seed: Of the candidates.
+        requirements: On the poses.
+        parameters: The parameters to estimate.
+        seed: Random seed of the candidates.
 
     Raises:
-        NoSolution: Too few poses of the workspace can be held and are free.
+        NoSolution: Too few poses of the workspace are feasible and free.
     """
-    found = _candidates(rig, scene, wish, np.random.default_rng(seed))
-    if len(found) < wish.count:
+    found = _candidates(rig, scene, requirements, np.random.default_rng(seed))
+    if len(found) < requirements.count:
         raise NoSolution(
-            f"only {len(found)} of {2 * wish.candidates} tried poses are feasible and free",
+            f"only {len(found)} of {2 * requirements.candidates} tried poses are feasible and free",
             where=f"rig {rig.name}, scene {scene.name}",
             next_step="use fewer poses, less --reserve-n, less clearance in the scene, or more"
             " --candidates",
         )
-    best = _most_telling(_rows(rig, found, wish, parameters), wish.count)
+    best = _d_optimal(_rows(rig, found, requirements, parameters), requirements.count)
     reach = rms_anchor_radius(rig.anchors)
-    return _in_order([found[k] for k in best], scene.start, reach)
+    return _short_tour([found[k] for k in best], scene.start, reach)
 
 
-def _candidates(rig: Rig, scene: Scene, wish: Wish, random: np.random.Generator) -> list[Pose]:
-    """Places of the workspace, each as at home and turned as far as it can be from there."""
+def _candidates(
+    rig: Rig, scene: Scene, requirements: PoseRequirements, random: np.random.Generator
+) -> list[Pose]:
+    """Random positions, each in the home orientation and rotated as far as is free."""
     model = ClearanceModel(rig, scene)
     span = rig.workspace_upper - rig.workspace_lower
     found = []
-    for _ in range(wish.candidates):
+    for _ in range(requirements.candidates):
         position = rig.workspace_lower + random.random(3) * span
         angle, kind = random.uniform(0.0, 2.0 * np.pi), random.random()
-        tilted = wish.tilt * np.array([np.cos(angle), np.sin(angle), 0.0])
-        turned = np.array([0.0, 0.0, wish.turn if angle < np.pi else -wish.turn])
-        whole = turned if kind < TURNING_SHARE else tilted
+        tilted = requirements.tilt * np.array([np.cos(angle), np.sin(angle), 0.0])
+        turn = requirements.turn if angle < np.pi else -requirements.turn
+        about_vertical = np.array([0.0, 0.0, turn])
+        whole = about_vertical if kind < TURNING_SHARE else tilted
         steps = max(1, int(np.ceil(np.linalg.norm(whole) / STEP_OF_TURN)))
         last: Pose | None = None
         for share in np.linspace(0.0, 1.0, steps + 1):
             rotation = matrix_from_rotation_vector(share * whole) @ rig.home.rotation
             pose = Pose(position, rotation)
-            if not _is_free(rig, scene, model, pose, wish.reserve):
+            if not _is_free(rig, scene, model, pose, requirements.reserve):
                 break
             if share == 0.0:
                 found.append(pose)
@@ -130,15 +133,17 @@ def _is_free(rig: Rig, scene: Scene, model: ClearanceModel, pose: Pose, room: fl
     return own >= scene.self_clearance + CLEARANCE_RESERVE
 
 
-def _rows(rig: Rig, poses: Sequence[Pose], wish: Wish, parameters: Parameters) -> Array:
-    """Information of each pose: derivatives over deviations, with its error in them, (k, m, p)."""
+def _rows(
+    rig: Rig, poses: Sequence[Pose], requirements: PoseRequirements, parameters: Parameters
+) -> Array:
+    """Whitened Jacobian of each pose, its pose error included, shape (k, m, p)."""
     winches = WinchMap(rig)
     tensions = np.array([working_tensions(rig, pose).tensions for pose in poses])
     lengths = np.array([cables_at(rig, pose).lengths for pose in poses])
     positions = np.array([pose.position for pose in poses])
     rotations = np.array([pose.rotation for pose in poses])
-    covariance = np.diag(np.square(wish.pose_deviations))
-    places = RigMeasurements(
+    covariance = np.diag(np.square(requirements.pose_deviations))
+    samples = RigMeasurements(
         names=("",) * len(poses),
         counts=winches.counts(winches.unstrained(lengths, tensions)),
         tensions=tensions,
@@ -146,48 +151,48 @@ def _rows(rig: Rig, poses: Sequence[Pose], wish: Wish, parameters: Parameters) -
         rotations=rotations,
         covariances=np.tile(covariance, (len(poses), 1, 1)),
     )
-    line = RigModel(parameters, places).linearised(np.zeros(len(parameters)), positions, rotations)
+    line = RigModel(parameters, samples).linearised(np.zeros(len(parameters)), positions, rotations)
     noise = line.by_pose @ covariance @ np.swapaxes(line.by_pose, 1, 2)
-    noise += wish.length_deviation**2 * np.eye(rig.cable_count)
+    noise += requirements.length_deviation**2 * np.eye(rig.cable_count)
     white = np.linalg.inv(np.linalg.cholesky(noise))
     return np.asarray(white @ (line.by_values * parameters.deviations))
 
 
-def _most_telling(rows: Array, count: int) -> list[int]:
-    """The rows that make the determinant of the information largest, one after the other."""
-    known = np.eye(rows.shape[2])  # the inverse information; at first the rig file's
-    left = np.ones(len(rows), dtype=bool)
+def _d_optimal(rows: Array, count: int) -> list[int]:
+    """Indices that maximise the determinant of the information, greedily."""
+    known = np.eye(rows.shape[2])  # inverse information; initially the rig file's
+    remaining = np.ones(len(rows), dtype=bool)
     chosen: list[int] = []
     unit = np.eye(rows.shape[1])
     for _ in range(count):
-        news = rows @ known @ np.swapaxes(rows, 1, 2)
-        gains = np.where(left, np.linalg.slogdet(unit + news)[1], -np.inf)
+        gained = rows @ known @ np.swapaxes(rows, 1, 2)
+        gains = np.where(remaining, np.linalg.slogdet(unit + gained)[1], -np.inf)
         best = int(np.argmax(gains))
         chosen.append(best)
-        left[best] = False
+        remaining[best] = False
         row = rows[best]
-        known = known - known @ row.T @ np.linalg.solve(unit + news[best], row @ known)
+        known = known - known @ row.T @ np.linalg.solve(unit + gained[best], row @ known)
     return chosen
 
 
-def _in_order(poses: list[Pose], start: Pose, reach: float) -> list[Pose]:
-    """From near to near, then without crossings (2-opt); turns count by the anchors' way."""
+def _short_tour(poses: list[Pose], start: Pose, reach: float) -> list[Pose]:
+    """Nearest-neighbour order, improved by 2-opt; rotations count by the anchors' path."""
     stops = [start, *poses]
-    ways = np.array([[a.distance_to(b) + reach * a.angle_to(b) for b in stops] for a in stops])
-    order, left = [0], set(range(1, len(stops)))
-    while left:
-        nearest = min(left, key=lambda k: float(ways[order[-1], k]))
+    distances = np.array([[a.distance_to(b) + reach * a.angle_to(b) for b in stops] for a in stops])
+    order, remaining = [0], set(range(1, len(stops)))
+    while remaining:
+        nearest = min(remaining, key=lambda k: float(distances[order[-1], k]))
         order.append(nearest)
-        left.remove(nearest)
+        remaining.remove(nearest)
     improved = True
     while improved:
         improved = False
         for i in range(1, len(order) - 1):
             for j in range(i + 1, len(order)):
-                before, after = ways[order[i - 1], order[i]], ways[order[i - 1], order[j]]
+                before, after = distances[order[i - 1], order[i]], distances[order[i - 1], order[j]]
                 if j + 1 < len(order):
-                    before = before + ways[order[j], order[j + 1]]
-                    after = after + ways[order[i], order[j + 1]]
+                    before = before + distances[order[j], order[j + 1]]
+                    after = after + distances[order[i], order[j + 1]]
                 if after < before - 1e-12:
                     order[i : j + 1] = order[i : j + 1][::-1]
                     improved = True
@@ -197,9 +202,10 @@ def _in_order(poses: list[Pose], start: Pose, reach: float) -> list[Pose]:
 # A plan through the chosen poses, with a stop at each.
 
 RESERVE_SHARE = 0.075
-"""Of the tension range, kept from its ends: more leaves only the middle of the workspace."""
+"""Margin to the tension limits as a share of their range; more leaves only the middle of the
+workspace."""
 ROUNDS = 3
-"""Of shortening each way: measuring is not about speed."""
+"""Improvement rounds per path; few, as measuring does not need short paths."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,7 +213,7 @@ class MeasurementPlan:
     """Poses to measure at, and a plan through them.
 
     Attributes:
-        poses: In their order.
+        poses: In order.
         document: The plan, with a stop at each.
     """
 
@@ -216,7 +222,7 @@ class MeasurementPlan:
 
     @property
     def plan(self) -> Plan:
-        """The path through the poses, which `cdpr.run` takes."""
+        """The plan through the poses, for `cdpr.run`."""
         return plan_from_document(self.document)
 
     def __repr__(self) -> str:
@@ -237,35 +243,36 @@ def measurement_poses(
     seed: int = 0,
     listener: Listener = SILENT,
 ) -> MeasurementPlan:
-    """Chooses the most informative poses, and plans a path through them with stops.
+    """Selects the most informative poses and plans a path with stops through them.
 
     Args:
         rig: The robot.
         scene: Its obstacles, clearances and load.
-        count: How many poses.
-        tilt: The platform is tilted up to this, [rad].
-        turn: It is turned about the vertical up to this, [rad].
-        dwell: How long it is at rest at each, [s].
-        candidates: How many positions they are chosen from.
-        reserve: Kept from the tension limits, [N]; 7.5 % of their range when left out.
-        seed: Of the candidates and of the paths.
-        listener: Receives how far it is.
+        count: Number of poses.
+        tilt: Largest tilt of the platform, [rad].
+        turn: Largest rotation about the vertical, [rad].
+        dwell: Dwell time at each pose, [s].
+        candidates: Number of positions to choose from.
+        reserve: Margin to the tension limits, [N]; 7.5 % of their range when left out.
+        seed: Random seed of the candidates and paths.
+        listener: Receives the progress.
 
     Raises:
-        NoSolution: Too few poses can be held and are free, or there is no path between two.
+        NoSolution: Too few poses are feasible and free, or there is no path between two.
     """
     room = RESERVE_SHARE * (rig.max_tension - rig.min_tension) if reserve is None else reserve
     of_poses = (0.3e-3,) * 3 + (radians(0.05),) * 3
-    wish = Wish(count, tilt, turn, candidates, room, 0.1e-3, of_poses)
+    requirements = PoseRequirements(count, tilt, turn, candidates, room, 0.1e-3, of_poses)
     with listener.waiting("choosing poses"):
-        chosen = chosen_poses(rig, scene, wish, Parameters.of(rig, DEFAULT_DEVIATIONS), seed)
+        parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
+        chosen = choose_poses(rig, scene, requirements, parameters, seed)
     settings = TurningSettings(weights=OBJECTIVES["length"], seed=seed, rounds=ROUNDS)
     document = plan_path(rig, _with_stops(scene, chosen, dwell), settings, listener)
     return MeasurementPlan(tuple(chosen), document)
 
 
 def _with_stops(scene: Scene, chosen: Sequence[Pose], dwell: float) -> Scene:
-    """The scene with the poses as its stops, ending where it begins, and limits that allow them."""
+    """The scene with the poses as stops, back to its start, and rotation limits to match."""
     stops = [
         StopDocument(name=f"pose {number}", dwell_s=dwell, **PoseDocument.of(pose).model_dump())
         for number, pose in enumerate(chosen, start=1)

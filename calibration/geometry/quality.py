@@ -1,10 +1,10 @@
-"""What a rig's calibration is good for, and what to do where it is not.
+"""Quality of a rig calibration: verdict, reasons and next steps.
 
-Among this whether the data show another stiffness than the rig file, or cables that differ: one
-step of the fit with the compliance (1 / stiffness) as one more number that the rig file does not
-give, all others and the poses eliminated. A wrong stiffness makes residuals grow with tension and
-length alike, and nothing else does. The other numbers would hide a part of it, and their intervals
-would be false. Where the stiffness is among them, the doubt that was stated counts too.
+This includes whether the data contradict the rig file's stiffness, or one stiffness for all
+cables: one step of the fit with the compliance (1 / stiffness) as a further parameter without a
+prior, all others and the poses eliminated. Only a wrong stiffness makes residuals grow with both
+tension and length. The other parameters would absorb a part of it, which makes their intervals too
+narrow. Where the stiffness is among the parameters, its prior counts too.
 """
 
 from __future__ import annotations
@@ -26,42 +26,42 @@ from model.rig import Rig
 CONTRADICTION = 4.0
 """This many standard deviations from the rig file are significant."""
 LEAST_CHANCE = 1e-3
-"""Cables differ where chance explains it less often."""
+"""Cables differ if chance explains the differences with a lower probability."""
 
 
 @dataclass(frozen=True, slots=True)
 class Compliance:
-    """Estimate of the cables' compliance, 1 / stiffness; of their mean where they differ.
+    """Estimate of the cables' compliance, 1 / stiffness; of the mean if they differ.
 
     Attributes:
-        drawn: By the rig file, to first order about the fit, [1/N].
+        nominal: Of the rig file, to first order about the fit, [1/N].
         estimated: From the data, [1/N].
         deviation: Standard deviation of the difference, [1/N].
     """
 
-    drawn: float
+    nominal: float
     estimated: float
     deviation: float
 
     @property
     def contradicts(self) -> bool:
         """Whether the data contradict the rig file."""
-        return abs(self.estimated - self.drawn) > CONTRADICTION * self.deviation
+        return abs(self.estimated - self.nominal) > CONTRADICTION * self.deviation
 
     def __str__(self) -> str:
-        """The estimated stiffness, in words."""
+        """The estimated stiffness as text."""
         if self.estimated > 0.0:
             return f"about {1.0 / self.estimated:.2g} N"
         return "too high to determine"
 
 
 @dataclass(frozen=True, slots=True)
-class Differences:
+class CableCompliances:
     """Estimate of each cable's own compliance.
 
     Attributes:
         estimated: Shape (m,), [1/N].
-        chance: How likely differences from the rig file as large as these are by chance.
+        chance: Probability of such differences by chance (p-value).
     """
 
     estimated: Array
@@ -73,30 +73,30 @@ class Differences:
         return self.chance < LEAST_CHANCE
 
     def __str__(self) -> str:
-        """The estimated stiffnesses, in words."""
+        """The estimated stiffnesses as text."""
         estimated = (
             f"{1.0 / c:.2g} N" if c > 0.0 else "too high to determine" for c in self.estimated
         )
         return ", ".join(estimated)
 
 
-def compliance_told(result: RigCalibration) -> Compliance | None:
-    """The estimate; None where the tensions were not measured in all samples.
+def estimate_compliance(result: RigCalibration) -> Compliance | None:
+    """Estimates the compliance; None where tensions are missing in some samples.
 
     Args:
         result: The fit with the rig file's stiffness.
     """
     if not np.isfinite(result.measured.tensions).all():
         return None
-    information, pull = _told(result, np.ones((result.rig.cable_count, 1)))
-    drawn, own = float(_drawn(result).mean()), float(information[0, 0])
+    information, pull = _compliance_information(result, np.ones((result.rig.cable_count, 1)))
+    nominal, own = float(_nominal_compliance(result).mean()), float(information[0, 0])
     compliance = float(np.mean(1.0 / result.rig.cable_stiffness))
     change, deviation = -float(pull[0]) / own, own**-0.5
-    return Compliance(drawn * compliance, (drawn + change) * compliance, deviation * compliance)
+    return Compliance(nominal * compliance, (nominal + change) * compliance, deviation * compliance)
 
 
-def differences_told(result: RigCalibration) -> Differences | None:
-    """The estimate of each cable; None where tensions were not measured in all samples.
+def estimate_cable_compliances(result: RigCalibration) -> CableCompliances | None:
+    """Estimates each cable's compliance; None where tensions are missing in some samples.
 
     Args:
         result: The fit with one stiffness for all cables.
@@ -104,33 +104,33 @@ def differences_told(result: RigCalibration) -> Differences | None:
     if not np.isfinite(result.measured.tensions).all():
         return None
     cables = result.rig.cable_count
-    information, pull = _told(result, np.eye(cables))
+    information, pull = _compliance_information(result, np.eye(cables))
     change = -np.asarray(np.linalg.solve(information, pull))
     chance = float(chi2.sf(-pull @ change, cables))
-    estimated: Array = (_drawn(result) + change) / result.rig.cable_stiffness
-    return Differences(estimated, chance)
+    estimated: Array = (_nominal_compliance(result) + change) / result.rig.cable_stiffness
+    return CableCompliances(estimated, chance)
 
 
-def _drawn(result: RigCalibration) -> Array:
-    """The rig file's compliances as the fit sees them, as a share of themselves, shape (m,).
+def _nominal_compliance(result: RigCalibration) -> Array:
+    """Relative compliances of the rig file, linearised about the fit, shape (m,).
 
     Changes are solved about the fit, whose unknown is the logarithm of the stiffness: the rig
-    file is as far off as the tangent there says, not as the reciprocal of its own number.
+    file's deviation follows the tangent there, not the reciprocal of its own value.
     """
     ratio = result.geometry.stiffness / result.rig.cable_stiffness
     shares: Array = (1.0 + np.log(ratio)) / ratio
     return shares
 
 
-def _told(result: RigCalibration, groups: Array) -> tuple[Array, Array]:
-    """Information on compliances, as shares of the rig file's, beside all else, per variance.
+def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Array, Array]:
+    """Information on compliances relative to the rig file's, all else eliminated, per variance.
 
     Args:
         result: The fit.
-        groups: Which cables share a compliance, shape (m, q).
+        groups: 1 where a cable is in a group of one compliance, shape (m, q).
 
     Returns:
-        Information, shape (q, q), and half the slope of the squares, shape (q,).
+        Information, shape (q, q), and half the gradient of the squares, shape (q,).
     """
     data, fit, parameters = result.measured, result.fit, result.parameters
     model = RigModel(parameters, data)
@@ -162,23 +162,23 @@ def _told(result: RigCalibration, groups: Array) -> tuple[Array, Array]:
 
 
 FAR = 5.0
-"""No number should be farther from the rig file, in the standard deviations that were stated."""
+"""Largest credible deviation from the rig file, in stated standard deviations."""
 SCATTERED = 2.0
-"""Residuals of a sensor should be smaller, RMS, in the standard deviations that were stated."""
+"""Largest acceptable RMS residual of a sensor, in stated standard deviations."""
 _INSET = 0.15
-"""The workspace is judged at its centre and this share inside its corners."""
+"""The workspace is assessed at its centre and this share inside its corners."""
 
 
 @dataclass(frozen=True, slots=True)
 class RigQuality:
-    """How good a rig's calibration is.
+    """Quality of a rig's calibration.
 
     Attributes:
-        verdict: Of all of it.
-        before: How far off places are by the rig file, RMS, [m].
-        held_out: By fits that did not see them, RMS, [m].
-        level: How far off the platform may be at the orientation of home, 95 %, [m].
-        turned: Turned by `tilt`, 95 %, [m].
+        verdict: On the calibration as a whole.
+        before: Error of samples with the rig file, RMS, [m].
+        held_out: Error of held-out samples, RMS, [m].
+        level: Position error of the platform in the orientation of home, 95 %, [m].
+        rotated: The same, rotated by `tilt`, 95 %, [m].
         tilt: About any horizontal axis, [rad].
     """
 
@@ -186,11 +186,11 @@ class RigQuality:
     before: float
     held_out: float
     level: float
-    turned: float
+    rotated: float
     tilt: float
 
     def facts(self, found: RigCalibration) -> list[tuple[str, str]]:
-        """What was found beside the numbers, for people."""
+        """Human-readable details beside the estimates."""
         what = "positions" if found.held_out.poses else "cables"
         facts = [
             (
@@ -200,7 +200,7 @@ class RigQuality:
             ),
             (
                 "in the workspace",
-                f"within {self.level * 1e3:.2g} mm, rotated within {self.turned * 1e3:.2g} mm"
+                f"within {self.level * 1e3:.2g} mm, rotated within {self.rotated * 1e3:.2g} mm"
                 " (95 %)",
             ),
         ]
@@ -211,20 +211,22 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     """The verdict.
 
     Args:
-        result: What was found.
-        wanted: What is good enough, 95 %, [m].
-        tilt: By how much the platform will be turned from its orientation at home, [rad].
+        result: The calibration.
+        wanted: Required error, 95 %, [m].
+        tilt: Largest rotation of the platform from its orientation at home, [rad].
     """
-    level = float(result.position_error(*judged_places(result.rig, 0.0)).max())
-    turned = float(result.position_error(*judged_places(result.rig, tilt)).max()) if tilt else level
+    level, rotated = (
+        float(result.position_error(*workspace_poses(result.rig, angle)).max())
+        for angle in (0.0, tilt)
+    )
     out = result.held_out
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
-    lacks = _far_numbers(result) + _other_stiffness(result) + _unknown_stretch(result)
-    lacks += _scattered_sensors(result)
+    issues = _deviation_issues(result) + _stiffness_issues(result) + _tension_issues(result)
+    issues += _sensor_issues(result)
     if missed > wanted:
         what = "samples" if out.poses else "cable lengths of samples"
-        lacks.append(
+        issues.append(
             Issue(
                 f"errors of held-out {what} reach {missed * 1e3:.2g} mm",
                 "calibrate the camera and its pose, and check for worn guides, slack cables and"
@@ -232,43 +234,43 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
             )
         )
     if after > before:
-        lacks.append(
+        issues.append(
             Issue(
                 f"the rig file without calibration fits better ({before * 1e3:.2g} mm)",
                 "check units, the order of the cables and the homing of the drives",
             )
         )
     if level > wanted:
-        lacks.append(
+        issues.append(
             Issue(
                 f"the platform may be {level * 1e3:.2g} mm off between the measured poses",
                 "measure at more poses all over the workspace"
                 + ("" if out.poses else ", and with a camera"),
             )
         )
-    if turned > max(wanted, level):
-        lacks.append(
+    if rotated > max(wanted, level):
+        issues.append(
             Issue(
-                f"rotated by {math.degrees(tilt):.3g}° it may be {turned * 1e3:.2g} mm off",
-                f"measure with the platform rotated by {math.degrees(tilt):.3g}° and more both ways"
+                f"rotated by {math.degrees(tilt):.3g}° it may be {rotated * 1e3:.2g} mm off",
+                f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
                 " (`cdpr calibrate poses` plans it), or pass --tilt-deg 0 if it never rotates",
             )
         )
-    error = max(missed, level, turned)
+    error = max(missed, level, rotated)
     verdict = CalibrationVerdict.of(
-        error, wanted, f"rotated by up to {math.degrees(tilt):.3g}°", lacks
+        error, wanted, f"rotated by up to {math.degrees(tilt):.3g}°", issues
     )
-    return RigQuality(verdict, before, after, level, turned, tilt)
+    return RigQuality(verdict, before, after, level, rotated, tilt)
 
 
-def _far_numbers(result: RigCalibration) -> list[Issue]:
-    """The number farthest from the rig file, where it is too far to be believed."""
+def _deviation_issues(result: RigCalibration) -> list[Issue]:
+    """An issue if the parameter farthest from the rig file is not credible."""
     parameters, values = result.parameters, result.fit.values
     times = np.abs(values) / parameters.deviations
     k = int(np.argmax(times))
     if times[k] <= FAR:
         return []
-    group = next(g for g, place in parameters.slices().items() if place.start <= k < place.stop)
+    group = next(g for g, s in parameters.slices().items() if s.start <= k < s.stop)
     option = f"--{group.replace('_', '-').removeprefix('cable-')}-{_UNITS.get(group, 'mm')}"
     return [
         Issue(
@@ -284,11 +286,11 @@ _UNITS = {
     **dict.fromkeys(("drum_scale", "stiffness", "cable_stiffness"), "percent"),
     **dict.fromkeys(("swivel_zeros", "imu_mounting"), "deg"),
 }
-"""Of the options of groups; of the others it is mm."""
+"""Unit in the option of a group; mm for the others."""
 
 
 def _far(group: str, value: float) -> str:
-    """How far a number is from the rig file, in words; of a stiffness it is the logarithm."""
+    """Deviation from the rig file as text; of a stiffness it is the logarithm."""
     if _UNITS.get(group) == "deg":
         return f"{math.degrees(abs(value)):.3g}°"
     if group in ("stiffness", "cable_stiffness"):
@@ -298,12 +300,12 @@ def _far(group: str, value: float) -> str:
     return f"{abs(value) * 1e3:.3g} mm from the rig file"
 
 
-def _other_stiffness(result: RigCalibration) -> list[Issue]:
-    compliance = compliance_told(result)
+def _stiffness_issues(result: RigCalibration) -> list[Issue]:
+    compliance = estimate_compliance(result)
     if compliance is None or "cable_stiffness" in result.parameters.groups:
         return []
     if not compliance.contradicts:
-        return _cables_that_differ(result)
+        return _difference_issues(result)
     return [
         Issue(
             f"the data give a cable stiffness of {compliance}, the rig file"
@@ -314,8 +316,8 @@ def _other_stiffness(result: RigCalibration) -> list[Issue]:
     ]
 
 
-def _cables_that_differ(result: RigCalibration) -> list[Issue]:
-    differences = differences_told(result)
+def _difference_issues(result: RigCalibration) -> list[Issue]:
+    differences = estimate_cable_compliances(result)
     if differences is None or not differences.contradict:
         return []
     return [
@@ -328,25 +330,25 @@ def _cables_that_differ(result: RigCalibration) -> list[Issue]:
     ]
 
 
-def _unknown_stretch(result: RigCalibration) -> list[Issue]:
-    """Tensions that were not measured and matter: they err alike in many places."""
+def _tension_issues(result: RigCalibration) -> list[Issue]:
+    """An issue if missing tensions matter: their errors are correlated between samples."""
     usual = result.length_deviation
     lengths = result.fit.deviations[:, : result.rig.cable_count]
     stretch = float(np.sqrt(np.max(lengths**2) - usual**2))
     if stretch <= usual:
         return []
-    places = int((~np.isfinite(result.measured.tensions)).any(axis=1).sum())
+    missing = int((~np.isfinite(result.measured.tensions)).any(axis=1).sum())
     return [
         Issue(
-            f"tensions were not measured at {places} poses, which makes cable lengths"
+            f"tensions were not measured at {missing} poses, which makes cable lengths"
             f" uncertain by {stretch * 1e3:.2g} mm; --length-mm is {usual * 1e3:.2g}",
             "measure tensions as well: use run folders, or tables with the columns tension_1_n …",
         )
     ]
 
 
-def _scattered_sensors(result: RigCalibration) -> list[Issue]:
-    """Angles that scatter more than stated, as all of a pulley do whose axis is another."""
+def _sensor_issues(result: RigCalibration) -> list[Issue]:
+    """An issue if sensors scatter more than stated, as with a wrong pulley axis."""
     fit, m = result.fit, result.rig.cable_count
     times = fit.sensor_rms / fit.deviations[:, m:].min(axis=0)
     bad = np.flatnonzero(times > SCATTERED)
@@ -362,12 +364,12 @@ def _scattered_sensors(result: RigCalibration) -> list[Issue]:
     ]
 
 
-def judged_places(rig: Rig, tilt: float) -> tuple[Array, Array]:
-    """Centre and corners of the workspace, turned about x and y both ways.
+def workspace_poses(rig: Rig, tilt: float) -> tuple[Array, Array]:
+    """Poses at the centre and near the corners of the workspace, rotated about ±x and ±y.
 
     Args:
         rig: As in its file.
-        tilt: How far, [rad]; 0 for the orientation of home alone.
+        tilt: Angle of rotation, [rad]; 0 for the orientation of home only.
 
     Returns:
         Positions, shape (k, 3), [m], and rotations, shape (k, 3, 3).

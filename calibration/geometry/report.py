@@ -1,4 +1,4 @@
-"""The report of a rig's calibration: what changed, how well it is known, how well it fits."""
+"""Report of a rig's calibration: changes, uncertainty and residuals."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from model.pose import Array
 from model.rig import Rig
 
 _SHARE = 0.12
-"""The longest arrow of the image, as a share of the frame's diagonal."""
+"""Length of the longest arrow, as a share of the frame's diagonal."""
 _LAYERS = (
     ("outlets", "Outlets moved", "limit", True),
     ("anchors", "Anchors moved", "tag", True),
@@ -41,13 +41,13 @@ _HEAD = ("", "rig file", "new", "change", "± 95 %", "changed")
 
 
 def rig_page(result: RigCalibration, quality: RigQuality, name: str, date: str) -> str:
-    """The whole page."""
+    """The report page."""
     data, out = result.measured, result.held_out
-    kind = "poses and drive positions" if out.poses else "drive positions alone"
+    kind = "poses and drive positions" if out.poses else "drive positions only"
     scene, factor = _scene(result)
-    told = result.not_identified
+    unidentified = result.not_identified
     sections = [
-        Section("What moved", _picture(result, scene, factor)),
+        Section("What moved", _viewer(result, scene, factor)),
         *_number_sections(result),
         Section(
             "Errors at held-out poses",
@@ -62,12 +62,12 @@ def rig_page(result: RigCalibration, quality: RigQuality, name: str, date: str) 
         *_sensor_sections(result),
         Section(
             "What cannot be identified",
-            bullets(told) if told else paragraph("All parameters were identified."),
+            bullets(unidentified) if unidentified else paragraph("All parameters were identified."),
             "Kept as in the rig file. It makes no difference at the measured poses.",
         ),
         Section(
             "Information of each direction",
-            _falling(result.observability.information),
+            _information_bars(result.observability.information),
             "On a logarithmic scale; below the line the rig file is more accurate than the data.",
         ),
         Section("Poses", _poses(result)),
@@ -85,7 +85,7 @@ def rig_page(result: RigCalibration, quality: RigQuality, name: str, date: str) 
 
 
 def _headline(result: RigCalibration, quality: RigQuality) -> str:
-    """What the calibration does for the rig, in five figures."""
+    """Tiles with the key figures."""
     what = "positions" if result.held_out.poses else "lengths of cables"
     moved = np.linalg.norm(result.geometry.outlets - result.rig.outlets, axis=1) * 1e3
     changed = sum(row[-1] == "yes" for row in number_rows(result))
@@ -101,7 +101,7 @@ def _headline(result: RigCalibration, quality: RigQuality) -> str:
             tile(
                 "In the workspace",
                 f"{quality.level * 1e3:.2g} mm",
-                f"at most, 95 %; rotated by {tilt:.3g}° {quality.turned * 1e3:.2g} mm",
+                f"at most, 95 %; rotated by {tilt:.3g}° {quality.rotated * 1e3:.2g} mm",
             ),
             tile(
                 "Farthest outlet",
@@ -118,11 +118,11 @@ def _headline(result: RigCalibration, quality: RigQuality) -> str:
     )
 
 
-# The numbers: rig file, calibration, change and interval.
+# Parameter tables: rig file, calibration, change and interval.
 
 
 def numbers_in_file(rig: Rig) -> dict[str, float]:
-    """What the rig file says of all numbers that a calibration may find, by name with unit."""
+    """Values of all calibrated parameters in the rig file, by name with unit."""
     found = {
         f"{what}_{i}_{axis}_mm": float(value) * 1e3
         for what, points in (("outlet", rig.outlets), ("anchor", rig.anchors))
@@ -139,7 +139,7 @@ def numbers_in_file(rig: Rig) -> dict[str, float]:
 
 
 def number_rows(result: RigCalibration) -> list[tuple[str, str, str, str, str, str]]:
-    """A row a number: name, rig file, calibration, change, half width, whether it changed."""
+    """One row per parameter: name, rig file, calibration, change, half width, changed or not."""
     before = numbers_in_file(result.rig)
     return [_row(name, before[name], interval) for name, interval in result.intervals.items()]
 
@@ -152,13 +152,13 @@ def _row(name: str, before: float, found: Interval) -> tuple[str, str, str, str,
         f"{before:.{digits}f}",
         f"{found.value:.{digits}f}",
         f"{change:+z.{digits}f}",
-        found.doubt.removeprefix("± "),
+        found.half_width_text.removeprefix("± "),
         "yes" if abs(change) > found.half_width else "no",
     )
 
 
 def _number_sections(result: RigCalibration) -> list[Section]:
-    """A table a kind of number."""
+    """One table per kind of parameter."""
     rows = number_rows(result)
     kinds = (
         ("Outlets [mm]", "outlet_", "World frame."),
@@ -183,7 +183,7 @@ def _number_sections(result: RigCalibration) -> list[Section]:
 
 
 def _numbers(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of one kind without what their heading says; points three to a line."""
+    """Table of one kind, with short names and one row per point."""
     if not rows[0][0].startswith(("outlet_", "anchor_")):
         return list_table(_HEAD, [(_short(row[0]), *row[1:]) for row in rows], "numbers")
     points = [rows[k : k + 3] for k in range(0, len(rows), 3)]
@@ -196,7 +196,7 @@ def _short(name: str) -> str:
 
 
 def _point(rows: Sequence[Sequence[str]]) -> tuple[str, ...]:
-    """x, y and z of a point in one line each, in one row."""
+    """One table row with x, y and z of a point on three lines."""
     name = "\n".join((_short(rows[0][0]) if k == 0 else "") + f" {AXES[k]}" for k in range(3))
     return (name, *("\n".join(row[k] for row in rows) for k in range(1, 6)))
 
@@ -205,7 +205,7 @@ def _point(rows: Sequence[Sequence[str]]) -> tuple[str, ...]:
 
 
 def _scene(result: RigCalibration) -> tuple[SceneFigure, float]:
-    """Rig file's rig, arrows from it to what was found, and by what factor they are too long."""
+    """The rig as in its file, arrows to the calibrated points, and the arrows' scale."""
     rig, geometry = result.rig, result.geometry
     home = rig.home
     by_outlets, by_anchors = geometry.outlets - rig.outlets, geometry.anchors - rig.anchors
@@ -216,13 +216,13 @@ def _scene(result: RigCalibration) -> tuple[SceneFigure, float]:
     floor, _ = grid_floor(frame.vertices)
     anchors = home.apply(rig.anchors)
     exits = cables_to(rig, anchors).exits if rig.pulley_radius else rig.outlets
-    turned = by_anchors @ home.rotation.T
+    by_anchors_in_world = by_anchors @ home.rotation.T
     scene = SceneFigure(
         surfaces=(frame,),
         strokes=(
             floor,
             arrows("outlets", "limit", rig.outlets, rig.outlets + factor * by_outlets, 2.5),
-            arrows("anchors", "tag", anchors, anchors + factor * turned, 2.0),
+            arrows("anchors", "tag", anchors, anchors + factor * by_anchors_in_world, 2.0),
         ),
         labels=_moved_labels(rig, by_outlets),
         anchors=rig.anchors,
@@ -233,7 +233,7 @@ def _scene(result: RigCalibration) -> tuple[SceneFigure, float]:
 
 
 def _round(value: float) -> float:
-    """The round number below."""
+    """The largest of 1, 2 or 5 times a power of ten that is not above ``value``."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(max(f for f in (1.0, 2.0, 5.0) if f * power <= value) * power)
 
@@ -245,7 +245,7 @@ def _moved_labels(rig: Rig, moved: Array) -> tuple[Label, ...]:
     )
 
 
-def _picture(result: RigCalibration, scene: SceneFigure, factor: float) -> str:
+def _viewer(result: RigCalibration, scene: SceneFigure, factor: float) -> str:
     moved = np.linalg.norm(result.geometry.outlets - result.rig.outlets, axis=1) * 1e3
     label = (
         f"The rig of the rig file, with arrows to the {len(moved)} calibrated outlets and"
@@ -260,7 +260,7 @@ def _picture(result: RigCalibration, scene: SceneFigure, factor: float) -> str:
 
 
 def _chart(title: str, text: str, quantity: str, lines: Iterable[ChartLine], count: int) -> Chart:
-    """A chart over the number of the pose."""
+    """A chart over pose numbers."""
     return Chart(
         title,
         text,
@@ -289,7 +289,7 @@ def _by_pose(result: RigCalibration) -> Chart:
 
 
 def _residuals(result: RigCalibration) -> list[Chart]:
-    """A chart a cable, all of one height."""
+    """One chart per cable, all of the same height."""
     residuals = result.fit.cables * 1e3
     number = np.arange(1.0, len(residuals) + 1.0)
     largest = float(np.abs(residuals).max())
@@ -313,7 +313,7 @@ def _residuals(result: RigCalibration) -> list[Chart]:
 
 
 def _sensor_sections(result: RigCalibration) -> list[Section]:
-    """Residuals of what was measured beside cable lengths, a row a sensor."""
+    """Residuals of sensors beside cable lengths, one row each."""
     fit = result.fit
     if not fit.sensors:
         return []
@@ -348,13 +348,13 @@ def _held_out(quality: RigQuality) -> str:
         ("with the rig file as it is", f"{quality.before * 1e3:.3f} mm RMS"),
         ("held out of the fit", f"{quality.held_out * 1e3:.3f} mm RMS"),
         ("anywhere in the workspace, home orientation", f"within {quality.level * 1e3:.2g} mm"),
-        (f"rotated by {np.degrees(quality.tilt):.3g}°", f"within {quality.turned * 1e3:.2g} mm"),
+        (f"rotated by {np.degrees(quality.tilt):.3g}°", f"within {quality.rotated * 1e3:.2g} mm"),
     ]
     return table_of(rows)
 
 
 def _poses(result: RigCalibration) -> str:
-    """Every pose in a line, folded up."""
+    """Collapsible table with one row per pose."""
     out, residuals = result.held_out, np.abs(result.fit.cables) * 1e3
     each = zip(result.measured.names, out.before * 1e3, out.after * 1e3, residuals, strict=True)
     rows = [
@@ -375,8 +375,8 @@ def _poses(result: RigCalibration) -> str:
     )
 
 
-def _falling(information: Array) -> str:
-    """A bar a direction, from 10⁻³ to 10⁶."""
+def _information_bars(information: Array) -> str:
+    """One bar per direction, from 10⁻³ to 10⁶."""
     width, height = 560.0, 200.0
     digits = np.clip(np.log10(np.maximum(information, 1e-3)), -3.0, 6.0)
     step, one = width / len(digits), height * 6.0 / 9.0

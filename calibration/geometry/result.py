@@ -1,4 +1,4 @@
-"""The result file of a rig's geometry and winches."""
+"""Result file of a rig's geometry and winches."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from calibration.geometry.calibrate import RigCalibration
-from calibration.geometry.quality import RigQuality, judged_places
+from calibration.geometry.quality import RigQuality, workspace_poses
 from calibration.results import ResultDocument, common_keys
 from model.errors import BadInput
 from model.files.documents import AnyNonNegative, AnyNumber, Finding, Positive, Vector
@@ -69,10 +69,10 @@ class RigResult(ResultDocument):
     )
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
-        """Those of every result, and one entry a cable."""
-        return (*super().rules(), self._one_a_cable)
+        """Rules of every result, and one entry per cable."""
+        return (*super().rules(), self._one_per_cable)
 
-    def _one_a_cable(self) -> list[Finding]:
+    def _one_per_cable(self) -> list[Finding]:
         cables = len(self.outlets_mm)
         keys = ("anchors_mm", "drums_mm_per_rev", "home_counts", "cable_residuals_mm")
         lists = {key: getattr(self, key) for key in (*keys, "cable_stiffness_n")}
@@ -83,16 +83,16 @@ class RigResult(ResultDocument):
         ]
 
     def apart_mm(self, other: Self) -> float:
-        """How far apart both say that the platform goes, RMS over the workspace, [mm].
+        """RMS distance over the workspace between platform positions by both results, [mm].
 
-        Outlets and anchors may differ by more where they cannot be separated.
+        Outlets and anchors may differ by more where the data cannot separate them.
 
         Raises:
-            BadInput: The results rest on different rig files.
+            BadInput: The results depend on different rig files.
         """
         if self.rests_on != other.rests_on:
             raise BadInput(
-                "the results rest on different rig files",
+                "the results depend on different rig files",
                 where=f"rig {self.name}, {self.date} and {other.date}",
                 next_step="compare results made with the same rig file",
             )
@@ -100,15 +100,15 @@ class RigResult(ResultDocument):
         return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
     def corrected(self, rig: RigDocument) -> RigDocument:
-        """The rig file's content with these numbers.
+        """The rig file's content with these values.
 
         Raises:
             BadInput: The result is of another rig.
         """
-        self.require_basis(drawing_of(rig), _WHAT)
+        self.require_basis(nominal_geometry(rig), _WHAT)
         if len(self.outlets_mm) != len(rig.winches):
             raise BadInput(
-                f"this result is of {len(self.outlets_mm)} cables, the rig has {len(rig.winches)}",
+                f"this result has {len(self.outlets_mm)} cables, the rig has {len(rig.winches)}",
                 where=f"calibration {self.kind} {self.name}, {self.date}",
                 next_step="run `cdpr calibrate rig` again; the rig file was changed since",
             )
@@ -140,7 +140,7 @@ def _with_numbers(
     cable_stiffness_n: list[float] | None,
     home_counts: list[int],
 ) -> RigDocument:
-    """The rig file's content with other numbers."""
+    """The rig file's content with other values."""
     one_for_all: list[float | None] = [None] * len(rig.winches)
     winches = [
         winch.model_copy(
@@ -166,12 +166,12 @@ def _with_numbers(
 
 
 def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date) -> RigResult:
-    """The result with its quality.
+    """The result file's content.
 
     Args:
-        result: What was found.
-        quality: What it is good for.
-        name: Of the result.
+        result: The calibration.
+        quality: Its quality.
+        name: Name of the result.
         on: The date.
     """
     rig, geometry = result.rig, result.geometry
@@ -193,7 +193,7 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
             result.intervals,
             quality.verdict,
             data.unused,
-            drawing_of(rig.document),
+            nominal_geometry(rig.document),
         ),
         **numbers,
         outlets_error_mm=_millimetres(result.error_of("outlets")),
@@ -207,9 +207,9 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
         held_out_mm=quality.held_out * 1e3,
         before_mm=quality.before * 1e3,
         level_mm=quality.level * 1e3,
-        turned_mm=quality.turned * 1e3,
+        turned_mm=quality.rotated * 1e3,
         tilt_deg=float(np.degrees(quality.tilt)),
-        reached_mm=_rows(result.reached(*judged_places(rig, 0.0))),
+        reached_mm=_rows(result.reached(*workspace_poses(rig, 0.0))),
         cable_residuals_mm=[float(x) * 1e3 for x in np.sqrt(np.mean(result.fit.cables**2, axis=0))],
         sensor_residuals_deg=dict(
             zip(result.fit.sensors, np.degrees(result.fit.sensor_rms).tolist(), strict=True)
@@ -217,10 +217,10 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
     )
 
 
-def drawing_of(rig: RigDocument) -> object:
+def nominal_geometry(rig: RigDocument) -> object:
     """The parts of a rig file that a rig's calibration takes as known, or corrects.
 
-    Counts at home are not among them: `cdpr home` makes others.
+    Home counts are excluded: `cdpr home` changes them.
     """
     document = rig.model_dump(mode="json")
     parts = {key: document[key] for key in ("outlets_mm", "anchors_mm", "pulleys", "cables")}
@@ -232,18 +232,18 @@ def drawing_of(rig: RigDocument) -> object:
     return {**parts, "winches": winches, "home": document["platform"]["home"]}
 
 
-def require_one_drawing(rig: Rig, others: Sequence[tuple[str, Rig]]) -> Rig:
-    """The rig with the counts at home that all runs were made with.
+def require_same_nominal(rig: Rig, others: Sequence[tuple[str, Rig]]) -> Rig:
+    """The rig with the home counts common to all runs.
 
     Args:
-        rig: Of the rig file.
-        others: Of the runs, with their names.
+        rig: As in its file.
+        others: Names and rigs of the runs.
 
     Raises:
-        BadInput: A run is of another rig, or they were referenced differently.
+        BadInput: A run is from another rig, or the drives were homed again between runs.
     """
     for name, other in others:
-        if drawing_of(other.document) != drawing_of(rig.document):
+        if nominal_geometry(other.document) != nominal_geometry(rig.document):
             raise BadInput(
                 f"this run was made with {_WHAT} that differ from those of {rig.name!r}",
                 where=name,
@@ -270,7 +270,7 @@ def _rows(points: Array) -> list[list[float]]:
 
 
 def _home_counts(result: RigCalibration, numbers: dict[str, Any]) -> list[float]:
-    """What the drives count at home, where the corrected rig expects its own length of cable."""
+    """Home counts at which the corrected rig has the calibrated cable lengths."""
     rig = result.rig
     before = [winch.home_counts for winch in rig.winches]
     corrected = rig_from_document(_with_numbers(rig.document, **numbers, home_counts=before))

@@ -1,13 +1,12 @@
-"""Camera matrix and lens distortion from images of a board, and how well the images determine them.
+"""Camera matrix and lens distortion from images of a board, with their uncertainty.
 
-With r the errors of a picture's corners and A, B their derivatives by the camera's numbers and by
-the board's pose, what the picture says of those numbers is H = AᵀPA and s = AᵀPr, P projecting the
-pose out. From these follow the covariance by the scatter of the corners, the fit without any one
+With r the errors of an image's corners and A, B their derivatives by the camera's parameters and by
+the board's pose, the image's information is H = AᵀPA with score s = AᵀPr, where P projects the pose
+out. From these follow the covariance from the scatter of the corners, the fit without any one
 image, and the fits of two halves of the images, each to first order.
 
-The scatter alone promises too much: corners of one image err together (a bent board, blur, the
-lens model). The spread of the fits without one image (the jackknife over images) feels that,
-and the larger of both is stated.
+Scatter alone is too optimistic: corner errors within an image are correlated (a bent board, blur,
+the lens model). The jackknife over images covers that; the larger of both is stated.
 
 Source: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11.
 """
@@ -27,14 +26,14 @@ from calibration.statistics import (
     CONFIDENCE,
     EvenSample,
     Interval,
-    as_in,
+    duplicate_reason,
     is_duplicate_view,
     jackknife,
-    kept_share,
+    leverage_factor,
     rms_bound,
     widened,
 )
-from calibration.targets.boards import Board, Seen, mirrored
+from calibration.targets.boards import Board, DetectedBoard, is_mirrored
 from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
@@ -43,13 +42,13 @@ from tracking.camera_model import Image
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """What is known about the errors of a camera's n numbers, in the order of its lens model.
+    """Uncertainty of a camera's n parameters, in the order of its lens model.
 
     Attributes:
-        covariance: By the scatter of the corners alone, shape (n, n).
+        covariance: From the scatter of the corners only, shape (n, n).
         half_widths: Of the 95 % intervals, shape (n,).
-        without: How the numbers change when a picture is left out, shape (pictures, n).
-        halves: How the even pictures' numbers differ from the odd ones', shape (n,).
+        without: Changes of the parameters when each image is left out, shape (images, n).
+        halves: Difference between the fits to even and odd images, shape (n,).
     """
 
     covariance: Array
@@ -59,32 +58,32 @@ class Uncertainty:
 
     @property
     def stated_covariance(self) -> Array:
-        """The covariance that 95 % intervals of whatever depends on the numbers follow from.
+        """Covariance for 95 % intervals of quantities that depend on the parameters, (n, n).
 
-        That of the scatter, as much wider as `widened` finds it; shape (n, n).
+        That of the scatter, scaled up by `widened`.
         """
         quantile = _quantile(len(self.without)) / SURE
         return widened(self.covariance, self.without) * quantile**2
 
     def error_of(self, slopes: Array) -> float:
-        """How far off things are that depend on all numbers, 95 %, RMS.
+        """95 % error of quantities that depend on the parameters, RMS.
 
-        Taken as a whole by the scatter and by the jackknife, the larger counts: taken number by
-        number, errors that cancel in the whole would not.
+        The larger of scatter and jackknife, each with all its correlations: parameter by
+        parameter, errors that cancel would not.
 
         Args:
-            slopes: Their derivatives by the numbers, shape (..., n).
+            slopes: Their derivatives by the parameters, shape (..., n).
         """
         flat = slopes.reshape(-1, slopes.shape[-1])
-        by_pictures = jackknife(self.without) * kept_share(*self.without.shape)
-        larger = max(rms_bound(one, flat) for one in (self.covariance, by_pictures))
+        by_images = jackknife(self.without) * leverage_factor(*self.without.shape)
+        larger = max(rms_bound(one, flat) for one in (self.covariance, by_images))
         return _quantile(len(self.without)) / SURE * larger
 
 
 def uncertainty_of(
-    views: Sequence[Seen],
+    views: Sequence[DetectedBoard],
     turns: Sequence[Array],
-    places: Sequence[Array],
+    translations: Sequence[Array],
     matrix: Array,
     distortion: Array,
     lens: LensModel,
@@ -94,17 +93,17 @@ def uncertainty_of(
     Args:
         views: The board in each image.
         turns: Rotation vectors of the board in the camera's frame, shape (3,) each, [rad].
-        places: Its origin there, shape (3,) each, [m].
+        translations: Origins of the board there, shape (3,) each, [m].
         matrix: Camera matrix, shape (3, 3), [px].
         distortion: The lens's coefficients, shape (k,).
         lens: The lens model.
 
     Raises:
-        BadInput: The pictures leave some of the numbers open.
+        BadInput: The images do not determine all parameters.
     """
     parts, scores, squares, residuals = [], [], 0.0, 0
-    for seen, turn, place in zip(views, turns, places, strict=True):
-        there, of_pose, of_camera = lens.slopes(seen.points, turn, place, matrix, distortion)
+    for seen, turn, translation in zip(views, turns, translations, strict=True):
+        there, of_pose, of_camera = lens.slopes(seen.points, turn, translation, matrix, distortion)
         errors = (seen.corners - there).ravel()
         base = np.linalg.qr(of_pose)[0]
         left = of_camera - base @ (base.T @ of_camera)
@@ -122,8 +121,8 @@ def uncertainty_of(
         )
     by_scatter = np.linalg.inv(information) * squares / max(residuals - len(information), 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
-    by_pictures = jackknife(without)
-    larger = np.maximum(np.diag(by_scatter), np.diag(by_pictures) * kept_share(*without.shape))
+    by_images = jackknife(without)
+    larger = np.maximum(np.diag(by_scatter), np.diag(by_images) * leverage_factor(*without.shape))
     return Uncertainty(
         covariance=read_only(by_scatter),
         half_widths=read_only(_quantile(count) * np.sqrt(larger)),
@@ -133,12 +132,12 @@ def uncertainty_of(
 
 
 def _without(information: Array, part: Array, score: Array) -> Array:
-    """The change of the numbers when one image is left out."""
+    """Change of the parameters when one image is left out."""
     return np.asarray(-np.linalg.pinv(information - part, hermitian=True) @ score)
 
 
 def _half(parts: Sequence[Array], scores: Sequence[Array], which: int) -> Array:
-    """The change of the numbers when every other image is used, from the first or the second."""
+    """Change of the parameters when only the even or only the odd images are used."""
     information = np.sum(parts[which::2], axis=0)
     return np.asarray(
         np.linalg.pinv(information, hermitian=True) @ np.sum(scores[which::2], axis=0)
@@ -146,42 +145,42 @@ def _half(parts: Sequence[Array], scores: Sequence[Array], which: int) -> Array:
 
 
 def _quantile(count: int) -> float:
-    """Of Student's distribution, for a number of images."""
+    """Two-sided quantile of Student's t for a number of images."""
     return float(student.ppf(0.5 + CONFIDENCE / 2.0, max(count - 1, 1)))
 
 
-# The fit itself.
+# The fit.
 
 
 LEAST_VIEWS = 4
-"""Fewer images cannot be calibrated from; forty and more, tilted up to 40°, are good."""
+"""Minimum number of images; forty or more, tilted up to 40°, are good."""
 _FAR_OFF, _OFF = 4.0, 0.5
-"""A view is left out whose error is this many times the median, and this many pixels at least."""
-_LOOKED_AT = 5
-"""Images without the board, spread over all, that are searched for what they show instead."""
+"""A view is rejected if its error exceeds this many times the median and this many pixels."""
+_EXAMINED = 5
+"""Number of images without the board that are examined for what they show instead."""
 _PREVIEW = 800
 """Width of the reduced copies of images, [px]."""
 NOT_FOUND = "no board was found in it"
-"""Why most pictures are not used."""
-_MIRRORED = "it flipped over, so the pictures are mirrored, or the board's print is"
+"""Why most unused images are not used."""
+_MIRRORED = "it mirrored, so the images or the board's print are mirrored"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
-    """A camera's matrix and distortion, and what they rest on.
+    """A camera's matrix and distortion, with the data behind them.
 
     Attributes:
         size: Width and height of the images, [px].
         matrix: Camera matrix, shape (3, 3), [px].
         distortion: The lens's coefficients, shape (k,).
         lens: The lens model.
-        uncertainty: What is known about their errors.
-        views: What was seen of the board in each image used, by name.
-        boards: Where the board was in the camera's frame, by name.
-        view_errors: RMS distance of each used image's corners, by name, [px].
+        uncertainty: Of the parameters.
+        views: Detected board in each image used, by name.
+        boards: ``camera_from_board``, by image name.
+        view_errors: RMS corner error of each image used, by name, [px].
         unused: Why each of the other images is not used, by name.
-        data_hash: Of the corners it rests on.
-        previews: Reduced copies of the images used, by name; none where it is from corners.
+        data_hash: Of the corners used.
+        previews: Reduced copies of the images used, by name; empty when fitted to corners.
     """
 
     size: tuple[int, int]
@@ -189,7 +188,7 @@ class CameraCalibration:
     distortion: Array
     lens: LensModel
     uncertainty: Uncertainty
-    views: Mapping[str, Seen]
+    views: Mapping[str, DetectedBoard]
     boards: Mapping[str, Pose]
     view_errors: Mapping[str, float]
     unused: Mapping[str, str]
@@ -198,14 +197,14 @@ class CameraCalibration:
 
     @property
     def error(self) -> float:
-        """RMS distance over all corners, [px]; small also when too little is covered."""
+        """RMS error over all corners, [px]; small even when coverage is poor."""
         counts = [len(view.corners) for view in self.views.values()]
         squares = np.square(list(self.view_errors.values()))
         return float(np.sqrt(np.average(squares, weights=counts)))
 
     @property
     def intervals(self) -> dict[str, Interval]:
-        """The camera's numbers by the names of its lens model."""
+        """The camera's parameters with 95 % intervals, by the names of its lens model."""
         m, widths = self.matrix, self.uncertainty.half_widths
         numbers = [m[0, 0], m[1, 1], m[0, 2], m[1, 2], *self.distortion]
         return {
@@ -224,18 +223,18 @@ def fit_camera(
 
     Args:
         pictures: Names and grey images of one size.
-        board: What they show.
-        unused: Pictures that were left out before, with the reasons.
+        board: The board in the images.
+        unused: Images already left out, with the reasons.
         lens: One of `calibration.intrinsics.lens.LENSES`, or `AUTO`.
 
     Raises:
-        BadInput: Images of different sizes, or too few that show the board.
+        BadInput: Image sizes differ, or too few images show the board.
     """
-    views: dict[str, Seen] = {}
+    views: dict[str, DetectedBoard] = {}
     previews: dict[str, Image] = {}
     left_out = dict(unused or {})
     size: tuple[int, int] | None = None
-    without = EvenSample[tuple[str, Image]](_LOOKED_AT)
+    without = EvenSample[tuple[str, Image]](_EXAMINED)
     for name, image in pictures:
         own = (image.shape[1], image.shape[0])
         size = size or own
@@ -250,7 +249,7 @@ def fit_camera(
             left_out[name] = NOT_FOUND
             without.add((name, image))
         elif first := next((n for n, before in views.items() if _same(seen, before)), None):
-            left_out[name] = as_in(first)
+            left_out[name] = duplicate_reason(first)
         else:
             views[name] = seen
             previews[name] = _reduced(image)
@@ -266,30 +265,30 @@ def _reduced(image: Image) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _same(seen: Seen, before: Seen) -> bool:
+def _same(seen: DetectedBoard, before: DetectedBoard) -> bool:
     same_points = np.array_equal(seen.points, before.points)
     return same_points and is_duplicate_view(seen.corners, before.corners)
 
 
 def fit_corners(
-    views: Mapping[str, Seen], size: tuple[int, int], lens: str, where: str
+    views: Mapping[str, DetectedBoard], size: tuple[int, int], lens: str, where: str
 ) -> CameraCalibration:
-    """Fits a camera to corners that another program detected.
+    """Fits a camera to corners detected by another program.
 
     Args:
-        views: By picture.
+        views: By image name.
         size: Width and height of the images, [px].
-        lens: As of `fit_camera`.
+        lens: As in `fit_camera`.
         where: Names the source in messages.
 
     Raises:
-        BadInput: Too few pictures, or corners outside the images.
+        BadInput: Too few images, or corners outside them.
     """
     every = np.concatenate([seen.corners for seen in views.values()])
     low, high = every.min(axis=0), every.max(axis=0)
     if (low < -0.5).any() or (high > np.array(size) - 0.5).any() or len(views) < LEAST_VIEWS:
         raise BadInput(
-            f"{len(views)} pictures have corners from ({low[0]:.0f}, {low[1]:.0f}) to"
+            f"{len(views)} images have corners from ({low[0]:.0f}, {low[1]:.0f}) to"
             f" ({high[0]:.0f}, {high[1]:.0f}) px; {LEAST_VIEWS} are required, within {size[0]} x"
             f" {size[1]} px",
             where=where,
@@ -299,17 +298,17 @@ def fit_corners(
 
 
 def calibrate_from_views(
-    views: Mapping[str, Seen],
+    views: Mapping[str, DetectedBoard],
     size: tuple[int, int],
     unused: Mapping[str, str] | None = None,
     lens: str = AUTO,
 ) -> CameraCalibration:
     """Fits the camera to the board's corners in each image.
 
-    An image whose corners are far off, as of a board that moved or was mistaken, is left out.
+    Outlier images, such as of a moving or misdetected board, are rejected.
 
     Raises:
-        BadInput: Too few images are left, or they determine nothing.
+        BadInput: Too few images remain, or they do not determine the camera.
     """
     left_out, used = dict(unused or {}), dict(views)
     fit = _fit(used, size, lens)
@@ -330,14 +329,14 @@ def calibrate_from_views(
         uncertainty=uncertainty_of(
             list(used.values()),
             list(fit.turns.values()),
-            list(fit.places.values()),
+            list(fit.translations.values()),
             fit.matrix,
             fit.distortion,
             fit.lens,
         ),
         views=used,
         boards={
-            name: Pose(fit.places[name], matrix_from_rotation_vector(fit.turns[name]))
+            name: Pose(fit.translations[name], matrix_from_rotation_vector(fit.turns[name]))
             for name in used
         },
         view_errors=errors,
@@ -348,7 +347,7 @@ def calibrate_from_views(
     )
 
 
-def _fit(views: Mapping[str, Seen], size: tuple[int, int], lens: str) -> LensFit:
+def _fit(views: Mapping[str, DetectedBoard], size: tuple[int, int], lens: str) -> LensFit:
     try:
         fit = choose_lens(views, size) if lens == AUTO else fit_lens(LENSES[lens], views, size)
     except (cv2.error, np.linalg.LinAlgError):
@@ -358,8 +357,8 @@ def _fit(views: Mapping[str, Seen], size: tuple[int, int], lens: str) -> LensFit
     return fit
 
 
-def _errors(fit: LensFit, views: Mapping[str, Seen]) -> dict[str, float]:
-    """RMS distance of each picture's corners, [px]."""
+def _errors(fit: LensFit, views: Mapping[str, DetectedBoard]) -> dict[str, float]:
+    """RMS corner error of each image, [px]."""
     return {
         name: float(np.sqrt(np.mean(np.sum(fit.residuals(name, seen) ** 2, axis=1))))
         for name, seen in views.items()
@@ -369,17 +368,17 @@ def _errors(fit: LensFit, views: Mapping[str, Seen]) -> dict[str, float]:
 def _undetermined() -> BadInput:
     return BadInput(
         "these images do not determine a camera",
-        why="the fit has no finite solution, as when the board has the same tilt in all of them",
+        why="the fit has no finite solution, such as with the same tilt of the board in all images",
         next_step="take more images, with the board tilted up to 40° in every direction",
     )
 
 
 def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
-    """What most of the images without the board show, if anything is known."""
+    """What most images without the board show instead, if known."""
     shown: dict[str, list[str]] = {}
     for name, image in without:
-        flipped = mirrored(board, image)
-        if what := _MIRRORED if flipped else board.instead(image):
+        flipped = is_mirrored(board, image)
+        if what := _MIRRORED if flipped else board.describe_other(image):
             shown.setdefault(what, []).append(name)
     if not shown:
         return ""
@@ -391,17 +390,17 @@ def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
 
 
 def _too_few(
-    views: Mapping[str, Seen],
+    views: Mapping[str, DetectedBoard],
     unused: Mapping[str, str],
     board: Board,
     without: Sequence[tuple[str, Image]],
 ) -> BadInput:
     count = len(views) + len(unused)
     why = f"expected {board}{_instead(board, without)}"
-    told = [f"{name} {reason}" for name, reason in unused.items()]
-    if told:
-        more = f" and {len(told) - 4} more" if len(told) > 5 else ""
-        why += "; " + "; ".join(told[: 4 if more else 5]) + more
+    reasons = [f"{name} {reason}" for name, reason in unused.items()]
+    if reasons:
+        more = f" and {len(reasons) - 4} more" if len(reasons) > 5 else ""
+        why += "; " + "; ".join(reasons[: 4 if more else 5]) + more
     return BadInput(
         f"the board was found in {len(views)} of {count} images;"
         f" at least {LEAST_VIEWS} are required",

@@ -1,6 +1,6 @@
-"""Camera files of other programs, written and read: OpenCV, ROS, Kalibr and mrcal.
+"""Export and import of camera files: OpenCV, ROS, Kalibr and mrcal.
 
-None says how sure its numbers are. All count a pixel's middle as whole, as rig files do.
+None states uncertainties. All have integer coordinates at pixel centres, as rig files do.
 
 Source: OpenCV, samples/cpp/calibration.cpp (keys); ROS, sensor_msgs/CameraInfo and
 camera_calibration_parsers (keys, models plumb_bob, rational_polynomial, equidistant); Kalibr, wiki
@@ -39,14 +39,14 @@ _MRCAL_MODELS = {
     "LENSMODEL_OPENCV12": 12,
 }
 _SMALL, _TEXT_LIMIT = 1_000_000, 32_000_000
-"""Of characters, of OpenCV and of all; mrcal's may hold all corners that they were made from."""
+"""Largest files in characters, OpenCV's and any; mrcal's may include all corners."""
 _BAD_NUMBERS = (TypeError, ValueError, OverflowError, AttributeError)
-"""What a file raises whose numbers are none."""
+"""Exceptions from values that are not numbers."""
 _KEYS = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens")
 
 
 def opencv_text(camera: CameraDocument) -> str:
-    """The file that OpenCV's calibration sample writes, with ``fisheye_model`` 0 or 1."""
+    """The file of OpenCV's calibration sample, with ``fisheye_model`` 0 or 1."""
     storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     storage.write("image_width", camera.width_px)
     storage.write("image_height", camera.height_px)
@@ -92,7 +92,7 @@ def ros_text(camera: CameraDocument) -> str:
 
 
 def kalibr_text(camera: CameraDocument) -> str:
-    """A camchain of Kalibr with this camera alone, ``cam0``.
+    """A Kalibr camchain with only this camera, ``cam0``.
 
     Raises:
         BadInput: Kalibr has no such lens model.
@@ -103,7 +103,7 @@ def kalibr_text(camera: CameraDocument) -> str:
         lens, rest = list(camera.distortion[:4]), camera.distortion[4:]
         if any(rest):
             raise BadInput(
-                f"Kalibr's radtan has k1 k2 p1 p2 alone; this lens has {len(camera.distortion)}"
+                f"Kalibr's radtan has only k1 k2 p1 p2; this lens has {len(camera.distortion)}"
                 " coefficients",
                 where=f"camera {camera.name}",
                 next_step="calibrate it with --lens fisheye, or use --to opencv, ros or mrcal",
@@ -122,7 +122,7 @@ def kalibr_text(camera: CameraDocument) -> str:
 
 
 def mrcal_text(camera: CameraDocument) -> str:
-    """A ``.cameramodel`` of mrcal; its reference is the world of the rig file, in metres.
+    """A mrcal ``.cameramodel``; its reference frame is the rig file's world, in metres.
 
     Raises:
         BadInput: mrcal has no such lens model.
@@ -157,19 +157,19 @@ FORMATS: dict[FormatName, Callable[[CameraDocument], str]] = {
     "kalibr": kalibr_text,
     "mrcal": mrcal_text,
 }
-"""What writes a camera's numbers, by the name of the format."""
+"""Writers of camera files, by the name of the format."""
 
 
 def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None) -> CameraDocument:
-    """A camera with the numbers of a file of `FORMATS`, which is known by its content.
+    """A camera with the parameters of a file in one of `FORMATS`, detected by content.
 
     Args:
         path: The file.
-        camera: Its name, pose and rate are kept.
+        camera: Gives name, pose and rate.
         entry: Which camera of a Kalibr camchain, such as ``cam1``; the only one when left out.
 
     Raises:
-        BadInput: The file cannot be read, is none of them, or its numbers cannot be.
+        BadInput: The file cannot be read, has an unknown format, or values out of range.
     """
     plain = camera.model_dump(mode="json") | _found(path, entry)
     try:
@@ -181,7 +181,7 @@ def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None
 
 
 def _found(path: Path, entry: str | None) -> dict[str, Any]:
-    """The keys of the rig file's ``cameras`` in a file."""
+    """Keys of the rig file's ``cameras``, from a file."""
     text = read_text(path, _TEXT_LIMIT)
     if "lensmodel" in text and _without_comments(text).startswith("{"):
         found = _from_mrcal(text, path)
@@ -193,15 +193,15 @@ def _found(path: Path, entry: str | None) -> dict[str, Any]:
             return _from_kalibr(plain, path, entry)
         found = _from_ros(plain, path)
     if entry is not None:
-        raise _unusable(path, f"it holds one camera, there is no {entry!r} to choose")
+        raise _unusable(path, f"it has one camera, so {entry!r} does not exist")
     return found
 
 
 def with_imported_camera(rig: Rig, name: str, path: Path, entry: str | None = None) -> RigDocument:
-    """A rig file's content with the numbers of another program's file for one of its cameras.
+    """A rig file's content with the parameters of another program's file for one camera.
 
     Raises:
-        BadInput: As of `imported_camera`, or the rig has no such camera.
+        BadInput: As in `imported_camera`, or the rig has no such camera.
     """
     own = camera_named(rig.document, name)
     document = with_camera(rig.document, imported_camera(path, own, entry))
@@ -215,13 +215,13 @@ def write_rig_with_camera(
     """Writes a new rig file with the camera of another program's file; returns the camera.
 
     Raises:
-        BadInput: As of `with_imported_camera`, or ``output`` exists or cannot be written.
+        BadInput: As in `with_imported_camera`, or ``output`` exists or cannot be written.
     """
     if output.exists():
         raise BadInput(
             "the file exists already",
             where=str(output),
-            why="a rig file is never replaced by a calibration",
+            why="an import never replaces a rig file",
             next_step="choose a name that does not exist yet",
         )
     document = with_imported_camera(rig, name, path, entry)
@@ -248,7 +248,7 @@ def _ros_matrix(values: np.ndarray[Any, Any]) -> dict[str, Any]:
 
 
 def _from_opencv(text: str, path: Path) -> dict[str, Any]:
-    """Read without OpenCV, whose own reader dies of damaged files."""
+    """Parses without OpenCV, whose own reader crashes on damaged files."""
     if len(text) > _SMALL:
         raise _unusable(path, f"it is longer than {_SMALL} characters")
     try:
@@ -270,7 +270,7 @@ def _opencv_yaml(text: str) -> Mapping[str, Any]:
     body = text.lstrip().partition("\n")[2].replace("!!opencv-matrix", "")
     plain = yaml.safe_load(body)
     if not isinstance(plain, Mapping):
-        raise ValueError("it holds no names")
+        raise ValueError("it has no keys")
     return plain
 
 
@@ -284,7 +284,7 @@ def _opencv_xml(text: str) -> Mapping[str, Any]:
 
 def _from_ros(plain: object, path: Path) -> dict[str, Any]:
     if not isinstance(plain, Mapping):
-        raise _unusable(path, "it is neither of OpenCV, ROS, Kalibr nor mrcal")
+        raise _unusable(path, "it is not a file of OpenCV, ROS, Kalibr or mrcal")
     try:
         model = plain["distortion_model"]
         matrix = np.array(plain["camera_matrix"]["data"], dtype=np.float64)
@@ -293,13 +293,13 @@ def _from_ros(plain: object, path: Path) -> dict[str, Any]:
     except (KeyError, *_BAD_NUMBERS) as error:
         raise _unusable(path, f"{type(error).__name__}: {error}") from None
     if str(model) not in (*_ROS_MODELS, *_ROS_FISHEYE):
-        raise _unusable(path, f"its distortion_model {model!r} is not known")
+        raise _unusable(path, f"its distortion_model {model!r} is unknown")
     kind = "fisheye" if model in _ROS_FISHEYE else "pinhole"
     return _numbers(path, width, height, matrix, lens, kind)
 
 
 def _is_entry(key: object) -> bool:
-    """Whether a key of a YAML file is of a camera of Kalibr, such as ``cam0``."""
+    """Whether a YAML key is that of a Kalibr camera, such as ``cam0``."""
     text = str(key)
     return text.startswith("cam") and text[3:].isdecimal()
 
@@ -307,10 +307,10 @@ def _is_entry(key: object) -> bool:
 def _from_kalibr(plain: Mapping[Any, Any], path: Path, entry: str | None) -> dict[str, Any]:
     names = [str(key) for key in plain if _is_entry(key)]
     if entry is None and len(names) > 1:
-        raise _unusable(path, f"it holds {', '.join(names)}; say which with --entry")
+        raise _unusable(path, f"it has {', '.join(names)}; choose one with --entry")
     name = entry or names[0]
     if name not in names:
-        raise _unusable(path, f"it has no {name!r}, but {', '.join(names)}")
+        raise _unusable(path, f"it has {', '.join(names)}, but not {name!r}")
     try:
         own = plain[name]
         kind, model = own["camera_model"], own["distortion_model"]
@@ -336,7 +336,7 @@ def _from_mrcal(text: str, path: Path) -> dict[str, Any]:
         raise _unusable(path, f"{type(error).__name__}: {error}"[:200]) from None
     if str(model) not in _MRCAL_MODELS:
         known = ", ".join(_MRCAL_MODELS)
-        why = f"its lensmodel is {model!r}; mrcal-convert-lensmodel makes one of {known} of it"
+        why = f"its lensmodel is {model!r}; mrcal-convert-lensmodel converts it to one of {known}"
         raise _unusable(path, why)
     if len(numbers) != 4 + _MRCAL_MODELS[model]:
         raise _unusable(path, f"{model} has {4 + _MRCAL_MODELS[model]} intrinsics")
@@ -359,7 +359,7 @@ def _matrix_of(path: Path, numbers: list[Any]) -> np.ndarray[Any, Any]:
 def _numbers(
     path: Path, width: object, height: object, matrix: object, lens: object, kind: str
 ) -> dict[str, Any]:
-    """The keys of the rig file's ``cameras``."""
+    """Keys of the rig file's ``cameras``, from parsed values."""
     try:
         numbers = np.asarray(matrix, np.float64)
         coefficients = np.ravel(np.asarray(lens, np.float64))
@@ -369,7 +369,7 @@ def _numbers(
         raise _unusable(path, "camera_matrix is not 3 x 3")
     flat = numbers.ravel()
     if abs(flat[1]) > 1e-9:
-        raise _unusable(path, "camera_matrix has a skew, which rig files have no key for")
+        raise _unusable(path, "camera_matrix has a skew, which rig files do not support")
     values = (width, height, flat[0], flat[4], flat[2], flat[5], coefficients.tolist(), kind)
     return dict(zip(_KEYS, (_plain(value) for value in values), strict=True))
 
@@ -383,6 +383,6 @@ def _unusable(path: Path, why: str) -> BadInput:
         "no camera can be read from this file",
         where=str(path),
         why=why,
-        next_step="name a camera file of OpenCV (YAML, XML), ROS (camera_info), Kalibr (camchain)"
+        next_step="pass a camera file of OpenCV (YAML, XML), ROS (camera_info), Kalibr (camchain)"
         " or mrcal (.cameramodel)",
     )

@@ -1,7 +1,7 @@
-"""Lens models that a camera can be calibrated with, and how well each fits pictures held out.
+"""Lens models for camera calibration, their fit and their selection by cross-validation.
 
-Three are OpenCV's pinhole with more and more coefficients, the fourth is its fisheye model. All
-share one fit, by damped least squares from OpenCV's answer or, for the fisheye, from several focal
+Three are OpenCV's pinhole model with increasing numbers of coefficients, the fourth is its fisheye
+model. Pinhole models are fitted by OpenCV, the fisheye by damped least squares from several focal
 lengths.
 
 Source: Brown, "Close-range camera calibration", 1971 (five coefficients); Claus & Fitzgibbon, "A
@@ -19,7 +19,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from calibration.targets.boards import Seen
+from calibration.targets.boards import DetectedBoard
 from model.files.camera_file import LensName
 from model.pose import Array
 from tracking.camera_model import rays_of
@@ -31,7 +31,7 @@ _EIGHT = (*_FIVE, "k4", "k5", "k6")
 
 @dataclass(frozen=True, slots=True)
 class LensModel:
-    """How a lens bends rays.
+    """A lens distortion model.
 
     Attributes:
         name: For options and messages.
@@ -47,37 +47,41 @@ class LensModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The camera's numbers, matrix first, in the order of every array about them."""
+        """Names of the camera's parameters, matrix first, in the order of all arrays."""
         return (*_MATRIX, *self.coefficients)
 
     @property
     def kind(self) -> LensName:
-        """The key `lens` of the rig file."""
+        """Value of the key `lens` in the rig file."""
         return "fisheye" if self.fisheye else "pinhole"
 
     def slopes(
-        self, points: Array, turn: Array, place: Array, matrix: Array, distortion: Array
+        self, points: Array, turn: Array, translation: Array, matrix: Array, distortion: Array
     ) -> tuple[Array, Array, Array]:
-        """Where points are seen, and how that depends on pose and camera.
+        """Projections of points, with derivatives by pose and camera.
 
         Args:
             points: Shape (n, 3), [m].
             turn: Rotation vector into the camera's frame, shape (3,), [rad].
-            place: Translation into it, shape (3,), [m].
+            translation: Into the camera's frame, shape (3,), [m].
             matrix: Camera matrix, shape (3, 3), [px].
             distortion: Coefficients, shape (k,).
 
         Returns:
-            Pixels, shape (n, 2); derivatives by the pose's six numbers, shape (2n, 6), and by the
+            Pixels, shape (n, 2); derivatives by the pose's parameters, shape (2n, 6), and by the
             camera's, shape (2n, 4 + k).
         """
         if self.fisheye:
             seen, by = cv2.fisheye.projectPoints(
-                np.ascontiguousarray(points).reshape(-1, 1, 3), turn, place, matrix, distortion
+                np.ascontiguousarray(points).reshape(-1, 1, 3),
+                turn,
+                translation,
+                matrix,
+                distortion,
             )
             pose, camera = slice(8, 14), slice(0, 8)
         else:
-            seen, by = cv2.projectPoints(points, turn, place, matrix, distortion)
+            seen, by = cv2.projectPoints(points, turn, translation, matrix, distortion)
             pose, camera = slice(0, 6), slice(6, 10 + len(self.coefficients))
         derivatives = np.asarray(by, dtype=np.float64)
         pixels = np.asarray(seen, dtype=np.float64).reshape(-1, 2)
@@ -98,56 +102,56 @@ LENSES = {
         LensModel("fisheye", True, 0, ("k1", "k2", "k3", "k4")),
     )
 }
-"""By name; the first one is tried first."""
+"""Lens models by name; the first is tried first."""
 LensChoice = Literal["auto", "five", "rational", "thin-prism", "fisheye"]
 AUTO = "auto"
-"""In place of a name: the model that fits held-out pictures best."""
+"""Instead of a name: the model that fits held-out images best."""
 FOLDS = 4
-"""Parts of the pictures that are held out in turn."""
+"""Number of folds of the cross-validation."""
 GAIN = 0.03
-"""Share of the held-out error by which another model must be better than five coefficients."""
+"""Relative improvement of the held-out error that another model needs over ``five``."""
 RADIAL = 0.02
-"""Share of the squared errors in the radial pattern from which other models are tried."""
+"""Share of radial errors from which other models are tried; see `radial_share`."""
 _RINGS = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensFit:
-    """A camera, and where the board was.
+    """A fitted camera and the board's poses.
 
     Attributes:
         lens: The model.
         matrix: Camera matrix, shape (3, 3), [px].
         distortion: Coefficients, shape (k,).
-        turns: Rotation vectors of the board by picture, shape (3,) each, [rad].
-        places: Its origins, shape (3,) each, [m].
+        turns: Rotation vectors of the board by image, shape (3,) each, [rad].
+        translations: Origins of the board by image, shape (3,) each, [m].
     """
 
     lens: LensModel
     matrix: Array
     distortion: Array
     turns: dict[str, Array]
-    places: dict[str, Array]
+    translations: dict[str, Array]
 
-    def residuals(self, name: str, seen: Seen) -> Array:
-        """Corners less where they are expected, shape (n, 2), [px]."""
-        turn, place = self.turns[name], self.places[name]
-        there = self.lens.slopes(seen.points, turn, place, self.matrix, self.distortion)[0]
+    def residuals(self, name: str, seen: DetectedBoard) -> Array:
+        """Detected minus projected corners, shape (n, 2), [px]."""
+        turn, translation = self.turns[name], self.translations[name]
+        there = self.lens.slopes(seen.points, turn, translation, self.matrix, self.distortion)[0]
         return np.asarray(seen.corners - there)
 
     @property
     def finite(self) -> bool:
-        """Whether it is an answer."""
+        """Whether the parameters are finite and the focal lengths positive."""
         known = np.isfinite(self.matrix).all() and np.isfinite(self.distortion).all()
         return bool(known and self.matrix[0, 0] > 0.0 and self.matrix[1, 1] > 0.0)
 
 
-def fit_lens(lens: LensModel, views: Mapping[str, Seen], size: tuple[int, int]) -> LensFit:
-    """The camera that explains views best, by least squares.
+def fit_lens(lens: LensModel, views: Mapping[str, DetectedBoard], size: tuple[int, int]) -> LensFit:
+    """The least-squares fit of a camera to views.
 
     Raises:
-        cv2.error: OpenCV finds no answer.
-        np.linalg.LinAlgError: There is none.
+        cv2.error: OpenCV finds no solution.
+        np.linalg.LinAlgError: There is no solution.
     """
     if not lens.fisheye:
         return _fit_pinhole(lens, views, size)
@@ -156,18 +160,20 @@ def fit_lens(lens: LensModel, views: Mapping[str, Seen], size: tuple[int, int]) 
         focal = share * size[0]
         matrix = np.array([[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]])
         try:
-            fits.append(_polished(lens, views, matrix, np.zeros(4)))
+            fits.append(_fit_from(lens, views, matrix, np.zeros(4)))
         except (cv2.error, np.linalg.LinAlgError):
             continue
     if not fits:
-        raise np.linalg.LinAlgError("no focal length leads to an answer")
+        raise np.linalg.LinAlgError("no initial focal length leads to a solution")
     return min(fits, key=lambda fit: _squares(fit, views))
 
 
-def _fit_pinhole(lens: LensModel, views: Mapping[str, Seen], size: tuple[int, int]) -> LensFit:
+def _fit_pinhole(
+    lens: LensModel, views: Mapping[str, DetectedBoard], size: tuple[int, int]
+) -> LensFit:
     points = [seen.points.astype(np.float32).reshape(-1, 1, 3) for seen in views.values()]
     corners = [seen.corners.astype(np.float32).reshape(-1, 1, 2) for seen in views.values()]
-    _, matrix, distortion, turns, places = cv2.calibrateCamera(
+    _, matrix, distortion, turns, translations = cv2.calibrateCamera(
         points, corners, size, np.eye(3), np.zeros(0), flags=lens.flags
     )
     return LensFit(
@@ -175,14 +181,14 @@ def _fit_pinhole(lens: LensModel, views: Mapping[str, Seen], size: tuple[int, in
         np.asarray(matrix, dtype=np.float64),
         np.ravel(distortion)[: len(lens.coefficients)].astype(np.float64),
         {name: np.ravel(turn) for name, turn in zip(views, turns, strict=True)},
-        {name: np.ravel(place) for name, place in zip(views, places, strict=True)},
+        {name: np.ravel(shift) for name, shift in zip(views, translations, strict=True)},
     )
 
 
-def _polished(
-    lens: LensModel, views: Mapping[str, Seen], matrix: Array, distortion: Array
+def _fit_from(
+    lens: LensModel, views: Mapping[str, DetectedBoard], matrix: Array, distortion: Array
 ) -> LensFit:
-    """Damped least squares over camera and poses, the poses eliminated picture by picture."""
+    """Damped least squares over camera and poses, with the poses eliminated."""
     poses = {name: _first_pose(lens, seen, matrix, distortion) for name, seen in views.items()}
     fit = LensFit(
         lens,
@@ -207,12 +213,12 @@ def _polished(
     return fit
 
 
-def _stepped(fit: LensFit, views: Mapping[str, Seen], damping: float) -> LensFit:
+def _stepped(fit: LensFit, views: Mapping[str, DetectedBoard], damping: float) -> LensFit:
     lens, count = fit.lens, 4 + len(fit.distortion)
     normal, score, parts = np.zeros((count, count)), np.zeros(count), {}
     for name, seen in views.items():
         there, of_pose, of_camera = lens.slopes(
-            seen.points, fit.turns[name], fit.places[name], fit.matrix, fit.distortion
+            seen.points, fit.turns[name], fit.translations[name], fit.matrix, fit.distortion
         )
         errors = (seen.corners - there).ravel()
         own = of_pose.T @ of_pose
@@ -232,28 +238,28 @@ def _stepped(fit: LensFit, views: Mapping[str, Seen], damping: float) -> LensFit
         matrix,
         fit.distortion + step[4:],
         {name: fit.turns[name] + move[:3] for name, move in moves.items()},
-        {name: fit.places[name] + move[3:] for name, move in moves.items()},
+        {name: fit.translations[name] + move[3:] for name, move in moves.items()},
     )
 
 
-def _squares(fit: LensFit, views: Mapping[str, Seen]) -> float:
+def _squares(fit: LensFit, views: Mapping[str, DetectedBoard]) -> float:
     total = sum(float(np.sum(fit.residuals(name, seen) ** 2)) for name, seen in views.items())
     return total if np.isfinite(total) else np.inf
 
 
-def _first_pose(lens: LensModel, seen: Seen, matrix: Array, distortion: Array) -> Array:
-    """Rotation vector and place of a board, from rays; shape (6,)."""
+def _first_pose(lens: LensModel, seen: DetectedBoard, matrix: Array, distortion: Array) -> Array:
+    """Initial rotation vector and translation of a board, from rays; shape (6,)."""
     rays = rays_of(lens.kind, matrix, distortion, seen.corners)
-    _, turn, place = cv2.solvePnP(seen.points, rays, np.eye(3), np.zeros(0))
-    return np.concatenate([np.ravel(turn), np.ravel(place)]).astype(np.float64)
+    _, turn, translation = cv2.solvePnP(seen.points, rays, np.eye(3), np.zeros(0))
+    return np.concatenate([np.ravel(turn), np.ravel(translation)]).astype(np.float64)
 
 
 def held_out_errors(
-    lens: LensModel, views: Mapping[str, Seen], size: tuple[int, int]
+    lens: LensModel, views: Mapping[str, DetectedBoard], size: tuple[int, int]
 ) -> dict[str, float]:
-    """Mean squared error of each picture by fits that have not seen it, [px²].
+    """Mean squared error of each held-out image, [px²].
 
-    The board's pose in it is fitted, the camera is not. Infinite where there is no fit.
+    The board's pose is fitted to it, the camera is not. Infinite where there is no fit.
     """
     names = list(views)
     errors: dict[str, float] = {}
@@ -267,8 +273,8 @@ def held_out_errors(
     return {name: errors[name] for name in names}
 
 
-def error_of(fit: LensFit, seen: Seen) -> float:
-    """Mean squared error of a picture that a fit has not seen, its pose fitted, [px²]."""
+def error_of(fit: LensFit, seen: DetectedBoard) -> float:
+    """Mean squared error of a held-out image, with its pose fitted, [px²]."""
     try:
         pose = _first_pose(fit.lens, seen, fit.matrix, fit.distortion)
         for _ in range(5):
@@ -283,16 +289,16 @@ def error_of(fit: LensFit, seen: Seen) -> float:
     return mean if np.isfinite(mean) else np.inf
 
 
-def choose_lens(views: Mapping[str, Seen], size: tuple[int, int]) -> LensFit:
-    """The fit of the lens model that suits pictures best.
+def choose_lens(views: Mapping[str, DetectedBoard], size: tuple[int, int]) -> LensFit:
+    """The fit of the lens model selected by cross-validation.
 
     Five coefficients, unless their errors show a radial pattern (`RADIAL`) and another model has a
-    held-out error (RMS) lower by `GAIN`, and in most pictures: the mean of the logarithms of their
-    errors' ratios is beyond two of its standard errors. Of several such models that with the fewest
-    numbers whose error is within `GAIN` of the best.
+    held-out RMS error lower by `GAIN`, in most images: the mean log ratio of their errors exceeds
+    two of its standard errors. Of several such models, the one with the fewest parameters whose
+    error is within `GAIN` of the best.
 
     Raises:
-        cv2.error: OpenCV finds no answer.
+        cv2.error: OpenCV finds no solution.
     """
     plain = LENSES["five"]
     first = fit_lens(plain, views, size)
@@ -301,7 +307,7 @@ def choose_lens(views: Mapping[str, Seen], size: tuple[int, int]) -> LensFit:
     pattern = radial_share(shown, np.concatenate(rest), first.matrix)
     if first.finite and (pattern < RADIAL or len(views) < 2 * FOLDS):
         return first
-    errors = {name: _listed(held_out_errors(lens, views, size)) for name, lens in LENSES.items()}
+    errors = {name: _as_array(held_out_errors(lens, views, size)) for name, lens in LENSES.items()}
     rms = {name: float(np.sqrt(np.mean(each))) for name, each in errors.items()}
     better = [
         name for name in LENSES if name != "five" and _is_better(errors[name], errors["five"])
@@ -312,7 +318,7 @@ def choose_lens(views: Mapping[str, Seen], size: tuple[int, int]) -> LensFit:
     return first if lens is plain else fit_lens(lens, views, size)
 
 
-def _listed(errors: Mapping[str, float]) -> Array:
+def _as_array(errors: Mapping[str, float]) -> Array:
     return np.array(list(errors.values()))
 
 
@@ -322,16 +328,16 @@ def _is_better(mine: Array, plain: Array) -> bool:
     if not np.isfinite(plain).all():
         return True
     gains = np.log(np.maximum(plain, 1e-12) / np.maximum(mine, 1e-12))
-    doubt = 2.0 * float(np.std(gains, ddof=1)) / np.sqrt(len(gains))
+    margin = 2.0 * float(np.std(gains, ddof=1)) / np.sqrt(len(gains))
     by_share = float(np.mean(mine)) < float(np.mean(plain)) * (1.0 - GAIN) ** 2
-    return by_share and float(np.mean(gains)) > doubt
+    return by_share and float(np.mean(gains)) > margin
 
 
 def radial_share(corners: Array, errors: Array, matrix: Array) -> float:
     """Share of squared errors that is a function of the distance from the principal point.
 
-    The mean radial error of each of twelve rings with as many corners is such a function; what
-    chance adds to it is taken off.
+    It is estimated from the mean radial error in twelve rings of equal numbers of corners, less the
+    part expected by chance.
 
     Args:
         corners: Shape (n, 2), [px].

@@ -1,4 +1,4 @@
-"""Whether a camera is calibrated well enough: what the images covered, and millimetres."""
+"""Quality of a camera calibration: coverage, errors in millimetres, verdict."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ from model.pose import Array, rotation_vector_from_matrix
 from tracking.camera_model import rays_of
 
 CELLS = (8, 6)
-"""Columns and rows of the map of what is covered."""
+"""Columns and rows of the coverage map."""
 GOOD_VIEWS, GOOD_COVERAGE, GOOD_TILT, GOOD_ERROR = 12, 0.6, 20.0, 1.0
-"""Images, share of the map, degrees to either side of both axes together, pixels."""
+"""Required images, share of the map, tilt to either side [deg], reprojection error [px]."""
 GOOD_PIXELS = 1.0
-"""Of points all over the image, 95 %, [px]: unlike millimetres, no wrong size of squares changes
-them."""
+"""Required error of points over the whole image, 95 %, [px]; unlike millimetres, it does not depend
+on the stated size of the squares."""
 FULL_COVERAGE = 0.9
-"""Share of the map beyond which nothing is gained by more of it."""
-EDGES = "bring the board near the edges and corners of the picture"
+"""Share of the map beyond which more coverage gains nothing."""
+EDGES = "bring the board near the edges and corners of the image"
 ENOUGH_VIEWS = 40
 MORE = f"take more images: {ENOUGH_VIEWS} are recommended"
-NEARER = "take them again with the board filling more of the picture, sharp and held still"
-"""Where there are pictures enough, others like them gain little."""
+NEARER = "take them again with the board filling more of the image, sharp and held still"
+"""Used when there are enough images, as more like them gain little."""
 _BENT = 0.2
-"""Share of the squared errors that a bow of the board must explain to be named."""
+"""Share of the squared errors from which a bow of the board is reported."""
 _SEEN = 0.3
-"""Smaller errors of corners are not worth a word about the lens, RMS, [px]."""
+"""RMS corner error below which the lens model is not questioned, [px]."""
 _SIDES = (("left", 0, 0), ("right", 0, -1), ("top", 1, 0), ("bottom", 1, -1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraQuality:
-    """What a camera calibration is good for.
+    """Quality of a camera calibration.
 
     Attributes:
         verdict: The verdict.
-        coverage: How many corners were seen in each cell of the image, shape `CELLS`.
-        tilts: Angle of each image's board against the image's plane, about its x and y axes,
-            shape (pictures, 2), [deg].
-        distance: For which the errors are stated, [m].
-        nearest: Least distance of a board, [m]; it grows with the stated size of the squares.
-        farthest: Greatest distance of a board, [m].
-        halves: How far apart two halves of the pictures would see a point there, RMS over the
-            picture, [m].
-        bow: How far the board is from flat, highest to lowest, [m].
+        coverage: Number of corners in each cell of the image, shape `CELLS`.
+        tilts: Angle of the board to the image plane in each image, about the x and y axes, shape
+            (images, 2), [deg].
+        distance: Distance for which the errors are stated, [m].
+        nearest: Smallest distance of a board, [m]; proportional to the stated size of the squares.
+        farthest: Largest distance of a board, [m].
+        halves: RMS distance over the image between points at that distance by the fits to two
+            halves of the images, [m].
+        bow: Deviation of the board from flat, highest to lowest, [m].
         bent: Share of the squared errors of the corners that this bow explains.
         radial: Share of them that is a function of the distance from the principal point.
     """
@@ -69,13 +69,13 @@ class CameraQuality:
         return float(np.mean(self.coverage > 0))
 
     def facts(self, found: CameraCalibration) -> list[tuple[str, str]]:
-        """What was found beside the numbers, for people."""
+        """Human-readable details beside the estimates."""
         return [
             ("lens", f"model {found.lens.name}, {len(found.distortion)} coefficients"),
-            ("corners", f"{found.error:.3f} px off (RMS) in {len(found.views)} pictures"),
+            ("reprojection", f"{found.error:.3f} px RMS in {len(found.views)} images"),
             (
-                "boards were",
-                f"{self.nearest:.3g} to {self.farthest:.3g} m away; if not, the sizes are wrong",
+                "board distance",
+                f"{self.nearest:.3g} to {self.farthest:.3g} m; if not, the sizes are wrong",
             ),
             ("covered", f"{self.covered:.0%} of the image; {FULL_COVERAGE:.0%} or more is good"),
             (
@@ -89,16 +89,16 @@ class CameraQuality:
 def judge_camera(
     result: CameraCalibration, wanted: float, distance: float | None = None
 ) -> CameraQuality:
-    """Judges a calibration.
+    """Assesses a calibration.
 
     Args:
         result: The calibration.
-        wanted: What is good enough, [m].
-        distance: At which the camera will measure, [m]; that of the boards when left out, which
-            is true only if the stated size of the squares is: pixels are judged as well then.
+        wanted: Required error, [m].
+        distance: Working distance of the camera, [m]; that of the boards when left out. As that
+            depends on the stated size of the squares, pixels are assessed as well then.
     """
     away = [float(np.linalg.norm(pose.position)) for pose in result.boards.values()]
-    told = distance is not None
+    distance_given = distance is not None
     distance = float(np.median(away)) if distance is None else distance
     coverage, tilts = _coverage(result), _tilts(result)
     slopes = _without_rotation(*_grid_slopes(result))
@@ -108,21 +108,21 @@ def judge_camera(
     halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
     bow, bent = bow_of(result)
     radial = radial_share(*corner_errors(result), result.matrix)
-    lacks = [
-        *_about_pictures(result, coverage, tilts),
-        *_about_the_board(bow, bent),
-        *_about_the_lens(result, radial),
-        *_about_errors(result, coverage, error, halves, wanted, distance),
+    issues = [
+        *_image_issues(result, coverage, tilts),
+        *_board_issues(bow, bent),
+        *_lens_issues(result, radial),
+        *_error_issues(result, coverage, error, halves, wanted, distance),
     ]
     where = f"at {distance:.2g} m"
-    if not told:
+    if not distance_given:
         where += f", if the boards were {min(away):.2g} to {max(away):.2g} m away"
         if not error / scale <= GOOD_PIXELS:
             what = (
-                f"points are seen within {error / scale:.2g} px, {GOOD_PIXELS:.0f} px is required"
+                f"points are seen within {error / scale:.2g} px; {GOOD_PIXELS:.0f} px is required"
             )
-            lacks.append(Issue(what, f"{_more(result)}, or pass --distance-m"))
-    verdict = CalibrationVerdict.of(error, wanted, where, lacks)
+            issues.append(Issue(what, f"{_more(result)}, or pass --distance-m"))
+    verdict = CalibrationVerdict.of(error, wanted, where, issues)
     nearest, farthest = min(away), max(away)
     return CameraQuality(
         verdict, coverage, tilts, distance, nearest, farthest, halves, bow, bent, radial
@@ -137,22 +137,22 @@ def _coverage(result: CameraCalibration) -> Array:
 
 
 def _tilts(result: CameraCalibration) -> Array:
-    """Of the board's normal against the camera's axis, about the image's x and y axes, [deg]."""
+    """Tilt of the board's normal to the optical axis, about the image's axes, [deg]."""
     normals = np.array([pose.rotation[:, 2] for pose in result.boards.values()])
     normals *= np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
     return np.asarray(np.degrees(np.arctan2(normals[:, [1, 0]], normals[:, 2:])))
 
 
-def picture_grid(size: tuple[int, int]) -> Array:
+def image_grid(size: tuple[int, int]) -> Array:
     """Pixels all over an image, shape (81, 2)."""
     across = np.linspace(0.05, 0.95, 9)
     return np.array([(x * size[0], y * size[1]) for x in across for y in across])
 
 
 def pixel_uncertainty(result: CameraCalibration, pixels: Array) -> Array:
-    """Half widths of the 95 % intervals of points that are seen in pixels, [px].
+    """Half widths of the 95 % intervals of points at given pixels, [px].
 
-    Without what the rotation takes up that fits best over the whole image.
+    The rotation that fits best over the whole image is removed.
 
     Args:
         result: The calibration.
@@ -170,18 +170,18 @@ def pixel_uncertainty(result: CameraCalibration, pixels: Array) -> Array:
 
 
 def _grid_slopes(result: CameraCalibration) -> tuple[Array, Array]:
-    return _slopes(result, picture_grid(result.size))
+    return _slopes(result, image_grid(result.size))
 
 
 def _slopes(result: CameraCalibration, pixels: Array) -> tuple[Array, Array]:
-    """Derivatives of pixels by what is unknown of the camera.
+    """Derivatives of pixels by the camera's parameters and rotation.
 
     Args:
         result: The calibration.
         pixels: Shape (rays, 2), [px].
 
     Returns:
-        By the camera's n numbers, shape (rays, 2, n), and by its rotation, shape (rays, 2, 3).
+        By the n parameters, shape (rays, 2, n), and by the rotation, shape (rays, 2, 3).
     """
     lens = result.lens
     flat = rays_of(lens.kind, result.matrix, result.distortion, pixels)
@@ -191,11 +191,11 @@ def _slopes(result: CameraCalibration, pixels: Array) -> tuple[Array, Array]:
 
 
 def _without_rotation(slopes: Array, turns: Array) -> Array:
-    """Derivatives without what a rotation of the camera does as well, shape as ``slopes``.
+    """Derivatives with the equivalent camera rotation projected out, shape as ``slopes``.
 
-    The camera's place is found with the same numbers afterwards, and its orientation takes that
-    part up: cx and p2, say, trade against a turn about y. The rotation is the one that fits best
-    over the picture.
+    The extrinsics are estimated with the same parameters later, and their rotation compensates for
+    that part: cx and p2, for example, trade against a rotation about y. The rotation is the best
+    fit over the image.
 
     Source: mrcal, "Projection uncertainty and the implied transformation" (documentation), Kogan.
     """
@@ -205,10 +205,10 @@ def _without_rotation(slopes: Array, turns: Array) -> Array:
 
 
 def bow_of(result: CameraCalibration) -> tuple[float, float]:
-    """How far the board is from flat, and how much of the corners' errors that explains.
+    """Bow of the board, and the share of the corners' errors that it explains.
 
-    The board's height is taken as a square form of its coordinates, one for all pictures, and
-    fitted to first order together with the camera and the board's poses.
+    The board's height is a quadratic form of its coordinates, the same in all images, fitted to
+    first order together with the camera and the board's poses.
 
     Returns:
         Highest to lowest, [m], and a share of the squared errors.
@@ -241,12 +241,12 @@ def bow_of(result: CameraCalibration) -> tuple[float, float]:
     return float(np.ptp(heights)), float(score @ change) / max(squares, 1e-300)
 
 
-def _bow_shapes(places: Array) -> Array:
-    x, y = places.T
+def _bow_shapes(positions: Array) -> Array:
+    x, y = positions.T
     return np.column_stack([x * x, x * y, y * y])
 
 
-def _about_the_board(bow: float, bent: float) -> list[Issue]:
+def _board_issues(bow: float, bent: float) -> list[Issue]:
     if bent < _BENT:
         return []
     what = f"the board is not flat: it bows by {bow * 1e3:.2g} mm"
@@ -258,56 +258,56 @@ def corner_errors(result: CameraCalibration) -> tuple[Array, Array]:
     corners, errors = [], []
     for name, seen in result.views.items():
         turn = rotation_vector_from_matrix(result.boards[name].rotation)
-        place = result.boards[name].position
-        there = result.lens.slopes(seen.points, turn, place, result.matrix, result.distortion)[0]
+        origin = result.boards[name].position
+        there = result.lens.slopes(seen.points, turn, origin, result.matrix, result.distortion)[0]
         corners.append(seen.corners)
         errors.append(seen.corners - there)
     return np.concatenate(corners), np.concatenate(errors)
 
 
-def _about_the_lens(result: CameraCalibration, radial: float) -> list[Issue]:
+def _lens_issues(result: CameraCalibration, radial: float) -> list[Issue]:
     if radial < RADIAL or result.error < _SEEN:
         return []
     what = (
-        f"the lens bends otherwise than the model {result.lens.name!r} does: {radial:.0%} of the"
-        " squared errors of corners depend on the distance from the middle of the picture"
+        f"the lens model {result.lens.name!r} does not fit: {radial:.0%} of the squared corner"
+        " errors depend on the distance from the image centre"
     )
     others = [name for name in LENSES if name != result.lens.name]
     return [Issue(what, f"try another model: --lens {', '.join(others[:-1])} or {others[-1]}")]
 
 
 def _more(result: CameraCalibration) -> str:
-    """What to do where other pictures would help."""
+    """Next step where more or better images would help."""
     return MORE if len(result.views) < ENOUGH_VIEWS else NEARER
 
 
 def is_below(share: float, limit: float) -> bool:
-    """Whether a share is below a limit as people read both, in whole percent."""
+    """Whether a share is below a limit, both rounded to whole percent."""
     return round(100.0 * share) < round(100.0 * limit)
 
 
-def _about_pictures(result: CameraCalibration, coverage: Array, tilts: Array) -> list[Issue]:
-    """What the set of images lacks, and what to add."""
-    lacks = []
+def _image_issues(result: CameraCalibration, coverage: Array, tilts: Array) -> list[Issue]:
+    """Issues of the set of images."""
+    issues = []
     if len(result.views) < GOOD_VIEWS:
         what = f"{len(result.views)} images show the board; {GOOD_VIEWS} are required"
-        lacks.append(Issue(what, MORE))
+        issues.append(Issue(what, MORE))
     share = float(np.mean(coverage > 0))
     if is_below(share, GOOD_COVERAGE):
         empty = [side for side, axis, at in _SIDES if not coverage.take(at, axis=axis).any()]
-        place = f", none at the {' and '.join(empty)}" if empty else ""
-        what = f"the board covered {share:.0%} of the image{place}; {GOOD_COVERAGE:.0%} is required"
-        lacks.append(Issue(what, EDGES))
+        gap = f", none at the {' and '.join(empty)}" if empty else ""
+        what = f"the board covered {share:.0%} of the image{gap}; {GOOD_COVERAGE:.0%} is required"
+        issues.append(Issue(what, EDGES))
     for axis, name in enumerate(("forward and backward", "left and right")):
         span = float(np.ptp(tilts[:, axis]))
         if span < 2.0 * GOOD_TILT:
             needed = f"{2 * GOOD_TILT:.0f}° is required"
             what = f"the board was tilted {name} over only {span:.0f}°; {needed}"
-            lacks.append(Issue(what, "tilt the board up to 40° in every direction"))
-    return lacks
+            issues.append(Issue(what, "tilt the board up to 40° in every direction"))
+    return issues
 
 
-def _about_errors(
+def _error_issues(
     result: CameraCalibration,
     coverage: Array,
     error: float,
@@ -315,23 +315,23 @@ def _about_errors(
     wanted: float,
     distance: float,
 ) -> list[Issue]:
-    """What the numbers lack, and what to do."""
-    lacks = []
+    """Issues of the errors."""
+    issues = []
     if result.error > GOOD_ERROR:
         what = f"the reprojection error is {result.error:.2f} px"
         step = "take sharp images of a flat board, held still, and check its dimensions"
-        lacks.append(Issue(what, step))
+        issues.append(Issue(what, step))
     if not error <= wanted:
         what = (
             f"points at {distance:.2g} m are measured within {error * 1e3:.2g} mm;"
             f" {wanted * 1e3:.2g} mm are required"
         )
-        lacks.append(Issue(what, _more(result)))
+        issues.append(Issue(what, _more(result)))
         share = float(np.mean(coverage > 0))
         if not is_below(share, GOOD_COVERAGE) and is_below(share, FULL_COVERAGE):
             what = f"the board covered {share:.0%} of the image, {FULL_COVERAGE:.0%} are required"
-            lacks.append(Issue(what, EDGES))
+            issues.append(Issue(what, EDGES))
     if not halves <= 2.0 * wanted:
-        what = f"two halves of the pictures see them {halves * 1e3:.2g} mm apart"
-        lacks.append(Issue(what, _more(result)))
-    return lacks
+        what = f"fits to two halves of the images differ by {halves * 1e3:.2g} mm"
+        issues.append(Issue(what, _more(result)))
+    return issues

@@ -1,8 +1,8 @@
-"""How long a camera takes from its top row to its bottom row, by a platform that moves before it.
+"""Readout time of a camera from top row to bottom row, from images of a moving platform.
 
-Each row shows the platform a little later than the one above: a tag that goes down is stretched,
-one that goes sideways is sheared. The readout is that with which the edges of all tags in all
-images fit rigid poses best; the platform's motion follows from the images before and after.
+Each row is exposed slightly after the one above: a tag that moves down is stretched, one that moves
+sideways is sheared. The estimated readout is that for which the edges of all tags in all images fit
+rigid poses best; the platform's motion follows from the images before and after.
 
 Source: Oth, Furgale, Kneip & Siegwart, "Rolling shutter camera calibration", CVPR 2013.
 """
@@ -23,7 +23,7 @@ from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, interval_rows, page_of, table_of
 from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import CONFIDENCE, Interval
-from calibration.tag_map.observations import TagSights
+from calibration.tag_map.observations import TagObservations
 from model.errors import BadInput
 from model.files.camera_file import Readout
 from model.files.documents import AnyNonNegative, Positive
@@ -32,13 +32,13 @@ from model.pose import Array, PlatformMotion, Pose
 from model.rig import Camera, Rig
 from tracking.measurement import MEMORY
 from tracking.pnp import TagView, refine_pnp, solve_pnp
-from tracking.rolling_shutter import rows_at_once
+from tracking.rolling_shutter import correct_rolling_shutter
 
 LEAST = 5
-"""Images with a known motion; fewer show nothing of the scatter."""
+"""Minimum number of images with a known motion; fewer do not show the scatter."""
 GOOD = 20
 _STEP = 2e-4
-"""Of the readout, for how the errors depend on it, [s]."""
+"""Step of the readout for finite differences, [s]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,15 +46,14 @@ class ReadoutCalibration:
     """A camera's readout.
 
     Attributes:
-        camera: As the rig has it.
+        camera: As in the rig file.
         readout: From the exposure of the top row to that of the bottom row, [s].
         half_width: Of its 95 % interval, [s].
         speeds: Of the platform in each image used, by name, [m/s].
-        before: Root mean square of the edges' errors as if all rows were exposed at once, in their
-            standard deviations.
+        before: RMS edge error with a global shutter, in standard deviations.
         after: The same with the readout.
         unused: Why other images are not used.
-        data_hash: Of what was seen.
+        data_hash: Of the observations.
     """
 
     camera: Camera
@@ -67,11 +66,11 @@ class ReadoutCalibration:
     data_hash: str
 
     def facts(self) -> list[tuple[str, str]]:
-        """What was found beside the number, for people."""
+        """Human-readable details beside the estimate."""
         fastest, used = max(self.speeds.values()) * 1e3, len(self.speeds)
-        off = f"{self.before:.2f} standard deviations off before, {self.after:.2f} after"
+        off = f"error {self.before:.2f} standard deviations before, {self.after:.2f} after"
         return [
-            ("pictures", f"{used} used, the platform's speed up to {fastest:.0f} mm/s"),
+            ("images", f"{used} used, platform speed up to {fastest:.0f} mm/s"),
             ("edges", off),
         ]
 
@@ -83,7 +82,7 @@ class ReadoutCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Moving:
-    """An image of a platform whose motion is known."""
+    """An image of the platform with a known motion."""
 
     views: list[TagView]
     pose: Pose
@@ -92,26 +91,26 @@ class _Moving:
 
     def cost(self, camera: Camera) -> float:
         """Huber cost of the edges at the camera's readout, in variances."""
-        views = rows_at_once(camera, self.views, self.pose, self.motion)
+        views = correct_rolling_shutter(camera, self.views, self.pose, self.motion)
         found = refine_pnp(camera, views, self.camera_from_body)
         return float("inf") if found is None else found.cost
 
 
 def fit_readout(
-    rig: Rig, camera: Camera, sights: TagSights, times: Mapping[str, float]
+    rig: Rig, camera: Camera, observations: TagObservations, times: Mapping[str, float]
 ) -> ReadoutCalibration:
-    """Finds the readout.
+    """Estimates the readout.
 
     Args:
         rig: Its platform carries the tags.
-        camera: Its matrix and distortion hold.
-        sights: What was seen in images of the moving platform.
-        times: When these were taken, by name, [s].
+        camera: Its matrix and distortion are taken as known.
+        observations: Tags in images of the moving platform.
+        times: Capture times of the images, by name, [s].
 
     Raises:
-        BadInput: Too few images show the platform in motion, or its motion shows nothing.
+        BadInput: Too few images show the platform in motion, or do not determine the readout.
     """
-    moving, unused = _moving(rig, camera, sights, times)
+    moving, unused = _moving(rig, camera, observations, times)
     if len(moving) < LEAST:
         raise BadInput(
             f"{len(moving)} images show the platform between two others at most {MEMORY:g} s away;"
@@ -152,20 +151,20 @@ def fit_readout(
         speeds={n: float(np.linalg.norm(i.motion.velocity)) for n, i in moving.items()},
         before=float(np.sqrt(costs(0.0).sum() / edges)),
         after=float(np.sqrt(middle.sum() / edges)),
-        unused={**sights.unused, **unused},
-        data_hash=sights.data_hash(),
+        unused={**observations.unused, **unused},
+        data_hash=observations.data_hash(),
     )
 
 
 def _moving(
-    rig: Rig, camera: Camera, sights: TagSights, times: Mapping[str, float]
+    rig: Rig, camera: Camera, observations: TagObservations, times: Mapping[str, float]
 ) -> tuple[dict[str, _Moving], dict[str, str]]:
-    """Images whose motion is known by their neighbours, and why others are not used."""
+    """Images with a known motion from their neighbours, and why others are not used."""
     tags = {tag.id: tag for tag in rig.platform_tags}
     seen: list[tuple[str, list[TagView], Pose]] = []
     unused = {}
-    for name in sorted(sights.squares, key=lambda n: times[n]):
-        views = [TagView(tags[k], square) for k, square in sights.squares[name].items()]
+    for name in sorted(observations.squares, key=lambda n: times[n]):
+        views = [TagView(tags[k], square) for k, square in observations.squares[name].items()]
         bundle = solve_pnp(camera, views, seen[-1][2] if seen else None)
         if bundle is None:
             unused[name] = "no pose fits its tags"
@@ -186,7 +185,7 @@ def _moving(
 
 
 def _half_width(bends: Array, slopes: Array, cost: float, freedom: int) -> float:
-    """Of the 95 % interval: the larger of the scatter of edges and of the jackknife over images."""
+    """Half width of the 95 % interval: the larger of scatter and jackknife over images."""
     whole, count = float(bends.sum()), len(bends)
     if not whole > 0.0:
         return float("inf")
@@ -200,23 +199,23 @@ def _half_width(bends: Array, slopes: Array, cost: float, freedom: int) -> float
 
 
 def judge_readout(found: ReadoutCalibration, wanted: float, speed: float) -> CalibrationVerdict:
-    """What a readout is good for.
+    """The verdict on a readout.
 
     Args:
         found: The readout.
-        wanted: What is good enough, [m].
-        speed: Of the platform, for which the error is stated, [m/s].
+        wanted: Required error, [m].
+        speed: Platform speed for which the error is stated, [m/s].
     """
     error = 0.5 * found.half_width * speed  # rows at an edge of the image
-    lacks = []
+    issues = []
     step = "record more images of a faster platform, with tags all over the image's height"
     if len(found.speeds) < GOOD:
-        lacks.append(Issue(f"{len(found.speeds)} images were used; {GOOD} are required", step))
+        issues.append(Issue(f"{len(found.speeds)} images were used; {GOOD} are required", step))
     if not error <= wanted:
-        what = f"{error * 1e3:.2g} mm remain open, {wanted * 1e3:.2g} mm are required"
-        lacks.append(Issue(what, step))
+        what = f"the error is {error * 1e3:.2g} mm; {wanted * 1e3:.2g} mm are required"
+        issues.append(Issue(what, step))
     where = f"at {speed * 1e3:.0f} mm/s"
-    return CalibrationVerdict.of(error, wanted, where, lacks)
+    return CalibrationVerdict.of(error, wanted, where, issues)
 
 
 class ReadoutResult(ResultDocument):
@@ -234,7 +233,7 @@ class ReadoutResult(ResultDocument):
     edges_after: AnyNonNegative = Field(description="the same with readout_ms")
 
     def apart_mm(self, other: Self) -> float:
-        """How far apart a platform is measured at this speed at an edge of the image, [mm]."""
+        """Distance between measurements at this speed at the image border, [mm]."""
         return abs(self.readout_ms - other.readout_ms) / 2e3 * self.speed_mm_s
 
     def corrected(self, rig: RigDocument) -> RigDocument:
@@ -250,7 +249,7 @@ class ReadoutResult(ResultDocument):
 def readout_result(
     found: ReadoutCalibration, verdict: CalibrationVerdict, speed: float, on: date
 ) -> ReadoutResult:
-    """The result with its quality; the speed is that of the verdict, [m/s]."""
+    """The result file's content; the speed is that of the verdict, [m/s]."""
     return ReadoutResult(
         **common_keys(
             found.camera.name,
@@ -269,13 +268,13 @@ def readout_result(
 
 
 def readout_page(found: ReadoutCalibration, verdict: CalibrationVerdict, on: str) -> str:
-    """The report."""
+    """The report page."""
     images: Sequence[tuple[str, str]] = [
         (name, f"{speed * 1e3:.0f} mm/s") for name, speed in found.speeds.items()
     ]
     errors = [
-        ("edges off, all rows at once", f"{found.before:.2f} standard deviations"),
-        ("edges off, with the readout", f"{found.after:.2f} standard deviations"),
+        ("edge error, global shutter", f"{found.before:.2f} standard deviations"),
+        ("edge error, with the readout", f"{found.after:.2f} standard deviations"),
     ]
     return page_of(
         f"Readout of camera {found.camera.name}",
@@ -283,7 +282,7 @@ def readout_page(found: ReadoutCalibration, verdict: CalibrationVerdict, on: str
         verdict,
         [
             Section("Readout", table_of([*interval_rows(found.intervals), *errors])),
-            Section("Images used", table_of(images, ("image", "the platform's speed"))),
+            Section("Images used", table_of(images, ("image", "platform speed"))),
             Section("Images not used", table_of(found.unused.items())),
         ],
     )

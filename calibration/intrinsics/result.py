@@ -1,6 +1,6 @@
-"""The result file of a camera's matrix and lens distortion, and its page with figures.
+"""Result file and report of a camera's matrix and lens distortion.
 
-The figures show what was covered, how sure pixels are, and how corners err.
+The report's figures show coverage, pixel uncertainty and corner errors.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from calibration.intrinsics.calibrate import CameraCalibration
 from calibration.intrinsics.quality import (
     CameraQuality,
     corner_errors,
-    picture_grid,
+    image_grid,
     pixel_uncertainty,
 )
 from calibration.report import Section, drawing, interval_rows, page_of, table_of
 from calibration.results import ResultDocument, common_keys
-from calibration.targets.boards import Seen
+from calibration.targets.boards import DetectedBoard
 from model.errors import BadInput
 from model.files.camera_file import CameraDocument, LensCovariance, LensName
 from model.files.documents import AnyNonNegative, AnyNumber, Positive
@@ -35,16 +35,16 @@ from tracking.camera_model import rays_of
 
 _WIDTH = 560.0
 _MOST_ARROWS = 1500
-"""More of them hide each other and make the page slow."""
+"""More arrows overlap and make the page slow."""
 _LONGEST = 0.04
-"""Of an arrow of the usual error, as share of the figure's width."""
+"""Length of the arrow of the median error, as a share of the figure's width."""
 _MAP = (16, 10)
 """Columns and rows of the map of uncertainty."""
 _RINGS = 12
 
 
 def coverage_map(result: CameraCalibration, quality: CameraQuality) -> str:
-    """Corners seen, on cells that are darker the more corners they have."""
+    """Figure of all detected corners, on cells shaded by their number of corners."""
     width, height = result.size
     scale = _WIDTH / width
     columns, rows = quality.coverage.shape
@@ -67,7 +67,7 @@ def coverage_map(result: CameraCalibration, quality: CameraQuality) -> str:
 
 
 def tilt_figure(quality: CameraQuality) -> str:
-    """Tilt of each image's board, about both axes, ± 50°."""
+    """Figure of the board's tilt in each image, about both axes, ± 50°."""
     dots = "".join(
         f'<circle cx="{140 + 2.4 * np.clip(y, -50, 50):.1f}"'
         f' cy="{140 - 2.4 * np.clip(x, -50, 50):.1f}" r="4" fill="var(--ink)"/>'
@@ -83,7 +83,7 @@ def tilt_figure(quality: CameraQuality) -> str:
 
 
 def uncertainty_figure(result: CameraCalibration, quality: CameraQuality) -> str:
-    """Half widths of the 95 % intervals of pixels, on a map with a number in every third cell."""
+    """Map of the half widths of pixels' 95 % intervals, labelled in every third cell."""
     (width, height), (columns, rows) = result.size, _MAP
     scale = _WIDTH / width
     across = (np.arange(columns) + 0.5) / columns * width
@@ -112,7 +112,7 @@ def uncertainty_figure(result: CameraCalibration, quality: CameraQuality) -> str
 
 
 def residual_arrows(result: CameraCalibration) -> str:
-    """Errors of the corners of all images, magnified."""
+    """Figure of the corner errors of all images, magnified."""
     corners, errors = corner_errors(result)
     every = -(-len(corners) // _MOST_ARROWS)
     scale = _WIDTH / result.size[0]
@@ -127,12 +127,12 @@ def _caption(text: str) -> str:
     return f'<p class="quiet">{escape(text)}</p>'
 
 
-def _arrows(begins: Array, ways: Array) -> str:
-    """Lines with a dot where they begin; both in the figure's coordinates, shape (n, 2)."""
+def _arrows(begins: Array, offsets: Array) -> str:
+    """Lines with a dot at their start; both in figure coordinates, shape (n, 2)."""
     return "".join(
         f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx:.1f}" y2="{y + dy:.1f}"'
         f' stroke="var(--ink)"/><circle cx="{x:.1f}" cy="{y:.1f}" r="1" fill="var(--limit)"/>'
-        for (x, y), (dx, dy) in zip(begins, ways, strict=True)
+        for (x, y), (dx, dy) in zip(begins, offsets, strict=True)
     )
 
 
@@ -165,7 +165,7 @@ def radial_pattern(result: CameraCalibration) -> str:
 
 
 def worst_picture(result: CameraCalibration) -> Sequence[Section]:
-    """The image with the greatest error and the board as the fit puts it; none without images."""
+    """The image with the largest error and the fitted board; empty without images."""
     name = max(result.view_errors, key=lambda key: result.view_errors[key])
     image = result.previews.get(name)
     if image is None:
@@ -180,9 +180,9 @@ def worst_picture(result: CameraCalibration) -> Sequence[Section]:
     data = base64.b64encode(cv2.imencode(".jpg", image)[1].tobytes()).decode()
     area = f'width="{size[0]:.0f}" height="{size[1]:.1f}"'
     shapes = f'<image href="data:image/jpeg;base64,{data}" {area}/>'
-    drawn = there * scale
+    projected = there * scale
     for a, b in _neighbours(seen):
-        (x1, y1), (x2, y2) = drawn[a], drawn[b]
+        (x1, y1), (x2, y2) = projected[a], projected[b]
         shapes += (
             f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"'
             ' stroke="var(--encoder)" stroke-opacity="0.8"/>'
@@ -193,24 +193,24 @@ def worst_picture(result: CameraCalibration) -> Sequence[Section]:
     shapes += "".join(
         f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx:.1f}" y2="{y + dy:.1f}"'
         ' stroke="var(--limit)" stroke-width="1.5"/>'
-        for (x, y), (dx, dy) in zip(drawn, errors * by, strict=True)
+        for (x, y), (dx, dy) in zip(projected, errors * by, strict=True)
     )
     label = (
-        f"{name}: {result.view_errors[name]:.2f} px; the board where the fit puts it, and errors"
+        f"{name}: {result.view_errors[name]:.2f} px; the fitted board, and errors drawn"
         f" {by / scale:.3g} times as long."
     )
     return [Section("The worst image", drawing(shapes, size, label), label)]
 
 
-def _neighbours(seen: Seen) -> list[tuple[int, int]]:
-    """Pairs of points of a board that are next to each other."""
+def _neighbours(seen: DetectedBoard) -> list[tuple[int, int]]:
+    """Pairs of neighbouring points of a board."""
     gaps = np.linalg.norm(seen.points[:, None] - seen.points[None], axis=2)
     np.fill_diagonal(gaps, np.inf)
     near = gaps < 1.05 * np.median(gaps.min(axis=1))
     return [(int(a), int(b)) for a, b in np.argwhere(np.triu(near))]
 
 
-# The result and its page.
+# Result file.
 
 
 Pixels = Annotated[int, Field(ge=1, le=16384)]
@@ -249,9 +249,9 @@ class CameraResult(ResultDocument):
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     def apart_mm(self, other: Self) -> float:
-        """How far apart points at the distance are seen, RMS over the image, [mm].
+        """RMS distance over the image between points at the stated distance by both, [mm].
 
-        A rotation between both cameras, as their places take it up, does not count.
+        A rotation between both cameras is removed: the extrinsics compensate for it.
 
         Raises:
             BadInput: The images are of different sizes.
@@ -264,18 +264,18 @@ class CameraResult(ResultDocument):
                 next_step="compare results for one image size",
             )
         flat = [
-            rays_of(r.lens, r.matrix, np.array(r.distortion), picture_grid(size))
+            rays_of(r.lens, r.matrix, np.array(r.distortion), image_grid(size))
             for r in (self, other)
         ]
         rays = [np.column_stack([part, np.ones(len(part))]) for part in flat]
         units = [part / np.linalg.norm(part, axis=1, keepdims=True) for part in rays]
         turn = Rotation.align_vectors(units[0], units[1])[0].as_matrix()
-        turned = rays[1] @ turn.T
-        squares = np.sum((turned[:, :2] / turned[:, 2:] - flat[0]) ** 2, axis=1)
+        rotated = rays[1] @ turn.T
+        squares = np.sum((rotated[:, :2] / rotated[:, 2:] - flat[0]) ** 2, axis=1)
         return float(np.sqrt(np.mean(squares))) * self.distance_m * 1e3
 
     def corrected(self, rig: RigDocument) -> RigDocument:
-        """The rig file's content with this camera's numbers.
+        """The rig file's content with this camera's parameters.
 
         Raises:
             BadInput: The rig has no camera of this name, or one of another size.
@@ -296,11 +296,11 @@ class CameraResult(ResultDocument):
 def camera_result(
     result: CameraCalibration, quality: CameraQuality, name: str, on: date
 ) -> CameraResult:
-    """The result with its quality.
+    """The result file's content.
 
     Args:
-        result: What was found.
-        quality: What it is good for.
+        result: The calibration.
+        quality: Its quality.
         name: Of the camera in the rig file.
         on: The date.
     """
@@ -326,10 +326,10 @@ def camera_result(
 
 
 def camera_named(rig: RigDocument, name: str) -> CameraDocument:
-    """A camera of a rig file.
+    """The camera of a name in a rig file.
 
     Raises:
-        BadInput: It has none of this name; those that it has are listed.
+        BadInput: There is none of this name; the existing names are listed.
     """
     for camera in rig.cameras:
         if camera.name == name:
@@ -344,30 +344,30 @@ def camera_named(rig: RigDocument, name: str) -> CameraDocument:
 
 
 def with_camera(rig: RigDocument, changed: CameraDocument) -> RigDocument:
-    """The rig file's content with a camera in place of that of its name."""
+    """The rig file's content with the camera of the same name replaced."""
     cameras = [changed if camera.name == changed.name else camera for camera in rig.cameras]
     return rig.model_copy(update={"cameras": cameras})
 
 
-# The report of a camera calibration.
+# Report.
 
 
 def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, date: str) -> str:
-    """The whole page."""
+    """The report page."""
     lead = (
         f"{date}, {result.size[0]} × {result.size[1]} px, {len(result.views)} images used,"
         f" {len(result.unused)} not"
     )
     covered = f"{quality.covered:.0%} of the image's cells contain corners"
-    tilted = "A dot per image: vertical for forward and backward, horizontal for left and right."
+    tilted = "One dot per image: forward and backward tilt vertically, left and right horizontally."
     sure = (
-        "Half widths of the 95 % intervals of points seen there, without what a rotation of the"
-        " camera takes up."
+        "Half widths of the 95 % intervals of points seen there, without a common rotation of the"
+        " camera."
     )
-    arrows = "From where a corner is expected towards where it was detected."
+    arrows = "From the expected towards the detected corner."
     along = (
-        "Mean error away from the principal point, in rings with as many corners each; bars are 95"
-        " % of the mean. A lens that the model fits has none."
+        "Mean error away from the principal point, in rings of equal numbers of corners; bars are"
+        " 95 % intervals of the mean. With the right lens model it is zero."
     )
     used = "Error, corners, and change of fx without the image."
     return page_of(
@@ -377,12 +377,12 @@ def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, da
         [
             Section("Parameters, with 95 % intervals", _numbers(result, quality)),
             Section("Where the board was seen", coverage_map(result, quality), covered),
-            Section("How sure pixels are", uncertainty_figure(result, quality), sure),
+            Section("Uncertainty of pixels", uncertainty_figure(result, quality), sure),
             Section("Errors of corners", residual_arrows(result), arrows),
-            Section("Errors along the radius", radial_pattern(result), along),
+            Section("Radial errors", radial_pattern(result), along),
             *worst_picture(result),
-            Section("How the board was tilted", tilt_figure(quality), tilted),
-            Section("Images used", _pictures(result), used),
+            Section("Tilt of the board", tilt_figure(quality), tilted),
+            Section("Images used", _image_table(result), used),
             Section("Images not used", table_of(result.unused.items())),
         ],
     )
@@ -393,19 +393,19 @@ def _numbers(result: CameraCalibration, quality: CameraQuality) -> str:
     return table_of(
         [
             *interval_rows(result.intervals),
-            ("lens model", f"{result.lens.name}, errors along the radius {quality.radial:.0%}"),
-            ("corners off, RMS", f"{result.error:.3f} px"),
+            ("lens model", f"{result.lens.name}, radial share of errors {quality.radial:.0%}"),
+            ("reprojection error, RMS", f"{result.error:.3f} px"),
             (f"a point {verdict.where}", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
-            ("boards were", f"{quality.nearest:.3g} to {quality.farthest:.3g} m away"),
-            ("two halves of the pictures", f"{quality.halves * 1e3:.2g} mm apart there"),
-            ("the board's bow", f"{quality.bow * 1e3:.2g} mm, {quality.bent:.0%} of the errors"),
+            ("board distance", f"{quality.nearest:.3g} to {quality.farthest:.3g} m"),
+            ("two halves of the images", f"{quality.halves * 1e3:.2g} mm apart there"),
+            ("bow of the board", f"{quality.bow * 1e3:.2g} mm, {quality.bent:.0%} of the errors"),
             ("data", result.data_hash[:23]),
         ]
     )
 
 
-def _pictures(result: CameraCalibration) -> str:
-    """Error of each picture, and how much of the focal length hangs on it."""
+def _image_table(result: CameraCalibration) -> str:
+    """Table with the error of each image and its influence on the focal length."""
     change = result.uncertainty.without[:, 0]
     rows = [
         (name, f"{error:.3f} px", f"{len(seen.corners)}", f"{without:+z.2f} px")

@@ -1,9 +1,9 @@
-"""Where the tags are on the platform: all of them and all images fitted together.
+"""Tag layout of the platform by bundle adjustment over all tags and all images.
 
-Every image may be taken from anywhere; its camera pose is an unknown as well (bundle adjustment).
-Images give the layout only up to a rigid motion of the platform's frame; it is put where the
-layout fits the rig file best, or where one tag is as there. What an image says of the layout, its
-camera pose projected out, is added up as in `calibration.intrinsics.calibrate`.
+Images may be taken from anywhere: the camera pose of each is an unknown too. They determine the
+layout only up to a rigid motion; the platform frame is set by the best fit to the rig file, or by
+one tag kept as there. Each image's information about the layout, its camera pose projected out,
+is summed as in `calibration.intrinsics.calibrate`.
 """
 
 from __future__ import annotations
@@ -15,52 +15,52 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from calibration.extrinsics.result import widths_of
-from calibration.tag_map.observations import TagSights, TagViews, moved_tags
+from calibration.tag_map.observations import TagObservations, TagViews, moved_tags
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.detection.tags import tag_corners
 from tracking.pnp import TagView, moved, solve_pnp
 
-# Poses of cameras and tags of a platform fitted together: the start, the fit, what spoils it.
+# Joint fit of camera poses and tag poses: initial poses, fit, outliers.
 
 
 HUBER = 3.0
 """Errors of edges beyond this many deviations count linearly."""
 _NARROWING = (1e4, 1e2, 2e1, HUBER)
 _FAR_OFF_PX = 2.0
-"""An image whose corners are farther off does not show this platform as it is."""
+"""Corner errors above this mean that an image does not show this platform as it is."""
 
 
-def far_off(sights: TagSights, errors: Sequence[float]) -> dict[str, str]:
-    """The image that fits the others least, and why, where it is far off: it smears the fit."""
-    name, error = max(zip(sights.squares, errors, strict=True), key=lambda item: item[1])
+def outlier_image(observations: TagObservations, errors: Sequence[float]) -> dict[str, str]:
+    """The worst image and the reason, if it is an outlier; else empty."""
+    name, error = max(zip(observations.squares, errors, strict=True), key=lambda item: item[1])
     if error <= max(_FAR_OFF_PX, 4.0 * float(np.median(errors))):
         return {}
     return {name: f"has a corner error of {error:.2f} px, far more than the others"}
 
 
-def starts_of(
-    camera: Camera, drawn: Mapping[int, Tag], sights: TagSights
-) -> tuple[dict[str, Pose], TagSights]:
-    """``camera_from_platform`` of each image by the rig file; images without one are named."""
+def initial_poses(
+    camera: Camera, nominal: Mapping[int, Tag], observations: TagObservations
+) -> tuple[dict[str, Pose], TagObservations]:
+    """``camera_from_platform`` of each image by the rig file's tags; drops images without."""
     starts = {}
-    for name, squares in sights.squares.items():
-        found = solve_pnp(camera, [TagView(drawn[k], s) for k, s in squares.items()])
+    for name, squares in observations.squares.items():
+        found = solve_pnp(camera, [TagView(nominal[k], s) for k, s in squares.items()])
         if found is not None:
             starts[name] = found.camera_from_body
-    strange = {
+    outliers = {
         name: "fits no platform pose with the rig file's tags"
-        for name in sights.squares
+        for name in observations.squares
         if name not in starts
     }
-    return starts, sights.without(strange)
+    return starts, observations.without(outliers)
 
 
-def fitted(
+def adjust_bundle(
     views: TagViews, cameras: Sequence[Pose], tags: tuple[Tag, ...]
 ) -> tuple[list[Pose], tuple[Tag, ...]]:
-    """Poses of the cameras and tags that fit; the first tag holds still meanwhile."""
+    """Fitted camera poses and tags; the first tag stays fixed meanwhile."""
     count = 6 * len(cameras)
 
     def at(x: Array) -> tuple[list[Pose], tuple[Tag, ...]]:
@@ -75,8 +75,8 @@ def fitted(
         whole = views.dense_slopes(*at(x))
         return np.delete(whole, np.s_[count : count + 6], axis=1)
 
-    # The rig file may be many deviations off, where Huber's loss hardly pulls: so it narrows.
-    # Each round starts again from the last result: steps are small turns about the present poses.
+    # The rig file may be many deviations off, where Huber's loss has little gradient: so its scale
+    # narrows. Each round restarts at the last result: steps are small rotations of current poses.
     for scale in _NARROWING:
         found = least_squares(
             lambda x: views.errors(*at(x)).ravel(),
@@ -91,11 +91,11 @@ def fitted(
     return list(cameras), tags
 
 
-# Where the platform's frame is in a layout: images do not determine it, the rig file does.
+# Platform frame of a layout: the rig file determines it, images do not.
 
 
 def corner_slopes(tags: Sequence[Tag]) -> Array:
-    """How corners shift when tags shift and turn, shape (4 t, 3, 6 t)."""
+    """Derivatives of corners by tag poses, shape (4 t, 3, 6 t)."""
     slopes = np.zeros((4 * len(tags), 3, 6 * len(tags)))
     for k, tag in enumerate(tags):
         for corner, arm in enumerate(tag_corners(tag) - tag.pose.position):
@@ -103,29 +103,31 @@ def corner_slopes(tags: Sequence[Tag]) -> Array:
     return slopes
 
 
-def to_drawing(tags: Sequence[Tag], drawn: Sequence[Tag], fixed: int | None) -> tuple[Pose, float]:
-    """The motion that puts tags where the rig file has them, and their size by that there.
+def align_to_nominal(
+    tags: Sequence[Tag], nominal: Sequence[Tag], fixed: int | None
+) -> tuple[Pose, float]:
+    """The motion that aligns tags with the rig file, and their scale relative to it.
 
     Source: Umeyama 1991.
     """
     here = np.concatenate([tag_corners(tag) for tag in tags])
-    there = np.concatenate([tag_corners(tag) for tag in drawn])
+    there = np.concatenate([tag_corners(tag) for tag in nominal])
     a, b = here - here.mean(axis=0), there - there.mean(axis=0)
     left, _, right = np.linalg.svd(b.T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     rotation = left * sign @ right
-    places = [np.array([tag.pose.position for tag in which]) for which in (tags, drawn)]
-    sizes = [float(np.linalg.norm(place - place.mean(axis=0))) for place in places]
+    positions = [np.array([tag.pose.position for tag in which]) for which in (tags, nominal)]
+    sizes = [float(np.linalg.norm(p - p.mean(axis=0))) for p in positions]
     scale = sizes[0] / sizes[1]
     if fixed is not None:
         (one,) = (tag for tag in tags if tag.id == fixed)
-        (other,) = (tag for tag in drawn if tag.id == fixed)
+        (other,) = (tag for tag in nominal if tag.id == fixed)
         return other.pose.compose(one.pose.inverse()), scale
     return Pose(there.mean(axis=0) - rotation @ here.mean(axis=0), rotation), scale
 
 
 def fix_gauge(tags: Sequence[Tag], fixed: int | None) -> Array:
-    """What must not change with the layout, shape (6, 6 t): it would move the platform's frame."""
+    """Gauge constraints, shape (6, 6 t): layout changes that would move the platform frame."""
     if fixed is not None:
         which = [tag.id for tag in tags].index(fixed)
         return np.eye(6 * len(tags))[6 * which : 6 * which + 6]
@@ -136,18 +138,18 @@ def fix_gauge(tags: Sequence[Tag], fixed: int | None) -> Array:
     return np.concatenate([slopes.sum(axis=0), turns / 0.05])
 
 
-# Which tags can be located: those that images tie to each other.
+# Locatable tags: those that images connect to each other.
 
 
 def connected_tags(pictures: Sequence[Iterable[int]], fixed: int | None = None) -> list[int]:
-    """The largest group of tags that are tied by images that show two or more of them.
+    """The largest group of tags connected by images that show two or more of them.
 
     Args:
-        pictures: Numbers of the tags in each.
-        fixed: A tag whose group is wanted instead.
+        pictures: Tag numbers in each image.
+        fixed: Select the group of this tag instead.
 
     Returns:
-        Their numbers in order; none where nothing was seen.
+        Their numbers in order; empty when no image shows a tag.
     """
     groups: list[set[int]] = []
     for numbers in map(set, pictures):
@@ -161,30 +163,30 @@ def connected_tags(pictures: Sequence[Iterable[int]], fixed: int | None = None) 
 
 
 LEAST_PICTURES = 4
-"""Of two tags or more; twenty are good."""
+"""Images of two tags or more; twenty are good."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagLayout:
-    """Tags of the platform as they were measured.
+    """Measured tag layout of the platform.
 
     Attributes:
-        drawn: The tags as the rig file has them, those that were located.
-        tags: The same as they are.
+        nominal: The located tags as in the rig file.
+        tags: The same tags as measured.
         covariance: Of each tag's position [m] and rotation vector [rad] along the platform's axes,
             shape (6 t, 6 t).
         half_widths: Of the 95 % intervals of the same, shape (6 t,).
-        fixed: Number of the tag that is as in the rig file; None where all fit the rig file best.
+        fixed: Number of the tag kept as in the rig file; None for the best fit of all.
         errors: RMS corner error of each image, by name, [px].
-        seen: In how many images each tag was, by number.
-        unseen: Why each of the other tags is as in the rig file, by number.
+        seen: Number of images that show each tag, by tag number.
+        unseen: Why each other tag keeps its pose of the rig file, by tag number.
         sides: Largest angle between directions from which images were taken, [rad].
-        scale: Size of the layout by that of the rig file.
+        scale: Size of the layout relative to the rig file.
         unused: Why images are not used, by name.
-        data_hash: Of what was seen.
+        data_hash: Of the observations.
     """
 
-    drawn: tuple[Tag, ...]
+    nominal: tuple[Tag, ...]
     tags: tuple[Tag, ...]
     covariance: Array
     half_widths: Array
@@ -199,7 +201,7 @@ class TagLayout:
 
     @property
     def error(self) -> float:
-        """How far off corners of tags may be, 95 %, RMS, [m]."""
+        """Error of tag corners, 95 %, RMS, [m]."""
         deviations = np.sqrt(np.diag(self.covariance))
         factors = np.where(deviations > 0.0, self.half_widths / np.maximum(deviations, 1e-15), 0.0)
         grown = self.covariance * np.outer(factors, factors)
@@ -216,68 +218,68 @@ def require_tags(rig: Rig, fixed: int | None) -> None:
     """Refuses a rig whose layout cannot be measured.
 
     Raises:
-        BadInput: Its platform has one tag or none, or not the one that is to be as in the rig file.
+        BadInput: Its platform has fewer than two tags, or lacks the fixed one.
     """
     numbers = [tag.id for tag in rig.platform_tags]
-    told = f"tags of the platform: {', '.join(map(str, numbers)) or 'none'}"
+    known = f"tags of the platform: {', '.join(map(str, numbers)) or 'none'}"
     if len(numbers) < 2:
         raise BadInput(
             "the platform has fewer than two tags, so their poses cannot be compared",
             where=f"rig {rig.name}",
-            why=told,
+            why=known,
             next_step="add the platform's tags to the rig file under tags: platform",
         )
     if fixed is not None and fixed not in numbers:
         raise BadInput(
             f"no tag {fixed} on the platform",
             where="--fixed-tag",
-            why=told,
+            why=known,
             next_step="name one of them",
         )
 
 
 def measure_layout(
-    rig: Rig, camera: Camera, sights: TagSights, fixed: int | None = None
+    rig: Rig, camera: Camera, observations: TagObservations, fixed: int | None = None
 ) -> TagLayout:
-    """Finds the layout of the platform's tags.
+    """Measures the layout of the platform's tags.
 
     Args:
-        rig: Its platform tags as in the rig file; their sizes hold.
-        camera: Its matrix and distortion hold.
-        sights: Of platform tags, from anywhere.
-        fixed: Number of the tag that is as in the rig file; left out, all fit the rig file best.
+        rig: Its platform tags as in the rig file; their sizes are taken as known.
+        camera: Its matrix and distortion are taken as known.
+        observations: Of platform tags, from any camera pose.
+        fixed: Number of the tag kept as in the rig file; None for the best fit of all.
 
     Raises:
-        BadInput: Too few images show two tags or more, or none shows the fixed tag with others.
+        BadInput: Too few images show two tags or more, or the fixed tag with others.
     """
-    drawn = {tag.id: tag for tag in rig.platform_tags}
+    nominal = {tag.id: tag for tag in rig.platform_tags}
     single = {
         name: "shows only one tag, which does not locate the others"
-        for name, squares in sights.squares.items()
+        for name, squares in observations.squares.items()
         if len(squares) < 2
     }
-    sights = sights.without(single).each_view_once()
-    starts, sights = starts_of(camera, drawn, sights)
-    located = connected_tags([tuple(squares) for squares in sights.squares.values()], fixed)
+    observations = observations.without(single).without_duplicates()
+    starts, observations = initial_poses(camera, nominal, observations)
+    located = connected_tags([tuple(squares) for squares in observations.squares.values()], fixed)
     among = fixed if fixed is not None else next(iter(located), None)
-    sights = sights.without(
+    observations = observations.without(
         {
             name: f"shows only tags that no image shows together with tag {among}"
-            for name, squares in sights.squares.items()
+            for name, squares in observations.squares.items()
             if not set(squares) <= set(located)
         }
     )
-    if len(sights.squares) < LEAST_PICTURES:
-        raise _too_few(sights, fixed)
-    tags = tuple(drawn[number] for number in located)
-    views = TagViews.of(camera, sights, tags)
-    fit = fitted(views, [starts[name] for name in sights.squares], tags)
-    if strange := far_off(sights, views.picture_errors(*fit)):
-        sights = sights.without(strange)
-        if len(sights.squares) < LEAST_PICTURES:
-            raise _too_few(sights, fixed)
-        return measure_layout(rig, camera, sights, fixed)
-    return _result(rig, views, *fit, fixed, sights)
+    if len(observations.squares) < LEAST_PICTURES:
+        raise _too_few(observations, fixed)
+    tags = tuple(nominal[number] for number in located)
+    views = TagViews.of(camera, observations, tags)
+    fit = adjust_bundle(views, [starts[name] for name in observations.squares], tags)
+    if outliers := outlier_image(observations, views.picture_errors(*fit)):
+        observations = observations.without(outliers)
+        if len(observations.squares) < LEAST_PICTURES:
+            raise _too_few(observations, fixed)
+        return measure_layout(rig, camera, observations, fixed)
+    return _result(rig, views, *fit, fixed, observations)
 
 
 def _result(
@@ -286,14 +288,14 @@ def _result(
     cameras: list[Pose],
     tags: tuple[Tag, ...],
     fixed: int | None,
-    sights: TagSights,
+    observations: TagObservations,
 ) -> TagLayout:
-    drawn = {tag.id: tag for tag in rig.platform_tags}
-    at_drawing = tuple(drawn[tag.id] for tag in tags)
-    shift, scale = to_drawing(tags, at_drawing, fixed)
+    nominal = {tag.id: tag for tag in rig.platform_tags}
+    located_nominal = tuple(nominal[tag.id] for tag in tags)
+    shift, scale = align_to_nominal(tags, located_nominal, fixed)
     tags = tuple(replace(tag, pose=shift.compose(tag.pose)) for tag in tags)
     cameras = [pose.compose(shift.inverse()) for pose in cameras]
-    informations, scores, misfit = views.about_tags(cameras, tags, HUBER)
+    informations, scores, misfit = views.tag_information(cameras, tags, HUBER)
     gauge = fix_gauge(tags, fixed)
     whole = np.sum(informations, axis=0)
     pinned = gauge.T @ gauge * (1e3 * np.trace(whole) / np.trace(gauge.T @ gauge))
@@ -302,40 +304,40 @@ def _result(
         np.linalg.solve(whole - part + pinned, -score)
         for part, score in zip(informations, scores, strict=True)
     ]
-    numbers = [number for squares in sights.squares.values() for number in squares]
+    numbers = [number for squares in observations.squares.values() for number in squares]
     return TagLayout(
-        drawn=at_drawing,
+        nominal=located_nominal,
         tags=tags,
         covariance=read_only(covariance),
         half_widths=read_only(widths_of(covariance, without)),
         fixed=fixed,
-        errors=dict(zip(sights.squares, views.picture_errors(cameras, tags), strict=True)),
+        errors=dict(zip(observations.squares, views.picture_errors(cameras, tags), strict=True)),
         seen={tag.id: numbers.count(tag.id) for tag in tags},
         unseen={
             number: "was not detected together with the others"
-            for number in drawn
+            for number in nominal
             if number not in {tag.id for tag in tags}
         },
         sides=_sides(cameras),
         scale=scale,
-        unused=sights.unused,
-        data_hash=sights.data_hash(),
+        unused=observations.unused,
+        data_hash=observations.data_hash(),
     )
 
 
 def _sides(cameras: Sequence[Pose]) -> float:
     """Largest angle between directions from the platform to ``camera_from_platform``, [rad]."""
-    places = np.array([pose.inverse().position for pose in cameras])
-    directions = places / np.linalg.norm(places, axis=1, keepdims=True)
+    positions = np.array([pose.inverse().position for pose in cameras])
+    directions = positions / np.linalg.norm(positions, axis=1, keepdims=True)
     return float(np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)).max())
 
 
-def _too_few(sights: TagSights, fixed: int | None) -> BadInput:
-    told = "; ".join(f"{name} {why}" for name, why in list(sights.unused.items())[:5])
+def _too_few(observations: TagObservations, fixed: int | None) -> BadInput:
+    reasons = "; ".join(f"{name} {why}" for name, why in list(observations.unused.items())[:5])
     together = f", linked to tag {fixed}" if fixed is not None else ""
     return BadInput(
-        f"{len(sights.squares)} images show two platform tags or more{together};"
+        f"{len(observations.squares)} images show two platform tags or more{together};"
         f" {LEAST_PICTURES} are required",
-        why=told,
+        why=reasons,
         next_step="take 20 images from all sides, two or three tags in each",
     )

@@ -1,4 +1,4 @@
-"""The tags of a rig in many images of one camera, and why others are of no use."""
+"""Observations of a rig's tags in many images of one camera, and why others are unused."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.results import data_hash
-from calibration.statistics import as_in, is_duplicate_view
+from calibration.statistics import duplicate_reason, is_duplicate_view
 from model.errors import BadInput
 from model.pose import Array, Pose
 from model.rig import Camera, Rig, Tag
@@ -25,11 +25,11 @@ from tracking.pnp import BundlePose, TagView, moved, solve_pnp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TagSights:
-    """Whole tags that were seen.
+class TagObservations:
+    """Tags detected completely, by image.
 
     Attributes:
-        squares: Of every image that shows some, by its name: the tags' squares by number.
+        squares: Refined tag corners by tag number, by image name.
         unused: Why an image, or a tag in it, is not used, by name.
     """
 
@@ -38,16 +38,16 @@ class TagSights:
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Numbers of the tags that were seen."""
+        """Numbers of the observed tags."""
         return tuple(sorted({number for squares in self.squares.values() for number in squares}))
 
-    def without(self, unused: Mapping[str, str]) -> TagSights:
-        """The sights without some more images, and why."""
-        left = {name: squares for name, squares in self.squares.items() if name not in unused}
-        return TagSights(left, {**self.unused, **unused})
+    def without(self, unused: Mapping[str, str]) -> TagObservations:
+        """The observations without further images; ``unused`` has the reasons."""
+        remaining = {name: squares for name, squares in self.squares.items() if name not in unused}
+        return TagObservations(remaining, {**self.unused, **unused})
 
-    def each_view_once(self) -> TagSights:
-        """Without images in which all tags are where another, which shows no fewer, has them."""
+    def without_duplicates(self) -> TagObservations:
+        """Without images that duplicate the view of another image with as many tags or more."""
         kept: dict[str, Mapping[int, RefinedTag]] = {}
         unused = {}
         for name, squares in sorted(self.squares.items(), key=lambda sight: -len(sight[1])):
@@ -55,11 +55,11 @@ class TagSights:
             if first is None:
                 kept[name] = squares
             else:
-                unused[name] = as_in(first)
+                unused[name] = duplicate_reason(first)
         return self.without(unused)
 
     def data_hash(self) -> str:
-        """Hash of what was seen."""
+        """Hash of the observations."""
         return data_hash(
             f"{name} {number}".encode() + np.round(square.corners, 6).tobytes()
             for name, squares in self.squares.items()
@@ -67,28 +67,28 @@ class TagSights:
         )
 
 
-def sights_of(
+def observe_tags(
     pictures: Iterable[tuple[str, Image]],
     rig: Rig,
     camera: Camera,
     wanted: Collection[int],
     unused: Mapping[str, str] | None = None,
-) -> TagSights:
-    """Looks for tags.
+) -> TagObservations:
+    """Detects tags in images.
 
-    A number that is seen twice in an image is left out there: it is unknown which is the rig's.
-    A copy of an image is left out: it adds no information. Images of a camera that stands still
-    differ by their noise at least.
+    A tag detected twice in an image is left out there: it is unknown which one is the rig's. A
+    copy of an image is left out: it adds no information. Images of a camera at rest still differ
+    by noise.
 
     Args:
         pictures: Names and grey images of the camera's size.
-        rig: Its family of tags, and what finds them.
-        camera: Its matrix and distortion hold.
-        wanted: Their numbers.
-        unused: Images that were left out before, with the reasons.
+        rig: Gives the tag family and the detector.
+        camera: Its matrix and distortion are taken as known.
+        wanted: Numbers of the tags.
+        unused: Images already left out, with the reasons.
 
     Raises:
-        BadInput: No image shows any of them whole.
+        BadInput: No image shows any of them completely.
     """
     family = rig.tag_family
     detector, modules = make_detector(rig.tag_detector, family), modules_across(family)
@@ -112,16 +112,16 @@ def sights_of(
             example = example or (name, image)
     if not found:
         raise _nothing_seen(camera, family, wanted, left_out, example)
-    return TagSights(found, left_out)
+    return TagObservations(found, left_out)
 
 
 def platform_pose(rig: Rig, camera: Camera, squares: Mapping[int, RefinedTag]) -> BundlePose | None:
-    """The platform in the camera's frame by its tags; None where they do not allow just one pose.
+    """The platform's pose in the camera frame from its tags; None if it is ambiguous.
 
     Args:
         rig: Its platform carries the tags.
-        camera: Its matrix and distortion hold.
-        squares: Of one image, by the tags' numbers.
+        camera: Its matrix and distortion are taken as known.
+        squares: Refined corners in one image, by tag number.
     """
     tags = {tag.id: tag for tag in rig.platform_tags}
     found = solve_pnp(camera, [TagView(tags[k], square) for k, square in squares.items()])
@@ -170,11 +170,11 @@ def _nothing_seen(
     )
 
 
-# All tags in all images as arrays: errors of their edges, and what these say of the layout.
+# Bundle adjustment of all tags in all images: residuals, Jacobians, information.
 
 
 def moved_tags(tags: Sequence[Tag], steps: Array) -> tuple[Tag, ...]:
-    """Tags after shifts [m] and turns [rad] along their carrier's axes, shape (6 t,)."""
+    """Tags after shifts [m] and rotations [rad] along their body's axes, shape (6 t,)."""
     return tuple(
         replace(tag, pose=moved(tag.pose, step))
         for tag, step in zip(tags, steps.reshape(-1, 6), strict=True)
@@ -186,9 +186,9 @@ class TagViews:
     """v views of t tags in p images.
 
     Attributes:
-        camera: That took them.
-        picture: Which image each view is in, shape (v,).
-        tag: Which tag it shows, shape (v,).
+        camera: Of all images.
+        picture: Image index of each view, shape (v,).
+        tag: Tag index of each view, shape (v,).
         whitening: Shape (v, 8, 8), [1/px].
         target: Shape (v, 8).
         flat: Corners of each view's tag in its own frame, shape (v, 4, 3), [m].
@@ -202,12 +202,12 @@ class TagViews:
     flat: Array
 
     @classmethod
-    def of(cls, camera: Camera, sights: TagSights, tags: Sequence[Tag]) -> TagViews:
-        """The views of those tags."""
+    def of(cls, camera: Camera, observations: TagObservations, tags: Sequence[Tag]) -> TagViews:
+        """Stacks the observations of those tags."""
         numbers = [tag.id for tag in tags]
         found = [
             (k, numbers.index(number), square)
-            for k, squares in enumerate(sights.squares.values())
+            for k, squares in enumerate(observations.squares.values())
             for number, square in squares.items()
         ]
         halves = np.array([tags[which].size / 2.0 for _, which, _ in found])
@@ -228,7 +228,7 @@ class TagViews:
         return np.asarray(np.einsum("vij,vj->vi", self.whitening, pixels) - self.target)
 
     def slopes(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> tuple[Array, Array]:
-        """Of the errors, by the image's camera pose and by the tag's pose, shape (v, 8, 6)."""
+        """Jacobians of the errors by camera pose and by tag pose, shape (v, 8, 6) each."""
         points, arms_camera, arms_tag = self._points(cameras, tags)
         depth = points[..., 2]
         by_point = np.zeros((*points.shape[:2], 2, 3))
@@ -237,34 +237,34 @@ class TagViews:
             by_point[..., axis, axis] = focal / depth
             by_point[..., axis, 2] = -focal * points[..., axis] / depth**2
         turn = np.array([pose.rotation for pose in cameras])[self.picture]
-        by_place = np.einsum("vcij,vjk->vcik", by_point, turn)
+        by_position = np.einsum("vcij,vjk->vcik", by_point, turn)
         by_camera = np.concatenate([by_point, np.cross(arms_camera[:, :, None], by_point)], -1)
-        by_tag = np.concatenate([by_place, np.cross(arms_tag[:, :, None], by_place)], -1)
+        by_tag = np.concatenate([by_position, np.cross(arms_tag[:, :, None], by_position)], -1)
         return (
             np.asarray(self.whitening @ by_camera.reshape(-1, 8, 6)),
             np.asarray(self.whitening @ by_tag.reshape(-1, 8, 6)),
         )
 
     def dense_slopes(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> Array:
-        """Of all errors by all poses of cameras, then of tags, shape (8 v, 6 p + 6 t)."""
+        """Jacobian of all errors by camera poses, then tag poses, shape (8 v, 6 p + 6 t)."""
         by_camera, by_tag = self.slopes(cameras, tags)
         whole = np.zeros((len(self.tag), 8, 6 * (len(cameras) + len(tags))))
         six = np.arange(6)
         view = np.arange(len(self.tag))[:, None, None]
         row = np.arange(8)[None, :, None]
         whole[view, row, (6 * self.picture[:, None] + six)[:, None, :]] = by_camera
-        place = 6 * (len(cameras) + self.tag[:, None]) + six
-        whole[view, row, place[:, None, :]] = by_tag
+        column = 6 * (len(cameras) + self.tag[:, None]) + six
+        whole[view, row, column[:, None, :]] = by_tag
         return whole.reshape(8 * len(self.tag), -1)
 
-    def about_tags(
+    def tag_information(
         self, cameras: Sequence[Pose], tags: Sequence[Tag], huber: float
     ) -> tuple[list[Array], list[Array], float]:
-        """What each image says of the tags' poses, its camera pose projected out.
+        """Each image's information on the tags' poses, its camera pose projected out.
 
         Returns:
-            Information, shape (6 t, 6 t), and score, shape (6 t,), of each image; and the squares
-            of the errors, in variances, for each that is free.
+            Information, shape (6 t, 6 t), and score, shape (6 t,), of each image; and the sum of
+            squared errors, in variances, per degree of freedom.
         """
         errors = self.errors(cameras, tags)
         weight = np.sqrt(np.minimum(1.0, huber / np.maximum(np.abs(errors), 1e-12)))
@@ -275,13 +275,13 @@ class TagViews:
             mine = np.flatnonzero(self.picture == k)
             wide = np.zeros((len(mine), 8, 6 * len(tags)))
             for row, view in enumerate(mine.tolist()):
-                place = 6 * int(self.tag[view])
-                wide[row, :, place : place + 6] = by_tag[view]
+                column = 6 * int(self.tag[view])
+                wide[row, :, column : column + 6] = by_tag[view]
             base = np.linalg.qr(by_camera[mine].reshape(-1, 6))[0]
             flat = wide.reshape(-1, 6 * len(tags))
-            left = flat - base @ (base.T @ flat)
-            informations.append(left.T @ left)
-            scores.append(-left.T @ errors[mine].ravel())
+            remaining = flat - base @ (base.T @ flat)
+            informations.append(remaining.T @ remaining)
+            scores.append(-remaining.T @ errors[mine].ravel())
         freedom = errors.size - 6 * len(cameras) - 6 * (len(tags) - 1)
         return informations, scores, float(np.sum(errors**2)) / max(freedom, 1)
 
@@ -294,11 +294,11 @@ class TagViews:
         return [float(np.sqrt(squares[self.picture == k].mean())) for k in range(len(cameras))]
 
     def _points(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> tuple[Array, Array, Array]:
-        """Corners in the camera's frame, (v, 4, 3); arms of camera turns and of tag turns."""
+        """Corners in the camera frame, (v, 4, 3); lever arms of camera and tag rotations."""
         tag_turn = np.array([tag.pose.rotation for tag in tags])[self.tag]
-        tag_place = np.array([tag.pose.position for tag in tags])[self.tag]
+        tag_position = np.array([tag.pose.position for tag in tags])[self.tag]
         turn = np.array([pose.rotation for pose in cameras])[self.picture]
-        place = np.array([pose.position for pose in cameras])[self.picture]
+        position = np.array([pose.position for pose in cameras])[self.picture]
         arms_tag = np.einsum("vij,vcj->vci", tag_turn, self.flat)
-        arms_camera = np.einsum("vij,vcj->vci", turn, arms_tag + tag_place[:, None])
-        return arms_camera + place[:, None], arms_camera, arms_tag
+        arms_camera = np.einsum("vij,vcj->vci", turn, arms_tag + tag_position[:, None])
+        return arms_camera + position[:, None], arms_camera, arms_tag

@@ -1,4 +1,4 @@
-"""The result file of the tags' places on the platform."""
+"""Result file of the tag layout on the platform."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class TagsResult(ResultDocument):
     seen: dict[str, int] = Field(description="number of images that show each tag")
 
     def in_words(self) -> list[tuple[str, str]]:
-        """As of every result; rotations are about the stated one: uncertainty only."""
+        """As for every result; rotations are relative to the stated one: uncertainty only."""
         return pose_rows(self.stated)
 
     def changes_to(self, other: Self) -> dict[str, float]:
-        """How far the other result's tags are off, and how turned about the platform's axes."""
+        """Shifts and rotations of the other result's tags, along the platform's axes."""
         others = {tag.id: tag.pose() for tag in other.platform}
         changes: dict[str, float] = {}
         for tag in self.platform:
@@ -50,7 +50,7 @@ class TagsResult(ResultDocument):
         return changes
 
     def apart_mm(self, other: Self) -> float:
-        """How far apart corners of tags that both have are, RMS, [mm].
+        """RMS distance between corners of the tags common to both, [mm].
 
         Raises:
             BadInput: They have no tag in common.
@@ -68,10 +68,10 @@ class TagsResult(ResultDocument):
         return float(np.sqrt(np.mean(np.sum(np.concatenate(gaps) ** 2, axis=1)))) * 1e3
 
     def corrected(self, rig: RigDocument) -> RigDocument:
-        """The rig file's content with the tags at these places.
+        """The rig file's content with the tags at these poses.
 
         Raises:
-            BadInput: The rig has tags of other numbers, sizes or families.
+            BadInput: The rig's tags differ in number, size or family.
         """
         self.require_basis(_basis(rig), "sizes or numbers of tags")
         assert rig.tags is not None  # or their basis were another
@@ -84,12 +84,12 @@ class TagsResult(ResultDocument):
 def tags_result(
     result: TagLayout, verdict: CalibrationVerdict, rig: RigDocument, on: date
 ) -> TagsResult:
-    """The result with its quality.
+    """The result file's content.
 
     Args:
-        result: What was found.
-        verdict: What it is good for.
-        rig: The rig file's content that it was found with.
+        result: The measured layout.
+        verdict: Of the calibration.
+        rig: The rig file's content used for the measurement.
         on: The date.
     """
     unseen = {f"tag {number}": why for number, why in result.unseen.items()}
@@ -113,7 +113,7 @@ def tags_result(
 
 
 def tag_intervals(result: TagLayout) -> dict[str, Interval]:
-    """All tags' numbers; turns are about the platform's axes, from the stated rotation."""
+    """Intervals of all tag poses; rotations are about the platform's axes, from the stated one."""
     found: dict[str, Interval] = {}
     widths = result.half_widths.reshape(-1, 6) * SCALES
     for tag, own in zip(result.tags, widths, strict=True):
@@ -126,7 +126,7 @@ def tag_intervals(result: TagLayout) -> dict[str, Interval]:
 
 
 def _named(number: int, values: Array) -> dict[str, float]:
-    """Six numbers of a tag, [m, rad], by name with unit."""
+    """Six pose parameters of a tag, [m, rad], by name with unit."""
     scaled = (values * SCALES).tolist()
     return {f"tag_{number}_{axis}": value for axis, value in zip(AXES, scaled, strict=True)}
 
@@ -151,7 +151,7 @@ def _document(tag: Tag) -> TagDocument:
 
 
 def _basis(rig: RigDocument) -> dict[str, Any]:
-    """What the result takes as known."""
+    """Parts of the rig file that the result takes as known."""
     platform: Sequence[TagDocument] = rig.tags.platform if rig.tags else ()
     return {
         "family": rig.tags.family if rig.tags else None,
@@ -159,11 +159,11 @@ def _basis(rig: RigDocument) -> dict[str, Any]:
     }
 
 
-# The report of the tags' places on a platform.
+# Report.
 
 
 def tags_page(result: TagLayout, document: TagsResult, verdict: CalibrationVerdict) -> str:
-    """The whole page."""
+    """The report page."""
     gauge = "The platform frame is the best fit of all tags to the rig file."
     if result.fixed is not None:
         gauge = f"Tag {result.fixed} is kept as in the rig file."
@@ -176,13 +176,13 @@ def tags_page(result: TagLayout, document: TagsResult, verdict: CalibrationVerdi
                 "Tags against the rig file",
                 table_of(
                     change_rows(result),
-                    ("tag", "moved [mm]", "turned [°]", "x, y, z [mm]", "seen in"),
+                    ("tag", "moved [mm]", "rotated [°]", "x, y, z [mm]", "seen in"),
                 ),
                 gauge,
             ),
             Section(
                 "Poses, with 95 % intervals",
-                table_of(_places(document), ("tag", *AXES)),
+                table_of(_pose_rows(document), ("tag", *AXES)),
                 "Rotations are about the platform's axes, relative to the stated one.",
             ),
             Section(
@@ -206,15 +206,15 @@ def tags_page(result: TagLayout, document: TagsResult, verdict: CalibrationVerdi
 
 
 def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
-    """What changed against the rig file, tag by tag."""
+    """Changes from the rig file, one row per tag."""
     rows = []
-    for tag, drawn in zip(result.tags, result.drawn, strict=True):
-        shift = (tag.pose.position - drawn.pose.position) * 1e3
+    for tag, nominal in zip(result.tags, result.nominal, strict=True):
+        shift = (tag.pose.position - nominal.pose.position) * 1e3
         rows.append(
             (
                 f"tag {tag.id}",
                 f"{np.linalg.norm(shift):.3f}",
-                f"{np.degrees(tag.pose.angle_to(drawn.pose)):.3f}",
+                f"{np.degrees(tag.pose.angle_to(nominal.pose)):.3f}",
                 ", ".join(f"{value:+z.3f}" for value in shift),
                 f"{result.seen[tag.id]} images",
             )
@@ -223,7 +223,7 @@ def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
 
 
 def layout_facts(found: TagLayout) -> list[tuple[str, str]]:
-    """What was found beside the numbers, for people."""
+    """Human-readable details beside the estimates."""
     used = f"{len(found.errors)} used, reprojection error {found.reprojection:.3f} px RMS"
     moved = [
         (name, f"moved {shift} mm, rotated {turn}° from the rig file; {count}")
@@ -232,78 +232,78 @@ def layout_facts(found: TagLayout) -> list[tuple[str, str]]:
     return [("pictures", used), *moved]
 
 
-def _places(document: TagsResult) -> list[tuple[str, ...]]:
-    told = dict(document.in_words())
+def _pose_rows(document: TagsResult) -> list[tuple[str, ...]]:
+    text = dict(document.in_words())
     return [
-        (f"tag {tag.id}", *(told[f"tag_{tag.id}_{axis}"] for axis in AXES))
+        (f"tag {tag.id}", *(text[f"tag_{tag.id}_{axis}"] for axis in AXES))
         for tag in document.platform
     ]
 
 
-# Whether the tags of a platform are located well enough.
+# Verdict.
 
 
 GOOD_PICTURES, GOOD_VIEWS, GOOD_ERROR = 12, 4, 0.3
-"""Images in all, images of each tag, pixels."""
+"""Required images in all, images of each tag, and reprojection error [px]."""
 GOOD_SIDES_DEG = 40.0
 GOOD_SCALE = 0.02
-"""Share by which a layout may be larger or smaller than in the rig file."""
+"""Allowed relative deviation of the layout's size from the rig file."""
 FAR_MM, FAR_DEG = 10.0, 8.0
-"""A tag farther from its place in the rig file was glued elsewhere, or this is another platform."""
+"""A tag farther off than this was mounted elsewhere, or this is another platform."""
 
 
 def judge_layout(result: TagLayout, wanted: float) -> CalibrationVerdict:
-    """Judges a layout.
+    """The verdict on a layout.
 
     Args:
-        result: What was found.
-        wanted: What is good enough, for corners of tags, [m].
+        result: The measured layout.
+        wanted: Required error of tag corners, [m].
     """
-    lacks = [*_about_pictures(result), *_about_tags(result)]
+    issues = [*_image_issues(result), *_tag_issues(result)]
     error = result.error
     if not error <= wanted:
         what = f"tags are located within {error * 1e3:.2g} mm; {wanted * 1e3:.2g} mm are required"
-        lacks.append(Issue(what, "take more images, closer, sharp and from all sides"))
-    return CalibrationVerdict.of(error, wanted, "in the tags' positions", lacks)
+        issues.append(Issue(what, "take more images, closer, sharp and from all sides"))
+    return CalibrationVerdict.of(error, wanted, "in the tags' positions", issues)
 
 
-def _about_pictures(result: TagLayout) -> list[Issue]:
-    lacks = []
+def _image_issues(result: TagLayout) -> list[Issue]:
+    issues = []
     if len(result.errors) < GOOD_PICTURES:
         what = f"{len(result.errors)} images show two tags or more; {GOOD_PICTURES} are required"
-        lacks.append(Issue(what, "take 20 images from all sides, two or three tags in each"))
+        issues.append(Issue(what, "take 20 images from all sides, two or three tags in each"))
     if np.degrees(result.sides) < GOOD_SIDES_DEG:
         what = (
             f"all images are taken from within {np.degrees(result.sides):.0f}°;"
             f" {GOOD_SIDES_DEG:.0f}° is required"
         )
-        lacks.append(Issue(what, "take images from all sides, all different"))
+        issues.append(Issue(what, "take images from all sides, all different"))
     if result.reprojection > GOOD_ERROR:
         what = f"the reprojection error is {result.reprojection:.2f} px"
         step = (
             "check sizes and numbers of the tags, that they lie flat, and the camera's parameters"
         )
-        lacks.append(Issue(what, step))
+        issues.append(Issue(what, step))
     if abs(result.scale - 1.0) > GOOD_SCALE:
-        way = "larger" if result.scale > 1.0 else "smaller"
-        what = f"the layout is {abs(result.scale - 1.0):.1%} {way} than in the rig file"
-        lacks.append(Issue(what, "measure the black squares and correct size_mm in the rig file"))
-    return lacks
+        direction = "larger" if result.scale > 1.0 else "smaller"
+        what = f"the layout is {abs(result.scale - 1.0):.1%} {direction} than in the rig file"
+        issues.append(Issue(what, "measure the black squares and correct size_mm in the rig file"))
+    return issues
 
 
-def _about_tags(result: TagLayout) -> list[Issue]:
-    lacks = []
+def _tag_issues(result: TagLayout) -> list[Issue]:
+    issues = []
     for number, why in result.unseen.items():
         step = f"take images that show tag {number} together with others"
-        lacks.append(Issue(f"tag {number} {why}", step))
+        issues.append(Issue(f"tag {number} {why}", step))
     for number, count in result.seen.items():
         if count < GOOD_VIEWS:
             what = f"tag {number} is in {count} images; {GOOD_VIEWS} are required"
-            lacks.append(Issue(what, f"take more images of tag {number} with its neighbours"))
-    for tag, drawn in zip(result.tags, result.drawn, strict=True):
-        shift, turn = drawn.pose.distance_to(tag.pose) * 1e3, drawn.pose.angle_to(tag.pose)
+            issues.append(Issue(what, f"take more images of tag {number} with its neighbours"))
+    for tag, nominal in zip(result.tags, result.nominal, strict=True):
+        shift, turn = nominal.pose.distance_to(tag.pose) * 1e3, nominal.pose.angle_to(tag.pose)
         if shift > FAR_MM or np.degrees(turn) > FAR_DEG:
             what = f"tag {tag.id} is {shift:.1f} mm and {np.degrees(turn):.1f}° from the rig file"
             step = f"check the position and rotation of tag {tag.id} in the rig file"
-            lacks.append(Issue(what, step))
-    return lacks
+            issues.append(Issue(what, step))
+    return issues

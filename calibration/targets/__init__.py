@@ -1,1 +1,1 @@
-"""Calibration targets: what they look like, where their points are, and how they are printed."""
+"""Calibration targets: their points, their detection, and prints of them."""

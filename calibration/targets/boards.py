@@ -1,4 +1,4 @@
-"""Calibration boards: what a calibration needs of them, and chessboards and ChArUco boards."""
+"""Calibration boards: their interface, chessboards and ChArUco boards."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from tracking.detection.detector import TagDetector
 from tracking.detection.diagnostics import diagnose_tags
 
 LEAST_POINTS = 8
-"""Of a board in an image: fewer say too little about its pose."""
+"""Minimum corners in an image: fewer do not determine the board's pose."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
-    """A board in an image.
+class DetectedBoard:
+    """Corners of a board detected in one image.
 
     Attributes:
         points: In the board's plane, shape (n, 3), [m].
         corners: Where they are in the image, shape (n, 2), [px].
-        twice: Numbers of markers or tags that were detected more than once and are left out: it is
-            unknown which of them is the board's.
+        twice: Numbers of markers or tags left out because they were detected more than once: it is
+            unknown which of them is on the board.
     """
 
     points: Array
@@ -42,30 +42,30 @@ class Seen:
 
 
 class Board(Protocol):
-    """What `calibration.intrinsics.calibrate` needs of a board."""
+    """Interface of a board for `calibration.intrinsics.calibrate`."""
 
-    def find(self, image: Image) -> Seen | None:
-        """The board in a grey image; None where too little of it is to be seen."""
+    def find(self, image: Image) -> DetectedBoard | None:
+        """Detects the board in a grey image; None where too little of it is visible."""
         ...
 
-    def instead(self, image: Image) -> str:
-        """What an image without the board shows, for messages; empty where that is unknown."""
+    def describe_other(self, image: Image) -> str:
+        """What an image without the board shows instead, for messages; empty if unknown."""
         ...
 
     def __str__(self) -> str:
-        """What was looked for, for messages."""
+        """The board, for messages."""
         ...
 
 
-def mirrored(board: Board, image: Image) -> bool:
-    """Whether an image shows the board only when it is flipped over."""
+def is_mirrored(board: Board, image: Image) -> bool:
+    """Whether an image shows the board mirrored."""
     return board.find(np.ascontiguousarray(image[:, ::-1])) is not None
 
 
 def require_board(
     holds: bool, what: str, next_step: str = "check the dimensions of the board"
 ) -> None:
-    """Refuses boards that cannot be.
+    """Refuses impossible boards.
 
     Raises:
         BadInput: ``holds`` is false.
@@ -74,11 +74,11 @@ def require_board(
         raise BadInput(what, next_step=next_step)
 
 
-# A camera of which nothing is known but the size of its images.
+# A camera of which only the image size is known.
 
 
-def plain_camera(size: tuple[int, int], name: str = "camera") -> Camera:
-    """A camera as most are: no distortion, and a view of about 53° across.
+def generic_camera(size: tuple[int, int], name: str = "camera") -> Camera:
+    """A camera without distortion and with a horizontal field of view of about 53°.
 
     Args:
         size: Width and height of its images, [px].
@@ -89,17 +89,17 @@ def plain_camera(size: tuple[int, int], name: str = "camera") -> Camera:
     return Camera(name, width, height, matrix, np.zeros(5), Pose.level([0.0, 0.0, 0.0]), 10.0)
 
 
-# Corners that another program detected, from a CSV file (docs/data-formats.md).
+# Corners detected by another program, from a CSV file (docs/data-formats.md).
 
 _COLUMNS = ("picture", "x_px", "y_px", "board_x_mm", "board_y_mm")
 
 
-def read_corners(path: Path) -> dict[str, Seen]:
-    """Corners of a flat board by picture, as another program detected them.
+def read_corners(path: Path) -> dict[str, DetectedBoard]:
+    """Corners of a flat board by image, as detected by another program.
 
     Raises:
-        BadInput: The file cannot be read, a column is missing, a number is none, or pictures show
-            fewer than `LEAST_POINTS`.
+        BadInput: The file cannot be read, a column is missing, a value is not a number, or no
+            image shows `LEAST_POINTS`.
     """
     table = CsvTable(path)
     pictures, numbers = table.texts(_COLUMNS[0]), table.of(_COLUMNS[1:])
@@ -112,22 +112,22 @@ def read_corners(path: Path) -> dict[str, Seen]:
             continue
         corners_of = np.array(corners)
         flat = np.column_stack([corners_of[:, 2:] / 1e3, np.zeros(len(corners_of))])
-        seen[picture] = Seen(read_only(flat), read_only(corners_of[:, :2]))
+        seen[picture] = DetectedBoard(read_only(flat), read_only(corners_of[:, :2]))
     if not seen:
         raise BadInput(
-            f"no picture has {LEAST_POINTS} corners",
+            f"no image has {LEAST_POINTS} corners",
             where=str(path),
-            next_step="write a line for every corner: its picture, pixels and place on the board",
+            next_step="write a line for every corner: its image, pixels and position on the board",
         )
     return seen
 
 
 _WINDOW = 0.3
-"""Half of the window a corner is refined in, as part of the way to the next."""
+"""Half width of the refinement window, as a share of the distance to the next corner."""
 _SEARCHED = 1600
-"""Longer side of the image in which the board is looked for, [px]."""
+"""Longer side of the image copy searched first, [px]."""
 _LARGEST, _SHARE = 11, 120
-"""At most this many pixels, or this share of the image width: large images are softer."""
+"""Largest half width: pixels, or image width by this, as large images are softer."""
 
 
 def _classic(image: Image, size: tuple[int, int]) -> tuple[bool, object]:
@@ -144,12 +144,12 @@ _FINDERS = (
     _sectors(0),
     _sectors(cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY),
 )
-"""OpenCV's finders, the fastest first: each finds boards that another one loses."""
+"""OpenCV's detectors, fastest first: each finds boards that another misses."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chessboard:
-    """A printed chessboard; all of it must be in the image.
+    """A printed chessboard; it must be completely in the image.
 
     Attributes:
         columns: Inner corners along a row of squares.
@@ -162,10 +162,10 @@ class Chessboard:
     square: float
 
     def __post_init__(self) -> None:
-        """Refuses boards that cannot be.
+        """Refuses impossible boards.
 
         Raises:
-            BadInput: Fewer than three inner corners a side, or a square without a size.
+            BadInput: Fewer than three inner corners per side, or a side of a square not above 0.
         """
         require_board(
             min(self.columns, self.rows) >= 3,
@@ -182,8 +182,8 @@ class Chessboard:
         grid = np.array([(x, y, 0.0) for y in range(self.rows) for x in range(self.columns)])
         return np.asarray(grid * self.square)
 
-    def find(self, image: Image) -> Seen | None:
-        """Its inner corners; in large images they are looked for in a smaller copy first."""
+    def find(self, image: Image) -> DetectedBoard | None:
+        """Detects its inner corners; a large image is searched in a smaller copy first."""
         rough = None
         if (times := max(image.shape) / _SEARCHED) > 1.0:
             size = (round(image.shape[1] / times), round(image.shape[0] / times))
@@ -192,25 +192,25 @@ class Chessboard:
             scale = np.array([image.shape[1], image.shape[0]]) / size
             rough = None if found is None else (found + 0.5) * scale - 0.5
         rough = self._found(image) if rough is None else rough
-        return None if rough is None else Seen(self.points(), self._refined(image, rough))
+        return None if rough is None else DetectedBoard(self.points(), self._refined(image, rough))
 
     def _found(self, image: Image) -> Array | None:
-        """Its inner corners roughly, by the first finder that finds all, shape (n, 2), [px]."""
+        """Approximate inner corners, from the first detector that finds all, shape (n, 2), [px]."""
         for finder in _FINDERS:
             try:
                 found, corners = finder(image, (self.columns, self.rows))
-            except cv2.error:  # as for pictures too small to hold the board
+            except cv2.error:  # such as for images too small for the board
                 continue
             if found:
                 return np.asarray(corners, dtype=np.float64).reshape(-1, 2)
         return None
 
-    def instead(self, image: Image) -> str:
-        """Inner corners of another chessboard that the image shows."""
+    def describe_other(self, image: Image) -> str:
+        """Size of another chessboard that the image shows."""
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
         try:
             found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags=flags)
-        except cv2.error:  # as for images too small to hold a board
+        except cv2.error:  # such as for images too small for a board
             return ""
         if not found:
             return ""
@@ -218,9 +218,9 @@ class Chessboard:
         return f"a chessboard of {columns} x {rows} inner corners, or part of one"
 
     def _refined(self, image: Image, corners: Array) -> Array:
-        """Corners at the saddles of brightness, which halves the error; shape (n, 2), [px].
+        """Corners refined to saddle points, which halves the error; shape (n, 2), [px].
 
-        A window holds one corner only: less than half of the way to the next.
+        The window holds one corner only: less than half of the distance to the next.
         """
         grid = corners.reshape(self.rows, self.columns, 2)
         gaps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
@@ -232,11 +232,11 @@ class Chessboard:
         return np.asarray(better, dtype=np.float64).reshape(-1, 2)
 
 
-# ChArUco boards: the corners between markers, in an image that may show a part only.
+# ChArUco boards: corners between markers; partial views suffice.
 
 
 _LEAST_FOURS = 4
-"""Markers of 16 modules are found by chance: this many are not."""
+"""Markers of 16 modules give false detections: this many at once do not."""
 _ARUCO = {
     name.removeprefix("DICT_"): getattr(cv2.aruco, name)
     for name in dir(cv2.aruco)
@@ -248,7 +248,7 @@ DICTIONARIES = tuple(sorted(_ARUCO))
 
 @dataclass(frozen=True)
 class Charuco:
-    """A chessboard with ArUco markers in its white squares; parts of it will do.
+    """A chessboard with ArUco markers in its white squares; partial views suffice.
 
     Attributes:
         columns: Squares along a row.
@@ -256,8 +256,7 @@ class Charuco:
         square: Side of a square, [m].
         marker: Side of a marker, [m].
         dictionary: One of `DICTIONARIES`.
-        legacy: Whether the first square is as OpenCV drew it before 4.6, where the number of rows
-            is even.
+        legacy: Whether a board with an even number of rows starts as OpenCV before 4.6 drew it.
     """
 
     columns: int
@@ -268,11 +267,11 @@ class Charuco:
     legacy: bool = False
 
     def __post_init__(self) -> None:
-        """Refuses boards that cannot be.
+        """Refuses impossible boards.
 
         Raises:
             BadInput: Too few squares, a marker that does not fit its square, or a dictionary that
-                is not known or has too few markers.
+                is unknown or has too few markers.
         """
         require_board(min(self.columns, self.rows) >= 3, "a ChArUco board needs 3 squares per side")
         require_board(0.0 < self.marker < self.square, "a marker must be smaller than its square")
@@ -293,43 +292,43 @@ class Charuco:
         """Its kind, size and dictionary."""
         return f"a ChArUco board of {self.columns} x {self.rows} squares with {self.dictionary}"
 
-    def find(self, image: Image) -> Seen | None:
-        """Its inner corners, as far as they are to be seen; black and white may be exchanged."""
+    def find(self, image: Image) -> DetectedBoard | None:
+        """Detects its visible inner corners; black and white may be inverted."""
         seen = self._seen_in(image)
         return self._seen_in(np.asarray(255 - image)) if seen is None else seen
 
-    def _seen_in(self, image: Image) -> Seen | None:
+    def _seen_in(self, image: Image) -> DetectedBoard | None:
         squares, markers, twice = self._markers_in(image)
         if not len(markers):
             return None
         corners, numbers, _, _ = self._detector.detectBoard(
             image, markerCorners=squares, markerIds=markers
         )
-        if np.size(numbers) < LEAST_POINTS:  # None where there is none
+        if np.size(numbers) < LEAST_POINTS:  # None when nothing is detected
             return None
         points = np.asarray(self._board.getChessboardCorners(), dtype=np.float64)
         chosen = points[np.ravel(numbers)]
         if _in_a_line(chosen):
             return None
-        return Seen(chosen, np.asarray(corners, dtype=np.float64).reshape(-1, 2), twice)
+        return DetectedBoard(chosen, np.asarray(corners, dtype=np.float64).reshape(-1, 2), twice)
 
-    def instead(self, image: Image) -> str:
-        """The other pattern of OpenCV, else tags and markers that the picture shows."""
+    def describe_other(self, image: Image) -> str:
+        """OpenCV's other pattern, else tags and markers that the image shows."""
         if replace(self, legacy=not self.legacy).find(image) is not None:
             use = "without --legacy" if self.legacy else "with --legacy"
             drawn = "4.6 and later draw" if self.legacy else "before 4.6 drew"
             return f"the board as versions of OpenCV {drawn} it: try {use}"
         family = self.dictionary if self.dictionary in FAMILIES else FAMILIES[-1]
-        told = diagnose_tags(image, family, [])
+        tags = diagnose_tags(image, family, [])
         fours = TagDetector("4X4_1000").detect(image)
         if len(fours) < _LEAST_FOURS:
-            return told
-        return f"{told}; 4X4 {', '.join(str(d.id) for d in fours)}"
+            return tags
+        return f"{tags}; 4X4 {', '.join(str(d.id) for d in fours)}"
 
     def _markers_in(
         self, image: Image
     ) -> tuple[list[NDArray[np.float32]], NDArray[np.int32], tuple[int, ...]]:
-        """Markers, their numbers, and numbers that were seen more than once and are left out."""
+        """Markers, their numbers, and numbers left out because they appear more than once."""
         corners, found, _ = self._marker_detector.detectMarkers(image)
         numbers = np.array([], np.int32) if not corners else np.ravel(found).astype(np.int32)
         seen, counts = np.unique(numbers, return_counts=True)
@@ -371,6 +370,6 @@ class Charuco:
 
 
 def _in_a_line(points: Array) -> bool:
-    """Whether points do not span the board's plane."""
+    """Whether points are collinear."""
     flat = points[:, :2] - points[:, :2].mean(axis=0)
     return bool(np.linalg.svd(flat, compute_uv=False)[1] < 1e-9)

@@ -1,12 +1,12 @@
-"""Grids of circles, whose centres are freed of what perspective adds, and grids of tags.
+"""Circle grids, with centres corrected for perspective, and grids of tags.
 
-A circle is seen as an ellipse, whose middle is not where the circle's middle is seen. The grid's
-homography says by how much, so that the circles' diameter is needed. Middles are means of
-darkness over the pixels of a circle, which takes the thresholds of the finder out of them.
+A circle is imaged as an ellipse whose centre is not the image of the circle's centre. The offset
+follows from the grid's homography and the circles' diameter. Centres are darkness-weighted means
+over the pixels of a circle, so they do not depend on the detector's thresholds.
 
-Of a grid of tags a picture may show a part only. Kalibr's AprilGrid numbers its tags from the
-bottom left and its rows upward, draws borders of two modules, and lets a black square touch each
-corner of a tag, so that corners are saddles as those of a chessboard.
+A grid of tags may be visible in part. Kalibr's AprilGrid numbers its tags from the bottom left and
+its rows upward, draws borders of two modules, and has a black square at each corner of a tag, so
+that corners are saddle points as on a chessboard.
 
 Source: Heikkilä, "Geometric camera calibration using circular control points", IEEE TPAMI 22(10),
 2000, section 2.2 (bias of the centre of a projected circle); ethz-asl/kalibr,
@@ -24,7 +24,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from calibration.targets.boards import LEAST_POINTS, Seen, plain_camera, require_board
+from calibration.targets.boards import LEAST_POINTS, DetectedBoard, generic_camera, require_board
 from model.files.camera_file import FAMILIES, tags_in
 from model.pose import Array
 from tracking.camera_model import Image
@@ -34,23 +34,23 @@ from tracking.detection.tags import CORNER_SIGNS, dictionary, modules_across, up
 from tracking.edges.refine import refine
 
 _SEARCHED = 1600
-"""Longer side of the picture in which the circles are looked for, [px]."""
+"""Longer side of the image copy in which circles are detected, [px]."""
 _LEAST_AREA, _LEAST_APART = 12.0, 4.0
-"""Of the circles in that picture, [px²] and [px]."""
+"""Minimum area of a circle and distance between circles in that copy, [px²] and [px]."""
 _WINDOW, _CORE = 1.3, 0.6
-"""Radii of the window around a circle and of its dark part, in radii of the circle."""
+"""Radii of the window around a circle and of its dark core, in radii of the circle."""
 
 
 @dataclass(frozen=True, slots=True)
 class CircleGrid:
-    """Printed circles, dark on white or white on dark; all of them must be in the picture.
+    """Printed circles, dark on white or white on dark; all must be in the image.
 
     Attributes:
         columns: Circles along a row.
         rows: Rows.
-        spacing: Of neighbouring rows, [m]. In a symmetric grid columns are as far apart; in an
-            asymmetric one circles of a row are twice as far apart, and every other row is shifted
-            by the spacing, the second one to the right.
+        spacing: Between rows, [m]. In a symmetric grid also between columns; in an asymmetric one
+            circles of a row are twice as far apart, and every other row is shifted by the
+            spacing, the second one to the right.
         diameter: Of a circle, [m].
         asymmetric: Whether every other row is shifted.
     """
@@ -62,16 +62,14 @@ class CircleGrid:
     asymmetric: bool = False
 
     def __post_init__(self) -> None:
-        """Refuses boards that cannot be.
+        """Refuses impossible boards.
 
         Raises:
-            BadInput: Too few circles, sizes that are none, or circles that touch.
+            BadInput: Too few circles, a size not above 0, or circles that touch.
         """
-        require_board(min(self.columns, self.rows) >= 3, "a circle grid needs 3 circles a side")
+        require_board(min(self.columns, self.rows) >= 3, "a circle grid needs 3 circles per side")
         apart = self.spacing * (np.sqrt(2.0) if self.asymmetric else 1.0)
-        require_board(
-            0.0 < self.diameter < apart, "circles must have a size, and white between them"
-        )
+        require_board(0.0 < self.diameter < apart, "circles must be larger than 0 mm and not touch")
 
     def __str__(self) -> str:
         """Its kind and size."""
@@ -88,8 +86,8 @@ class CircleGrid:
         ]
         return np.asarray(np.array(grid) * self.spacing)
 
-    def find(self, image: Image) -> Seen | None:
-        """The centres of its circles, where all are to be seen."""
+    def find(self, image: Image) -> DetectedBoard | None:
+        """Detects the centres of its circles, if all are visible."""
         times = max(1.0, max(image.shape) / _SEARCHED)
         small = image
         if times > 1.0:
@@ -101,10 +99,10 @@ class CircleGrid:
             centres = None if found is None else self._upright((found + 0.5) * scale - 0.5)
             if centres is not None:
                 dark = np.asarray(255 - image) if white else image
-                return Seen(self.points(), self._refined(dark, centres))
+                return DetectedBoard(self.points(), self._refined(dark, centres))
         return None
 
-    def instead(self, image: Image) -> str:
+    def describe_other(self, image: Image) -> str:
         """The same grid with rows and columns exchanged, or of the other kind."""
         others = [
             CircleGrid(*count, self.spacing, min(self.diameter, 0.9 * self.spacing), asymmetric)
@@ -114,7 +112,7 @@ class CircleGrid:
         return next((str(g) for g in others if str(g) != str(self) and g.find(image)), "")
 
     def _found(self, image: Image) -> Array | None:
-        """Centres of dark circles roughly, shape (n, 2), [px]."""
+        """Approximate centres of dark circles, shape (n, 2), [px]."""
         kind = cv2.CALIB_CB_ASYMMETRIC_GRID if self.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
         detector = self._blob_detector(image)
         for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
@@ -123,14 +121,14 @@ class CircleGrid:
                 found, centres = cv2.findCirclesGrid(
                     image, size, flags=flags, blobDetector=detector
                 )
-            except cv2.error:  # as for pictures too small to hold the board
+            except cv2.error:  # such as for images too small for the board
                 continue
             if found:
                 return np.asarray(centres, dtype=np.float64).reshape(-1, 2)
         return None
 
     def _blob_detector(self, image: Image) -> cv2.SimpleBlobDetector:
-        """For circles from tiny to as large as fit; OpenCV's own stops at 5000 px²."""
+        """For circles up to the largest that fit; OpenCV's default limit is 5000 px²."""
         parameters = cv2.SimpleBlobDetector.Params()
         parameters.minArea = _LEAST_AREA
         parameters.maxArea = float(max(5000.0, image.size / (self.columns * self.rows)))
@@ -138,7 +136,7 @@ class CircleGrid:
         return cv2.SimpleBlobDetector.create(parameters)
 
     def _upright(self, centres: Array) -> Array | None:
-        """Centres in an order that the board can have unmirrored; None where it cannot."""
+        """Centres in an order without mirroring; None where there is none."""
         if self._homography(centres) is not None:
             return centres
         if self.asymmetric:
@@ -147,7 +145,7 @@ class CircleGrid:
         return flipped if self._homography(flipped) is not None else None
 
     def _homography(self, centres: Array) -> Array | None:
-        """From the board's plane to the picture, (3, 3); None where it mirrors or is none."""
+        """Homography from board plane to image, (3, 3); None if mirrored or not found."""
         plane = self.points()[:, :2]
         turn, _ = cv2.findHomography(plane, centres)
         if np.shape(turn) != (3, 3) or np.linalg.det(turn) * np.sign(turn[2, 2]) <= 0.0:
@@ -155,21 +153,21 @@ class CircleGrid:
         return np.asarray(turn, dtype=np.float64)
 
     def _refined(self, dark: Image, centres: Array) -> Array:
-        """Where the circles' middles are seen, shape (n, 2), [px]."""
+        """Images of the circles' centres, shape (n, 2), [px]."""
         turn = self._homography(centres)
         if turn is None:  # not after `_upright`
             return centres
         middles = np.array(
-            [_middle(dark, c, e) for c, e in zip(centres, self._ellipses(turn)[1], strict=True)]
+            [_centroid(dark, c, e) for c, e in zip(centres, self._ellipses(turn)[1], strict=True)]
         )
         return np.asarray(middles - self._ellipses(turn)[0])
 
     def _ellipses(self, turn: Array) -> tuple[Array, Array]:
-        """The ellipses as which the circles are seen.
+        """The ellipses that are the circles' images.
 
         Returns:
-            Their middles less the images of the circles' own, shape (n, 2), [px], and the matrices
-            E of xᵀE⁻¹x = 1 around these middles, shape (n, 2, 2), [px²].
+            Their centres minus the images of the circles' centres, shape (n, 2), [px], and the
+            matrices E of xᵀE⁻¹x = 1 about the ellipse centres, shape (n, 2, 2), [px²].
         """
         offsets, shapes = [], []
         for x, y, _ in self.points().tolist():
@@ -184,13 +182,13 @@ class CircleGrid:
         return np.array(offsets), np.array(shapes)
 
 
-def _middle(dark: Image, centre: Array, shape: Array) -> Array:
-    """Mean of darkness over an ellipse's surroundings, shape (2,), [px].
+def _centroid(dark: Image, centre: Array, shape: Array) -> Array:
+    """Darkness-weighted centroid of an ellipse, shape (2,), [px].
 
     Args:
-        dark: Picture in which circles are dark.
-        centre: Of the ellipse, roughly, shape (2,), [px].
-        shape: Its matrix, as of `CircleGrid._ellipses`.
+        dark: Image in which circles are dark.
+        centre: Approximate centre of the ellipse, shape (2,), [px].
+        shape: Its matrix, from `CircleGrid._ellipses`.
     """
     inverse = np.linalg.inv(shape)
     reach = _WINDOW * np.sqrt(np.diag(shape)) + 2.0
@@ -221,17 +219,17 @@ ORDERS = {
     "rows": "numbered from the top left, rows downward",
     "kalibr": "numbered from the bottom left, rows upward, as Kalibr prints them",
 }
-"""How tags are numbered, by name."""
+"""Numbering of the tags, by name."""
 _SADDLE = 0.12
-"""Half of the window a corner is refined in where black squares touch it, in sides of a tag."""
+"""Half width of the refinement window for corners that black squares touch, in tag sides."""
 _BETTER, _OFF = 3.0, 0.05
-"""The other order is right where it fits better by this factor, and ours misfits by that share of a
-tag's side."""
+"""The other order is right if it fits better by this factor and this order misfits by that share
+of a tag's side."""
 
 
 @dataclass(frozen=True)
 class TagGrid:
-    """A grid of AprilTags, numbered row after row; parts of it will do.
+    """A grid of AprilTags, numbered row by row; partial views suffice.
 
     Attributes:
         columns: Tags along a row.
@@ -239,7 +237,7 @@ class TagGrid:
         tag: Side of a tag's black square, [m].
         gap: Between neighbouring black squares, [m].
         family: One of `model.files.rig_file.FAMILIES`.
-        first: The smallest number: of the tag at the top left, or at the bottom left.
+        first: Smallest number: of the tag at the top left, or at the bottom left.
         order: One of `ORDERS`.
     """
 
@@ -252,11 +250,11 @@ class TagGrid:
     order: str = "rows"
 
     def __post_init__(self) -> None:
-        """Refuses boards that cannot be.
+        """Refuses impossible boards.
 
         Raises:
-            BadInput: Too few tags, sizes that are none, an unknown family, or numbers that it
-                does not have.
+            BadInput: Too few tags, a size not above 0, an unknown family, or numbers outside the
+                family.
         """
         require_board(self.columns * self.rows >= 4, "a tag grid needs 4 tags")
         require_board(min(self.columns, self.rows) >= 1, "a tag grid needs a row and a column")
@@ -285,18 +283,18 @@ class TagGrid:
         last = self.first + self.columns * self.rows - 1
         return f"a grid of {self.columns} x {self.rows} tags, {self.family} {self.first} to {last}"
 
-    def find(self, image: Image) -> Seen | None:
-        """The corners of its tags, as far as these are to be seen whole.
+    def find(self, image: Image) -> DetectedBoard | None:
+        """Detects the corners of its completely visible tags.
 
-        Black and white may be exchanged. None, too, where the numbers contradict the order and the
+        Black and white may be inverted. None, too, where the numbers contradict the order and the
         other order fits.
         """
         seen = self._seen_in(image)
         return self._seen_in(np.asarray(255 - image)) if seen is None else seen
 
-    def _seen_in(self, image: Image) -> Seen | None:
+    def _seen_in(self, image: Image) -> DetectedBoard | None:
         squares, twice = self._edges(image)
-        if self.order == "kalibr":  # printed by Kalibr, or by others with narrow borders
+        if self.order == "kalibr":  # printed by Kalibr, or with narrow borders by others
             squares, twice = max((squares, twice), self._saddles(image), key=lambda f: len(f[0]))
         if 4 * len(squares) < LEAST_POINTS:
             return None
@@ -305,23 +303,23 @@ class TagGrid:
         ours, others = (grid._misfit(squares) for grid in (self, other))
         if ours > max(_BETTER * others, _OFF):
             return None
-        return Seen(self.points_of(squares), corners, twice)
+        return DetectedBoard(self.points_of(squares), corners, twice)
 
     def _edges(self, image: Image) -> tuple[dict[int, Array], tuple[int, ...]]:
-        """Corners of tags by number where their edges meet, and numbers seen more than once."""
+        """Corners of tags by intersecting edges, by number, and numbers seen more than once."""
         numbers = range(self.first, self.first + self.columns * self.rows)
         detected = [d for d in self._detector.detect_all(image) if d.id in numbers]
         counts = Counter(d.id for d in detected)
         detected = [d for d in detected if counts[d.id] == 1]
         rough = np.array([d.corners for d in detected]).reshape(-1, 4, 2)
-        # An edge is short: its bend by the lens does not count.
-        lens = plain_camera((image.shape[1], image.shape[0]))
+        # An edge is short: its curvature from lens distortion is negligible.
+        lens = generic_camera((image.shape[1], image.shape[0]))
         squares = refine(image, lens, rough, modules_across(self.family))
         whole = {d.id: s.corners for d, s in zip(detected, squares, strict=True) if s and s.whole}
         return whole, tuple(number for number, count in counts.items() if count > 1)
 
     def _saddles(self, image: Image) -> tuple[dict[int, Array], tuple[int, ...]]:
-        """As `_edges`, of tags with wide borders whose corners black squares touch."""
+        """As `_edges`, for tags with wide borders and black squares at their corners."""
         found, ids, _ = self._wide_detector.detectMarkers(image)
         numbers = [int(n) for n in np.ravel(ids)] if found else []
         counts = Counter(numbers)
@@ -340,7 +338,7 @@ class TagGrid:
         return squares, tuple(number for number, count in counts.items() if count > 1)
 
     def _misfit(self, squares: dict[int, Array]) -> float:
-        """RMS distance of corners from the nearest flat view of the board, in sides of a tag."""
+        """RMS misfit of corners to a homography of the board, in sides of a tag."""
         corners = np.concatenate(list(squares.values()))
         plane = self.points_of(squares)[:, :2] / self.tag
         back, _ = cv2.findHomography(corners, plane)
@@ -352,8 +350,8 @@ class TagGrid:
     def _other_order(self) -> str:
         return next(order for order in ORDERS if order != self.order)
 
-    def instead(self, image: Image) -> str:
-        """The tags in another order, else tags that the picture shows."""
+    def describe_other(self, image: Image) -> str:
+        """The tags in another order, else tags that the image shows."""
         other = self._other_order()
         if replace(self, order=other).find(image) is not None:
             return f"these tags {ORDERS[other]}: try --order {other}"

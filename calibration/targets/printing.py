@@ -1,4 +1,4 @@
-"""What is black on boards and tags: rectangles in exact size, and the white they need around."""
+"""Prints of boards and tags in exact size: vector shapes, PDF pages, paper layout."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from tracking.detection.tags import modules_across, official_modules
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Print:
-    """Something to be printed.
+    """Vector shapes of one target.
 
     Attributes:
-        black: Left, top, width and height of black rectangles, from the top left of what is
-            printed, shape (n, 4), [m].
-        size: Width and height of what is printed, shape (2,), [m].
-        quiet: Width of the white that must surround it, [m].
-        caption: What it is, printable ASCII.
-        discs: Centre and radius of black discs, likewise, shape (n, 3), [m].
+        black: Left, top, width and height of black rectangles, from the target's top left, shape
+            (n, 4), [m].
+        size: Width and height of the target, shape (2,), [m].
+        quiet: Width of the quiet zone around it, [m].
+        caption: Name of the target, printable ASCII.
+        discs: Centre and radius of black discs, from the same origin, shape (n, 3), [m].
     """
 
     black: Array
@@ -66,7 +66,7 @@ def tag_print(family: str, number: int, size: float) -> Print:
 
 
 def _chessboard(board: Chessboard) -> Print:
-    """One square more than inner corners each way, the one at the top left black."""
+    """One square more than inner corners in each direction; the top left one is black."""
     rows, columns = np.indices((board.rows + 1, board.columns + 1))
     black = _modules((rows + columns) % 2 == 0, np.zeros(2), board.square)
     size = np.array([board.columns + 1, board.rows + 1]) * board.square
@@ -122,12 +122,12 @@ def _circle_grid(board: CircleGrid) -> Print:
 
 
 def _quiet(square: float) -> float:
-    """White around a chessboard, [m]: enough to separate its outermost squares from the table."""
+    """Quiet zone of a chessboard, [m]: it separates the outermost squares from the table."""
     return min(square / 3.0, 0.008)
 
 
 def _modules(black: NDArray[np.bool_], corner: Array, side: float) -> Array:
-    """Rectangles of the black modules of a grid, runs along a row joined, shape (n, 4), [m]."""
+    """Rectangles of a grid's black modules, merged along rows, shape (n, 4), [m]."""
     found = []
     for row, line in enumerate(black):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(np.int8), [0]])))
@@ -137,9 +137,9 @@ def _modules(black: NDArray[np.bool_], corner: Array, side: float) -> Array:
     return np.array(found).reshape(-1, 4)
 
 
-# Vector pages in exact size: black rectangles and plain text, in millimetres, as PDF 1.4.
+# PDF 1.4 pages in exact size: black shapes and plain text, in millimetres.
 #
-# Rectangles of a page are one path, so that no viewer shows seams where they touch.
+# Rectangles of a page are one path, so that viewers show no seams between them.
 #
 # Source: ISO 32000-1, 7.5 (file structure), 8.5 (paths), 9.4 (text).
 
@@ -172,8 +172,8 @@ class Page:
         width_mm: Of the paper.
         height_mm: Of the paper.
         black_mm: Left, top, width and height of black rectangles, from the top left, shape (n, 4).
-        texts: On top of them.
-        discs_mm: Centre and radius of black discs, likewise, shape (n, 3).
+        texts: Drawn on top.
+        discs_mm: Centre and radius of black discs, from the same origin, shape (n, 3).
     """
 
     width_mm: float
@@ -184,7 +184,7 @@ class Page:
 
 
 def pdf_of(pages: list[Page], title: str) -> bytes:
-    """The whole file.
+    """The PDF file.
 
     Args:
         pages: One or more.
@@ -202,22 +202,22 @@ def pdf_of(pages: list[Page], title: str) -> bytes:
             f"<< /Type /Page /Parent 2 0 R /MediaBox {box} /Contents {5 + 2 * number} 0 R"
             " /Resources << /Font << /F1 3 0 R >> >> >>".encode()
         )
-        drawn = _drawn(page)
-        objects.append(b"<< /Length %d >>\nstream\n%s\nendstream" % (len(drawn), drawn))
+        content = _content_stream(page)
+        objects.append(b"<< /Length %d >>\nstream\n%s\nendstream" % (len(content), content))
     objects.append(f"<< /Title ({_escaped(title)}) /Producer (cdpr) >>".encode())
     return _file(objects)
 
 
-def _drawn(page: Page) -> bytes:
-    """The operators of a page; one unit is a millimetre, y runs down."""
+def _content_stream(page: Page) -> bytes:
+    """The content stream of a page; one unit is a millimetre, y points down."""
     scale = f"{POINTS_A_MM:.10f}"
     lines = [f"{scale} 0 0 -{scale} 0 {page.height_mm * POINTS_A_MM:.6f} cm", "0 g"]
     lines += [f"{x:.5f} {y:.5f} {w:.5f} {h:.5f} re" for x, y, w, h in page.black_mm.tolist()]
     lines += [_disc(*disc) for disc in page.discs_mm.tolist()]
     lines.append("f")
     for text in page.texts:
-        place = f"1 0 0 -1 {text.x_mm:.4f} {text.y_mm:.4f} Tm"
-        lines.append(f"BT /F1 {text.size_mm:.3f} Tf {place} ({_escaped(text.text)}) Tj ET")
+        matrix = f"1 0 0 -1 {text.x_mm:.4f} {text.y_mm:.4f} Tm"
+        lines.append(f"BT /F1 {text.size_mm:.3f} Tf {matrix} ({_escaped(text.text)}) Tj ET")
     return "\n".join(lines).encode("ascii")
 
 
@@ -242,44 +242,44 @@ def _escaped(text: str) -> str:
 
 
 def _file(objects: list[bytes]) -> bytes:
-    """Objects numbered from 1, the table of their places, and the trailer."""
+    """Objects numbered from 1, the cross-reference table, and the trailer."""
     out = bytearray(b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n")
-    places = []
+    offsets = []
     for number, body in enumerate(objects, 1):
-        places.append(len(out))
+        offsets.append(len(out))
         out += b"%d 0 obj\n%s\nendobj\n" % (number, body)
     start = len(out)
     out += b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1)
-    for place in places:
-        out += b"%010d 00000 n \n" % place
+    for offset in offsets:
+        out += b"%010d 00000 n \n" % offset
     out += b"trailer\n<< /Size %d /Root 1 0 R /Info %d 0 R >>\n" % (len(objects) + 1, len(objects))
     out += b"startxref\n%d\n%%%%EOF\n" % start
     return bytes(out)
 
 
-# Prints on paper: in exact size, with a ruler to prove it, or refused.
+# Layout on paper: in exact size, with a ruler to check it, or refused.
 
 
 PaperName = Literal["a4", "a3", "letter"]
 PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-"""Width and height upright, [mm]."""
+"""Width and height in portrait, [mm]."""
 MARGIN_MM = 5.0
-"""What printers leave white."""
+"""Margin that printers leave white, [mm]."""
 _FOOT_MM = 12.0
-"""For ruler and caption."""
+"""Height of ruler and caption, [mm]."""
 _CAPTION_MM = 5.0
-"""For the line below each of several prints."""
+"""Height of the caption below each of several prints, [mm]."""
 _LETTERS_MM = 2.8
 RULER_MM = 100.0
 
 
 def sheet_of(print_: Print, paper: str) -> Page:
-    """A print in the middle of a page of its own, upright or across.
+    """A print centred on its own page, in portrait or landscape.
 
     Raises:
         BadInput: It does not fit, and must not be scaled or cut into tiles.
     """
-    for width, height in _turns(paper):
+    for width, height in _orientations(paper):
         if _fits(print_, width, height):
             border = _border(print_)
             free = np.array([width, height - _FOOT_MM - MARGIN_MM + border])
@@ -290,7 +290,7 @@ def sheet_of(print_: Print, paper: str) -> Page:
 
 
 def sheets_of(prints: Sequence[Print], paper: str) -> list[Page]:
-    """Several prints with their names below, row after row on upright pages.
+    """Several captioned prints, in rows on portrait pages.
 
     Raises:
         BadInput: One of them does not fit.
@@ -318,7 +318,7 @@ class Printout:
     """Targets on sheets of paper.
 
     Attributes:
-        what: The targets, for people.
+        what: Human-readable name of the targets.
         pages: The sheets.
     """
 
@@ -359,18 +359,18 @@ def tag_prints(rig: Rig) -> list[Print]:
     return [replace(made, caption=f"{made.caption}, {group}") for group, made in prints]
 
 
-def _turns(paper: str) -> list[tuple[float, float]]:
+def _orientations(paper: str) -> list[tuple[float, float]]:
     width, height = PAPERS[paper]
     return [(width, height), (height, width)]
 
 
 def _border(print_: Print) -> float:
-    """White at the sides and above, [mm]: what it needs, of which the printer leaves some."""
+    """White border at the sides and above, [mm]; includes the printer's margin."""
     return max(MARGIN_MM, 1e3 * print_.quiet)
 
 
 def _needed(print_: Print) -> Array:
-    """Width and height of the paper that it needs, shape (2,), [mm]."""
+    """Width and height of paper required, shape (2,), [mm]."""
     border = _border(print_)
     below = 1e3 * print_.quiet + _FOOT_MM + MARGIN_MM
     return np.asarray(1e3 * print_.size + [2.0 * border, border + below])
@@ -381,7 +381,7 @@ def _fits(print_: Print, width: float, height: float) -> bool:
 
 
 def _page(width: float, height: float, placed: Sequence[tuple[Print, Array]], caption: str) -> Page:
-    """A page with prints, the ruler, and one caption at its foot or each print's below it."""
+    """A page with prints, the ruler, and a caption at the foot or one below each print."""
     black, texts = _ruler(width, height)
     discs = np.zeros((0, 3))
     for print_, corner in placed:
@@ -402,13 +402,13 @@ def _ruler(width: float, height: float) -> tuple[Array, list[Text]]:
     for millimetre in range(int(RULER_MM) + 1):
         deep = 4.0 if millimetre % 10 == 0 else 2.5 if millimetre % 5 == 0 else 1.5
         ticks.append([left + millimetre - 0.05, top, 0.1, deep])
-    say = f"{RULER_MM:g} mm: measure it. Print at 100 %, not scaled to the page."
-    return np.array(ticks), [Text(left + RULER_MM + 3.0, top + 3.0, _LETTERS_MM, say)]
+    note = f"{RULER_MM:g} mm: measure it. Print at 100 %, not scaled to the page."
+    return np.array(ticks), [Text(left + RULER_MM + 3.0, top + 3.0, _LETTERS_MM, note)]
 
 
 def _too_large(print_: Print, paper: str) -> BadInput:
     needed = _needed(print_)
-    others = [name for name in PAPERS if any(_fits(print_, *turned) for turned in _turns(name))]
+    others = [name for name in PAPERS if any(_fits(print_, *size) for size in _orientations(name))]
     width, height = PAPERS[paper]
     return BadInput(
         f"{print_.caption} needs paper of {needed[0]:.0f} x {needed[1]:.0f} mm with its white"

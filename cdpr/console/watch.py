@@ -220,9 +220,9 @@ class CameraPictures:
 def _compressed(newest: LiveImage, rig: Rig, name: str) -> bytes:
     import cv2  # a console that shows no image does not load it
 
-    from tracking.track import outlined
+    from tracking.track import draw_outline
 
-    drawn = outlined(newest.image, rig, rig.camera(name), newest.found)
+    drawn = draw_outline(newest.image, rig, rig.camera(name), newest.found)
     height, width = newest.image.shape
     if width > WIDEST:
         size = (WIDEST, round(height * WIDEST / width))

@@ -26,7 +26,7 @@ from model.pose import Pose
 from model.rig import Camera, Rig
 from tracking.clearance import MeasuredClearance
 from tracking.measurement import NoPose, Observation
-from tracking.tracker import DrivesAhead, Tracker
+from tracking.tracker import EncoderExtrapolator, Tracker
 
 # What a camera's process does with a trigger: an image, and the pose in it.
 
@@ -118,7 +118,7 @@ class CameraWorker:
         """
         self._source, self._folder, self._keep_every = source, folder, keep_every
         self._name = camera.name if named else ""
-        self._tracker, self._drives = Tracker(rig, camera), DrivesAhead()
+        self._tracker, self._drives = Tracker(rig, camera), EncoderExtrapolator()
         self._live, self._newest = live, _NOTHING
 
     def __enter__(self) -> CameraWorker:

@@ -22,7 +22,7 @@ from executor.recording.csv_columns import (
     write_table,
 )
 from model.pose import Array, Pose, quaternion_from_matrix
-from tracking.fusion import Measured, fused
+from tracking.fusion import Measured, fuse_with_encoders
 from tracking.pose_log import POSE_COLUMNS
 
 _MM, _MS = 1e3, 1e3
@@ -418,7 +418,7 @@ def fused_table(cycles: CycleTable, poses: PoseTable) -> FusedTable:
         )
         for i in np.flatnonzero(poses.ok)
     ]
-    rows = list(fused(cycles.time[known].tolist(), by_drives, measured))
+    rows = list(fuse_with_encoders(cycles.time[known].tolist(), by_drives, measured))
     covariances = np.array([row.covariance for row in rows]).reshape(-1, 6, 6)
     return FusedTable(
         time=np.array([row.time for row in rows]),

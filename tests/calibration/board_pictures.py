@@ -1,4 +1,4 @@
-"""Images of boards from a camera that is known exactly."""
+"""Images of boards by a camera with known parameters."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _SUB = 2
 def poses_before_the_camera(
     middle: Array, count: int, seed: int = 4, spread: float = 0.06
 ) -> list[Pose]:
-    """Tilted board poses whose middle, board frame, shape (3,), [m], is near the image's."""
+    """Tilted board poses whose centre, board frame, shape (3,), [m], is near the image centre."""
     rng = np.random.default_rng(seed)
     poses = []
     for _ in range(count):
         turn = matrix_from_rotation_vector(rng.uniform(-0.6, 0.6, 3))
-        place = np.array([*rng.uniform(-spread, spread, 2), rng.uniform(0.4, 0.6)])
-        poses.append(Pose(place - turn @ middle, turn))
+        position = np.array([*rng.uniform(-spread, spread, 2), rng.uniform(0.4, 0.6)])
+        poses.append(Pose(position - turn @ middle, turn))
     return poses
 
 
 @cache
 def sample_rays() -> Array:
-    """Of all 2 x 2 samples a pixel, camera frame, shape (n, 3); found once for all images."""
+    """Rays of 2 x 2 samples per pixel, camera frame, shape (n, 3); cached for all images."""
     columns = (np.arange(SIZE[0] * _SUB) + 0.5) / _SUB - 0.5
     rows = (np.arange(SIZE[1] * _SUB) + 0.5) / _SUB - 0.5
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
@@ -39,7 +39,7 @@ def sample_rays() -> Array:
 
 
 def picture_of(print_: np.ndarray, pixel: float, origin: Array, pose: Pose) -> np.ndarray:
-    """What the camera sees of a print on a board, on a grey wall.
+    """Image of a print on a board in front of a grey wall.
 
     Args:
         print_: Grey image of the print.
@@ -49,8 +49,8 @@ def picture_of(print_: np.ndarray, pixel: float, origin: Array, pose: Pose) -> n
     """
     rays = sample_rays() @ pose.rotation
     eye = -pose.rotation.T @ pose.position
-    places = (eye + (-eye[2] / rays[:, 2])[:, None] * rays)[:, :2]
-    found = ((places + origin) / pixel - 0.5).astype(np.float32)
+    on_board = (eye + (-eye[2] / rays[:, 2])[:, None] * rays)[:, :2]
+    found = ((on_board + origin) / pixel - 0.5).astype(np.float32)
     shape = (SIZE[1] * _SUB, SIZE[0] * _SUB)
     fine = cv2.remap(
         print_.astype(np.float32),

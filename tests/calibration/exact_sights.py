@@ -1,4 +1,4 @@
-"""Sights of tags as a perfect detector with known noise would have them."""
+"""Observations of tags by a perfect detector with known noise."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from calibration.tag_map.observations import TagSights
+from calibration.tag_map.observations import TagObservations
 from model.pose import Pose
 from model.rig import Camera, Tag
 from tracking.camera_model import project_undistorted
@@ -17,7 +17,7 @@ from tracking.edges.refine import RefinedTag
 def seen_tag(
     camera: Camera, camera_from_carrier: Pose, tag: Tag, noise: float, rng: np.random.Generator
 ) -> RefinedTag | None:
-    """The square of a tag; None where it shows its back or is out of the image."""
+    """The square of a tag; None if it faces away or is out of the image."""
     points = camera_from_carrier.apply(tag_corners(tag))
     normal = camera_from_carrier.rotation @ tag.pose.rotation[:, 2]
     middle = points.mean(axis=0)
@@ -31,16 +31,16 @@ def seen_tag(
     return RefinedTag(corners, whitening, whitening @ corners.ravel(), np.ones(4, bool))
 
 
-def sights_at(
+def observe(
     camera: Camera,
     tags: Sequence[Tag],
     poses: Mapping[str, Pose],
     noise: float,
     rng: np.random.Generator,
-) -> TagSights:
+) -> TagObservations:
     """Tags of a carrier at poses ``camera_from_carrier``, by image."""
     squares = {}
     for name, pose in poses.items():
         seen = {tag.id: seen_tag(camera, pose, tag, noise, rng) for tag in tags}
         squares[name] = {number: square for number, square in seen.items() if square is not None}
-    return TagSights({name: found for name, found in squares.items() if found}, {})
+    return TagObservations({name: found for name, found in squares.items() if found}, {})

@@ -1,4 +1,4 @@
-"""Images as turned cameras store them."""
+"""Images as rotated cameras store them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 
 
-def turned_by_exif(image: np.ndarray) -> bytes:
-    """A JPEG whose pixels are turned by 90°, and which says so (orientation 6)."""
-    turned = np.ascontiguousarray(np.rot90(image))  # stored anticlockwise, shown turned back
-    data = cv2.imencode(".jpg", turned, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+def rotated_by_exif(image: np.ndarray) -> bytes:
+    """A JPEG with pixels rotated by 90° and the EXIF orientation 6."""
+    rotated = np.ascontiguousarray(np.rot90(image))  # stored anticlockwise, shown rotated back
+    data = cv2.imencode(".jpg", rotated, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
     entry = struct.pack(">HHIHH", 0x0112, 3, 1, 6, 0)
     tiff = b"MM\x00\x2a" + struct.pack(">IH", 8, 1) + entry + struct.pack(">I", 0)
     body = b"Exif\x00\x00" + tiff

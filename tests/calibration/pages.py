@@ -1,4 +1,4 @@
-"""Reads our PDF pages back by an independent route: the operators of their content streams."""
+"""Reads our PDF pages back from the operators of their content streams."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results as if found by a calibration."""
+"""Calibration results for tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places at rest of a rig that is not built as its file says, with exact truth."""
+"""Stationary samples of a rig that differs from its file, with exact ground truth."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ POSITION_NOISE, TURN_NOISE = 0.2e-3, 0.5e-3
 
 @dataclass(frozen=True)
 class Truth:
-    """Measurements and what is true of them."""
+    """Measurements and their ground truth."""
 
     measured: RigMeasurements
     positions: Array
     rotations: Array
 
 
-def places(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) -> Truth:
-    """Where a simulated rig comes to rest when its drives are told to go to random poses."""
+def samples(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) -> Truth:
+    """Samples of a simulated rig whose drives are commanded to random poses."""
     random = np.random.default_rng(seed)
     winches, plant = WinchMap(rig), _plant(rig)
     span = rig.workspace_upper - rig.workspace_lower
@@ -61,7 +61,7 @@ def places(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) 
     ]
     covariance = np.diag([POSITION_NOISE**2] * 3 + [TURN_NOISE**2] * 3)
     measured = RigMeasurements(
-        names=tuple(f"place {k}" for k in range(count)),
+        names=tuple(f"sample {k}" for k in range(count)),
         counts=np.array([counts for counts, _, _ in rows]),
         tensions=np.array([t for _, t, _ in rows]),
         positions=np.array([p for p, _ in shaken]),
@@ -75,13 +75,13 @@ def places(rig: Rig, count: int, *, tilt: float, seed: int, noise: float = 1.0) 
     )
 
 
-def built_otherwise(rig: Rig, seed: int, stiffness: Sequence[float] | None = None) -> Rig:
-    """The same rig file, but built with other random errors, as large as are usually stated.
+def rig_with_errors(rig: Rig, seed: int, stiffness: Sequence[float] | None = None) -> Rig:
+    """A rig with random errors of the usual size relative to its file.
 
     Args:
         rig: Of the rehearsal.
         seed: Of the errors.
-        stiffness: Of each cable, [N]; left out, as the rig file tells.
+        stiffness: Of each cable, [N]; as in the rig file when left out.
     """
     random, document = np.random.default_rng(seed), rig.document
     assert document.simulation is not None
@@ -102,14 +102,14 @@ def built_otherwise(rig: Rig, seed: int, stiffness: Sequence[float] | None = Non
     return rig_from_document(document.model_copy(update={"simulation": simulation}))
 
 
-def drawn_with(rig: Rig, stiffness: float) -> Rig:
+def with_nominal_stiffness(rig: Rig, stiffness: float) -> Rig:
     """The rig with another stiffness in its file, [N]."""
     cables = rig.document.cables.model_copy(update={"stiffness_n": stiffness})
     return rig_from_document(rig.document.model_copy(update={"cables": cables}))
 
 
 def true_numbers(rig: Rig) -> dict[str, float]:
-    """As a calibration names them, without the offsets."""
+    """True values by the names of a calibration, without the offsets."""
     truth = rig_as_built(rig)
     found = {
         f"{what}_{i}_{axis}_mm": 1e3 * float(value)
@@ -123,7 +123,7 @@ def true_numbers(rig: Rig) -> dict[str, float]:
 
 
 def share_inside(intervals: Mapping[str, Interval], true: Mapping[str, float]) -> float:
-    """How many of the intervals hold what is true."""
+    """Share of the intervals that contain the truth."""
     found = [
         abs(intervals[name].value - value) < intervals[name].half_width
         for name, value in true.items()
@@ -135,15 +135,15 @@ def _plant(rig: Rig) -> Plant:
     return Plant(rig_as_built(rig), rig.home, None, stiffness_as_built(rig))
 
 
-def write_places(path: Path, measured: RigMeasurements, *, poses: bool = True) -> None:
-    """As a CSV file of docs/data-formats.md."""
+def write_samples(path: Path, measured: RigMeasurements, *, poses: bool = True) -> None:
+    """Writes a CSV file as in docs/data-formats.md."""
     m = measured.counts.shape[1]
     names = [f"actual_{i}_counts" for i in range(1, m + 1)]
     names += [f"tension_{i}_n" for i in range(1, m + 1)]
     table = [measured.counts, measured.tensions]
     if poses:
         names += ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"]
-        turned = [Pose(np.zeros(3), r).quaternion for r in measured.rotations]
-        table += [measured.positions * 1e3, np.array(turned)]
+        quaternions = [Pose(np.zeros(3), r).quaternion for r in measured.rotations]
+        table += [measured.positions * 1e3, np.array(quaternions)]
     rows = [",".join(f"{x:.9g}" for x in row) for row in np.concatenate(table, axis=1)]
     path.write_text("\n".join([",".join(names), *rows]) + "\n", encoding="utf-8")

@@ -1,7 +1,7 @@
-"""A rig over pulleys that is not built as its file says, and what its sensors read.
+"""A rig with pulleys that differs from its file, and the readings of its sensors.
 
-No formula is from `calibration`: angles by rotations of scipy, lengths in the complex plane of
-each pulley. Tensions are any that the rig allows, as if it carried something else at each pose.
+No formula is from `calibration`: angles use scipy's rotations, lengths the complex plane of each
+pulley. Tensions are random within the rig's limits, as with a different load at each pose.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from model.statics.gravity import working_tensions
 
 LENGTH_NOISE, POSITION_NOISE, TURN_NOISE = 0.1e-3, 0.2e-3, 0.5e-3
 ANGLE_NOISE = float(np.radians(0.1))
-"""Of swivel angles, and of the IMU's vertical, [rad]."""
+"""Noise of swivel angles, and of the IMU's vertical, [rad]."""
 SPREAD: Mapping[str, tuple[float, int]] = {
     "outlets": (4e-3, 3),
     "anchors": (1e-3, 3),
@@ -28,16 +28,16 @@ SPREAD: Mapping[str, tuple[float, int]] = {
     "stiffness": (0.2, 1),
     "swivel_zeros": (float(np.radians(1.0)), 1),
 }
-"""How far off numbers of a cable are, [m], [rad] or as a share, and how many there are."""
+"""Standard deviation of a cable's parameters, [m], [rad] or relative, and their number."""
 
 
 @dataclass(frozen=True)
 class BuiltRig:
-    """The truth about a rig: how far each number is from the rig file, as a calibration counts it.
+    """Ground truth of a rig: deviations from its file, in the units of a calibration.
 
     Attributes:
         rig: As in its file.
-        off: By group, numbers of all cables one after the other; stiffness as a logarithm.
+        off: By group, values of all cables in order; stiffness as a logarithm.
     """
 
     rig: Rig
@@ -59,8 +59,8 @@ def built_rig(rig: Rig, seed: int, imu_mounting_deg: float = 1.0, alike: bool = 
     Args:
         rig: As in its file.
         seed: Of the errors.
-        imu_mounting_deg: Standard deviation of how the IMU is turned.
-        alike: All cables are of one stiffness.
+        imu_mounting_deg: Standard deviation of the IMU's mounting rotation.
+        alike: All cables have the same stiffness.
     """
     random, m = np.random.default_rng(seed), rig.cable_count
     off = {g: size * random.standard_normal(k * m) for g, (size, k) in SPREAD.items()}
@@ -74,14 +74,14 @@ def built_rig(rig: Rig, seed: int, imu_mounting_deg: float = 1.0, alike: bool = 
 def measured(
     built: BuiltRig, count: int, seed: int, noise: float = 1.0, steady: int | None = None
 ) -> RigMeasurements:
-    """All that can be measured of a rig at random poses, tilted by up to 8 degrees.
+    """All measurements of a rig at random poses, tilted by up to 8 degrees.
 
     Args:
         built: The truth.
         count: Number of poses.
         seed: Of the poses and the noise.
-        noise: Of all measurements, in units of what is usual.
-        steady: The number of a cable that carries the same tension at all poses.
+        noise: Of all measurements, relative to the usual.
+        steady: Number of a cable with the same tension at all poses.
     """
     random, rig, off = np.random.default_rng(seed), built.rig, built.off
     m, span = rig.cable_count, rig.workspace_upper - rig.workspace_lower
@@ -91,8 +91,8 @@ def measured(
     turns = Rotation.from_rotvec(np.radians(8.0) * random.uniform(-1.0, 1.0, (count, 3)))
     positions = rig.workspace_lower + random.uniform(0.1, 0.9, (count, 3)) * span
     home = rig.home.apply(anchors) - outlets
-    ways = turns.as_matrix() @ anchors.T
-    ways = positions[:, None] + np.swapaxes(ways, 1, 2) - outlets
+    vectors = turns.as_matrix() @ anchors.T
+    vectors = positions[:, None] + np.swapaxes(vectors, 1, 2) - outlets
 
     tensions = random.uniform(rig.min_tension, rig.max_tension, (count, m))
     if steady is not None:
@@ -101,14 +101,14 @@ def measured(
     at_home = (_lengths(home, rig.feed_directions, radius) + behind) / (
         1.0 + working_tensions(rig, rig.home).tensions / built.stiffness
     )
-    lengths = _lengths(ways, rig.feed_directions, radius)
+    lengths = _lengths(vectors, rig.feed_directions, radius)
     lengths = lengths + noise * LENGTH_NOISE * random.standard_normal((count, m))
     unstrained = (lengths + behind) / (1.0 + tensions / built.stiffness)
     paid_out = (unstrained - at_home - off["offsets"]) / (1.0 + off["drum_scale"])
     winches = np.array([[w.home_counts, w.counts_per_metre] for w in rig.winches]).T
 
     drawn = rig.home.apply(rig.anchors) - rig.outlets
-    swivels = np.array([_angles(drawn, way, rig.feed_directions) for way in ways])
+    swivels = np.array([_angles(drawn, vector, rig.feed_directions) for vector in vectors])
     swivels = swivels + off["swivel_zeros"]
     swivels = swivels + noise * ANGLE_NOISE * random.standard_normal((count, m))
     mounting = Rotation.from_rotvec(off["imu_mounting"])
@@ -117,7 +117,7 @@ def measured(
 
     seen = Rotation.from_rotvec(noise * TURN_NOISE * random.standard_normal((count, 3))) * turns
     return RigMeasurements(
-        names=tuple(f"place {k}" for k in range(count)),
+        names=tuple(f"sample {k}" for k in range(count)),
         counts=winches[0] + winches[1] * paid_out,
         tensions=tensions,
         positions=positions + noise * POSITION_NOISE * random.standard_normal((count, 3)),
@@ -136,14 +136,14 @@ def only(data: RigMeasurements, *sensors: str) -> RigMeasurements:
     return replace(data, **empty)  # type: ignore[arg-type]
 
 
-def _lengths(ways: Array, axes: Array, radius: float) -> Array:
+def _lengths(vectors: Array, axes: Array, radius: float) -> Array:
     """From outlets over pulleys to anchors: arc and tangent in the plane of each pulley.
 
     The plane's real axis points from the outlet to the pulley's centre, its imaginary axis along
     the feed; the cable enters the pulley at 0.
     """
-    along = np.sum(ways * axes, axis=-1)
-    across = np.linalg.norm(np.cross(ways, axes), axis=-1)
+    along = np.sum(vectors * axes, axis=-1)
+    across = np.linalg.norm(np.cross(vectors, axes), axis=-1)
     anchor = across + 1j * along
     to_anchor = anchor - radius
     straight = np.sqrt(np.abs(to_anchor) ** 2 - radius**2)
@@ -153,7 +153,9 @@ def _lengths(ways: Array, axes: Array, radius: float) -> Array:
 
 
 def _angles(before: Array, after: Array, axes: Array) -> Array:
-    """By which rotation about each axis the plane through one vector comes to another, [rad]."""
-    x, y = (way - np.sum(way * axes, axis=1, keepdims=True) * axes for way in (before, after))
+    """Rotation about each axis from the plane through one vector to another, [rad]."""
+    x, y = (
+        vector - np.sum(vector * axes, axis=1, keepdims=True) * axes for vector in (before, after)
+    )
     sine, cosine = np.sum(np.cross(x, y) * axes, axis=1), np.sum(x * y, axis=1)
     return np.asarray(np.arctan2(sine, cosine))

@@ -1,4 +1,4 @@
-"""Boards in rendered images: every point where it is, and no point that is not there."""
+"""Boards in rendered images: points at their true positions, and no false points."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from calibration.intrinsics.calibrate import fit_camera
 from calibration.statistics import EvenSample
-from calibration.targets.boards import Charuco, Chessboard, mirrored
+from calibration.targets.boards import Charuco, Chessboard, is_mirrored
 from calibration.targets.grids import CircleGrid, TagGrid
 from model.errors import BadInput
 from model.pose import Pose
@@ -41,7 +41,7 @@ def charuco_print() -> np.ndarray:
 
 
 def tag_print() -> np.ndarray:
-    """White, with the official images of the tags, which are OpenCV's turned by 180°."""
+    """White, with the official images of the tags, which are OpenCV's rotated by 180°."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36H11)
     sheet = np.full((4 * 104 + 40, 5 * 104 + 40), 255, np.uint8)
     for number in range(20):
@@ -75,13 +75,13 @@ def kalibr_print() -> np.ndarray:
 
 
 def circle_print(board: CircleGrid) -> np.ndarray:
-    """Black circles on white, the first one's middle `MARGIN` from the left and the top."""
+    """Black circles on white, the first centre `MARGIN` from the left and the top."""
     fine = 4
-    places = (board.points()[:, :2] + MARGIN) / PIXEL
-    width, height = (places.max(axis=0) + MARGIN / PIXEL).astype(int)
+    centres = (board.points()[:, :2] + MARGIN) / PIXEL
+    width, height = (centres.max(axis=0) + MARGIN / PIXEL).astype(int)
     sheet = np.full((height * fine, width * fine), 255, np.uint8)
-    for place in places:
-        middle = tuple(np.round((place * fine - 0.5) * 16).astype(int).tolist())
+    for centre in centres:
+        middle = tuple(np.round((centre * fine - 0.5) * 16).astype(int).tolist())
         radius = round(board.diameter / 2.0 / PIXEL * fine * 16)
         cv2.circle(sheet, middle, radius, 0, -1, cv2.LINE_8, 4)
     return cv2.resize(sheet, (width, height), interpolation=cv2.INTER_AREA)
@@ -102,8 +102,8 @@ def off(board, pictures) -> np.ndarray:
     errors = []
     for image, pose in pictures:
         if (seen := board.find(image)) is not None:
-            turned = cv2.Rodrigues(pose.rotation)[0]
-            truth = cv2.projectPoints(seen.points, turned, pose.position, MATRIX, DISTORTION)[0]
+            rotation = cv2.Rodrigues(pose.rotation)[0]
+            truth = cv2.projectPoints(seen.points, rotation, pose.position, MATRIX, DISTORTION)[0]
             errors.append(seen.corners - truth.reshape(-1, 2))
     return np.concatenate(errors) if errors else np.zeros((0, 2))
 
@@ -112,7 +112,7 @@ def off(board, pictures) -> np.ndarray:
     ("board", "points", "limit"), [(CIRCLES, 200, 0.04), (SHIFTED, 200, 0.05), (KALIBR, 500, 0.1)]
 )
 def test_centres_and_saddles_are_found_where_they_are(board, points: int, limit: float) -> None:
-    """Middles of ellipses would be 0.1 px and more off where circles are seen aslant."""
+    """Centres of ellipses would be off by 0.1 px and more for oblique circles."""
     errors = off(board, grid_pictures(board))
     assert len(errors) > points
     assert np.sqrt(np.mean(errors**2)) < limit
@@ -122,7 +122,7 @@ def test_centres_and_saddles_are_found_where_they_are(board, points: int, limit:
 def first(
     count: int, pictures: list[tuple[np.ndarray, Pose]], fits: Callable[[np.ndarray], bool]
 ) -> list[tuple[np.ndarray, Pose]]:
-    """The first pictures that fit; to look for a board takes long."""
+    """The first suitable images; detecting a board takes long."""
     return list(islice(((image, pose) for image, pose in pictures if fits(image)), count))
 
 
@@ -144,8 +144,8 @@ def test_the_order_of_kalibr_is_named_where_the_numbers_contradict_the_rows() ->
     assert "rows upward, as Kalibr prints them: try --order kalibr" in caught.value.why
 
 
-def test_our_own_tags_told_in_the_order_of_kalibr_are_not_taken() -> None:
-    told = replace(TAGS, order="kalibr")
+def test_own_tags_in_the_order_of_kalibr_are_rejected() -> None:
+    other = replace(TAGS, order="kalibr")
 
     def is_whole(image: np.ndarray) -> bool:
         seen = TAGS.find(image)
@@ -154,8 +154,8 @@ def test_our_own_tags_told_in_the_order_of_kalibr_are_not_taken() -> None:
     whole = first(3, pictures(TAGS), is_whole)
     assert whole
     for image, _ in whole:
-        assert told.find(image) is None
-        assert "--order rows" in told.instead(image)
+        assert other.find(image) is None
+        assert "--order rows" in other.describe_other(image)
 
 
 def test_a_charuco_board_of_an_old_opencv_is_named() -> None:
@@ -164,7 +164,7 @@ def test_a_charuco_board_of_an_old_opencv_is_named() -> None:
     drawn.setLegacyPattern(True)
     image = cv2.copyMakeBorder(drawn.generateImage((400, 480)), 40, 40, 40, 40, 0, value=255)
     assert Charuco(5, 6, 0.040, 0.030, "4X4_50", legacy=True).find(image) is not None
-    assert "try with --legacy" in Charuco(5, 6, 0.040, 0.030, "4X4_50").instead(image)
+    assert "try with --legacy" in Charuco(5, 6, 0.040, 0.030, "4X4_50").describe_other(image)
 
 
 @cache
@@ -186,8 +186,8 @@ def test_points_are_found_where_they_are(board: Charuco | TagGrid, limit: float)
         seen = board.find(image)
         if seen is None:
             continue
-        turned = cv2.Rodrigues(pose.rotation)[0]
-        truth = cv2.projectPoints(seen.points, turned, pose.position, MATRIX, DISTORTION)[0]
+        rotation = cv2.Rodrigues(pose.rotation)[0]
+        truth = cv2.projectPoints(seen.points, rotation, pose.position, MATRIX, DISTORTION)[0]
         errors.append(seen.corners - truth.reshape(-1, 2))
         points += len(seen.points)
     assert points > 120
@@ -213,31 +213,31 @@ def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid
     assert other.find(image) is None
     flipped = np.ascontiguousarray(image[:, ::-1])
     assert board.find(flipped) is None
-    assert mirrored(board, flipped)
+    assert is_mirrored(board, flipped)
     with pytest.raises(BadInput) as caught:
         fit_camera([("a", flipped), ("b", flipped)], board)
     assert "mirrored" in caught.value.why
 
 
 @pytest.mark.parametrize(
-    ("board", "wrong", "told"),
+    ("board", "wrong", "named"),
     [
         (CHARUCO, Charuco(7, 5, 0.040, 0.030, "6X6_50"), "; 4X4 0, 1"),
         (TAGS, TagGrid(5, 4, 0.040, 0.012, "tag25h9"), "shows tag36h11 20, 21"),
         (TAGS, TagGrid(5, 4, 0.040, 0.012, "tag36h11", first=300), "shows tag36h11 20, 21"),
     ],
 )
-def test_what_pictures_show_instead_is_told(board, wrong, told: str) -> None:
+def test_the_message_names_what_images_show_instead(board, wrong, named: str) -> None:
     image = next(image for image, _ in pictures(board) if board.find(image) is not None)
     with pytest.raises(BadInput) as caught:
         fit_camera([("a", image), ("b", np.full_like(image, 128))], wrong)
     assert "was found in 0 of 2 images" in caught.value.what
-    assert told in caught.value.why
+    assert named in caught.value.why
     assert "; a shows " in caught.value.why
 
 
-def test_what_most_pictures_show_instead_is_told_not_what_the_first_one_does() -> None:
-    """One image of another board lies among six."""
+def test_the_message_names_what_most_images_show_instead() -> None:
+    """One image of another board among six."""
     image, stray = (
         next(image for image, _ in pictures(board) if board.find(image) is not None)
         for board in (TAGS, CHARUCO)
@@ -297,11 +297,11 @@ def test_a_number_that_is_seen_twice_is_left_out_by_name(board, number: int) -> 
         (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", 580), "tags 0 to 586; .* 580 to 591"),
         (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", order="up"), "unknown order"),
         (lambda: CircleGrid(2, 6, 0.02, 0.01), "3 circles"),
-        (lambda: CircleGrid(4, 6, 0.02, 0.02), "white between"),
+        (lambda: CircleGrid(4, 6, 0.02, 0.02), "not touch"),
         (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", -1), "tags 0 to 586; .* -1 to 10"),
     ],
 )
-def test_boards_that_cannot_be_are_refused(make, named: str) -> None:
+def test_impossible_boards_are_refused(make, named: str) -> None:
     with pytest.raises(BadInput, match=named):
         make()
 

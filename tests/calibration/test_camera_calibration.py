@@ -1,4 +1,4 @@
-"""Intrinsics from a chessboard: the true ones come back from exact and from rendered images."""
+"""Intrinsics from a chessboard: recovered from exact corners and from rendered images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from calibration.intrinsics.quality import is_below, judge_camera
 from calibration.intrinsics.result import camera_result
 from calibration.result_files import load_result
 from calibration.results import write_result
-from calibration.targets.boards import Chessboard, Seen
+from calibration.targets.boards import Chessboard, DetectedBoard
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import DISTORTION, MATRIX, SIZE, sample_rays
@@ -43,22 +43,22 @@ def corners_at(pose: Pose) -> Array:
     return cv2.projectPoints(points, zero, zero, MATRIX, DISTORTION)[0].reshape(-1, 2)
 
 
-def views(count: int, noise: float, seed: int = 5) -> dict[str, Seen]:
+def views(count: int, noise: float, seed: int = 5) -> dict[str, DetectedBoard]:
     rng = np.random.default_rng(seed)
     found = {}
     for k, pose in enumerate(board_poses(count)):
         corners = corners_at(pose)
         noisy = corners + noise * rng.standard_normal(corners.shape)
-        found[f"view {k}"] = Seen(BOARD.points(), noisy)
+        found[f"view {k}"] = DetectedBoard(BOARD.points(), noisy)
     return found
 
 
 def board_picture(pose: Pose) -> np.ndarray:
-    """The board rendered by meeting its plane with every ray, 2 x 2 samples a pixel."""
+    """The board rendered by ray casting, 2 x 2 samples per pixel."""
     rays = sample_rays() @ pose.rotation
     origin = -pose.rotation.T @ pose.position
-    places = (origin + (-origin[2] / rays[:, 2])[:, None] * rays)[:, :2] / BOARD.square + 1.0
-    squares = np.floor(places).astype(int)
+    on_board = (origin + (-origin[2] / rays[:, 2])[:, None] * rays)[:, :2] / BOARD.square + 1.0
+    squares = np.floor(on_board).astype(int)
     board = (squares[:, 0] >= 0) & (squares[:, 0] <= BOARD.columns)
     board &= (squares[:, 1] >= 0) & (squares[:, 1] <= BOARD.rows)
     black = board & (squares.sum(axis=1) % 2 == 0)
@@ -93,19 +93,19 @@ def test_noisy_corners_stay_within_the_stated_intervals() -> None:
     assert shares.mean() >= 0.9
 
 
-def test_corners_that_err_together_widen_the_intervals() -> None:
-    """As where a board bends: by the scatter alone each image is as sure as before."""
+def test_correlated_corner_errors_widen_the_intervals() -> None:
+    """As with a bent board: by scatter alone the intervals would not change."""
     straight, bent = views(14, 0.02), {}
     for k, (name, seen) in enumerate(straight.items()):
         shift = 0.4 * np.array([np.sin(2.0 * k), np.cos(3.0 * k)])
         wave = np.sin(np.arange(len(seen.corners)) / 5.0 + k)[:, None]
-        bent[name] = Seen(seen.points, seen.corners + shift * wave)
+        bent[name] = DetectedBoard(seen.points, seen.corners + shift * wave)
     sure = calibrate_from_views(straight, SIZE).uncertainty.half_widths
     unsure = calibrate_from_views(bent, SIZE).uncertainty.half_widths
     assert (unsure[:4] > 3.0 * sure[:4]).all()
 
 
-def test_leaving_a_picture_out_is_told_as_a_fit_without_it_finds() -> None:
+def test_the_change_without_an_image_is_that_of_a_fit_without_it() -> None:
     all_views = views(12, 0.1)
     found = calibrate_from_views(all_views, SIZE)
     for k, name in enumerate(list(all_views)[:4]):
@@ -114,11 +114,11 @@ def test_leaving_a_picture_out_is_told_as_a_fit_without_it_finds() -> None:
         assert found.uncertainty.without[k, 0] == pytest.approx(change, abs=0.25)
 
 
-def test_a_picture_whose_corners_are_mistaken_is_left_out_by_name() -> None:
+def test_an_image_with_wrong_corners_is_left_out_by_name() -> None:
     all_views = views(12, 0.05)
     wrong = all_views["view 3"]
     rolled = np.roll(wrong.corners, 1, axis=0)
-    all_views["view 3"] = Seen(wrong.points, rolled)
+    all_views["view 3"] = DetectedBoard(wrong.points, rolled)
     found = calibrate_from_views(all_views, SIZE)
     assert list(found.unused) == ["view 3"]
     assert "px" in found.unused["view 3"]
@@ -173,7 +173,7 @@ def test_other_data_have_another_hash() -> None:
 
 
 def test_a_bowed_board_is_named_with_its_bow() -> None:
-    """Of 200 mm by 125 mm, its middle 1 mm higher than its corners."""
+    """200 mm by 125 mm, with its centre 1 mm above its corners."""
     flat = views(14, 0.05)
     poses = calibrate_from_views(flat, SIZE).boards
     bent = {}
@@ -184,7 +184,7 @@ def test_a_bowed_board_is_named_with_its_bow() -> None:
         turn = cv2.Rodrigues(poses[name].rotation)[0]
         there = cv2.projectPoints(high, turn, poses[name].position, MATRIX, DISTORTION)[0]
         noise = np.random.default_rng(len(bent)).normal(scale=0.05, size=seen.corners.shape)
-        bent[name] = Seen(seen.points, there.reshape(-1, 2) + noise)
+        bent[name] = DetectedBoard(seen.points, there.reshape(-1, 2) + noise)
     quality = judge_camera(calibrate_from_views(bent, SIZE), 1e-3)
     assert quality.bow == pytest.approx(1e-3, rel=0.3)
     assert any("the board is not flat" in reason for reason in quality.verdict.reasons)
@@ -194,7 +194,7 @@ def test_a_bowed_board_is_named_with_its_bow() -> None:
 
 
 def test_no_advice_contradicts_what_is_there_already() -> None:
-    """Neither more pictures where there are enough, nor 90 % where 90 % are covered."""
+    """Neither more images if there are enough, nor 90 % coverage if it is 90 %."""
     many = views(42, 2.0)
     verdict = judge_camera(calibrate_from_views(many, SIZE), 1e-4).verdict
     assert not verdict.good

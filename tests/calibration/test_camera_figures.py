@@ -1,4 +1,4 @@
-"""The figures of a camera's report: they show what the calibration says, and no other picture."""
+"""The figures of a camera's report agree with the calibration."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views, fit_camera
-from calibration.intrinsics.quality import judge_camera, picture_grid, pixel_uncertainty
+from calibration.intrinsics.quality import image_grid, judge_camera, pixel_uncertainty
 from calibration.intrinsics.result import (
     camera_page,
     radial_pattern,
@@ -32,7 +32,7 @@ def found() -> CameraCalibration:
 
 @pytest.fixture(scope="module")
 def photographed() -> CameraCalibration:
-    """Six rendered pictures of a chessboard."""
+    """Six rendered images of a chessboard."""
     mm = 4
     squares = np.indices((7, 10)).sum(axis=0) % 2 == 0
     black = np.kron(squares, np.ones((20 * mm, 20 * mm), dtype=bool))
@@ -50,15 +50,15 @@ def photographed() -> CameraCalibration:
 def test_the_map_of_uncertainty_makes_up_the_verdicts_error(found) -> None:
     quality = judge_camera(found, 1e-3, 1.0)
     focal = np.sqrt(found.matrix[0, 0] * found.matrix[1, 1])
-    each = pixel_uncertainty(found, picture_grid(SIZE))
+    each = pixel_uncertainty(found, image_grid(SIZE))
     whole = np.sqrt(np.mean(each**2)) / focal
     assert each.shape == (81,)
-    # Pixel by pixel the larger of both covariances counts, for the whole that of the whole.
+    # Per pixel the larger of both covariances counts, for the mean that of the mean.
     assert quality.verdict.error <= whole <= 1.4 * quality.verdict.error
 
 
 def test_the_map_is_darkest_where_no_board_was_seen() -> None:
-    """Pictures of the left half: the right edge is not known."""
+    """Images of the left half: the right edge is unknown."""
     left = {
         name: seen for name, seen in views("five", 90).items() if seen.corners[:, 0].max() < 520
     }
@@ -114,7 +114,7 @@ def test_a_page_from_corners_alone_has_no_picture(found, photographed) -> None:
     for calibration, pictures in ((found, 0), (photographed, 1)):
         page = camera_page(calibration, judge_camera(calibration, 1e-3), "front", "2026-03-01")
         assert page.count("<image ") == pictures
-        for heading in ("How sure pixels are", "Errors of corners", "Errors along the radius"):
+        for heading in ("Uncertainty of pixels", "Errors of corners", "Radial errors"):
             assert heading in page
 
 

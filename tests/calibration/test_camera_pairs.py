@@ -1,4 +1,4 @@
-"""A camera located by another one: both see the platform, or a board, at the same time."""
+"""A camera located by another: both see the platform, or a board, at the same time."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import pytest
 import yaml
 
 from calibration.extrinsics.camera_pairs import (
-    BodyLook,
+    BodyObservation,
     _board_pose,
     locate_by_pairs,
     require_oriented,
 )
-from calibration.targets.boards import Chessboard, Seen
+from calibration.targets.boards import Chessboard, DetectedBoard
 from calibration.targets.grids import TagGrid
 from model.errors import BadInput
 from model.files.documents import PoseDocument
@@ -33,8 +33,8 @@ RIG = Path(__file__).parents[2] / "configs" / "gachon_8_6.yaml"
 WRONG = np.array([0.03, -0.02, 0.01])
 
 
-def turned_about_home(rig: Rig, degrees: float) -> Pose:
-    """The first camera's pose, carried around the vertical through home."""
+def rotated_about_home(rig: Rig, degrees: float) -> Pose:
+    """The first camera's pose, rotated about the vertical through home."""
     turn = matrix_from_rotation_vector(np.array([0.0, 0.0, np.radians(degrees)]))
     own = rig.cameras[0].world_from_camera
     return Pose(turn @ (own.position - rig.home.position) + rig.home.position, turn @ own.rotation)
@@ -42,9 +42,9 @@ def turned_about_home(rig: Rig, degrees: float) -> Pose:
 
 @pytest.fixture(scope="module")
 def two() -> tuple[Rig, Pose]:
-    """A rig with a second camera, whose pose in the file is wrong, and where it truly is."""
+    """A rig with a second camera with a wrong pose in the file, and its true pose."""
     rig = load_rig(RIG)
-    truth = turned_about_home(rig, 25.0)
+    truth = rotated_about_home(rig, 25.0)
     first = rig.document.cameras[0]
     covariance = np.diag([0.04] * 3 + [1e-4] * 3).tolist()
     front = first.model_copy(update={"pose_covariance": covariance})
@@ -67,18 +67,18 @@ def where_it_goes(rig: Rig, count: int) -> list[Pose]:
 @pytest.fixture(scope="module")
 def folders(two: tuple[Rig, Pose], tmp_path_factory: pytest.TempPathFactory) -> Path:
     rig, truth = two
-    place = tmp_path_factory.mktemp("pairs")
+    root = tmp_path_factory.mktemp("pairs")
     for camera in (rig.cameras[0], replace(rig.cameras[1], world_from_camera=truth)):
-        (place / camera.name).mkdir()
+        (root / camera.name).mkdir()
         optics = Optics(noise=1.5, cables=False)
         eye = SyntheticCamera(rig, nothing_in_the_way(rig), camera, 7, optics)
         for number, pose in enumerate(where_it_goes(rig, 14)):
-            file = place / camera.name / f"{number:02}.png"
+            file = root / camera.name / f"{number:02}.png"
             cv2.imwrite(str(file), eye.render(pose, number))
-    (place / "side" / "alone.png").write_bytes((place / "side" / "00.png").read_bytes())
+    (root / "side" / "alone.png").write_bytes((root / "side" / "00.png").read_bytes())
     document = rig.document.model_dump(mode="json", exclude_unset=True)
-    (place / "rig.yaml").write_text(yaml.safe_dump(document))
-    return place
+    (root / "rig.yaml").write_text(yaml.safe_dump(document))
+    return root
 
 
 def test_a_second_camera_is_located_by_the_first(two, folders: Path, tmp_path: Path) -> None:
@@ -87,17 +87,17 @@ def test_a_second_camera_is_located_by_the_first(two, folders: Path, tmp_path: P
     verb = ("calibrate", "extrinsics", folders / "rig.yaml", folders / "side", "--camera", "side")
     answer = call(*verb, "--beside", beside, "-o", tmp_path / "out", "--json", "--wanted-mm", 2)
     assert answer.code == 0, answer
-    told = json.loads(answer.out)
-    found = PoseDocument.model_validate(told["world_from_camera"]).pose()
+    result = json.loads(answer.out)
+    found = PoseDocument.model_validate(result["world_from_camera"]).pose()
     assert found.distance_to(truth) < 1e-3
     assert np.degrees(found.angle_to(truth)) < 0.05
-    assert told["by"] == "another camera"
-    assert any("alone.png" in name for name in told["unused"])
+    assert result["by"] == "another camera"
+    assert any("alone.png" in name for name in result["unused"])
     for axis, name in enumerate(("x_mm", "y_mm", "z_mm")):
-        low, high = told["intervals"][name]
+        low, high = result["intervals"][name]
         assert low < truth.position[axis] * 1e3 < high
-    # 0.2 mm of the other camera's place are in it: they do not average away.
-    assert np.sqrt(told["pose_covariance"][0][0]) > 0.19
+    # It includes 0.2 mm from the other camera's pose, which do not average out.
+    assert np.sqrt(result["pose_covariance"][0][0]) > 0.19
     [file] = (tmp_path / "out").glob("*.yaml")
     new = tmp_path / "new.yaml"
     assert call("calibrate", "apply", folders / "rig.yaml", file, "-o", new).code == 0
@@ -106,20 +106,20 @@ def test_a_second_camera_is_located_by_the_first(two, folders: Path, tmp_path: P
 def test_mistakes_are_refused_in_one_message(folders: Path) -> None:
     rig, side = folders / "rig.yaml", folders / "side"
     verb = ("calibrate", "extrinsics", rig, side, "--camera", "side", "--beside")
-    one_message(call(*verb, f"side={side}"), 2, "cannot be located by itself")
+    one_message(call(*verb, f"side={side}"), 2, "cannot be located relative to itself")
     one_message(call(*verb, f"top={side}"), 2, "'top'")
     board = ("--columns", 9, "--rows", 6, "--square-mm", 25)
-    one_message(call(*verb, f"front={folders / 'front'}", *board), 2, "turned by 180")
+    one_message(call(*verb, f"front={folders / 'front'}", *board), 2, "rotated by 180")
 
 
-def test_only_boards_that_show_their_orientation_will_do() -> None:
+def test_boards_without_a_unique_orientation_are_refused() -> None:
     require_oriented(TagGrid(4, 3, 0.05, 0.02, "tag36h11"))
     with pytest.raises(BadInput, match="180"):
         require_oriented(Chessboard(9, 6, 0.02))
 
 
 def test_a_boards_pose_and_its_covariance_are_honest(two) -> None:
-    """Of 200 noisy views of a board the squared error in units of the covariance is 6."""
+    """The squared error of 200 noisy views in units of the covariance is 6 on average."""
     camera = two[0].cameras[0]
     board = TagGrid(4, 3, 0.05, 0.02, "tag36h11")
     points = board.points_of(range(12))
@@ -128,7 +128,7 @@ def test_a_boards_pose_and_its_covariance_are_honest(two) -> None:
     for _ in range(200):
         corners = pixels_of(camera, pose.apply(points))
         look = _board_pose(
-            Seen(points, corners + noise * rng.standard_normal(corners.shape)), camera
+            DetectedBoard(points, corners + noise * rng.standard_normal(corners.shape)), camera
         )
         assert look is not None
         gap = look.camera_from_body.position - pose.position
@@ -145,8 +145,8 @@ def test_pairs_that_agree_but_for_one_are_not_led_astray(two) -> None:
         off = 0.05 if number == 3 else 0.0
         body = Pose(pose.position + off, pose.rotation)
         pairs[str(number)] = (
-            BodyLook(truth.inverse().compose(pose), covariance, 0.1),
-            BodyLook(front.world_from_camera.inverse().compose(body), covariance, 0.1),
+            BodyObservation(truth.inverse().compose(pose), covariance, 0.1),
+            BodyObservation(front.world_from_camera.inverse().compose(body), covariance, 0.1),
         )
     found = locate_by_pairs(rig, rig.cameras[1], front, pairs, {}, "sha256:0")
     assert found.world_from_camera.distance_to(truth) < 1e-3

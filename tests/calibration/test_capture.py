@@ -1,4 +1,4 @@
-"""Which images a live camera takes, and what the person with the board is told."""
+"""Which images a live camera captures, and the instructions to the operator."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibration.pictures import CaptureGuide
-from calibration.targets.boards import Chessboard, Seen
+from calibration.targets.boards import Chessboard, DetectedBoard
 from model.pose import Array, Pose, matrix_from_rotation_vector
 
 SIZE = (1280, 720)
@@ -17,25 +17,25 @@ BLANK = np.zeros((SIZE[1], SIZE[0]), np.uint8)
 
 
 class Shown:
-    """A board that is where a test holds it."""
+    """A board at a pose set by the test."""
 
     def __init__(self) -> None:
         self.pose: Pose | None = None
 
-    def find(self, image: np.ndarray) -> Seen | None:
+    def find(self, image: np.ndarray) -> DetectedBoard | None:
         if self.pose is None:
             return None
         zero = np.zeros(3)
         points = self.pose.apply(POINTS)
         corners = cv2.projectPoints(points, zero, zero, MATRIX, np.zeros(5))[0].reshape(-1, 2)
-        return Seen(POINTS, corners)
+        return DetectedBoard(POINTS, corners)
 
-    def instead(self, image: np.ndarray) -> str:
+    def describe_other(self, image: np.ndarray) -> str:
         return ""
 
 
 def held(x: float, y: float, turn: Array | list[float] = (0.0, 0.0, 0.0), z: float = 0.6) -> Pose:
-    """A board whose middle is at a place before the camera, [m], turned about its middle."""
+    """A board with its centre at a position in front of the camera, [m], rotated about it."""
     rotation = matrix_from_rotation_vector(turn)
     return Pose(np.array([x, y, z]) - rotation @ POINTS.mean(axis=0), rotation)
 
@@ -47,22 +47,22 @@ def shown() -> Shown:
 
 def show(guide: CaptureGuide, board: Shown, pose: Pose | None, times: int = 2):
     board.pose = pose
-    advice = [guide.look(BLANK) for _ in range(times)]
+    advice = [guide.judge(BLANK) for _ in range(times)]
     return advice[-1]
 
 
-def test_a_picture_is_taken_when_the_board_stands_still_and_shows_something_new(shown) -> None:
+def test_an_image_is_taken_when_the_board_is_at_rest_and_shows_something_new(shown) -> None:
     guide = CaptureGuide(shown, wanted=10)
-    assert guide.look(BLANK).text == "0 of 10 images: show the board"
+    assert guide.judge(BLANK).text == "0 of 10 images: show the board"
     shown.pose = held(0.0, 0.0)
-    moving = guide.look(BLANK)
+    moving = guide.judge(BLANK)
     assert not moving.taken
     assert "hold it still" in moving.text
-    assert guide.look(BLANK).taken
-    assert not guide.look(BLANK).taken  # the same again
+    assert guide.judge(BLANK).taken
+    assert not guide.judge(BLANK).taken  # the same again
     shown.pose = held(0.15, 0.0)
-    assert not guide.look(BLANK).taken  # still moving
-    assert guide.look(BLANK).taken
+    assert not guide.judge(BLANK).taken  # still moving
+    assert guide.judge(BLANK).taken
     assert len(guide.views) == 2
 
 
@@ -111,15 +111,15 @@ def test_tilts_are_named_by_the_edge_that_is_away(shown, turn, edge: str) -> Non
 
 def test_what_was_seen_is_drawn_in_plain_characters(shown) -> None:
     guide = CaptureGuide(shown, wanted=4)
-    assert guide.drawn().count("#") == 0
+    assert guide.coverage_map().count("#") == 0
     show(guide, shown, held(-0.21, -0.11))
-    rows = guide.drawn().splitlines()
+    rows = guide.coverage_map().splitlines()
     assert rows[0].split()[0] == "#"
     assert rows[2].split()[2] == "."
-    assert "upper" not in guide.drawn()
+    assert "upper" not in guide.coverage_map()
     show(guide, shown, held(0.0, 0.0, [-0.5, 0.0, 0.0]))
-    assert guide.drawn().splitlines()[0].endswith("upper")
-    assert guide.drawn().isascii()
+    assert guide.coverage_map().splitlines()[0].endswith("upper")
+    assert guide.coverage_map().isascii()
 
 
 def test_enough_is_said_when_all_parts_and_tilts_were_seen(shown) -> None:

@@ -1,4 +1,4 @@
-"""Two results side by side: chance is told from change."""
+"""Comparison of two results: chance or change."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_a_result_agrees_with_itself() -> None:
     assert str(same).startswith("they agree")
 
 
-def test_a_number_that_changed_beyond_its_interval_is_told() -> None:
+def test_a_change_beyond_the_interval_is_reported() -> None:
     found = compare(camera_result_of(), camera_result_of(fx=915.0))
     by_name = {change.name: change for change in found.changes}
     assert by_name["fx_px"].by == pytest.approx(10.0)

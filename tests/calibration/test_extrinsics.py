@@ -1,4 +1,4 @@
-"""The camera's place from surveyed tags on the frame, and how honest its intervals are."""
+"""The camera's pose from surveyed frame tags, and the coverage of its intervals."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from calibration.extrinsics.result import (
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
 from calibration.result_files import load_result
 from calibration.results import write_result
-from calibration.tag_map.observations import sights_of
+from calibration.tag_map.observations import observe_tags
 from model.cameras import SURE
 from model.errors import BadInput
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Rig, Tag, load_rig
 from model.scene import load_scene
 from simulation.camera.camera import SyntheticCamera
-from tests.calibration.exact_sights import sights_at
+from tests.calibration.exact_sights import observe
 from tracking.camera_model import project_undistorted
 from tracking.detection.tags import tag_corners
 from tracking.pnp import moved
@@ -40,7 +40,7 @@ def rig() -> Rig:
 
 
 def elsewhere(rig: Rig) -> Pose:
-    """Where the camera truly stands: not where the rig file says."""
+    """The true pose of the camera, which differs from the rig file's."""
     named = rig.cameras[0].world_from_camera
     turn = matrix_from_rotation_vector([0.02, -0.01, 0.015])
     return Pose(named.position + np.array([0.03, -0.02, 0.01]), turn @ named.rotation)
@@ -61,7 +61,7 @@ def numbers(rig: Rig) -> list[int]:
 def test_a_camera_is_located_to_half_a_millimetre(rig: Rig, pictures) -> None:
     truth, camera = elsewhere(rig), rig.cameras[0]
     found = locate_by_frame_tags(
-        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(0.1e-3)
+        rig, camera, observe_tags(pictures, rig, camera, numbers(rig)), Survey(0.1e-3)
     )
     pose = found.world_from_camera
     assert pose.distance_to(truth) < 0.5e-3
@@ -77,7 +77,7 @@ def test_a_camera_is_located_to_half_a_millimetre(rig: Rig, pictures) -> None:
 
 
 def crooked(tags: tuple[Tag, ...], survey: float, rng: np.random.Generator) -> tuple[Tag, ...]:
-    """Tags where they truly are: off from their survey by so much along each axis."""
+    """The true tags, with random survey errors along each axis."""
     return tuple(
         replace(
             tag,
@@ -101,7 +101,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) 
         found = locate_by_frame_tags(
             rig,
             camera,
-            sights_at(camera, tags, poses, 0.03, rng),
+            observe(camera, tags, poses, 0.03, rng),
             Survey(survey, 2.0 * survey / tags[0].size),
         )
         pose = found.world_from_camera
@@ -113,11 +113,11 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, survey: float) 
         stated.append(found.error)
     assert np.mean(inside) >= 0.9
     assert np.mean(np.array(errors) <= stated) >= 0.9
-    assert np.median(stated) < 3.0 * np.median(errors)  # and not by promising nothing
+    assert np.median(stated) < 3.0 * np.median(errors)  # and not because the intervals are too wide
 
 
-def test_who_knows_that_tags_are_turned_as_told_finds_the_camera_twice_as_well(rig: Rig) -> None:
-    """Eight tags in the plane of the floor, each 1 mm off as a whole."""
+def test_known_tag_rotations_halve_the_error_of_the_camera(rig: Rig) -> None:
+    """Eight tags on the floor, each 1 mm off as a whole."""
     truth, camera, errors = elsewhere(rig), rig.cameras[0], []
     tags = [
         Tag(401 + k, 0.12, Pose.level([0.45 * np.cos(a), 0.45 * np.sin(a), 0.0]))
@@ -131,10 +131,10 @@ def test_who_knows_that_tags_are_turned_as_told_finds_the_camera_twice_as_well(r
             replace(tag, pose=Pose(tag.pose.position + shift, tag.pose.rotation))
             for tag, shift in zip(tags, shifts, strict=True)
         ]
-        sights = sights_at(camera, there, {"a": truth.inverse()}, 0.03, rng)
+        observations = observe(camera, there, {"a": truth.inverse()}, 0.03, rng)
         errors.append([])
         for survey in (Survey(1e-3), Survey(1e-3, 0.0)):
-            found = locate_by_frame_tags(rig, camera, sights, survey)
+            found = locate_by_frame_tags(rig, camera, observations, survey)
             back = found.world_from_camera.apply(truth.inverse().apply(found.points))
             off = np.sqrt(np.mean(np.sum((back - found.points) ** 2, axis=1)))
             errors[-1].append(off)
@@ -144,8 +144,8 @@ def test_who_knows_that_tags_are_turned_as_told_finds_the_camera_twice_as_well(r
 
 
 @pytest.mark.parametrize("turn", [None, 0.0, 0.01])
-def test_the_pixels_of_a_survey_scatter_as_told(rig: Rig, turn: float | None) -> None:
-    """Against pixels of tags that were drawn at random."""
+def test_the_pixels_of_a_survey_scatter_as_predicted(rig: Rig, turn: float | None) -> None:
+    """Against pixels of random tags."""
     rng, camera, tag = np.random.default_rng(5), rig.cameras[0], rig.frame_tags[0]
     world, survey = elsewhere(rig).inverse(), Survey(1e-3, turn)
     pixels = []
@@ -158,22 +158,22 @@ def test_the_pixels_of_a_survey_scatter_as_told(rig: Rig, turn: float | None) ->
             middle = tag.pose.position
             corners = (corners - middle) @ off.T + middle + 1e-3 * rng.standard_normal(3)
         pixels.append(project_undistorted(camera, world.apply(corners)).ravel())
-    told = survey.of_pixels(camera, world, tag)
+    predicted = survey.of_pixels(camera, world, tag)
     found = np.cov(np.array(pixels).T)
-    np.testing.assert_allclose(found, told, atol=0.08 * np.diag(told).max())
+    np.testing.assert_allclose(found, predicted, atol=0.08 * np.diag(predicted).max())
 
 
 def test_a_tag_that_was_knocked_is_named_and_does_not_move_the_camera(rig: Rig) -> None:
     camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
-    places = [(0.42, 0), (0, 0.42), (-0.42, 0), (0, -0.42), (0.3, 0.3), (-0.3, 0.3)]
-    tags = [Tag(401 + k, 0.12, Pose.level([x, y, 0.0])) for k, (x, y) in enumerate(places)]
+    positions = [(0.42, 0), (0, 0.42), (-0.42, 0), (0, -0.42), (0.3, 0.3), (-0.3, 0.3)]
+    tags = [Tag(401 + k, 0.12, Pose.level([x, y, 0.0])) for k, (x, y) in enumerate(positions)]
     rig = replace(rig, frame_tags=tuple(tags))
     knocked = [replace(tags[0], pose=Pose.level([0.44, 0.0, 0.0])), *tags[1:]]
-    sights = sights_at(camera, knocked, {"a": truth.inverse()}, 0.02, rng)
-    found = locate_by_frame_tags(rig, camera, sights, Survey(0.2e-3))
+    observations = observe(camera, knocked, {"a": truth.inverse()}, 0.02, rng)
+    found = locate_by_frame_tags(rig, camera, observations, Survey(0.2e-3))
     assert list(found.unused) == ["tag 401"]
     away = float(found.unused["tag 401"].split()[2])
-    assert away == pytest.approx(18.0, abs=4.0)  # 20 mm along the floor, seen aslant
+    assert away == pytest.approx(18.0, abs=4.0)  # 20 mm along the floor, at an oblique view
     assert found.world_from_camera.distance_to(truth) < 3e-3
 
 
@@ -181,7 +181,7 @@ def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
     camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
     tags = crooked(rig.frame_tags, 10e-3, rng)
     found = locate_by_frame_tags(
-        rig, camera, sights_at(camera, tags, {"a": truth.inverse()}, 0.02, rng), Survey(1e-4)
+        rig, camera, observe(camera, tags, {"a": truth.inverse()}, 0.02, rng), Survey(1e-4)
     )
     verdict = judge_extrinsics(found, 1.0)
     assert not verdict.good
@@ -193,8 +193,8 @@ def test_tags_that_contradict_each_other_are_named(rig: Rig) -> None:
 def test_too_few_tags_are_not_good_enough(rig: Rig, count: int, seen: str) -> None:
     camera, truth = rig.cameras[0], elsewhere(rig)
     rng = np.random.default_rng(3)
-    sights = sights_at(camera, rig.frame_tags[:count], {"a": truth.inverse()}, 0.02, rng)
-    found = locate_by_frame_tags(rig, camera, sights, Survey(0.5e-3))
+    observations = observe(camera, rig.frame_tags[:count], {"a": truth.inverse()}, 0.02, rng)
+    found = locate_by_frame_tags(rig, camera, observations, Survey(0.5e-3))
     verdict = judge_extrinsics(found, 1e-3)
     assert f"{seen} seen; 3 are required" in verdict.reasons
     assert "survey more tags, all around the camera's view" in verdict.next_steps
@@ -205,14 +205,14 @@ def test_a_picture_of_a_camera_that_was_moved_is_left_out_by_name(rig: Rig) -> N
     poses = {f"{k}.png": truth.inverse() for k in range(4)}
     poses["3.png"] = moved(truth.inverse(), np.array([0.01, 0, 0, 0, 0, 0]))
     found = locate_by_frame_tags(
-        rig, camera, sights_at(camera, rig.frame_tags, poses, 0.02, rng), Survey(1e-4)
+        rig, camera, observe(camera, rig.frame_tags, poses, 0.02, rng), Survey(1e-4)
     )
     assert list(found.unused) == ["3.png"]
     assert "the camera moved" in found.unused["3.png"]
     assert found.pictures == 3
 
 
-def test_the_inverse_of_a_pose_changes_as_told() -> None:
+def test_the_inverse_of_a_pose_changes_as_predicted() -> None:
     base = Pose(np.array([0.1, -0.3, 1.2]), matrix_from_rotation_vector([0.4, 2.0, -0.7]))
     change = np.zeros((6, 6))
     for k in range(6):
@@ -226,10 +226,10 @@ def test_the_inverse_of_a_pose_changes_as_told() -> None:
     np.testing.assert_allclose(change_of_inverse(base), change, atol=1e-6)
 
 
-def test_the_result_takes_the_place_of_the_rig_files(rig: Rig, pictures, tmp_path: Path) -> None:
+def test_the_result_replaces_the_pose_of_the_rig_file(rig: Rig, pictures, tmp_path: Path) -> None:
     camera = rig.cameras[0]
     found = locate_by_frame_tags(
-        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4)
+        rig, camera, observe_tags(pictures, rig, camera, numbers(rig)), Survey(5e-4)
     )
     verdict = judge_extrinsics(found, 1e-3)
     result = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
@@ -245,7 +245,7 @@ def test_the_result_takes_the_place_of_the_rig_files(rig: Rig, pictures, tmp_pat
 def test_a_result_is_refused_where_what_it_rests_on_was_changed(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
     found = locate_by_frame_tags(
-        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4)
+        rig, camera, observe_tags(pictures, rig, camera, numbers(rig)), Survey(5e-4)
     )
     result = extrinsics_result(found, judge_extrinsics(found, 1e-3), rig.document, date(2026, 3, 2))
     other = rig.document.cameras[0].model_copy(update={"fx_px": 901.0})
@@ -257,16 +257,16 @@ def test_a_result_is_refused_where_what_it_rests_on_was_changed(rig: Rig, pictur
 def test_two_results_are_compared_by_what_they_do_in_the_work_space(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
     found = locate_by_frame_tags(
-        rig, camera, sights_of(pictures, rig, camera, numbers(rig)), Survey(5e-4)
+        rig, camera, observe_tags(pictures, rig, camera, numbers(rig)), Survey(5e-4)
     )
     verdict = judge_extrinsics(found, 1e-3)
     one = extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
     pose = found.world_from_camera
-    turned = Pose(
+    rotated = Pose(
         pose.position + np.array([0.001, 0.0, 0.0]),
         matrix_from_rotation_vector([0, 0, 0.002]) @ pose.rotation,
     )
-    there = replace(found, camera=replace(found.camera, world_from_camera=turned))
+    there = replace(found, camera=replace(found.camera, world_from_camera=rotated))
     two = extrinsics_result(there, verdict, rig.document, date(2026, 3, 3))
     changes = one.changes_to(two)
     assert changes["x_mm"] == pytest.approx(1.0, abs=1e-6)
@@ -277,48 +277,48 @@ def test_two_results_are_compared_by_what_they_do_in_the_work_space(rig: Rig, pi
     assert one.apart_mm(two) == pytest.approx(expected, rel=2e-3)
 
 
-def test_pictures_of_no_use_are_told_by_name(rig: Rig, pictures) -> None:
+def test_unused_images_are_listed_by_name(rig: Rig, pictures) -> None:
     camera = rig.cameras[0]
     blank = np.full((720, 1280), 100, np.uint8)
     first, image = pictures[0]
     more = [("blank.png", blank), ("copy.png", image.copy())]
-    sights = sights_of([*pictures, *more], rig, camera, numbers(rig))
-    assert sights.unused == {
+    observations = observe_tags([*pictures, *more], rig, camera, numbers(rig))
+    assert observations.unused == {
         "blank.png": "shows no complete tag",
         "copy.png": f"is the same image as {first}",
     }
-    assert sights.squares.keys() == {name for name, _ in pictures}
+    assert observations.squares.keys() == {name for name, _ in pictures}
     with pytest.raises(BadInput, match="none of the tag36h11 tags 401, 402, 403, 404"):
-        sights_of([("blank.png", blank)], rig, camera, numbers(rig))
+        observe_tags([("blank.png", blank)], rig, camera, numbers(rig))
 
 
-def test_mirrored_pictures_and_other_tags_are_told(rig: Rig, pictures) -> None:
+def test_mirrored_images_and_other_tags_are_reported(rig: Rig, pictures) -> None:
     camera, (name, image) = rig.cameras[0], pictures[0]
     flipped = np.ascontiguousarray(image[:, ::-1])
     with pytest.raises(BadInput) as caught:
-        sights_of([(name, flipped)], rig, camera, numbers(rig))
+        observe_tags([(name, flipped)], rig, camera, numbers(rig))
     assert "mirrored" in caught.value.why
     with pytest.raises(BadInput) as caught:
-        sights_of([(name, image)], rig, camera, [411, 412])
+        observe_tags([(name, image)], rig, camera, [411, 412])
     assert "shows tag36h11" in caught.value.why
     assert "401" in caught.value.why
     with pytest.raises(BadInput, match="none of the tag25h9 tags 401") as caught:
-        sights_of([(name, image)], replace(rig, tag_family="tag25h9"), camera, numbers(rig))
+        observe_tags([(name, image)], replace(rig, tag_family="tag25h9"), camera, numbers(rig))
     assert "shows tag36h11 301" in caught.value.why
 
 
 def test_a_number_that_is_seen_twice_is_left_out_by_name(rig: Rig, pictures) -> None:
     camera, (name, image) = rig.cameras[0], pictures[0]
-    seen = sights_of(pictures[:1], rig, camera, numbers(rig)).squares[name]
+    seen = observe_tags(pictures[:1], rig, camera, numbers(rig)).squares[name]
     corners = seen[402].corners
     low, high = corners.min(axis=0).astype(int) - 8, corners.max(axis=0).astype(int) + 9
     patch = image[low[1] : high[1], low[0] : high[0]]
     doubled = image.copy()
     doubled[4 : 4 + patch.shape[0], 4 : 4 + patch.shape[1]] = patch
-    sights = sights_of([(name, doubled)], rig, camera, numbers(rig))
-    assert sights.unused == {f"{name}, tag 402": "is detected more than once"}
-    assert 402 not in sights.squares[name]
-    assert sights.squares[name].keys() == seen.keys() - {402}
+    observations = observe_tags([(name, doubled)], rig, camera, numbers(rig))
+    assert observations.unused == {f"{name}, tag 402": "is detected more than once"}
+    assert 402 not in observations.squares[name]
+    assert observations.squares[name].keys() == seen.keys() - {402}
 
 
 def test_a_rig_without_frame_tags_is_refused(rig: Rig) -> None:
@@ -327,13 +327,15 @@ def test_a_rig_without_frame_tags_is_refused(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_stated_error_of_a_place_is_exceeded_in_one_case_of_twenty(rig, seed: int) -> None:
-    """Taken as 1.96 RMS it was exceeded in one of 200, and good places were refused."""
+def test_the_stated_error_of_a_camera_pose_is_exceeded_in_one_case_of_twenty(
+    rig, seed: int
+) -> None:
+    """As 1.96 RMS it was exceeded in one of 200, and good poses were refused."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(6, 6)) * np.array([*[3e-4] * 3, *[3e-4] * 3])[:, None]
     camera = rig.cameras[0]
     covariance = root @ root.T
-    place = ExtrinsicCalibration(
+    result = ExtrinsicCalibration(
         camera=camera,
         by="frame tags",
         covariance=covariance,
@@ -343,11 +345,11 @@ def test_the_stated_error_of_a_place_is_exceeded_in_one_case_of_twenty(rig, seed
         tag_errors={},
         pictures=1,
         unused={},
-        lacks=(),
+        issues=(),
         data_hash="",
     )
-    arms = place.points - camera.world_from_camera.position
+    arms = result.points - camera.world_from_camera.position
     steps = rng.multivariate_normal(np.zeros(6), covariance, size=4000)
     moved_by = steps[:, None, :3] + np.cross(steps[:, None, 3:], arms)
     errors = np.sqrt(np.mean(np.sum(moved_by**2, axis=2), axis=1))
-    assert np.mean(errors > place.error) == pytest.approx(0.05, abs=0.015)
+    assert np.mean(errors > result.error) == pytest.approx(0.05, abs=0.015)

@@ -1,4 +1,4 @@
-"""The camera's place from the rig's own motion."""
+"""The camera's pose from the rig's own motion."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 
 from calibration.extrinsics.hand_eye import locate_by_motion, read_poses
 from calibration.extrinsics.result import judge_extrinsics
-from calibration.tag_map.observations import TagSights
+from calibration.tag_map.observations import TagObservations
 from model.errors import BadInput, InvalidFile
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, load_rig
-from tests.calibration.exact_sights import sights_at
+from tests.calibration.exact_sights import observe
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -32,27 +32,27 @@ def shaken(pose: Pose, noise: float, rng: np.random.Generator) -> Pose:
 def session(
     rig: Rig, count: int, turn: float, noise: float, seed: int, tags_off: Pose | None = None
 ):
-    """Images of a platform that the drives put near where they tell: sights and told poses."""
+    """Images of a platform near its encoder poses: observations and encoder poses."""
     rng = np.random.default_rng(seed)
-    camera, told, seen = rig.cameras[0], {}, {}
+    camera, encoder, seen = rig.cameras[0], {}, {}
     off = tags_off or Pose.level(np.zeros(3))
     for k in range(count):
-        place = rng.uniform([-0.2, -0.2, 0.25], [0.2, 0.2, 0.6])
-        pose = Pose(place, matrix_from_rotation_vector(rng.uniform(-turn, turn, 3)))
-        told[f"{k}.png"] = shaken(pose, noise, rng)
+        position = rng.uniform([-0.2, -0.2, 0.25], [0.2, 0.2, 0.6])
+        pose = Pose(position, matrix_from_rotation_vector(rng.uniform(-turn, turn, 3)))
+        encoder[f"{k}.png"] = shaken(pose, noise, rng)
         seen[f"{k}.png"] = camera.world_from_camera.inverse().compose(pose).compose(off)
-    return sights_at(camera, rig.platform_tags, seen, 0.03, rng), told
+    return observe(camera, rig.platform_tags, seen, 0.03, rng), encoder
 
 
 def unaware(camera: Camera) -> Camera:
-    """The camera as of a rig file that knows nothing of its place."""
+    """The camera as in a rig file with an unknown camera pose."""
     return replace(camera, world_from_camera=Pose.level([0.0, 0.0, 1.0]))
 
 
-def test_exact_poses_give_the_exact_place(rig: Rig) -> None:
+def test_exact_poses_give_the_exact_camera_pose(rig: Rig) -> None:
     off = Pose(np.array([4e-4, -3e-4, 2e-4]), matrix_from_rotation_vector([0.002, 0.001, -0.003]))
-    sights, told = session(rig, 30, 0.3, 1e-6, seed=1, tags_off=off)
-    found = locate_by_motion(rig, unaware(rig.cameras[0]), sights, told)
+    observations, encoder = session(rig, 30, 0.3, 1e-6, seed=1, tags_off=off)
+    found = locate_by_motion(rig, unaware(rig.cameras[0]), observations, encoder)
     truth = rig.cameras[0].world_from_camera
     assert found.world_from_camera.distance_to(truth) < 1e-3
     assert np.degrees(found.world_from_camera.angle_to(truth)) < 0.05
@@ -65,17 +65,17 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig, turn: float) ->
     for seed in range(7):
         rng = np.random.default_rng(1000 + seed)
         off = shaken(Pose.level(np.zeros(3)), 1e-3, rng)
-        sights, told = session(rig, 16, turn, 0.5e-3, seed, off)
-        result = locate_by_motion(rig, unaware(rig.cameras[0]), sights, told)
+        observations, encoder = session(rig, 16, turn, 0.5e-3, seed, off)
+        result = locate_by_motion(rig, unaware(rig.cameras[0]), observations, encoder)
         pose = result.world_from_camera
-        turned = rotation_vector_from_matrix(pose.rotation @ truth.rotation.T)
-        gap = np.concatenate([pose.position - truth.position, turned])
+        rotation = rotation_vector_from_matrix(pose.rotation @ truth.rotation.T)
+        gap = np.concatenate([pose.position - truth.position, rotation])
         inside.append(np.abs(gap) <= result.half_widths)
     assert np.mean(inside) >= 0.9
 
 
 def test_motion_without_rotation_leaves_the_drawing_and_says_so(rig: Rig) -> None:
-    """Where the tags are on the platform cannot be told from where the camera stands."""
+    """The tags' poses on the platform cannot be separated from the camera's pose."""
     still = locate_by_motion(rig, rig.cameras[0], *session(rig, 20, 0.0, 1e-5, seed=4))
     turning = locate_by_motion(rig, rig.cameras[0], *session(rig, 20, 0.3, 1e-5, seed=4))
     assert (still.half_widths[:3] > 1.5e-3).all()
@@ -86,66 +86,68 @@ def test_motion_without_rotation_leaves_the_drawing_and_says_so(rig: Rig) -> Non
 
 
 def test_a_pose_that_was_written_wrongly_counts_little(rig: Rig) -> None:
-    sights, told = session(rig, 16, 0.3, 1e-4, seed=5)
-    told["3.png"] = Pose(told["3.png"].position + np.array([0.05, 0, 0]), told["3.png"].rotation)
-    found = locate_by_motion(rig, unaware(rig.cameras[0]), sights, told)
+    observations, encoder = session(rig, 16, 0.3, 1e-4, seed=5)
+    encoder["3.png"] = Pose(
+        encoder["3.png"].position + np.array([0.05, 0, 0]), encoder["3.png"].rotation
+    )
+    found = locate_by_motion(rig, unaware(rig.cameras[0]), observations, encoder)
     assert found.world_from_camera.distance_to(rig.cameras[0].world_from_camera) < 2e-3
 
 
 def test_poses_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
     rng, camera = np.random.default_rng(7), rig.cameras[0]
-    told = {
+    encoder = {
         f"{k}.png": Pose.level(rig.home.position + 1e-3 * rng.uniform(-1.0, 1.0, 3))
         for k in range(10)
     }
     world = camera.world_from_camera.inverse()
-    seen = {name: world.compose(pose) for name, pose in told.items()}
-    sights = sights_at(camera, rig.platform_tags, seen, 0.03, rng)
-    verdict = judge_extrinsics(locate_by_motion(rig, camera, sights, told), 1.0)
+    seen = {name: world.compose(pose) for name, pose in encoder.items()}
+    observations = observe(camera, rig.platform_tags, seen, 0.03, rng)
+    verdict = judge_extrinsics(locate_by_motion(rig, camera, observations, encoder), 1.0)
     assert any("all poses lie within" in reason for reason in verdict.reasons)
 
 
 def test_the_same_view_counts_once(rig: Rig) -> None:
-    """As of one image saved several times, or of a platform that stood still."""
-    sights, told = session(rig, 10, 0.3, 1e-4, seed=7)
+    """As with one image saved several times, or a platform at rest."""
+    observations, encoder = session(rig, 10, 0.3, 1e-4, seed=7)
     rng = np.random.default_rng(1)
     copies = {
         f"again {name}": {
             k: replace(square, corners=square.corners + 0.04 * rng.standard_normal((4, 2)))
             for k, square in squares.items()
         }
-        for name, squares in sights.squares.items()
+        for name, squares in observations.squares.items()
     }
-    both = TagSights({**sights.squares, **copies}, {})
-    named = {f"again {name}": pose for name, pose in told.items()}
-    once = locate_by_motion(rig, rig.cameras[0], sights, told)
-    found = locate_by_motion(rig, rig.cameras[0], both, {**told, **named})
+    both = TagObservations({**observations.squares, **copies}, {})
+    named = {f"again {name}": pose for name, pose in encoder.items()}
+    once = locate_by_motion(rig, rig.cameras[0], observations, encoder)
+    found = locate_by_motion(rig, rig.cameras[0], both, {**encoder, **named})
     assert found.pictures == once.pictures
     assert found.half_widths == pytest.approx(once.half_widths)
     assert set(found.unused) == set(copies)
     assert found.unused["again 3.png"] == "duplicates 3.png: nothing moved in between"
 
 
-def test_of_two_views_of_one_stand_the_one_with_more_tags_counts(rig: Rig) -> None:
-    sights, _ = session(rig, 4, 0.3, 1e-4, seed=7)
-    squares = max(sights.squares.values(), key=len)
+def test_of_two_views_of_one_pose_the_one_with_more_tags_counts(rig: Rig) -> None:
+    observations, _ = session(rig, 4, 0.3, 1e-4, seed=7)
+    squares = max(observations.squares.values(), key=len)
     assert len(squares) > 1
     fewer = dict(list(squares.items())[:1])
     for order in ({"a": fewer, "b": squares}, {"b": squares, "a": fewer}):
-        once = TagSights(order, {}).each_view_once()
+        once = TagObservations(order, {}).without_duplicates()
         assert set(once.squares) == {"b"}
         assert once.unused == {"a": "duplicates b: nothing moved in between"}
 
 
 def test_pictures_without_a_pose_are_named_and_too_few_are_refused(rig: Rig) -> None:
-    sights, told = session(rig, 6, 0.3, 1e-4, seed=6)
-    del told["2.png"]
-    found = locate_by_motion(rig, rig.cameras[0], sights, told)
+    observations, encoder = session(rig, 6, 0.3, 1e-4, seed=6)
+    del encoder["2.png"]
+    found = locate_by_motion(rig, rig.cameras[0], observations, encoder)
     assert found.unused == {"2.png": "has no pose"}
-    assert any("5 poses were seen; 8 are required" in lack.reason for lack in found.lacks)
-    few = {name: told[name] for name in ("0.png", "1.png")}
+    assert any("5 poses were observed; 8 are required" in issue.reason for issue in found.issues)
+    few = {name: encoder[name] for name in ("0.png", "1.png")}
     with pytest.raises(BadInput, match="2 images show the platform at a known pose"):
-        locate_by_motion(rig, rig.cameras[0], sights, few)
+        locate_by_motion(rig, rig.cameras[0], observations, few)
 
 
 HEAD = "picture,x_mm,y_mm,z_mm,qw,qx,qy,qz\n"
@@ -170,7 +172,9 @@ def test_poses_are_read_by_picture_and_rows_without_one_left_out(tmp_path: Path)
         (HEAD + ",1,2,3,1,0,0,0\n", "no image is named"),
     ],
 )
-def test_files_of_poses_that_cannot_be_used_are_told(tmp_path: Path, text: str, named: str) -> None:
+def test_unusable_pose_files_are_refused_with_the_reason(
+    tmp_path: Path, text: str, named: str
+) -> None:
     path = tmp_path / "poses.csv"
     path.write_text(text)
     with pytest.raises(InvalidFile) as caught:

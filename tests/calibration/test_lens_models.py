@@ -1,4 +1,4 @@
-"""Lens models: found with their uncertainty, chosen by held-out pictures, used everywhere alike."""
+"""Lens models: fitted with uncertainty, selected by held-out images, used consistently."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from calibration.intrinsics.lens import LENSES, fit_lens, held_out_errors, radia
 from calibration.intrinsics.quality import (
     _slopes,
     _without_rotation,
+    image_grid,
     judge_camera,
-    picture_grid,
 )
-from calibration.targets.boards import Chessboard, Seen
+from calibration.targets.boards import Chessboard, DetectedBoard
 from model.cameras import camera_from
 from model.errors import BadInput
 from model.files.camera_file import CameraDocument
@@ -36,11 +36,11 @@ from simulation.camera.camera import SyntheticCamera
 from tests.cli.program import call, one_message
 from tracking.camera_model import (
     WIDEST,
-    ideal_from_pixels,
-    pixels_from_ideal,
+    distort_pixels,
     pixels_of,
     project,
     rays_of,
+    undistort_pixels,
 )
 from tracking.measurement import PoseMeasurement
 from tracking.shared_errors import CameraMoved
@@ -60,8 +60,10 @@ def matrix_of(focal: float) -> np.ndarray:
     return np.array([[focal, 0.0, 470.0], [0.0, focal * 1.002, 305.0], [0.0, 0.0, 1.0]])
 
 
-def views(name: str, count: int = 30, noise: float = 0.08, seed: int = 3) -> dict[str, Seen]:
-    """A board that is held all over the picture, near to its corners too."""
+def views(
+    name: str, count: int = 30, noise: float = 0.08, seed: int = 3
+) -> dict[str, DetectedBoard]:
+    """A board all over the image, also near its corners."""
     rng, found = np.random.default_rng(seed), {}
     focal, lens = TRUTH[name]
     middle, tries = BOARD.points().mean(axis=0), 0
@@ -77,20 +79,20 @@ def views(name: str, count: int = 30, noise: float = 0.08, seed: int = 3) -> dic
         if (corners < 2.0).any() or (corners > np.array(SIZE) - 2.0).any():
             continue
         noisy = corners + noise * rng.standard_normal(corners.shape)
-        found[f"{len(found)}"] = Seen(BOARD.points(), noisy)
+        found[f"{len(found)}"] = DetectedBoard(BOARD.points(), noisy)
     assert len(found) == count
     return found
 
 
 @cache
 def chosen(name: str) -> CameraCalibration:
-    """The model left to choose."""
+    """The automatically selected model."""
     return calibrate_from_views(views(name), SIZE)
 
 
 @pytest.mark.parametrize("name", TRUTH)
 def test_a_lens_comes_back_within_its_intervals(name: str) -> None:
-    """Of three trials at least nine in ten numbers, each within its 95 % interval."""
+    """At least 90 % of the parameters in three trials are within their 95 % intervals."""
     focal, lens = TRUTH[name]
     m = matrix_of(focal)
     truth = np.array([m[0, 0], m[1, 1], m[0, 2], m[1, 2], *lens])
@@ -118,10 +120,10 @@ def test_the_model_is_chosen_by_pictures_held_out(true: str, accepted: set[str])
 
 @pytest.mark.parametrize("true", ["rational", "fisheye"])
 def test_the_advice_names_the_lens_where_errors_run_along_the_radius(true: str) -> None:
-    told = judge_camera(calibrate_from_views(views(true), SIZE, lens="five"), 1e-3)
-    assert told.radial > 0.02
-    assert any("the lens bends otherwise" in reason for reason in told.verdict.reasons)
-    assert any("--lens" in step and "fisheye" in step for step in told.verdict.next_steps)
+    result = judge_camera(calibrate_from_views(views(true), SIZE, lens="five"), 1e-3)
+    assert result.radial > 0.02
+    assert any("the lens model" in reason for reason in result.verdict.reasons)
+    assert any("--lens" in step and "fisheye" in step for step in result.verdict.next_steps)
     right = judge_camera(chosen(true), 1e-3)
     assert not any("lens" in reason for reason in right.verdict.reasons)
 
@@ -137,9 +139,9 @@ def test_the_radial_share_is_nothing_for_noise_and_all_for_a_pure_pattern() -> N
 
 
 def apart_without_rotation(found: CameraCalibration, true: str) -> float:
-    """RMS distance of points a metre away, as seen by both cameras turned to agree best, [m]."""
+    """RMS distance of points 1 m away by both cameras, rotated for the best agreement, [m]."""
     focal, lens = TRUTH[true]
-    pixels = picture_grid(SIZE)
+    pixels = image_grid(SIZE)
     kind = LENSES[true].kind
     rays = [
         np.column_stack([rays_of(*model, pixels), np.ones(len(pixels))])
@@ -150,13 +152,13 @@ def apart_without_rotation(found: CameraCalibration, true: str) -> float:
     ]
     units = [part / np.linalg.norm(part, axis=1, keepdims=True) for part in rays]
     turn = Rotation.align_vectors(*units)[0].as_matrix()
-    turned = rays[1] @ turn.T
-    gaps = turned[:, :2] / turned[:, 2:] - rays[0][:, :2]
+    rotated = rays[1] @ turn.T
+    gaps = rotated[:, :2] / rotated[:, 2:] - rays[0][:, :2]
     return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
 
 
 def test_a_clean_camera_is_good_and_the_truth_within_what_is_stated() -> None:
-    """The rotation that the camera's place takes up does not count: cx alone is 0.5 mm off."""
+    """The rotation that the extrinsics compensate does not count: cx alone is 0.5 mm off."""
     good, inside, ratios = 0, 0, []
     for seed in range(12):
         found = calibrate_from_views(views("five", 40, 0.05, seed), SIZE)
@@ -167,12 +169,12 @@ def test_a_clean_camera_is_good_and_the_truth_within_what_is_stated() -> None:
         inside += ratios[-1] < 1.0
     assert good == 12
     assert inside >= 11
-    assert np.median(ratios) > 0.15  # nor are intervals so wide that they say nothing
+    assert np.median(ratios) > 0.15  # and the intervals are not too wide
 
 
 def test_a_rotation_of_the_camera_is_no_error_of_it() -> None:
     found = calibrate_from_views(views("fisheye"), SIZE, lens="fisheye")
-    slopes, turns = _slopes(found, picture_grid(SIZE))
+    slopes, turns = _slopes(found, image_grid(SIZE))
     assert np.abs(_without_rotation(turns, turns)).max() < 1e-9 * np.abs(turns).max()
     freed = _without_rotation(slopes, turns)
     assert (np.linalg.norm(freed, axis=(0, 1)) <= np.linalg.norm(slopes, axis=(0, 1))).all()
@@ -191,15 +193,15 @@ def some_camera(name: str) -> Camera:
 def test_pixels_come_back_from_ideal_ones(name: str) -> None:
     camera = some_camera(name)
     across = np.stack(np.meshgrid(np.linspace(120, 820, 9), np.linspace(60, 540, 7)), axis=-1)
-    ideal = ideal_from_pixels(camera, across)
-    np.testing.assert_allclose(pixels_from_ideal(camera, ideal), across, atol=1e-5)
+    ideal = undistort_pixels(camera, across)
+    np.testing.assert_allclose(distort_pixels(camera, ideal), across, atol=1e-5)
 
 
 def test_rays_beside_and_behind_a_fisheye_are_put_at_its_rim() -> None:
-    """Not on the other side of the picture, where OpenCV's iteration puts them."""
+    """Not on the other side of the image, where OpenCV's iteration puts them."""
     camera = some_camera("fisheye")
     corners = np.array([[5.0, 5.0], [955.0, 5.0], [5.0, 595.0], [955.0, 595.0]])
-    ideal = ideal_from_pixels(camera, corners) - camera.matrix[:2, 2]
+    ideal = undistort_pixels(camera, corners) - camera.matrix[:2, 2]
     assert (np.sign(ideal) == np.sign(corners - camera.matrix[:2, 2])).all()
     reach = np.linalg.norm(ideal / [camera.matrix[0, 0], camera.matrix[1, 1]], axis=1)
     np.testing.assert_allclose(np.arctan(reach), WIDEST, atol=1e-3)
@@ -239,7 +241,7 @@ def test_a_synthetic_camera_of_any_lens_is_tracked_to_a_millimetre(name: str) ->
     found = Tracker(bent, camera).observe(picture, 0.0)
     assert isinstance(found, PoseMeasurement)
     assert np.linalg.norm(found.pose.position - truth.position) < 1e-3
-    with pytest.raises(CameraMoved):  # the lens is left out
+    with pytest.raises(CameraMoved):  # without the lens
         Tracker(rig, plain).observe(picture, 0.0)
 
 
@@ -254,7 +256,7 @@ def with_lens(rig: Rig, kind: str, lens: list[float]) -> CameraDocument:
 
 
 UNKNOWN_THERE = {("kalibr", "five"), ("kalibr", "rational"), ("mrcal", "fisheye")}
-"""Lens models that a program does not have."""
+"""Lens models that a program does not support."""
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -304,20 +306,20 @@ def test_a_camera_of_a_kalibr_chain_is_read_by_its_entry(rig, tmp_path) -> None:
     assert (first.fx_px, first.fy_px, first.cx_px, first.cy_px) == (
         461.629, 460.152, 362.680, 246.049)  # fmt: skip
     assert (second.width_px, second.height_px) == (512, 512)
-    with pytest.raises(BadInput) as told:
+    with pytest.raises(BadInput) as caught:
         imported_camera(file, plain)
-    assert "cam0, cam1; say which with --entry" in str(told.value.why)
-    with pytest.raises(BadInput) as told:
+    assert "cam0, cam1; choose one with --entry" in str(caught.value.why)
+    with pytest.raises(BadInput) as caught:
         imported_camera(file, plain, "cam7")
-    assert "no 'cam7'" in str(told.value.why)
+    assert "not 'cam7'" in str(caught.value.why)
 
 
 def test_kalibr_models_that_rig_files_lack_are_named(rig, tmp_path) -> None:
     file = tmp_path / "camchain.yaml"
     file.write_text(KALIBR.replace("camera_model: pinhole", "camera_model: ds", 1))
-    with pytest.raises(BadInput) as told:
+    with pytest.raises(BadInput) as caught:
         imported_camera(file, rig.document.cameras[0], "cam0")
-    assert "cam0 is ds-radtan" in str(told.value.why)
+    assert "cam0 is ds-radtan" in str(caught.value.why)
 
 
 MRCAL = """# generated on 2024-01-01 with mrcal-calibrate-cameras
@@ -349,9 +351,9 @@ def test_a_camera_of_mrcal_is_read_and_a_splined_one_refused(rig, tmp_path) -> N
         2196,
     )
     file.write_text(MRCAL.replace("LENSMODEL_OPENCV8", "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3"))
-    with pytest.raises(BadInput) as told:
+    with pytest.raises(BadInput) as caught:
         imported_camera(file, plain)
-    assert "mrcal-convert-lensmodel" in str(told.value.why)
+    assert "mrcal-convert-lensmodel" in str(caught.value.why)
 
 
 @pytest.mark.skipif(not Path("/usr/bin/mrcal-to-cahvor").exists(), reason="needs Debian's mrcal")
@@ -368,11 +370,11 @@ def test_mrcal_itself_reads_what_is_written_and_projects_alike(rig, tmp_path) ->
         " np.array([float(x) for x in sys.argv[2:]]));"
         "print(*mrcal.project(p, *m.intrinsics()))"
     )
-    told = subprocess.run(
+    result = subprocess.run(
         ["/usr/bin/python3", "-c", code, str(file), *map(str, point[0])],
         capture_output=True, text=True, check=True, timeout=60,
     )  # fmt: skip
-    theirs = [float(x) for x in told.stdout.split()]
+    theirs = [float(x) for x in result.stdout.split()]
     np.testing.assert_allclose(
         theirs, pixels_of(camera, np.array([[0.1, -0.2, 1.0]]))[0], atol=1e-6
     )

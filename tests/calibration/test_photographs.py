@@ -1,4 +1,4 @@
-"""Photographs that we did not render, in the formats, sizes and turns that people have."""
+"""Real photographs, in common formats, sizes and orientations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
 from calibration.intrinsics.quality import judge_camera
 from calibration.targets.boards import Charuco, Chessboard
 from drivers.cameras.files import OneCamerasPictures, read_picture
-from tests.calibration.exif import turned_by_exif
+from tests.calibration.exif import rotated_by_exif
 from tracking.detection.detector import TagDetector
 
 FOLDER = Path(__file__).parent / "photographs"
@@ -55,7 +55,7 @@ def test_thirteen_photographs_with_a_small_error_are_not_said_to_be_good(found) 
 
 @pytest.mark.parametrize("factor", [1.0, 0.5])
 def test_every_board_is_found_that_any_finder_of_opencv_finds(factor: float) -> None:
-    """The sector finder alone loses two of thirteen, and more of the halved ones."""
+    """The sector-based detector alone misses two of thirteen, and more at half size."""
     exhaustive = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     for path in chessboards():
         image = cv2.resize(
@@ -70,10 +70,10 @@ def test_every_board_is_found_that_any_finder_of_opencv_finds(factor: float) -> 
         assert (BOARD.find(255 - image) is not None) >= theirs, path.name
 
 
-def test_turned_and_coloured_photographs_show_the_same(tmp_path: Path) -> None:
-    """JPEG turned by EXIF, and PNG in colour."""
+def test_rotated_and_coloured_photographs_show_the_same(tmp_path: Path) -> None:
+    """JPEG rotated by EXIF, and PNG in colour."""
     grey = read_picture(chessboards()[0])
-    (tmp_path / "a.jpg").write_bytes(turned_by_exif(grey))
+    (tmp_path / "a.jpg").write_bytes(rotated_by_exif(grey))
     cv2.imwrite(str(tmp_path / "b.png"), cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
     expected = BOARD.find(grey).corners
     for name, image in OneCamerasPictures(tmp_path):

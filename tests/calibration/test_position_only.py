@@ -1,4 +1,4 @@
-"""Rig calibration from positions of one point, as trackers with one reflector give them."""
+"""Rig calibration from positions of one point, as from trackers with one reflector."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from calibration.geometry.result import rig_result
 from model.errors import BadInput
 from model.pose import read_only
 from model.rig import Rig, load_rig
-from tests.calibration.rig_places import Truth, places
+from tests.calibration.rig_places import Truth, samples
 from tests.calibration.test_rig_calibration import LENGTH_DEVIATION, TODAY, errors_of, rms
 from tests.cli.program import call
 
@@ -32,11 +32,11 @@ def rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def truth(rig: Rig) -> Truth:
-    return places(rig, 60, tilt=np.radians(12.0), seed=5)
+    return samples(rig, 60, tilt=np.radians(12.0), seed=5)
 
 
 def followed(truth: Truth, reflector: np.ndarray) -> RigMeasurements:
-    """What a tracker of one reflector would have measured."""
+    """Measurements of a tracker with one reflector."""
     data = truth.measured
     points = data.positions + data.rotations @ reflector
     return replace(
@@ -69,7 +69,7 @@ def test_a_wrong_reflector_fits_worse(rig: Rig, truth: Truth) -> None:
 
 
 def test_what_a_position_says_of_a_pose_is_by_finite_differences(rig: Rig, truth: Truth) -> None:
-    """The gradient of the squared distances, about estimated poses."""
+    """The gradient of the squared distances, at estimated poses."""
     data = followed(truth, REFLECTOR)
     fitter = RigFitter(Parameters.of(rig, DEFAULT_DEVIATIONS), data, LENGTH_DEVIATION)
     positions, rotations = truth.positions + 1e-3, truth.rotations
@@ -95,8 +95,8 @@ def test_a_file_of_positions_needs_no_rotation_and_half_of_one_is_refused(
     lines = [",".join(names), *(",".join(f"{x:.6f}" for x in row) for row in rows)]
     file.write_text("\n".join(lines))
     back = read_rig_data(file, 8)
-    assert back.posed.all()
-    assert not back.turned.any()
+    assert back.has_position.all()
+    assert not back.has_rotation.any()
     np.testing.assert_allclose(back.positions, data.positions, atol=1e-8)
     np.testing.assert_allclose(back.covariances[0, :3, :3], 4e-8 * np.eye(3))
     answer = call("calibrate", "rig", RIG, file, "--reflector-mm", "0", "0", "0", "--tilt-deg", "0")

@@ -1,4 +1,4 @@
-"""Printed boards and tags: exact to the micrometre, and found by our own detectors."""
+"""Printed boards and tags: exact to the micrometre, and detectable."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_printed_board_is_found_in_its_size(board: Board) -> None:
     size, rectangles, texts = page_of(board)
     seen = board.find(drawn(size, rectangles, PER_MM))
     assert seen is not None
-    # The corners as found on paper, [mm], must be the board's points turned and shifted only.
+    # The corners as found on paper, [mm], must be the board's points after a rigid motion.
     on_paper, points = (seen.corners + 0.5) / PER_MM, seen.points[:, :2] * 1e3
     spread = np.linalg.norm(points - points.mean(axis=0))
     assert np.linalg.norm(on_paper - on_paper.mean(axis=0)) / spread == pytest.approx(1.0, abs=5e-4)
@@ -145,9 +145,9 @@ def test_the_table_of_a_file_points_at_its_objects(paper: str) -> None:
     data = pdf_of([sheet_of(board_print(Chessboard(4, 3, 0.03)), paper)] * 2, "two (2) pages")
     start = int(re.search(rb"startxref\n(\d+)", data).group(1))
     assert data[start : start + 4] == b"xref"
-    places = re.findall(rb"(\d{10}) 00000 n ", data)
-    for number, place in enumerate(places, 1):
-        assert data[int(place) :].startswith(b"%d 0 obj" % number)
+    offsets = re.findall(rb"(\d{10}) 00000 n ", data)
+    for number, offset in enumerate(offsets, 1):
+        assert data[int(offset) :].startswith(b"%d 0 obj" % number)
     assert rb"two \(2\) pages" in data
 
 

@@ -1,4 +1,4 @@
-"""Whole calibrations from a script: result, report and progress without the command line."""
+"""Complete calibrations from a script: result, report and progress."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.pictures import Pictures, pictures_in
+from calibration.pictures import ImageSet, open_images
 from calibration.procedures import calibrate_camera
 from calibration.result_files import load_result
 from calibration.results import Destination
@@ -23,7 +23,7 @@ ON = date(2026, 3, 1)
 
 
 class Heard(Listener):
-    """Remembers what was reported."""
+    """Records the reported progress."""
 
     def __init__(self) -> None:
         self.totals: list[tuple[str, float | None]] = []
@@ -56,8 +56,8 @@ def test_a_folder_becomes_a_result_file_and_a_report(folder: Path, tmp_path: Pat
 
 
 def test_pictures_need_no_folder_and_nothing_is_written_unless_asked(folder: Path) -> None:
-    images = list(pictures_in(folder).images)
-    made = calibrate_camera(Pictures(images, len(images)), BOARD)
+    images = list(open_images(folder).images)
+    made = calibrate_camera(ImageSet(images, len(images)), BOARD)
     assert made.files == ()
     assert np.isfinite(made.found.matrix).all()
 
@@ -66,7 +66,7 @@ def test_a_result_that_exists_is_refused_before_any_picture_is_read(tmp_path: Pa
     (tmp_path / "calibration_camera_front_2026-03-01.yaml").write_text("mine")
     with pytest.raises(BadInput, match="exists already"):
         calibrate_camera(
-            Pictures(_unread(), 1), BOARD, name="front", output=Destination(tmp_path, on=ON)
+            ImageSet(_unread(), 1), BOARD, name="front", output=Destination(tmp_path, on=ON)
         )
 
 

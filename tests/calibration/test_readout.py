@@ -26,7 +26,7 @@ TRUE, RATE = 0.025, 20.0
 
 
 def swinging(rig: Rig, time: float) -> Pose:
-    """Up and down and sideways, at most at about 0.12 m/s."""
+    """Vertical and lateral oscillation, at most 0.12 m/s."""
     shift = np.array([0.02 * np.sin(4.0 * time), 0.0, 0.02 * np.sin(5.0 * time + 1.0)])
     return Pose(rig.home.position + shift, rig.home.rotation)
 
@@ -82,14 +82,14 @@ def test_the_verb_writes_a_result_that_applies_to_the_rig(film: Path, tmp_path: 
     out = tmp_path / "out"
     answer = call("calibrate", "readout", RIG, film, "--rate-hz", RATE, "-o", out, "--json")
     assert answer.code == 0, answer
-    told = json.loads(answer.out)
-    assert told["kind"] == "readout"
+    result = json.loads(answer.out)
+    assert result["kind"] == "readout"
     [file] = out.glob("calibration_readout_front_*.yaml")
     assert load_result(file).good_enough
     assert "Readout of camera front" in file.with_suffix(".html").read_text()
     new = tmp_path / "new.yaml"
     assert call("calibrate", "apply", RIG, file, "-o", new).code == 0
-    assert yaml.safe_load(new.read_text())["cameras"][0]["readout_ms"] == told["readout_ms"]
+    assert yaml.safe_load(new.read_text())["cameras"][0]["readout_ms"] == result["readout_ms"]
 
 
 def test_few_images_and_a_rate_for_a_video_are_refused(rig: Rig, film: Path, tmp_path) -> None:

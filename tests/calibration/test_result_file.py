@@ -1,4 +1,4 @@
-"""Result files: read as written, refused for other rigs, numbers shown with their widths."""
+"""Result files: read as written, refused for other rigs, values shown with half widths."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_seal_outlives_the_file_whatever_the_number(tmp_path_factory, value: f
     assert load_result(path).stated  # read, so the hash fits
 
 
-def test_a_camera_result_takes_the_place_of_the_rig_files_numbers(rig: Rig) -> None:
+def test_a_camera_result_replaces_the_parameters_of_the_rig_file(rig: Rig) -> None:
     better = rig.with_calibration(camera_result_of())
     assert better.cameras[0].matrix[0, 0] == 905.0
     assert better.cameras[0].distortion.tolist() == [-0.1, 0.04, 0.0, 0.0, 0.0]
@@ -99,7 +99,9 @@ def test_two_results_of_one_camera_are_refused(rig: Rig) -> None:
         ("kind: [\n", "yaml"),
     ],
 )
-def test_files_that_are_no_results_are_told_by_name(tmp_path: Path, text: str, named: str) -> None:
+def test_files_that_are_not_results_are_refused_by_name(
+    tmp_path: Path, text: str, named: str
+) -> None:
     path = tmp_path / "wrong.yaml"
     path.write_text(text)
     with pytest.raises(BadInput) as caught:
@@ -108,11 +110,11 @@ def test_files_that_are_no_results_are_told_by_name(tmp_path: Path, text: str, n
     assert str(path) in str(caught.value)
 
 
-def test_a_result_tells_how_far_it_is_from_another() -> None:
+def test_a_result_states_its_distance_from_another() -> None:
     one, two = camera_result_of(), camera_result_of(fx=908.0)
     assert one.changes_to(two)["fx_px"] == pytest.approx(3.0)
     assert one.apart_mm(one) < 1e-9
-    # Points of a picture lie up to 0.7 of the distance off its axis; 3 of 905 px is 0.33 %.
+    # Points are up to 0.7 of the distance off the axis; 3 of 905 px is 0.33 %.
     assert 0.5 < one.apart_mm(two) < 3.5
 
 
@@ -128,8 +130,8 @@ def test_a_number_is_never_a_negative_zero() -> None:
 
 
 def test_a_verdict_says_each_next_step_once() -> None:
-    lacks = [Issue("few", "take more"), Issue("wide", "take more"), Issue("flat", "tilt")]
-    verdict = CalibrationVerdict.of(2e-3, 1e-3, "at 1 m", lacks)
+    issues = [Issue("few", "take more"), Issue("wide", "take more"), Issue("flat", "tilt")]
+    verdict = CalibrationVerdict.of(2e-3, 1e-3, "at 1 m", issues)
     assert not verdict.good
     assert verdict.next_steps == ("take more", "tilt")
     assert str(verdict) == "not good enough: few; wide; flat"
@@ -137,7 +139,7 @@ def test_a_verdict_says_each_next_step_once() -> None:
 
 
 def test_a_camera_result_from_before_there_were_lens_models_is_read(tmp_path: Path) -> None:
-    """It has no key `lens`, and its hash knows of none."""
+    """It has no key `lens`, and its hash does not include one."""
     path = write_result(tmp_path, camera_result_of())
     text = path.read_text()
     assert "lens: pinhole\n" in text
@@ -148,20 +150,20 @@ def test_a_camera_result_from_before_there_were_lens_models_is_read(tmp_path: Pa
         load_result(path)
 
 
-def test_what_the_place_of_a_camera_may_be_off_by_goes_into_the_rig(rig: Rig) -> None:
+def test_the_covariance_of_a_camera_pose_goes_into_the_rig(rig: Rig) -> None:
     deviations = np.array([2e-3, 1e-3, 3e-3, 1e-3, 2e-3, 5e-4])
     by_lens = np.arange(48.0).reshape(6, 8) * 1e-4
     found = ExtrinsicCalibration(
         camera=rig.cameras[0],
         by="frame tags",
         covariance=np.diag(deviations**2),
-        half_widths=2.0 * 1.96 * deviations,  # twice as wide by leaving tags out
+        half_widths=2.0 * 1.96 * deviations,  # twice as wide by the jackknife
         by_lens=by_lens,
         points=workspace_corners(rig),
         tag_errors={},
         pictures=3,
         unused={},
-        lacks=(),
+        issues=(),
         data_hash="sha256:0",
     )
     verdict = judge_extrinsics(found, 1e-3)

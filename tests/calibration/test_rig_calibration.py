@@ -1,4 +1,4 @@
-"""A rig's numbers from places at rest, against the truth that only the simulation knows."""
+"""A rig's parameters from stationary samples, against the simulation's ground truth."""
 
 from __future__ import annotations
 
@@ -33,9 +33,14 @@ from calibration.geometry.measurements import (
 )
 from calibration.geometry.model import CountedLengths, RigModel
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
-from calibration.geometry.quality import compliance_told, differences_told, judge_rig, judged_places
+from calibration.geometry.quality import (
+    estimate_cable_compliances,
+    estimate_compliance,
+    judge_rig,
+    workspace_poses,
+)
 from calibration.geometry.report import number_rows, rig_page
-from calibration.geometry.result import RigResult, require_one_drawing, rig_result
+from calibration.geometry.result import RigResult, require_same_nominal, rig_result
 from calibration.result_files import load_result
 from model.errors import BadInput, InvalidFile
 from model.files.rig_file import RigDocument
@@ -46,11 +51,11 @@ from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 from tests.calibration.rig_places import (
     Truth,
-    built_otherwise,
-    drawn_with,
-    places,
+    rig_with_errors,
+    samples,
     share_inside,
     true_numbers,
+    with_nominal_stiffness,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -64,18 +69,18 @@ def rig() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def turned(rig: Rig) -> Truth:
-    return places(rig, 60, tilt=np.radians(8.0), seed=1)
+def tilted(rig: Rig) -> Truth:
+    return samples(rig, 60, tilt=np.radians(8.0), seed=1)
 
 
 @pytest.fixture(scope="module")
 def level(rig: Rig) -> Truth:
-    return places(rig, 60, tilt=0.0, seed=2)
+    return samples(rig, 60, tilt=0.0, seed=2)
 
 
 @pytest.fixture(scope="module")
-def found(rig: Rig, turned: Truth) -> RigCalibration:
-    return fit_rig(rig, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+def found(rig: Rig, tilted: Truth) -> RigCalibration:
+    return fit_rig(rig, tilted.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
 
 
 @pytest.fixture(scope="module")
@@ -83,24 +88,24 @@ def found_level(rig: Rig, level: Truth) -> RigCalibration:
     return fit_rig(rig, level.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
 
 
-def told_by(rig: Rig, truth: Truth) -> Array:
-    """Where forward kinematics of a rig puts the platform, by its own winches, (n, 3), [m]."""
+def positions_by(rig: Rig, truth: Truth) -> Array:
+    """Platform positions by forward kinematics of a rig with its own winches, (n, 3), [m]."""
     winches, data = WinchMap(rig), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
     return poses_near(rig, lengths, truth.positions, truth.rotations, steps=20)[0]
 
 
 def errors_of(rig: Rig, truth: Truth) -> Array:
-    """How far off that is, shape (n,), [m]."""
-    return np.asarray(np.linalg.norm(told_by(rig, truth) - truth.positions, axis=1))
+    """Errors of these positions, shape (n,), [m]."""
+    return np.asarray(np.linalg.norm(positions_by(rig, truth) - truth.positions, axis=1))
 
 
 def errors_of_shape(rig: Rig, truth: Truth) -> Array:
-    """The same, with all places moved and turned as one to where they fit best, (n,), [m]."""
-    told = told_by(rig, truth)
-    centres = told.mean(axis=0), truth.positions.mean(axis=0)
-    turn, _ = Rotation.align_vectors(truth.positions - centres[1], told - centres[0])
-    moved = turn.apply(told - centres[0]) + centres[1]
+    """The same after the best-fitting rigid motion of all positions, (n,), [m]."""
+    commanded = positions_by(rig, truth)
+    centres = commanded.mean(axis=0), truth.positions.mean(axis=0)
+    turn, _ = Rotation.align_vectors(truth.positions - centres[1], commanded - centres[0])
+    moved = turn.apply(commanded - centres[0]) + centres[1]
     return np.asarray(np.linalg.norm(moved - truth.positions, axis=1))
 
 
@@ -146,9 +151,9 @@ def test_derivatives_are_those_of_finite_differences(name: str, seed: int) -> No
         assert line.by_pose[:, :, 3 + k] == pytest.approx(change / (2.0 * step), abs=2e-6)
 
 
-def test_the_fit_is_the_one_that_scipy_finds(rig: Rig, turned: Truth) -> None:
-    """Unknowns and poses in one dense problem of another solver; no outlier, so plain squares."""
-    data = turned.measured.part(np.arange(60) < 12)
+def test_the_fit_is_the_one_that_scipy_finds(rig: Rig, tilted: Truth) -> None:
+    """One dense problem in another solver; without outliers, so plain least squares."""
+    data = tilted.measured.part(np.arange(60) < 12)
     parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
     fit = RigFitter(parameters, data, LENGTH_DEVIATION).fit()
     model, n, p = RigModel(parameters, data), len(data), len(parameters)
@@ -166,12 +171,12 @@ def test_the_fit_is_the_one_that_scipy_finds(rig: Rig, turned: Truth) -> None:
     assert fit.values / parameters.deviations == pytest.approx(other.x[:p], abs=2e-3)
 
 
-def test_places_that_were_not_measured_are_told_ten_times_better(
+def test_the_error_at_unmeasured_poses_falls_by_a_factor_of_ten(
     rig: Rig, found: RigCalibration
 ) -> None:
     quality = judge_rig(found, 1e-3, np.radians(5.0))
     result = rig_result(found, quality, "rig", TODAY)
-    others = places(rig, 40, tilt=np.radians(8.0), seed=9)
+    others = samples(rig, 40, tilt=np.radians(8.0), seed=9)
     corrected = rig.with_calibration(result)
     before, after = rms(errors_of(rig, others)), rms(errors_of(corrected, others))
     assert before > 1e-3
@@ -184,10 +189,10 @@ def test_places_that_were_not_measured_are_told_ten_times_better(
 
 @pytest.mark.parametrize("stiffness", [4000.0, 6000.0, 10000.0])
 def test_intervals_hold_the_truth_about_as_often_as_they_say(rig: Rig, stiffness: float) -> None:
-    """The cables have 6000 N, whatever the rig file says."""
-    built = built_otherwise(rig, seed=11)
-    data = places(built, 60, tilt=np.radians(8.0), seed=12).measured
-    drawn = drawn_with(built, stiffness)
+    """The cables have 6000 N, whatever the rig file states."""
+    built = rig_with_errors(rig, seed=11)
+    data = samples(built, 60, tilt=np.radians(8.0), seed=12).measured
+    drawn = with_nominal_stiffness(built, stiffness)
     result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     true = true_numbers(built)
     assert len(true) == 57
@@ -196,24 +201,24 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(rig: Rig, stiffness
     assert abs(result.intervals["stiffness_n"].value - 6000.0) < 600.0
 
 
-def test_a_stiffness_that_is_found_is_applied(rig: Rig, turned: Truth) -> None:
-    """The rig file tells half as much again as the cables have."""
-    drawn = drawn_with(rig, 9000.0)
-    result = fit_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    told = rig_result(result, judge_rig(result, 1e-3, 0.0), "rig", TODAY)
-    corrected = drawn.with_calibration(told)
+def test_a_stiffness_that_is_found_is_applied(rig: Rig, tilted: Truth) -> None:
+    """The rig file states 1.5 times the stiffness of the cables."""
+    drawn = with_nominal_stiffness(rig, 9000.0)
+    result = fit_rig(drawn, tilted.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    document = rig_result(result, judge_rig(result, 1e-3, 0.0), "rig", TODAY)
+    corrected = drawn.with_calibration(document)
     assert corrected.cable_stiffness == pytest.approx(result.geometry.stiffness)
-    assert told.stiffness_n == pytest.approx(result.geometry.stiffness)
-    low, high = told.intervals["stiffness_n"]
-    assert low * high == pytest.approx(told.stiffness_n**2)
-    others = places(rig, 20, tilt=0.1, seed=4)
+    assert document.stiffness_n == pytest.approx(result.geometry.stiffness)
+    low, high = document.intervals["stiffness_n"]
+    assert low * high == pytest.approx(document.stiffness_n**2)
+    others = samples(rig, 20, tilt=0.1, seed=4)
     assert rms(errors_of(corrected, others)) < 0.3e-3
 
 
 def test_without_tensions_the_stiffness_stays_as_drawn_and_is_named(
-    rig: Rig, turned: Truth
+    rig: Rig, tilted: Truth
 ) -> None:
-    blind = replace(turned.measured, tensions=np.full_like(turned.measured.tensions, np.nan))
+    blind = replace(tilted.measured, tensions=np.full_like(tilted.measured.tensions, np.nan))
     result = fit_rig(rig, blind, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     assert result.geometry.stiffness == pytest.approx(rig.cable_stiffness, rel=1e-12)
     assert "the stiffness of the cables" in result.not_identified
@@ -228,43 +233,39 @@ def test_without_tensions_the_stiffness_stays_as_drawn_and_is_named(
 
 
 def test_without_tensions_cables_that_hardly_stretch_are_as_certain(
-    rig: Rig, turned: Truth
+    rig: Rig, tilted: Truth
 ) -> None:
-    stiff = drawn_with(rig, 1e6)
-    blind = replace(turned.measured, tensions=np.full_like(turned.measured.tensions, np.nan))
+    stiff = with_nominal_stiffness(rig, 1e6)
+    blind = replace(tilted.measured, tensions=np.full_like(tilted.measured.tensions, np.nan))
     model = RigModel(Parameters.of(stiff, DEFAULT_DEVIATIONS), blind)
     deviations = model.length_deviations(LENGTH_DEVIATION)
     assert deviations == pytest.approx(LENGTH_DEVIATION, rel=0.01)
     assert deviations.min() > LENGTH_DEVIATION
     soft = RigModel(Parameters.of(rig, DEFAULT_DEVIATIONS), blind)
     assert soft.length_deviations(LENGTH_DEVIATION).min() > 5.0 * LENGTH_DEVIATION
-    measured = RigModel(Parameters.of(rig, DEFAULT_DEVIATIONS), turned.measured)
+    measured = RigModel(Parameters.of(rig, DEFAULT_DEVIATIONS), tilted.measured)
     assert np.all(measured.length_deviations(LENGTH_DEVIATION) == LENGTH_DEVIATION)
 
 
-def test_tensions_that_were_not_measured_are_the_working_ones_of_their_place(
-    rig: Rig, turned: Truth
-) -> None:
-    tensions = turned.measured.tensions.copy()
+def test_missing_tensions_are_the_working_ones_of_their_pose(rig: Rig, tilted: Truth) -> None:
+    tensions = tilted.measured.tensions.copy()
     tensions[0, 2], tensions[1], tensions[2] = np.nan, np.nan, np.nan
-    positions = turned.measured.positions.copy()
+    positions = tilted.measured.positions.copy()
     positions[2] = np.nan
-    data = replace(turned.measured, tensions=tensions, positions=positions)
+    data = replace(tilted.measured, tensions=tensions, positions=positions)
     likely = nominal_tensions(rig, data)
-    place = Pose(positions[1], data.rotations[1])
-    assert np.array_equal(likely[1], working_tensions(rig, place).tensions)
+    pose = Pose(positions[1], data.rotations[1])
+    assert np.array_equal(likely[1], working_tensions(rig, pose).tensions)
     assert np.array_equal(likely[2], working_tensions(rig, rig.home).tensions)
     assert np.isfinite(likely[0, 2])
     assert np.array_equal(np.delete(likely[0], 2), np.delete(tensions[0], 2))
     assert np.array_equal(likely[3:], tensions[3:])
-    assert np.abs(likely - turned.measured.tensions).max() < 3.0 * tension_sigma(rig)
+    assert np.abs(likely - tilted.measured.tensions).max() < 3.0 * tension_sigma(rig)
 
 
-def test_what_leaving_a_place_out_changes_is_what_fits_without_it_find(
-    rig: Rig, turned: Truth
-) -> None:
-    """The jackknife to first order against twenty fits."""
-    data = turned.measured.part(np.arange(60) < 20)
+def test_the_change_without_a_sample_is_that_of_a_fit_without_it(rig: Rig, tilted: Truth) -> None:
+    """The first-order jackknife against twenty fits."""
+    data = tilted.measured.part(np.arange(60) < 20)
     parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
     fit, observability = identified(parameters, data, LENGTH_DEVIATION)
     known = observability.known
@@ -276,29 +277,29 @@ def test_what_leaving_a_place_out_changes_is_what_fits_without_it_find(
     apart = (changes - changes.mean(axis=0)) / parameters.deviations @ known
     by_drawing = np.linalg.inv(known.T @ fit.information @ known + np.eye(known.shape[1]))
     expected = 19.0 / 20.0 * apart.T @ apart + by_drawing @ by_drawing
-    stated = found.by_places / np.outer(parameters.deviations, parameters.deviations)
+    stated = found.by_jackknife / np.outer(parameters.deviations, parameters.deviations)
     stated = known.T @ stated @ known
     assert np.diag(stated) == pytest.approx(np.diag(expected), rel=0.05)
 
 
-def test_places_that_err_each_as_one_widen_the_intervals(rig: Rig, turned: Truth) -> None:
-    """Poses ten times as far off as stated: cables of a place agree about a wrong pose."""
+def test_correlated_errors_within_samples_widen_the_intervals(rig: Rig, tilted: Truth) -> None:
+    """Pose errors ten times as stated: cables of a sample agree about a wrong pose."""
     random = np.random.default_rng(8)
-    shaken = turned.measured.positions + 2e-3 * random.standard_normal((60, 3))
-    data = replace(turned.measured, positions=shaken)
+    shaken = tilted.measured.positions + 2e-3 * random.standard_normal((60, 3))
+    data = replace(tilted.measured, positions=shaken)
     result = fit_rig(rig, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    scatter, by_places = (
+    scatter, by_jackknife = (
         np.sqrt(np.diag(covariance))
-        for covariance in (result.uncertainty.by_scatter, result.uncertainty.by_places)
+        for covariance in (result.uncertainty.by_scatter, result.uncertainty.by_jackknife)
     )
-    assert np.median(by_places / scatter) > 1.3
+    assert np.median(by_jackknife / scatter) > 1.3
     assert share_inside(result.intervals, true_numbers(rig)) >= 0.9
 
 
-def test_without_turning_it_names_what_cannot_be_told_and_leaves_it_as_drawn(
+def test_without_rotation_it_names_what_is_unidentified_and_keeps_it_nominal(
     rig: Rig, found_level: RigCalibration
 ) -> None:
-    """A cable of a platform that never turns tells outlet and anchor only as a sum."""
+    """Without rotation, a cable determines only the sum of outlet and anchor errors."""
     assert found_level.observability.unknown.shape[1] == 24
     assert found_level.not_identified == [
         "outlet and anchor of one cable moved together: every cable along x, y and z"
@@ -306,15 +307,15 @@ def test_without_turning_it_names_what_cannot_be_told_and_leaves_it_as_drawn(
     spread = found_level.parameters.deviations
     moved = found_level.fit.values / spread
     assert np.abs(found_level.observability.unknown.T @ moved).max() < 1e-9
-    turned_error = judge_rig(found_level, 0.5e-3, np.radians(15.0))
-    assert turned_error.turned > 2.0 * turned_error.level
-    assert not turned_error.verdict.good
-    assert any("rotated" in step for step in turned_error.verdict.next_steps)
+    rotated_quality = judge_rig(found_level, 0.5e-3, np.radians(15.0))
+    assert rotated_quality.rotated > 2.0 * rotated_quality.level
+    assert not rotated_quality.verdict.good
+    assert any("rotated" in step for step in rotated_quality.verdict.next_steps)
 
 
-def test_one_cable_that_is_told_badly_does_not_spoil_the_rest(rig: Rig, turned: Truth) -> None:
-    """Two of sixty places with a cable 5 mm and a pose 20 mm off: named and left out."""
-    data = turned.measured
+def test_one_badly_measured_cable_does_not_spoil_the_rest(rig: Rig, tilted: Truth) -> None:
+    """Two of sixty samples with a cable 5 mm and a pose 20 mm off: listed and left out."""
+    data = tilted.measured
     counts, positions = data.counts.copy(), data.positions.copy()
     counts[7, 3] += 0.005 * rig.winches[3].counts_per_metre
     positions[20] += [0.02, 0.0, 0.0]
@@ -322,24 +323,24 @@ def test_one_cable_that_is_told_badly_does_not_spoil_the_rest(rig: Rig, turned: 
     result = fit_rig(rig, spoiled, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     quality = judge_rig(result, 1e-3, 0.0)
     assert quality.verdict.good
-    told = rig_result(result, quality, "rig", TODAY)
-    assert set(told.unused) == {"place 7", "place 20"}
-    assert "cable 4 is" in told.unused["place 7"]
-    assert "pose is" in told.unused["place 20"]
-    assert told.places == 58
-    corrected = rig.with_calibration(told)
-    assert rms(errors_of(corrected, places(rig, 20, tilt=0.1, seed=4))) < 0.3e-3
+    document = rig_result(result, quality, "rig", TODAY)
+    assert set(document.unused) == {"sample 7", "sample 20"}
+    assert "cable 4 is" in document.unused["sample 7"]
+    assert "pose is" in document.unused["sample 20"]
+    assert document.places == 58
+    corrected = rig.with_calibration(document)
+    assert rms(errors_of(corrected, samples(rig, 20, tilt=0.1, seed=4))) < 0.3e-3
     untouched = fit_rig(
         rig, data.part(~np.isin(np.arange(60), [7, 20])), DEFAULT_DEVIATIONS, LENGTH_DEVIATION
     )
     assert result.uncertainty.half_widths == pytest.approx(untouched.uncertainty.half_widths)
 
 
-def test_lengths_alone_make_cables_agree_and_tell_that_the_world_is_unknown(
-    rig: Rig, turned: Truth
+def test_lengths_alone_make_cables_agree_and_report_the_world_as_unknown(
+    rig: Rig, tilted: Truth
 ) -> None:
-    """As without a camera: eight lengths of a pose of six numbers must fit each other."""
-    alone = turned.measured.without_poses()
+    """Without a camera: eight lengths of a pose with six degrees of freedom must agree."""
+    alone = tilted.measured.without_poses()
     result = fit_rig(rig, alone, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     quality = judge_rig(result, 1e-3, 0.0)
     assert not result.held_out.poses
@@ -348,12 +349,12 @@ def test_lengths_alone_make_cables_agree_and_tell_that_the_world_is_unknown(
     assert not quality.verdict.good
     assert any("with a camera" in step for step in quality.verdict.next_steps)
     corrected = rig.with_calibration(rig_result(result, quality, "rig", TODAY))
-    assert rms(errors_of_shape(corrected, turned)) < 0.9 * rms(errors_of_shape(rig, turned))
+    assert rms(errors_of_shape(corrected, tilted)) < 0.9 * rms(errors_of_shape(rig, tilted))
 
 
-def test_groups_that_are_known_stay_as_drawn(rig: Rig, turned: Truth) -> None:
+def test_groups_that_are_known_stay_as_drawn(rig: Rig, tilted: Truth) -> None:
     only = {"drum_scale": 0.005, "offsets": 2e-3}
-    result = fit_rig(rig, turned.measured, only, LENGTH_DEVIATION)
+    result = fit_rig(rig, tilted.measured, only, LENGTH_DEVIATION)
     assert np.array_equal(result.geometry.outlets, rig.outlets)
     assert result.parameters.groups == ("drum_scale", "offsets")
     assert set(result.intervals) == {
@@ -362,14 +363,14 @@ def test_groups_that_are_known_stay_as_drawn(rig: Rig, turned: Truth) -> None:
     }
 
 
-def test_pulleys_are_looked_for_only_where_the_rig_has_them(rig: Rig) -> None:
+def test_pulleys_are_estimated_only_if_the_rig_has_them(rig: Rig) -> None:
     hall = load_rig(ROOT / "configs/hall_10_6.yaml")
     assert "pulley_radius" in Parameters.of(hall, DEFAULT_DEVIATIONS).names
     assert "pulley_radius" not in Parameters.of(rig, DEFAULT_DEVIATIONS).names
 
 
-def test_a_rig_over_pulleys_is_told_better_than_by_its_file() -> None:
-    """Another rig: ten cables over pulleys of another radius than drawn."""
+def test_a_rig_with_pulleys_is_more_accurate_than_by_its_file() -> None:
+    """Another rig: ten cables, with a pulley radius that differs from the file."""
     drawn = load_rig(ROOT / "configs/hall_10_6.yaml")
     document, random = drawn.document.model_dump(mode="json"), np.random.default_rng(3)
     m = drawn.cable_count
@@ -385,26 +386,26 @@ def test_a_rig_over_pulleys_is_told_better_than_by_its_file() -> None:
         }
     }
     hall = rig_from_document(RigDocument.model_validate(document))
-    data = places(hall, 40, tilt=0.12, seed=1).measured
+    data = samples(hall, 40, tilt=0.12, seed=1).measured
     result = fit_rig(hall, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     corrected = hall.with_calibration(
         rig_result(result, judge_rig(result, 1e-3, 0.0), "hall", TODAY)
     )
-    others = places(hall, 20, tilt=0.12, seed=2, noise=0.0)
+    others = samples(hall, 20, tilt=0.12, seed=2, noise=0.0)
     assert rms(errors_of(corrected, others)) < 0.3 * rms(errors_of(hall, others))
     radius = result.intervals["pulley_radius_mm"]
     assert abs(radius.value - 40.8) < radius.half_width
 
 
-def test_unknown_directions_without_a_name_are_told_by_their_largest_parts(rig: Rig) -> None:
+def test_unknown_directions_without_a_name_are_listed_by_their_largest_parts(rig: Rig) -> None:
     parameters = Parameters.of(rig, {"outlets": 1e-3, "offsets": 1e-3})
     direction = np.zeros(len(parameters))
     direction[[0, 30]] = np.sqrt(0.5)
     information = 100.0 * (np.eye(len(parameters)) - np.outer(direction, direction))
-    (told,) = sentences(Observability.of(information), parameters)
-    assert told.startswith("1 combinations of parameters")
-    assert "outlet_1_x" in told
-    assert "offset_7" in told
+    (sentence,) = sentences(Observability.of(information), parameters)
+    assert sentence.startswith("1 combinations of parameters")
+    assert "outlet_1_x" in sentence
+    assert "offset_7" in sentence
 
 
 def test_a_result_file_is_applied_to_its_own_rig_only(
@@ -449,26 +450,26 @@ def test_a_result_file_with_a_cable_too_few_is_refused_by_name(
     document[key] = document[key][:-1]
     path = tmp_path / "edited.yaml"
     path.write_text(yaml.safe_dump(document), encoding="utf-8")
-    with pytest.raises(InvalidFile, match=f"{key}.*has 7 entries, outlets_mm has 8") as told:
+    with pytest.raises(InvalidFile, match=f"{key}.*has 7 entries, outlets_mm has 8") as caught:
         load_result(path)
-    assert "edited.yaml" in str(told.value)
+    assert "edited.yaml" in str(caught.value)
 
 
-def test_a_result_with_fewer_cables_throughout_is_told_of_the_result(
+def test_a_result_with_fewer_cables_throughout_is_refused_by_name(
     rig: Rig, found: RigCalibration
 ) -> None:
     result = rig_result(found, judge_rig(found, 1e-3, 0.0), "rig", TODAY)
     keys = ("outlets_mm", "anchors_mm", "drums_mm_per_rev", "home_counts", "cable_residuals_mm")
     fewer = result.model_copy(update={key: getattr(result, key)[:-1] for key in keys})
-    with pytest.raises(BadInput, match="of 7 cables, the rig has 8") as told:
+    with pytest.raises(BadInput, match="has 7 cables, the rig has 8") as caught:
         rig.with_calibration(fewer)
-    assert told.value.where == "calibration rig rig, 2026-03-14"
+    assert caught.value.where == "calibration rig rig, 2026-03-14"
 
 
 def test_two_results_are_compared_by_where_the_platform_goes(
     rig: Rig, found: RigCalibration, found_level: RigCalibration
 ) -> None:
-    """Never turned, outlets are known worse than where the platform is: that is no disagreement."""
+    """Without rotation, outlets are less certain than the platform: not a disagreement."""
     one, other = (
         rig_result(r, judge_rig(r, 1e-3, 0.0), "rig", TODAY) for r in (found, found_level)
     )
@@ -477,57 +478,57 @@ def test_two_results_are_compared_by_where_the_platform_goes(
     assert 0.0 < apart < 0.3
     assert rms(outlets) > 3.0 * apart
     assert one.apart_mm(one) == 0.0
-    sent = judged_places(rig, 0.0)[0]
-    assert np.linalg.norm(found.reached(*judged_places(rig, 0.0)) - sent, axis=1).max() > 1e-3
-    with pytest.raises(BadInput, match="rest on different rig files"):
+    sent = workspace_poses(rig, 0.0)[0]
+    assert np.linalg.norm(found.reached(*workspace_poses(rig, 0.0)) - sent, axis=1).max() > 1e-3
+    with pytest.raises(BadInput, match="depend on different rig files"):
         one.apart_mm(one.model_copy(update={"rests_on": "another"}))
 
 
 def test_counts_of_home_lead_the_corrected_rig_to_the_lengths_that_were_fitted(
     rig: Rig, found: RigCalibration
 ) -> None:
-    """Its winches pay out for a count what the fit says, to a count."""
+    """Its winches pay out the fitted length, to one count."""
     result = rig_result(found, judge_rig(found, 1e-3, 0.0), "rig", TODAY)
     corrected, data = rig.with_calibration(result), found.measured
     winches = WinchMap(corrected)
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
-    by_fit = RigModel(found.parameters, data).counted.by(found.geometry)
+    by_fit = RigModel(found.parameters, data).counted.lengths(found.geometry)
     assert lengths == pytest.approx(by_fit, abs=3e-6)
 
 
 def test_runs_of_another_rig_or_of_two_references_are_refused(rig: Rig) -> None:
     other = load_rig(ROOT / "configs/gachon_8_6.yaml")
     with pytest.raises(BadInput, match="this run was made with outlets"):
-        require_one_drawing(rig, [("runs/a", other)])
+        require_same_nominal(rig, [("runs/a", other)])
     winches = [w.model_copy(update={"home_counts": 5}) for w in rig.document.winches]
     again = rig_from_document(rig.document.model_copy(update={"winches": winches}))
     with pytest.raises(BadInput, match="homed again"):
-        require_one_drawing(rig, [("runs/a", rig), ("runs/b", again)])
-    assert require_one_drawing(rig, [("runs/b", again)]) is again
-    assert require_one_drawing(rig, []) is rig
+        require_same_nominal(rig, [("runs/a", rig), ("runs/b", again)])
+    assert require_same_nominal(rig, [("runs/b", again)]) is again
+    assert require_same_nominal(rig, []) is rig
 
 
-def test_too_few_places_and_nothing_to_look_for_are_refused(rig: Rig, turned: Truth) -> None:
-    few = turned.measured.part(np.arange(60) < 9)
+def test_too_few_samples_and_no_parameters_are_refused(rig: Rig, tilted: Truth) -> None:
+    few = tilted.measured.part(np.arange(60) < 9)
     with pytest.raises(BadInput, match="only 9 stationary samples"):
         fit_rig(rig, few, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     with pytest.raises(BadInput, match="nothing to calibrate"):
-        fit_rig(rig, turned.measured, {}, LENGTH_DEVIATION)
+        fit_rig(rig, tilted.measured, {}, LENGTH_DEVIATION)
 
 
 def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
-    """Standing for 1 s, moving for 1 s, standing for 1 s; an image every 0.1 s."""
+    """At rest for 1 s, moving for 1 s, at rest for 1 s; an image every 0.1 s."""
     time = np.arange(0.0, 3.0, 0.01)
-    way = np.clip(time - 1.0, 0.0, 1.0)
-    counts = np.rint(1000.0 * np.stack([way, -way], axis=1))
+    travel = np.clip(time - 1.0, 0.0, 1.0)
+    counts = np.rint(1000.0 * np.stack([travel, -travel], axis=1))
     seen = np.arange(0.0, 2.5, 0.1)  # none after 2.5 s
     turns = [matrix_from_rotation_vector((0.0, 0.0, 1e-3 * (-1) ** k)) for k in range(len(seen))]
     run = Recording(
         time=time,
-        asked=counts,
+        setpoints=counts,
         counts=counts,
         tensions=np.full((len(time), 2), 20.0),
-        seen=seen,
+        pose_times=seen,
         positions=np.stack([np.clip(seen - 1.0, 0.0, 1.0), 0 * seen, 0 * seen], axis=1),
         rotations=np.array(turns),
         covariances=np.tile(np.eye(6) * 1e-8, (len(seen), 1, 1)),
@@ -543,7 +544,7 @@ def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
         "blind",
         replace(
             run,
-            seen=seen[:8],
+            pose_times=seen[:8],
             positions=run.positions[:8],
             rotations=run.rotations[:8],
             covariances=run.covariances[:8],
@@ -553,16 +554,16 @@ def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
     assert len(joined([found, blind])) == 3
 
 
-def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, turned: Truth) -> None:
-    """Winches 1 and 2 changed over; the drums' largest error is 0.8 % of 0.5."""
-    counts = turned.measured.counts.copy()
+def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, tilted: Truth) -> None:
+    """Winches 1 and 2 swapped, or a stated drum deviation far below the true error."""
+    counts = tilted.measured.counts.copy()
     counts[:, [0, 1]] = counts[:, [1, 0]]
-    swapped = replace(turned.measured, counts=counts)
+    swapped = replace(tilted.measured, counts=counts)
     verdicts = [
         judge_rig(fit_rig(rig, data, deviations, LENGTH_DEVIATION), 1e-3, 0.0).verdict
         for data, deviations in (
             (swapped, DEFAULT_DEVIATIONS),
-            (turned.measured, {**DEFAULT_DEVIATIONS, "drum_scale": 2e-4}),
+            (tilted.measured, {**DEFAULT_DEVIATIONS, "drum_scale": 2e-4}),
         )
     ]
     assert not any(verdict.good for verdict in verdicts)
@@ -572,20 +573,20 @@ def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, turned: Tru
     assert "--drum-scale-percent" in verdicts[1].next_steps[0]
 
 
-def test_a_pose_outside_the_rig_is_refused_by_name(rig: Rig, turned: Truth) -> None:
-    metres = replace(turned.measured, positions=turned.measured.positions / 1e3)
-    with pytest.raises(BadInput, match="outside the rig") as told:
+def test_a_pose_outside_the_rig_is_refused_by_name(rig: Rig, tilted: Truth) -> None:
+    metres = replace(tilted.measured, positions=tilted.measured.positions / 1e3)
+    with pytest.raises(BadInput, match="outside the rig") as caught:
         fit_rig(rig, metres, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    assert told.value.where == "place 0"
+    assert caught.value.where == "sample 0"
 
 
 @pytest.mark.parametrize("poses", [True, False])
-def test_a_wrong_stiffness_is_told_with_the_true_one(turned: Truth, poses: bool) -> None:
-    """The data are of cables with 6000 N, and the file of the paper's rig says 848230 N."""
+def test_a_wrong_stiffness_is_reported_with_the_true_one(tilted: Truth, poses: bool) -> None:
+    """The cables have 6000 N, the paper's rig file states 848230 N."""
     drawn = load_rig(ROOT / "configs/gachon_8_6.yaml")
-    data = turned.measured if poses else turned.measured.without_poses()
+    data = tilted.measured if poses else tilted.measured.without_poses()
     result = fit_rig(drawn, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    compliance = compliance_told(result)
+    compliance = estimate_compliance(result)
     assert compliance is not None
     assert 1.0 / compliance.estimated == pytest.approx(6000.0, rel=0.05 if poses else 0.35)
     verdict = judge_rig(result, 1e-3, 0.0).verdict
@@ -595,69 +596,67 @@ def test_a_wrong_stiffness_is_told_with_the_true_one(turned: Truth, poses: bool)
 
 
 @pytest.mark.parametrize("stiffness", [3500.0, 12000.0, 60000.0])
-def test_the_stiffness_that_the_data_tell_is_the_same_for_every_rig_file(
-    rig: Rig, turned: Truth, stiffness: float
+def test_the_estimated_stiffness_is_the_same_for_every_rig_file(
+    rig: Rig, tilted: Truth, stiffness: float
 ) -> None:
-    drawn = drawn_with(rig, stiffness)
-    result = fit_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    compliance, differences = compliance_told(result), differences_told(result)
+    drawn = with_nominal_stiffness(rig, stiffness)
+    result = fit_rig(drawn, tilted.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    compliance, differences = estimate_compliance(result), estimate_cable_compliances(result)
     assert compliance is not None
     assert differences is not None
     assert 1.0 / compliance.estimated == pytest.approx(6000.0, rel=0.05)
     assert 1.0 / differences.estimated == pytest.approx(6000.0, rel=0.3)
 
 
-def test_a_stiffness_far_from_the_rig_file_is_told_as_a_factor(rig: Rig, turned: Truth) -> None:
-    drawn = drawn_with(rig, 60000.0)
-    result = fit_rig(drawn, turned.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+def test_a_stiffness_far_from_the_rig_file_is_reported_as_a_factor(rig: Rig, tilted: Truth) -> None:
+    drawn = with_nominal_stiffness(rig, 60000.0)
+    result = fit_rig(drawn, tilted.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     factor = float(result.geometry.stiffness[0]) / 60000.0
     assert factor < 0.3
     reason = judge_rig(result, 1e-3, 0.0).verdict.reasons[0]
     assert reason.startswith(f"stiffness is {factor:.3g} times that of the rig file")
 
 
-def test_a_stiffness_that_nothing_tells_is_positive_however_uncertain(
-    rig: Rig, turned: Truth
-) -> None:
-    blind = replace(turned.measured, tensions=np.full_like(turned.measured.tensions, np.nan))
+def test_an_undetermined_stiffness_is_positive_however_uncertain(rig: Rig, tilted: Truth) -> None:
+    blind = replace(tilted.measured, tensions=np.full_like(tilted.measured.tensions, np.nan))
     loose = {"outlets": 4e-3, "stiffness": 2.0}
     stiffness = fit_rig(rig, blind, loose, LENGTH_DEVIATION).intervals["stiffness_n"]
     assert 0.0 < stiffness.bounds[0] < 6000.0 / 20.0
     assert stiffness.bounds[1] > 6000.0 * 20.0
 
 
-def test_a_stiffness_that_is_hardly_known_is_found_from_afar(turned: Truth) -> None:
-    """As the next step of a contradiction advises: a hundred and forty times too stiff."""
+def test_a_stiffness_that_is_hardly_known_is_found_from_afar(tilted: Truth) -> None:
+    """As advised for a contradiction: 140 times too stiff."""
     drawn = load_rig(ROOT / "configs/gachon_8_6.yaml")
     loose = {**DEFAULT_DEVIATIONS, "stiffness": 5.0}
-    result = fit_rig(drawn, turned.measured, loose, LENGTH_DEVIATION)
+    result = fit_rig(drawn, tilted.measured, loose, LENGTH_DEVIATION)
     stiffness = result.intervals["stiffness_n"]
     assert abs(stiffness.value - 6000.0) < stiffness.half_width < 1200.0
     assert judge_rig(result, 1e-3, 0.0).verdict.good
 
 
-def test_cables_that_differ_are_told_and_others_are_not(rig: Rig) -> None:
-    """Cable 3 is of half the stiffness; the tensions of all were measured."""
+def test_cables_that_differ_are_reported_and_others_are_not(rig: Rig) -> None:
+    """Cable 3 has half the stiffness; all tensions were measured."""
     for weak in (6000.0, 3000.0):
-        built = built_otherwise(rig, 5, [6000.0] * 2 + [weak] + [6000.0] * 5)
-        data = places(built, 60, tilt=np.radians(8.0), seed=6).measured
+        built = rig_with_errors(rig, 5, [6000.0] * 2 + [weak] + [6000.0] * 5)
+        data = samples(built, 60, tilt=np.radians(8.0), seed=6).measured
         result = fit_rig(built, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-        differences = differences_told(result)
+        differences = estimate_cable_compliances(result)
         assert differences is not None
         reasons = judge_rig(result, 1e-3, 0.0).verdict.reasons
         assert any("the cables differ" in reason for reason in reasons) == (weak < 6000.0)
     assert np.argmax(differences.estimated) == 2
     assert 1.0 / differences.estimated[2] == pytest.approx(3000.0, rel=0.25)
     blind = replace(data, tensions=np.full_like(data.tensions, np.nan))
-    told = fit_rig(built, blind, {"offsets": 2e-3}, LENGTH_DEVIATION)
-    assert differences_told(told) is None
+    result = fit_rig(built, blind, {"offsets": 2e-3}, LENGTH_DEVIATION)
+    assert estimate_cable_compliances(result) is None
 
 
 def test_the_true_stiffness_is_not_doubted(
     found: RigCalibration, found_level: RigCalibration
 ) -> None:
     for result in (found, found_level):
-        compliance = compliance_told(result)
+        compliance = estimate_compliance(result)
         assert compliance is not None
         assert not compliance.contradicts
         stiffness = result.intervals["stiffness_n"]
@@ -665,21 +664,21 @@ def test_the_true_stiffness_is_not_doubted(
 
 
 def test_the_derivative_by_compliance_is_that_of_finite_differences(
-    rig: Rig, turned: Truth, found: RigCalibration
+    rig: Rig, tilted: Truth, found: RigCalibration
 ) -> None:
-    step, data = 1e-9, turned.measured
+    step, data = 1e-9, tilted.measured
     counted, geometry = CountedLengths(rig, data.counts, data.tensions), found.geometry
     compliance = 1.0 / geometry.stiffness
     ends = [
-        counted.by(replace(geometry, stiffness=1.0 / (compliance + sign * step)))
+        counted.lengths(replace(geometry, stiffness=1.0 / (compliance + sign * step)))
         for sign in (1.0, -1.0)
     ]
     slope = counted.by_compliance(geometry)
     assert slope == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=1e-4, abs=1e-4)
 
 
-def test_the_hash_of_the_data_is_of_every_number(turned: Truth) -> None:
-    data = turned.measured
+def test_the_hash_of_the_data_is_of_every_number(tilted: Truth) -> None:
+    data = tilted.measured
     assert re.fullmatch("sha256:[0-9a-f]{64}", data.data_hash)
     assert replace(data, counts=data.counts.copy()).data_hash == data.data_hash
     for key in ("counts", "tensions", "positions", "rotations"):
@@ -688,13 +687,13 @@ def test_the_hash_of_the_data_is_of_every_number(turned: Truth) -> None:
         assert replace(data, **{key: values}).data_hash != data.data_hash
 
 
-def test_a_place_with_the_numbers_of_an_earlier_one_counts_once(turned: Truth) -> None:
-    data = turned.measured
+def test_a_sample_with_the_numbers_of_an_earlier_one_counts_once(tilted: Truth) -> None:
+    data = tilted.measured
     copy = replace(data, names=tuple(f"copy of {name}" for name in data.names))
     both = joined([data, copy])
     assert both.names == data.names
-    assert both.unused["copy of place 3"] == "has the same numbers as place 3"
+    assert both.unused["copy of sample 3"] == "has the same numbers as sample 3"
     assert len(both.unused) == len(data)
-    again = replace(copy, positions=copy.positions + 1e-6)  # measured anew at the same place
+    again = replace(copy, positions=copy.positions + 1e-6)  # measured again at the same pose
     assert len(joined([data, again])) == 2 * len(data)
     assert len(joined([data.without_poses(), again.without_poses()])) == len(data)

@@ -1,4 +1,4 @@
-"""Poses chosen for measuring: they tell more than others, can be held, and are free."""
+"""Poses selected for measuring: more informative than others, feasible and free."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
-from calibration.geometry.pose_selection import Wish, _in_order, _most_telling, chosen_poses
+from calibration.geometry.pose_selection import (
+    PoseRequirements,
+    _d_optimal,
+    _short_tour,
+    choose_poses,
+)
 from model.clearance import ClearanceModel
 from model.errors import NoSolution
 from model.pose import Pose
@@ -18,7 +23,9 @@ from model.scene import Scene, load_scene
 from model.statics.gravity import working_tensions
 
 ROOT = Path(__file__).resolve().parents[2]
-WISH = Wish(12, np.radians(15.0), np.radians(15.0), 60, 4.0, 0.1e-3, (0.3e-3,) * 3 + (1e-3,) * 3)
+WISH = PoseRequirements(
+    12, np.radians(15.0), np.radians(15.0), 60, 4.0, 0.1e-3, (0.3e-3,) * 3 + (1e-3,) * 3
+)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +40,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def poses(rig: Rig, scene: Scene) -> list[Pose]:
-    return chosen_poses(rig, scene, WISH, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=1)
+    return choose_poses(rig, scene, WISH, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=1)
 
 
 def test_every_pose_can_be_held_and_is_free(rig: Rig, scene: Scene, poses: list[Pose]) -> None:
@@ -48,44 +55,44 @@ def test_every_pose_can_be_held_and_is_free(rig: Rig, scene: Scene, poses: list[
         assert model.self_clearance(pose).distance > scene.self_clearance
 
 
-def test_the_platform_is_turned_no_further_than_its_cables_let_it_on_the_way(
+def test_the_platform_is_rotated_no_further_than_its_cables_allow(
     rig: Rig, poses: list[Pose]
 ) -> None:
-    """At 12° and more cables of this rig are apart again, but have passed through each other."""
+    """From 12° on, cables of this rig are apart again, but have passed through each other."""
     angles = np.degrees([pose.angle_to(rig.home) for pose in poses])
     assert 4.0 < angles.max() < 11.0
 
 
 def test_the_same_seed_chooses_the_same_poses(rig: Rig, scene: Scene, poses: list[Pose]) -> None:
-    again = chosen_poses(rig, scene, WISH, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=1)
+    again = choose_poses(rig, scene, WISH, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=1)
     assert all(a.distance_to(b) == 0.0 for a, b in zip(poses, again, strict=True))
 
 
-def test_what_is_chosen_tells_more_than_chance() -> None:
+def test_selected_poses_are_more_informative_than_random_ones() -> None:
     random = np.random.default_rng(3)
     rows = random.normal(size=(80, 4, 10)) * random.uniform(0.1, 3.0, (80, 1, 1))
 
-    def told(chosen: list[int]) -> float:
+    def log_determinant(chosen: list[int]) -> float:
         information = np.eye(10) + sum(rows[k].T @ rows[k] for k in chosen)
         return float(np.linalg.slogdet(information)[1])
 
-    chosen = _most_telling(rows, 15)
+    chosen = _d_optimal(rows, 15)
     assert len(set(chosen)) == 15
-    others = [told(random.choice(80, 15, replace=False).tolist()) for _ in range(50)]
-    assert told(chosen) > max(others)
-    first = max(range(80), key=lambda k: told([k]))
+    others = [log_determinant(random.choice(80, 15, replace=False).tolist()) for _ in range(50)]
+    assert log_determinant(chosen) > max(others)
+    first = max(range(80), key=lambda k: log_determinant([k]))
     assert chosen[0] == first
 
 
-def test_the_way_through_all_poses_has_no_detour() -> None:
+def test_the_tour_through_all_poses_has_no_detour() -> None:
     line = [Pose.level([x, 0.0, 0.0]) for x in (0.3, 0.1, 0.5, 0.2, 0.4)]
-    ordered = _in_order(line, Pose.level([0.0, 0.0, 0.0]), 0.1)
+    ordered = _short_tour(line, Pose.level([0.0, 0.0, 0.0]), 0.1)
     assert [round(float(p.position[0]), 1) for p in ordered] == [0.1, 0.2, 0.3, 0.4, 0.5]
 
 
-def test_a_scene_without_room_is_told(rig: Rig, scene: Scene) -> None:
+def test_a_scene_without_room_is_refused(rig: Rig, scene: Scene) -> None:
     narrow = replace(scene, self_clearance=0.05)
     with pytest.raises(NoSolution, match="tried poses are feasible and free"):
-        chosen_poses(
+        choose_poses(
             rig, narrow, replace(WISH, candidates=15), Parameters.of(rig, {"offsets": 1e-3}), 0
         )

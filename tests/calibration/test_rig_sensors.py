@@ -1,4 +1,4 @@
-"""Tensions, swivel angles and an IMU in a rig's calibration, against rigs by other formulas."""
+"""Tensions, swivel angles and an IMU in rig calibration, against independent formulas."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from calibration.geometry.model import RigModel
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.quality import judge_rig
 from calibration.geometry.report import number_rows, rig_page
-from calibration.geometry.result import RigResult, drawing_of, rig_result
+from calibration.geometry.result import RigResult, nominal_geometry, rig_result
 from model.errors import BadInput
 from model.pose import matrix_from_rotation_vector
 from model.rig import Rig, load_rig
 from model.winches import WinchMap
-from tests.calibration.rig_places import write_places
+from tests.calibration.rig_places import write_samples
 from tests.calibration.synthetic_rig import (
     LENGTH_NOISE,
     SPREAD,
@@ -63,16 +63,16 @@ def found(rig: Rig, data: RigMeasurements) -> RigCalibration:
 
 
 def inside(result: RigCalibration, built: BuiltRig, group: str) -> float:
-    """How many numbers of a group are in their 95 % intervals."""
-    place = result.parameters.slices()[group]
-    off = result.fit.values[place] - built.values((group,))
-    return float(np.mean(np.abs(off) < result.uncertainty.half_widths[place]))
+    """Share of a group's parameters within their 95 % intervals."""
+    columns = result.parameters.slices()[group]
+    off = result.fit.values[columns] - built.values((group,))
+    return float(np.mean(np.abs(off) < result.uncertainty.half_widths[columns]))
 
 
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=5)
 def test_the_truth_leaves_nothing_over(rig: Rig, seed: int) -> None:
-    """Without noise, lengths, swivel angles and verticals are what other formulas give."""
+    """Without noise, lengths, swivel angles and verticals agree with independent formulas."""
     built = built_rig(rig, seed)
     data = measured(built, 6, seed + 1, noise=0.0)
     parameters = Parameters.of(rig, PER_CABLE)
@@ -112,8 +112,8 @@ def test_every_number_is_found_with_its_interval(built: BuiltRig, found: RigCali
         assert stated[f"stiffness_{i}_n"].value == pytest.approx(true, rel=0.05)
         assert stated[f"stiffness_{i}_n"].half_width < 0.05 * true
     zeros = np.degrees(built.off["swivel_zeros"])
-    turned = np.degrees(built.off["imu_mounting"])
-    for key, true in {"swivel_zero_3_deg": zeros[2], "imu_mounting_x_deg": turned[0]}.items():
+    rotated = np.degrees(built.off["imu_mounting"])
+    for key, true in {"swivel_zero_3_deg": zeros[2], "imu_mounting_x_deg": rotated[0]}.items():
         assert abs(stated[key].value - true) < 2.0 * stated[key].half_width < 1.0
 
 
@@ -121,17 +121,17 @@ def test_a_result_holds_each_cables_stiffness_and_applies_it(
     rig: Rig, found: RigCalibration, data: RigMeasurements
 ) -> None:
     quality = judge_rig(found, 1e-3, 0.0)
-    told = rig_result(found, quality, "rig", TODAY)
-    again = RigResult.model_validate(told.model_dump())
+    document = rig_result(found, quality, "rig", TODAY)
+    again = RigResult.model_validate(document.model_dump())
     corrected = rig.with_calibration(again)
     assert corrected.cable_stiffness == pytest.approx(found.geometry.stiffness)
-    assert [w.cable_stiffness_n for w in corrected.document.winches] == told.cable_stiffness_n
+    assert [w.cable_stiffness_n for w in corrected.document.winches] == document.cable_stiffness_n
     winches = WinchMap(corrected)
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
-    by_fit = RigModel(found.parameters, data).counted.by(found.geometry)
+    by_fit = RigModel(found.parameters, data).counted.lengths(found.geometry)
     assert lengths == pytest.approx(by_fit, abs=30e-6)  # a count is 12 micrometres
-    assert told.sensor_residuals_deg.keys() >= {"swivel 1", "swivel 10", "IMU 1", "IMU 2"}
-    assert all(0.05 < x < 0.15 for x in told.sensor_residuals_deg.values())
+    assert document.sensor_residuals_deg.keys() >= {"swivel 1", "swivel 10", "IMU 1", "IMU 2"}
+    assert all(0.05 < x < 0.15 for x in document.sensor_residuals_deg.values())
     page = rig_page(found, quality, "rig", "2026-11-23")
     for title in (
         "Stiffness of each cable [N]",
@@ -153,16 +153,16 @@ def test_a_common_factor_keeps_the_differences_of_the_rig_file(
 
 
 def test_results_of_rig_files_without_the_new_key_still_apply(rig: Rig) -> None:
-    """What a result rests on has no key that is left out."""
-    (winch, *_) = drawing_of(rig.document)["winches"]
+    """The basis of a result does not include absent keys."""
+    (winch, *_) = nominal_geometry(rig.document)["winches"]
     assert "cable_stiffness_n" not in winch
     other = rig.document.winches[0].model_copy(update={"cable_stiffness_n": 5.0})
     changed = rig.document.model_copy(update={"winches": [other, *rig.document.winches[1:]]})
-    assert drawing_of(changed) != drawing_of(rig.document)
+    assert nominal_geometry(changed) != nominal_geometry(rig.document)
 
 
 def widths(rig: Rig, data: RigMeasurements) -> dict[str, float]:
-    """Half the 95 % intervals of what is not a sensor's own, by name."""
+    """Half widths of the geometry's parameters, by name."""
     own = {"swivel_zeros": data.swivels, "imu_mounting": data.verticals}
     absent = {group for group, values in own.items() if not np.isfinite(values).any()}
     sought = {group: d for group, d in PER_CABLE.items() if group not in absent}
@@ -174,7 +174,7 @@ def widths(rig: Rig, data: RigMeasurements) -> dict[str, float]:
 
 
 def test_a_sensor_more_does_not_widen_the_geometry(rig: Rig) -> None:
-    """In clean data; which directions stay as in the rig file may move single numbers a little."""
+    """In clean data; changes of unidentified directions may move single values slightly."""
     for seed in range(3):
         data = measured(built_rig(rig, seed), 30, 50 + seed, noise=0.3)
         before = widths(rig, only(data))
@@ -197,16 +197,16 @@ def test_a_wrong_reading_is_named_and_left_out(rig: Rig, data: RigMeasurements) 
     verticals[20] = matrix_from_rotation_vector([0.2, 0.0, 0.0]) @ verticals[20]
     spoiled = replace(data, swivels=swivels, verticals=verticals)
     result = fit_rig(rig, spoiled, PER_CABLE, LENGTH_NOISE)
-    assert set(result.measured.unused) == {"place 7", "place 20"}
-    assert "swivel 4 is " in result.measured.unused["place 7"]
-    assert "IMU " in result.measured.unused["place 20"]
-    assert "° off" in result.measured.unused["place 20"]
+    assert set(result.measured.unused) == {"sample 7", "sample 20"}
+    assert "swivel 4 is " in result.measured.unused["sample 7"]
+    assert "IMU " in result.measured.unused["sample 20"]
+    assert "° off" in result.measured.unused["sample 20"]
 
 
 def test_an_imu_whose_mounting_is_not_asked_for_is_found_to_scatter(
     rig: Rig, data: RigMeasurements
 ) -> None:
-    """It is turned by a degree, ten times what is stated."""
+    """It is rotated by a degree, ten times what is stated."""
     for sought, good in ((NO_MOUNTING, False), (PER_CABLE, True)):
         result = fit_rig(rig, data, sought, LENGTH_NOISE)
         reasons = judge_rig(result, 1e-2, 0.0).verdict.reasons
@@ -216,13 +216,13 @@ def test_an_imu_whose_mounting_is_not_asked_for_is_found_to_scatter(
 def test_whole_turns_of_a_swivel_encoder_do_not_matter(
     rig: Rig, data: RigMeasurements, found: RigCalibration
 ) -> None:
-    turned = replace(data, swivels=data.swivels + 2.0 * np.pi * np.arange(-5.0, 5.0))
-    fit, _ = identified(found.parameters, turned, LENGTH_NOISE)
+    rotated = replace(data, swivels=data.swivels + 2.0 * np.pi * np.arange(-5.0, 5.0))
+    fit, _ = identified(found.parameters, rotated, LENGTH_NOISE)
     assert fit.values == pytest.approx(found.fit.values, abs=1e-7)
 
 
 def test_sensors_of_a_part_of_the_data_count_there(rig: Rig, data: RigMeasurements) -> None:
-    """As of two files, one without their columns; it is as if they had been left out there."""
+    """As with two files, one without their columns: the same as leaving them out there."""
     first = np.arange(len(data)) < 20
     parts = [data.part(first), only(data.part(~first))]
     both = replace(
@@ -257,7 +257,7 @@ def test_what_is_missing_for_a_stiffness_is_said(rig: Rig, built: BuiltRig) -> N
     assert any("tension_1_n" in line for line in lines)
 
 
-def test_sensors_that_cannot_be_are_refused(rig: Rig, data: RigMeasurements) -> None:
+def test_impossible_sensor_data_are_refused(rig: Rig, data: RigMeasurements) -> None:
     points = load_rig(ROOT / "configs/gachon_8_6.yaml")
     eight = {k: getattr(data, k)[:, :8] for k in ("counts", "tensions", "swivels")}
     home = np.tile(points.home.position, (len(data), 1))
@@ -271,7 +271,7 @@ def test_sensors_that_cannot_be_are_refused(rig: Rig, data: RigMeasurements) -> 
 
 def written(path: Path, data: RigMeasurements, unit: str = "m_s2", size: float = 9.81) -> Path:
     """The measurements with all sensors as a CSV file."""
-    write_places(path, data)
+    write_samples(path, data)
     lines = path.read_text(encoding="utf-8").splitlines()
     m = data.swivels.shape[1]
     names = [f"swivel_{i}_deg" for i in range(1, m + 1)] + [f"accel_{a}_{unit}" for a in "xyz"]
@@ -295,7 +295,7 @@ def test_sensors_are_read_from_their_columns(
 def test_an_acceleration_that_is_not_gravitys_is_refused(
     data: RigMeasurements, tmp_path: Path
 ) -> None:
-    with pytest.raises(BadInput, match=r"line 2: accel_x_m_s2.* are 1 together; at rest it"):
+    with pytest.raises(BadInput, match=r"line 2: accel_x_m_s2.* are 1 in magnitude; at rest it"):
         read_rig_data(written(tmp_path / "wrong.csv", data, "m_s2", 1.0), 10)
 
 
@@ -307,10 +307,10 @@ def test_the_program_finds_and_applies_them(
     options = ("--stiffness-per-cable", "--imu-mounting-deg", 1, "--swivel-deg", 0.1)
     done = call("calibrate", "rig", path, file, *options, "-o", out, "--json")
     assert done.code in (0, 3), done
-    told = json.loads(done.out)
-    assert told["cable_stiffness_n"] == pytest.approx(built.stiffness, rel=0.05)
-    assert {"swivel_zero_10_deg", "imu_mounting_z_deg"} <= told["intervals"].keys()
+    document = json.loads(done.out)
+    assert document["cable_stiffness_n"] == pytest.approx(built.stiffness, rel=0.05)
+    assert {"swivel_zero_10_deg", "imu_mounting_z_deg"} <= document["intervals"].keys()
     (result,) = out.glob("*.yaml")
     new = tmp_path / "new.yaml"
     assert call("calibrate", "apply", path, result, "-o", new).code == 0
-    assert load_rig(new).cable_stiffness == pytest.approx(told["cable_stiffness_n"])
+    assert load_rig(new).cable_stiffness == pytest.approx(document["cable_stiffness_n"])

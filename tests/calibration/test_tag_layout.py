@@ -1,4 +1,4 @@
-"""The tags' places on the platform from images taken from anywhere."""
+"""The tags' poses on the platform from images taken from anywhere."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from calibration.tag_map.bundle_adjustment import (
     measure_layout,
     require_tags,
 )
-from calibration.tag_map.observations import TagSights, TagViews, moved_tags
+from calibration.tag_map.observations import TagObservations, TagViews, moved_tags
 from calibration.tag_map.result import judge_layout, tags_result
 from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig, Tag, load_rig
-from tests.calibration.exact_sights import sights_at
+from tests.calibration.exact_sights import observe
 from tracking.detection.tags import tag_corners
 from tracking.pnp import moved
 
@@ -37,37 +37,37 @@ def rig() -> Rig:
     return load_rig(CONFIGS / "gachon_8_6.yaml")
 
 
-def as_glued(rig: Rig, rng: np.random.Generator, shift: float = 1e-3) -> tuple[Tag, ...]:
-    """Tags where people glued them: off by so much, and turned by the like."""
+def as_mounted(rig: Rig, rng: np.random.Generator, shift: float = 1e-3) -> tuple[Tag, ...]:
+    """Tags as mounted by hand: shifted and rotated by small random amounts."""
     steps = rng.standard_normal((len(rig.platform_tags), 6)) * np.repeat([shift, 10 * shift], 3)
     return moved_tags(rig.platform_tags, steps.ravel())
 
 
 def around(rig: Rig, count: int, rng: np.random.Generator) -> dict[str, Pose]:
-    """Poses ``camera_from_platform`` of a platform that is turned every way before the camera.
+    """Poses ``camera_from_platform`` of a platform rotated in all directions before the camera.
 
-    As asked for, no image looks straight at one face.
+    As recommended, no image is frontal to a face.
     """
     poses = {}
     for k in range(count):
         turn = Rotation.random(random_state=rng).as_matrix()
         while np.abs(turn[2]).max() > 0.85:
             turn = Rotation.random(random_state=rng).as_matrix()
-        place = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.5, 0.7)])
-        poses[f"{k:02}.png"] = Pose(place, turn)
+        position = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.5, 0.7)])
+        poses[f"{k:02}.png"] = Pose(position, turn)
     return poses
 
 
-def session(rig: Rig, tags, count: int, seed: int, noise: float = 0.02) -> TagSights:
+def session(rig: Rig, tags, count: int, seed: int, noise: float = 0.02) -> TagObservations:
     rng = np.random.default_rng(seed)
-    return sights_at(rig.cameras[0], tags, around(rig, count, rng), noise, rng)
+    return observe(rig.cameras[0], tags, around(rig, count, rng), noise, rng)
 
 
 def gaps(found: TagLayout, truth) -> tuple[float, float]:
-    """RMS error of corners [mm] and of turns [deg], the truth put where it fits the drawing."""
+    """RMS error of corners [mm] and rotations [deg], with the truth aligned to the rig file."""
     true = {tag.id: tag for tag in truth}
     here = np.concatenate([tag_corners(true[tag.id]) for tag in found.tags])
-    there = np.concatenate([tag_corners(tag) for tag in found.drawn])
+    there = np.concatenate([tag_corners(tag) for tag in found.nominal])
     middle, target = here.mean(axis=0), there.mean(axis=0)
     u, _, vt = np.linalg.svd((there - target).T @ (here - middle))
     turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
@@ -82,11 +82,11 @@ def gaps(found: TagLayout, truth) -> tuple[float, float]:
 
 
 def test_twenty_pictures_give_the_layout_to_hundredths_of_a_millimetre(rig: Rig) -> None:
-    tags = as_glued(rig, np.random.default_rng(1))
+    tags = as_mounted(rig, np.random.default_rng(1))
     found = measure_layout(rig, rig.cameras[0], session(rig, tags, 24, seed=2))
-    off, turned = gaps(found, tags)
+    off, rotated = gaps(found, tags)
     assert off < 0.04
-    assert turned < 0.02
+    assert rotated < 0.02
     assert found.reprojection < 0.05
     assert found.unseen == {}
     verdict = judge_layout(found, 0.2e-3)
@@ -96,11 +96,11 @@ def test_twenty_pictures_give_the_layout_to_hundredths_of_a_millimetre(rig: Rig)
 def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig) -> None:
     inside, errors, stated = [], [], []
     for seed in range(8):
-        tags = as_glued(rig, np.random.default_rng(seed))
-        sights = session(rig, tags, 16, seed=100 + seed, noise=0.05)
-        found = measure_layout(rig, rig.cameras[0], sights, fixed=301)
+        tags = as_mounted(rig, np.random.default_rng(seed))
+        observations = session(rig, tags, 16, seed=100 + seed, noise=0.05)
+        found = measure_layout(rig, rig.cameras[0], observations, fixed=301)
         true = {tag.id: tag for tag in tags}
-        home = next(tag for tag in found.drawn if tag.id == 301)
+        home = next(tag for tag in found.nominal if tag.id == 301)
         shift = home.pose.compose(true[301].pose.inverse())
         off = np.array(
             [tag.pose.position - shift.compose(true[tag.id].pose).position for tag in found.tags]
@@ -115,12 +115,14 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig) -> None:
 
 
 def test_slopes_are_those_of_finite_differences(rig: Rig) -> None:
-    sights = session(rig, rig.platform_tags, 4, seed=3)
+    observations = session(rig, rig.platform_tags, 4, seed=3)
     tags = tuple(rig.platform_tags)
-    views = TagViews.of(rig.cameras[0], sights, tags)
+    views = TagViews.of(rig.cameras[0], observations, tags)
     rng = np.random.default_rng(3)
     poses = [
-        p for name, p in around(rig, 4, np.random.default_rng(3)).items() if name in sights.squares
+        p
+        for name, p in around(rig, 4, np.random.default_rng(3)).items()
+        if name in observations.squares
     ]
     poses = [moved(p, 1e-3 * rng.standard_normal(6)) for p in poses]
     exact = views.dense_slopes(poses, tags)
@@ -138,22 +140,23 @@ def test_slopes_are_those_of_finite_differences(rig: Rig) -> None:
     np.testing.assert_allclose(exact / scale, numeric / scale, atol=1e-6)
 
 
-def test_what_pictures_cannot_tell_is_said(rig: Rig) -> None:
-    """A tag that is never seen with others stays as drawn; an image of one tag tells nothing."""
-    sights = session(rig, rig.platform_tags, 24, seed=4)
+def test_what_images_do_not_determine_is_reported(rig: Rig) -> None:
+    """A tag never seen with others stays nominal; an image of one tag adds nothing."""
+    observations = session(rig, rig.platform_tags, 24, seed=4)
     squares = {
-        name: {k: s for k, s in seen.items() if k != 306} for name, seen in sights.squares.items()
+        name: {k: s for k, s in seen.items() if k != 306}
+        for name, seen in observations.squares.items()
     }
     squares["alone.png"] = {301: next(s[301] for s in squares.values() if 301 in s)}
-    found = measure_layout(rig, rig.cameras[0], TagSights(squares, {}))
+    found = measure_layout(rig, rig.cameras[0], TagObservations(squares, {}))
     assert found.unseen == {306: "was not detected together with the others"}
     assert "only one tag" in found.unused["alone.png"]
     verdict = judge_layout(found, 1e-3)
     assert "take images that show tag 306 together with others" in verdict.next_steps
 
 
-def test_sizes_that_are_not_as_told_are_noticed(rig: Rig) -> None:
-    """All places are right, but the tags were printed at 97 %."""
+def test_wrong_tag_sizes_are_noticed(rig: Rig) -> None:
+    """All positions are right, but the tags were printed at 97 %."""
     small = tuple(replace(tag, size=0.97 * tag.size) for tag in rig.platform_tags)
     found = measure_layout(rig, rig.cameras[0], session(rig, small, 24, seed=5))
     verdict = judge_layout(found, 1.0)
@@ -172,18 +175,20 @@ def test_a_tag_that_was_glued_elsewhere_is_named(rig: Rig) -> None:
 
 
 def test_a_picture_of_another_tag_is_left_out_by_name(rig: Rig) -> None:
-    sights = session(rig, rig.platform_tags, 16, seed=8)
-    numbers = [number for seen in sights.squares.values() for number in seen]
+    observations = session(rig, rig.platform_tags, 16, seed=8)
+    numbers = [number for seen in observations.squares.values() for number in seen]
     number = max(set(numbers), key=numbers.count)
-    name, seen = next((n, s) for n, s in sights.squares.items() if number in s and len(s) == 3)
+    name, seen = next(
+        (n, s) for n, s in observations.squares.items() if number in s and len(s) == 3
+    )
     square = seen[number]
     off = replace(
         square,
         corners=square.corners + 12.0,
         target=square.whitening @ (square.corners + 12.0).ravel(),
     )
-    wrong = {**sights.squares, name: {**seen, number: off}}
-    found = measure_layout(rig, rig.cameras[0], TagSights(wrong, {}))
+    wrong = {**observations.squares, name: {**seen, number: off}}
+    found = measure_layout(rig, rig.cameras[0], TagObservations(wrong, {}))
     others = [why for other, why in found.unused.items() if other != name]
     assert all("only one tag" in why for why in others)
     assert "px, far more than the others" in found.unused[name]
@@ -195,8 +200,8 @@ def test_pictures_that_are_all_alike_are_not_good_enough(rig: Rig) -> None:
     base = next(iter(around(rig, 1, rng).values()))
     poses = {f"{k}.png": moved(base, 0.01 * rng.standard_normal(6)) for k in range(20)}
     camera = rig.cameras[0]
-    sights = sights_at(camera, rig.platform_tags, poses, 0.02, rng)
-    verdict = judge_layout(measure_layout(rig, camera, sights), 1.0)
+    observations = observe(camera, rig.platform_tags, poses, 0.02, rng)
+    verdict = judge_layout(measure_layout(rig, camera, observations), 1.0)
     assert any("all images are taken from within" in reason for reason in verdict.reasons)
     assert "take images from all sides, all different" in verdict.next_steps
 
@@ -212,13 +217,13 @@ def test_too_few_pictures_and_tags_are_refused(rig: Rig) -> None:
 
 def test_a_fixed_tag_that_no_picture_shows_is_refused_by_name(rig: Rig) -> None:
     unseen, *seen = rig.platform_tags
-    with pytest.raises(BadInput, match=f"^0 images show .* linked to tag {unseen.id}") as told:
+    with pytest.raises(BadInput, match=f"^0 images show .* linked to tag {unseen.id}") as caught:
         measure_layout(rig, rig.cameras[0], session(rig, seen, 6, seed=3), unseen.id)
-    assert f"no image shows together with tag {unseen.id}" in told.value.why
+    assert f"no image shows together with tag {unseen.id}" in caught.value.why
 
 
-def test_the_result_takes_the_place_of_the_drawing(rig: Rig, tmp_path: Path) -> None:
-    tags = as_glued(rig, np.random.default_rng(1))
+def test_the_result_replaces_the_nominal_layout(rig: Rig, tmp_path: Path) -> None:
+    tags = as_mounted(rig, np.random.default_rng(1))
     found = measure_layout(rig, rig.cameras[0], session(rig, tags, 16, seed=2))
     verdict = judge_layout(found, 2e-4)
     result = tags_result(found, verdict, rig.document, date(2026, 3, 4))
@@ -262,7 +267,7 @@ def test_results_are_compared_tag_by_tag(rig: Rig) -> None:
     pictures=st.lists(st.sets(st.integers(0, 7), min_size=1, max_size=3), max_size=8),
     fixed=st.one_of(st.none(), st.integers(0, 7)),
 )
-def test_tags_are_tied_as_by_walking_from_picture_to_picture(pictures, fixed) -> None:
+def test_tags_are_connected_as_by_a_walk_from_image_to_image(pictures, fixed) -> None:
     found = connected_tags(pictures, fixed)
 
     def walked(start: int) -> set[int]:

@@ -12,7 +12,7 @@ import yaml
 
 from model.pose import Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import MATRIX, picture_of, poses_before_the_camera, with_noise
-from tests.calibration.exif import turned_by_exif
+from tests.calibration.exif import rotated_by_exif
 from tests.cli.program import call, one_message
 
 BOARD = ("--board", "chessboard", "--columns", "9", "--rows", "6", "--square-mm", "25")
@@ -46,7 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("my images")
     for k, image in enumerate(pictures(14, 0.09)):
         if k == 0:
-            (folder / "turned.jpg").write_bytes(turned_by_exif(image))
+            (folder / "turned.jpg").write_bytes(rotated_by_exif(image))
         elif k == 1:
             save(folder / "colour.png", cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
         else:

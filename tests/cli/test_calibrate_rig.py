@@ -15,7 +15,7 @@ from cdpr.cli.calibrate import rig as rig_verb
 from model.kinematics import poses_near
 from model.rig import Rig, load_rig
 from model.winches import WinchMap
-from tests.calibration.rig_places import places, write_places
+from tests.calibration.rig_places import samples, write_samples
 from tests.cli.program import call
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,7 +31,7 @@ def rig() -> Rig:
 @pytest.fixture(scope="module")
 def file(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("my data") / "places.csv"
-    write_places(path, places(rig, 40, tilt=0.1, seed=5).measured)
+    write_samples(path, samples(rig, 40, tilt=0.1, seed=5).measured)
     return path
 
 
@@ -58,7 +58,7 @@ def test_the_recorded_session_calibrates_its_rig_to_a_tenth_of_a_millimetre(
     assert done.code == 0, done
     (result,) = folder.glob("*.yaml")
     corrected = rig.with_calibration(load_result(result))
-    truth = places(rig, 20, tilt=0.05, seed=8, noise=0.0)
+    truth = samples(rig, 20, tilt=0.05, seed=8, noise=0.0)
     winches, data = WinchMap(corrected), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
     told, _ = poses_near(corrected, lengths, truth.positions, truth.rotations, steps=10)
@@ -135,9 +135,9 @@ def changed(file: Path, tmp_path: Path, how: str) -> Path:
         ("text", "line 6, actual_1_counts: 'lost' is not a finite number"),
         ("short", "line 5 has 22 values for 23 columns"),
         ("column", "the column 'actual_1_counts' is missing"),
-        ("time", "line 3: time_s does not rise"),
+        ("time", "line 3: time_s does not increase"),
         ("quaternion", "line 3: the quaternion's length is"),
-        ("more", "the rig has 8 cables, the file more"),
+        ("more", "the rig has 8 cables, the file has more"),
         ("twice", "the column 'actual_1_counts' appears twice"),
         ("empty", "the file holds no values"),
         ("deviation", "a standard deviation is not positive"),
@@ -218,8 +218,8 @@ def test_a_folder_that_is_no_run_and_a_missing_file_are_refused(tmp_path: Path) 
 
 def test_lengths_alone_in_a_file_need_no_poses(rig: Rig, tmp_path: Path) -> None:
     path = tmp_path / "lengths.csv"
-    data = places(rig, 30, tilt=0.1, seed=6).measured
-    write_places(path, data, poses=False)
+    data = samples(rig, 30, tilt=0.1, seed=6).measured
+    write_samples(path, data, poses=False)
     done = call("calibrate", "rig", RIG, path, "--known", "outlets", "--json")
     assert done.code in (0, 3), done
     told = json.loads(done.out)

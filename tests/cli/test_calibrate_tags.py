@@ -28,7 +28,7 @@ OUTWARD_MM = 1.2  # or the platform's faces would hide tags that are not paralle
 TILTS_DEG = np.roll(ALONG_MM, 1, axis=0) / 2.0
 
 
-def as_glued() -> Rig:
+def as_mounted() -> Rig:
     """The rig with its tags where they truly are."""
     rig = load_rig(RIG)
     steps = []
@@ -63,7 +63,7 @@ def before_the_camera(count: int) -> list[Pose]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("platform")
-    rig = as_glued()
+    rig = as_mounted()
     scene = replace(load_scene(CONFIGS / "environment_1.yaml"), obstacles=())
     camera = SyntheticCamera(rig, scene, rig.cameras[0], seed=6)
     for k, pose in enumerate(before_the_camera(18)):
@@ -86,7 +86,7 @@ def test_the_tags_are_found_where_they_were_glued_and_the_result_used(folder, tm
     assert yaml.safe_load(saved.read_text()) == found
     page = saved.with_suffix(".html").read_text()
     assert "Tags against the rig file" in page
-    truth, drawn = as_glued().platform_tags, load_rig(RIG).platform_tags
+    truth, drawn = as_mounted().platform_tags, load_rig(RIG).platform_tags
     shift = drawn[0].pose.compose(truth[0].pose.inverse())
     tags = [TagDocument.model_validate(tag) for tag in found["platform"]]
     gaps = [

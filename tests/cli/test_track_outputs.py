@@ -20,7 +20,7 @@ from tests.cli.plans import CONFIGS, RIG, write_short_plan
 from tests.cli.program import call, nothing_written, one_message
 from tracking.measurement import NoPose
 from tracking.pose_log import CLEARANCE_COLUMNS, POSE_COLUMNS
-from tracking.track import USED, drawn_over
+from tracking.track import USED, draw_measurement
 from tracking.track import track as tracked
 from tracking.tracker import Tracker
 
@@ -156,7 +156,7 @@ def test_a_place_that_cannot_be_drawn_to_is_refused(
     one_message(answer, 2, words, name)
 
 
-def test_a_detector_nobody_knows_is_refused(plan: Path, tmp_path: Path) -> None:
+def test_an_unknown_detector_is_refused(plan: Path, tmp_path: Path) -> None:
     arguments = ("synthetic", "--plan", plan, "-o", tmp_path / "poses.csv", "--detector", "eyes")
     with nothing_written(tmp_path):
         answer = call("track", RIG, *arguments)
@@ -167,7 +167,7 @@ def test_a_picture_without_a_pose_says_why() -> None:
     rig = load_rig(RIG)
     camera = rig.cameras[0]
     grey = np.full((camera.height, camera.width), 90, dtype=np.uint8)
-    drawn = drawn_over(grey, rig, camera, NoPose(0.5, "no tag is to be seen"))
+    drawn = draw_measurement(grey, rig, camera, NoPose(0.5, "no tag is to be seen"))
     assert drawn.shape == (camera.height, camera.width, 3)
     changed = np.any(drawn != 90, axis=-1)
     assert changed[:60].any()

@@ -21,14 +21,14 @@ WALL = 120.0
 
 @dataclass(frozen=True)
 class Condition:
-    """How a tag is seen.
+    """Imaging condition of a tag.
 
     Attributes:
-        side_px: Side of its square seen from the front.
+        side_px: Side of its square in a frontal view.
         tilt: Between its normal and the view, [rad].
-        motion_px: Way of the image during the exposure.
+        motion_px: Motion of the image during the exposure.
         blur_px: Standard deviation of the lens's blur.
-        contrast: Brightness of paper less that of ink, of 255.
+        contrast: Brightness of paper minus that of ink, of 255.
         noise: Standard deviation, of 255.
     """
 
@@ -50,12 +50,12 @@ class HardPicture:
 
 
 class HardPrinter:
-    """Renders one tag before a grey wall.
+    """Renders one tag in front of a grey wall.
 
     Args:
         family: Of the tag.
-        numbers: As many the family has.
-        camera: Whose images they are.
+        numbers: Number of tags in the family.
+        camera: The camera of the images.
     """
 
     def __init__(self, family: str, numbers: int, camera: Camera | None = None) -> None:
@@ -63,7 +63,7 @@ class HardPrinter:
         self._rays = sample_rays(self.camera)
 
     def picture(self, condition: Condition, rng: np.random.Generator) -> HardPicture:
-        """An image with a tag somewhere in it, turned at will."""
+        """An image with a tag at a random position and rotation."""
         number = int(rng.integers(self.numbers))
         tag = Tag(number, SIZE, Pose.level(np.zeros(3)))
         pose = self._pose(condition, rng)
@@ -87,12 +87,12 @@ class HardPrinter:
         angle = rng.uniform(-np.pi, np.pi)
         axis = np.array([np.cos(angle), np.sin(angle), 0.0])
         lean = matrix_from_rotation_vector(axis * condition.tilt)
-        place = np.array([*rng.uniform(-0.1, 0.1, 2) * distance, distance])
-        return Pose(place, lean @ upright @ roll)
+        position = np.array([*rng.uniform(-0.1, 0.1, 2) * distance, distance])
+        return Pose(position, lean @ upright @ roll)
 
 
 def _streak(length: float, angle: float) -> NDArray[np.float32]:
-    """A line about the middle, of samples: what a steady motion does to a point."""
+    """Blur kernel of a steady motion: a line about the centre, in samples."""
     size = 2 * (int(length) // 2 + 2) + 1
     kernel = np.zeros((size, size), dtype=np.float64)
     middle = size // 2

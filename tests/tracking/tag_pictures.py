@@ -32,11 +32,11 @@ class TagPicture:
     image: NDArray[np.uint8]
     tag: Tag
     camera_from_tag: Pose
-    corners: Array  # ideal pixels, (4, 2)
+    corners: Array  # undistorted pixels, (4, 2)
 
 
 class TagPrinter:
-    """Renders one tag before a grey wall."""
+    """Renders one tag in front of a grey wall."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -57,10 +57,10 @@ class TagPrinter:
 
 
 def facing(rng: np.random.Generator, distance: float, tilt: float) -> Pose:
-    """A tag that looks at the camera, tilted up to ``tilt`` [rad] and turned at will."""
+    """A tag facing the camera, tilted up to ``tilt`` [rad] and rotated at random."""
     upright = np.diag([1.0, -1.0, -1.0])
     roll = matrix_from_rotation_vector([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
     axis = rng.standard_normal(3) * [1, 1, 0]
     lean = matrix_from_rotation_vector(axis / np.linalg.norm(axis) * rng.uniform(0, tilt))
-    place = np.array([*rng.uniform(-0.12, 0.12, 2) * distance, distance])
-    return Pose(place, lean @ roll @ upright)
+    position = np.array([*rng.uniform(-0.12, 0.12, 2) * distance, distance])
+    return Pose(position, lean @ roll @ upright)

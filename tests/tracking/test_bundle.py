@@ -1,4 +1,4 @@
-"""One rigid pose from all tags: exact, without mirror poses, with an honest covariance."""
+"""Rigid pose from all tags: exact, without mirror poses, with a correct covariance."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, Tag
 from tests.tracking.tag_pictures import small_camera
-from tracking.camera_model import ideal_from_pixels, pixels_from_ideal, project_undistorted
+from tracking.camera_model import distort_pixels, project_undistorted, undistort_pixels
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, _Squares, moved, refine_pnp, solve_pnp
@@ -23,7 +23,7 @@ def view_of(
     rng: np.random.Generator | None,
     worse: float = 1.0,
 ) -> TagView:
-    """A tag as ideal edges would show it, with errors as large as stated, or worse by a factor."""
+    """A tag with edge errors as stated, or larger by a factor."""
     corners = project_undistorted(camera, camera_from_body.apply(tag_corners(tag)))
     whitening = np.zeros((8, 8))
     for edge in range(4):
@@ -81,7 +81,7 @@ def test_several_tags_never_end_in_a_mirror_pose(rig: Rig) -> None:
 
 
 def test_edges_that_disagree_by_more_than_they_state_widen_the_intervals(rig: Rig) -> None:
-    """Twice as much: with what they state counted beside it, 81 % of the truth was inside."""
+    """Twice as large: if the stated deviations counted too, coverage was 81 %."""
     rng, camera = np.random.default_rng(4), small_camera()
     inside: list[bool] = []
     for _ in range(120):
@@ -133,7 +133,7 @@ def test_a_tag_with_a_wrong_edge_hardly_moves_the_pose(rig: Rig) -> None:
     assert spoilt.edge_errors[0, 0] > 50.0  # and the edge shows
 
 
-def test_a_single_tag_knows_its_rival(rig: Rig) -> None:
+def test_a_single_tag_has_a_second_best_pose(rig: Rig) -> None:
     rng, camera = np.random.default_rng(5), small_camera()
     tag = rig.platform_tags[0]
     upright = Pose(np.zeros(3), np.diag([1.0, -1.0, -1.0])).compose(tag.pose.inverse())
@@ -166,5 +166,5 @@ def test_a_start_behind_the_camera_gives_no_pose(rig: Rig) -> None:
 def test_distortion_is_put_on_and_taken_off(distortion: tuple[float, ...]) -> None:
     camera = small_camera(distortion)
     points: Array = np.random.default_rng(7).uniform([0, 0], [319, 239], (5, 4, 2))
-    back = pixels_from_ideal(camera, ideal_from_pixels(camera, points))
+    back = distort_pixels(camera, undistort_pixels(camera, points))
     np.testing.assert_allclose(back, points, atol=1e-5)

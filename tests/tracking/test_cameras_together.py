@@ -1,4 +1,4 @@
-"""Several cameras: better than each alone, one that is wrong does not count."""
+"""Several cameras: better than each alone, robust against a wrong one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.fusion import MultiCameraFusion, together
+from tracking.fusion import MultiCameraFusion, fuse_poses
 from tracking.measurement import NoPose, PoseMeasurement, extrapolate
 from tracking.tracker import Tracker
 
@@ -23,22 +23,22 @@ HERE = Pose.level([0.05, 0.05, 0.4])
 
 
 def other_side(camera: Camera) -> Camera:
-    """The same camera, standing a quarter turn round the frame."""
+    """The same camera, rotated by 90° about the frame."""
     quarter = matrix_from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
-    place = camera.world_from_camera
-    there = Pose(quarter @ place.position, quarter @ place.rotation)
+    pose = camera.world_from_camera
+    there = Pose(quarter @ pose.position, quarter @ pose.rotation)
     return replace(camera, name="side", world_from_camera=there)
 
 
-def measured(place: list[float], sigma: list[float]) -> PoseMeasurement:
+def measured(position: list[float], sigma: list[float]) -> PoseMeasurement:
     covariance = np.diag(np.square([*sigma, 1e-3, 1e-3, 1e-3]))
-    return PoseMeasurement(0.0, Pose.level(place), covariance, (301,), 0.1, "tracked")
+    return PoseMeasurement(0.0, Pose.level(position), covariance, (301,), 0.1, "tracked")
 
 
 def test_each_camera_counts_where_it_measures_well() -> None:
     a = measured([1e-3, 0.0, 0.4], [1e-3, 1e-5, 1e-3])
     b = measured([0.0, 1e-3, 0.4], [1e-5, 1e-3, 1e-3])
-    found = together({"a": a, "b": b})
+    found = fuse_poses({"a": a, "b": b})
     assert isinstance(found, PoseMeasurement)
     assert np.abs(found.pose.position - [0.0, 0.0, 0.4]).max() < 1e-6
     assert np.sqrt(np.diag(found.covariance)[:2]).max() < 1.01e-5
@@ -63,7 +63,7 @@ def test_two_cameras_give_a_better_pose_than_each_alone(
             name: Tracker(rig, eyes[name]).observe(pictures[name].render(truth, frame), 0.0)
             for name in eyes
         }
-        for name, one in {**seen, "both": together(seen)}.items():
+        for name, one in {**seen, "both": fuse_poses(seen)}.items():
             assert isinstance(one, PoseMeasurement), one
             error = error_of(one, truth)
             squares[name].append(float(error[:3] @ error[:3]))
@@ -77,7 +77,7 @@ def test_two_cameras_give_a_better_pose_than_each_alone(
 
 def test_of_two_that_disagree_there_is_no_pose() -> None:
     a, b = measured([0.0, 0.0, 0.4], [1e-4] * 3), measured([0.01, 0.0, 0.4], [1e-4] * 3)
-    found = together({"front": a, "side": b})
+    found = fuse_poses({"front": a, "side": b})
     assert isinstance(found, NoPose)
     assert found.reason == "cameras front and side disagree by 10.0 mm"
 
@@ -85,7 +85,7 @@ def test_of_two_that_disagree_there_is_no_pose() -> None:
 def test_of_three_the_one_that_disagrees_is_left_out() -> None:
     good = [measured([0.0, 0.0, 0.4], [1e-4] * 3), measured([1e-4, 0.0, 0.4], [1e-4] * 3)]
     wrong = measured([0.03, 0.0, 0.4], [1e-4] * 3)
-    found = together({"a": good[0], "wrong": wrong, "b": good[1]})
+    found = fuse_poses({"a": good[0], "wrong": wrong, "b": good[1]})
     assert isinstance(found, PoseMeasurement)
     assert found.pose.distance_to(Pose.level([5e-5, 0.0, 0.4])) < 1e-9
 
@@ -95,7 +95,7 @@ def test_of_three_the_one_that_disagrees_is_left_out() -> None:
     late=st.floats(0.0, 0.049),
     period=st.floats(0.06, 0.4),
 )
-def test_cameras_that_look_a_little_apart_in_time_agree_on_a_platform_that_moves(
+def test_cameras_slightly_apart_in_time_agree_on_a_moving_platform(
     speed: tuple[float, float, float], late: float, period: float
 ) -> None:
     def seen(time: float, deviation: float) -> PoseMeasurement:
@@ -113,8 +113,8 @@ def test_cameras_that_look_a_little_apart_in_time_agree_on_a_platform_that_moves
     assert (found.position_deviation <= 2e-4 + 1e-12).all()
 
 
-def test_what_carrying_on_costs_is_in_the_covariance() -> None:
-    """By many noisy pairs: the later pose scatters as its covariance says."""
+def test_the_covariance_includes_the_extrapolation() -> None:
+    """From many noisy pairs: the extrapolated pose scatters as its covariance states."""
     rng, errors = np.random.default_rng(3), []
     for _ in range(400):
         noise = rng.normal(0.0, 1e-4, (2, 3))
@@ -153,7 +153,7 @@ def test_the_camera_that_is_named_first_does_not_decide_which_pictures_count(fir
 
 @pytest.mark.parametrize("late", [0.0, 0.07, 0.099])
 def test_cameras_that_run_free_at_the_same_rate_are_taken_together(late: float) -> None:
-    """Asked every 0.1 s, each answers with an image of its own time: up to a period apart."""
+    """Triggered every 0.1 s, each returns an image of its own time: up to a period apart."""
     front, common = measured([0.0, 0.0, 0.4], [1e-4] * 3), MultiCameraFusion(0.05)
     for now in (0.0, 0.1):
         seen = {"front": replace(front, time=now), "side": replace(front, time=now + late)}
@@ -170,7 +170,7 @@ def test_cameras_that_run_free_at_the_same_rate_are_taken_together(late: float) 
 def test_a_pose_is_of_the_time_it_states_though_no_speed_is_known(
     speed: float, late: float, pause: float
 ) -> None:
-    """First images, and those after nothing was seen for long: the later, worse camera."""
+    """First images, and those after a long gap: the later, worse camera counts."""
 
     def seen(time: float, deviation: float) -> PoseMeasurement:
         one = measured([speed * time, 0.0, 0.4], [deviation] * 3)
@@ -188,8 +188,8 @@ def test_a_pose_is_of_the_time_it_states_though_no_speed_is_known(
 
 def test_one_that_sees_nothing_leaves_it_to_the_others() -> None:
     good = measured([0.0, 0.0, 0.4], [1e-4] * 3)
-    assert together({"a": NoPose(0.0, "dark"), "b": good}) is good
-    none = together({"a": NoPose(0.0, "dark", (7,)), "b": NoPose(0.0, "covered")})
+    assert fuse_poses({"a": NoPose(0.0, "dark"), "b": good}) is good
+    none = fuse_poses({"a": NoPose(0.0, "dark", (7,)), "b": NoPose(0.0, "covered")})
     assert isinstance(none, NoPose)
     assert none.reason == "a: dark; b: covered"
     assert none.seen == (7,)

@@ -1,4 +1,4 @@
-"""The frame of a tag is that of the AprilTag project's image, shown by published codes."""
+"""The frame of a tag is that of the AprilTag project's image, verified by published codes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_official_modules_are_the_published_ones(family: str) -> None:
 @pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
 @pytest.mark.parametrize("family", FIRST_CODES)
 def test_detected_corners_follow_the_upright_picture(family: str, quarter_turns: int) -> None:
-    """Projects the published image without OpenCV and asks for the corners back."""
+    """Projects the published image without OpenCV and recovers the corners."""
     modules = published_modules(family)
     angle = np.radians(17.0) + quarter_turns * np.pi / 2
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

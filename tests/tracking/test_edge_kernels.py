@@ -1,4 +1,4 @@
-"""Compiled kernels beside plain NumPy and SciPy, each written another way."""
+"""Compiled kernels against independent implementations in plain NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from tracking.edges.fit import (
 )
 from tracking.edges.sampling import (
     ACROSS,
+    ALONG,
     BOXED,
     COLUMNS,
     HALF,
     MIDDLE,
     OFFSET,
     OFFSET_VARIANCE,
-    PLACE,
     SHARE,
     SPREAD,
     TILT,
     VALUE,
     beside,
+    blurred_step,
     plane_of,
-    rise,
     sample_edge,
 )
 
@@ -49,8 +49,10 @@ NO_BOW = np.zeros((1, 4, 2))
 
 
 @given(x=st.floats(-6.0, 6.0), boxed=st.floats(0.0, 1.0))
-def test_the_rise_is_that_of_a_bell_and_a_box_of_unit_variance(x: float, boxed: float) -> None:
-    share, slope, kind = rise(x, boxed)
+def test_the_blurred_step_is_that_of_a_gaussian_and_a_box_of_unit_variance(
+    x: float, boxed: float
+) -> None:
+    share, slope, kind = blurred_step(x, boxed)
     box = uniform(-math.sqrt(3.0), 2.0 * math.sqrt(3.0))
     assert box.var() == pytest.approx(1.0)
     bell = norm.cdf(x) if abs(x) < 4.5 else float(x > 0)
@@ -63,7 +65,7 @@ def test_the_rise_is_that_of_a_bell_and_a_box_of_unit_variance(x: float, boxed: 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=40), st.data())
 def test_the_ranked_value_is_the_sorted_one(values: list[float], data: st.DataObject) -> None:
     rank = data.draw(st.integers(0, len(values) - 1))
-    padded = np.array([*values, -1e9])  # what lies beyond the count does not matter
+    padded = np.array([*values, -1e9])  # values beyond the count do not matter
     assert ranked(padded, len(values), rank) == sorted(values)[rank]
 
 
@@ -79,29 +81,31 @@ def test_symmetric_equations_are_solved(size: int) -> None:
     assert not factored(-matrix, size)
 
 
-def test_places_of_the_square_are_those_of_its_homography() -> None:
+def test_points_of_the_square_are_those_of_its_homography() -> None:
     plane = np.empty(8)
     plane_of(SQUARE, 1, plane)
     for (a, b), corner in zip([(0, 0), (1, 0), (1, 1), (0, 1)], [1, 2, 3, 0], strict=True):
         along, outside = beside(SQUARE, 1, plane, a, b)
-        way = (SQUARE[2] - SQUARE[1]) / np.linalg.norm(SQUARE[2] - SQUARE[1])
+        direction = (SQUARE[2] - SQUARE[1]) / np.linalg.norm(SQUARE[2] - SQUARE[1])
         gap = SQUARE[corner] - SQUARE[1]
-        assert (along, outside) == pytest.approx((gap @ way, gap @ [way[1], -way[0]]), abs=1e-9)
-    # Diagonals keep their crossing: it is the square's middle.
+        assert (along, outside) == pytest.approx(
+            (gap @ direction, gap @ [direction[1], -direction[0]]), abs=1e-9
+        )
+    # The diagonals intersect at the square's centre.
     along, outside = beside(SQUARE, 1, plane, 0.5, 0.5)
-    middle = SQUARE[1] + along * way + outside * np.array([way[1], -way[0]])
+    middle = SQUARE[1] + along * direction + outside * np.array([direction[1], -direction[0]])
     for one, other in ((0, 2), (1, 3)):
         p, q = SQUARE[other] - SQUARE[one], middle - SQUARE[one]
         assert p[0] * q[1] - p[1] * q[0] == pytest.approx(0.0, abs=1e-6)
 
 
 def brute_band(image: Array, edge: int, span: tuple[float, float], reach: float) -> Array:
-    """Place, distance and value of the pixels beside an edge, from all pixels."""
+    """Position, distance and value of the pixels near an edge, from all pixels."""
     start, end = SQUARE[edge], SQUARE[(edge + 1) % 4]
-    way = (end - start) / np.linalg.norm(end - start)
+    direction = (end - start) / np.linalg.norm(end - start)
     rows, columns = np.indices(image.shape)
     gap = np.stack([columns - start[0], rows - start[1]], axis=-1)
-    s, u = gap @ way, gap @ [way[1], -way[0]]
+    s, u = gap @ direction, gap @ [direction[1], -direction[0]]
     inside = (s >= span[0]) & (s <= span[1]) & (np.abs(u) <= reach)
     middle, half = (span[0] + span[1]) / 2.0, (span[1] - span[0]) / 2.0
     return np.array([(s[inside] - middle) / half, u[inside], image[inside]])
@@ -114,11 +118,11 @@ def test_the_pixels_beside_an_edge_are_all_that_lie_there(edge: int) -> None:
     count = sample_edge(image, SQUARE, edge, np.zeros(2), (4.0, 41.5), 3.3, pixels)
     wanted = brute_band(image, edge, (4.0, 41.5), 3.3)
     assert count == wanted.shape[1] > 200
-    np.testing.assert_allclose(pixels[[PLACE, ACROSS, VALUE], :count], wanted, atol=1e-9)
+    np.testing.assert_allclose(pixels[[ALONG, ACROSS, VALUE], :count], wanted, atol=1e-9)
     few = np.zeros((6, 120))
     some = sample_edge(image, SQUARE, edge, np.zeros(2), (4.0, 41.5), 3.3, few)
     assert 60 < some <= 120
-    assert np.ptp(few[PLACE, :some]) > 1.7  # spread along the whole edge
+    assert np.ptp(few[ALONG, :some]) > 1.7  # spread along the whole edge
 
 
 def black_square(
@@ -126,14 +130,14 @@ def black_square(
 ) -> np.ndarray:
     """A black square on white: ink is the product of four blurred steps.
 
-    Noise is smoothed by a bell of ``alike`` pixels, its size kept.
+    Noise is smoothed by a Gaussian of ``alike`` pixels, with its deviation kept.
     """
     rows, columns = np.indices((130, 140))
     ink = np.ones(rows.shape)
     for edge in range(4):
         start, end = SQUARE[edge], SQUARE[(edge + 1) % 4]
-        way = (end - start) / np.linalg.norm(end - start)
-        outside = (columns - start[0]) * way[1] - (rows - start[1]) * way[0]
+        direction = (end - start) / np.linalg.norm(end - start)
+        outside = (columns - start[0]) * direction[1] - (rows - start[1]) * direction[0]
         ink *= norm.sf(outside / spread)
     grain = np.random.default_rng(seed).standard_normal(ink.shape)
     if alike > 0.0:
@@ -144,7 +148,7 @@ def black_square(
 
 
 def fitted(image: np.ndarray, quad: Array) -> tuple[Array, Array]:
-    """What the kernels say of the four edges, roughly and at last, shape (4, `COLUMNS`) each."""
+    """The four edges by the coarse and the final kernel, shape (4, `COLUMNS`) each."""
     widths, before = np.full((1, 4), 6.2), np.zeros((1, 4, COLUMNS))
     locate_edges(image, quad[None], NO_BOW, widths, before)
     found = np.zeros_like(before)
@@ -153,7 +157,7 @@ def fitted(image: np.ndarray, quad: Array) -> tuple[Array, Array]:
 
 
 def reference(image: np.ndarray, edge: int, rough: Array, found: Array) -> tuple[Array, Array]:
-    """SciPy's best blurred step beside an edge: parameters, and deviations of the first two."""
+    """SciPy's fit of a blurred step: parameters, and deviations of the first two."""
     span = (found[MIDDLE] - found[HALF], found[MIDDLE] + found[HALF])
     reach = REACH_SPREADS * rough[SPREAD] + REACH
     q, u, value = brute_band(image, edge, span, reach)
@@ -183,7 +187,7 @@ def test_a_fitted_edge_is_the_one_that_scipy_finds(edge: int) -> None:
     assert found[TILT] == pytest.approx(best[1], abs=2.0 * SETTLED)
     assert found[SPREAD] == pytest.approx(best[2], rel=0.01)
     assert found[BOXED] == pytest.approx(best[3], abs=0.05)
-    # Independent errors look alike by chance, here and there: never surer, seldom less sure.
+    # Independent errors correlate by chance at times: deviations never shrink, rarely grow.
     assert 0.95 < math.sqrt(found[OFFSET_VARIANCE]) / deviations[0] < 1.4
 
 
@@ -196,17 +200,17 @@ def test_edges_lie_where_they_were_drawn_as_often_as_they_say() -> None:
     assert abs(np.mean(errors)) < 0.3
 
 
-def test_edges_whose_errors_are_alike_along_them_know_that_they_are_less_sure() -> None:
-    """Noise smoothed over 1.5 px, as enlarging does: a seventh of the independent samples."""
+def test_correlated_errors_along_an_edge_widen_its_uncertainty() -> None:
+    """Noise smoothed over 1.5 px, as by upscaling: a seventh of the independent samples."""
     errors = []
     for seed in range(30):
         _, found = fitted(black_square(spread=1.2, noise=3.0, seed=seed, alike=1.5), SQUARE)
         errors.append(found[:, OFFSET] / np.sqrt(found[:, OFFSET_VARIANCE]))
-    assert 0.8 < np.std(errors) < 2.0  # 3 and more if every pixel counted by itself
+    assert 0.8 < np.std(errors) < 2.0  # 3 and more if pixels counted as independent
 
 
 def test_white_that_is_clipped_moves_no_edge() -> None:
-    """A lamp makes paper brighter than the sensor can say; what is left of the step is enough."""
+    """A lamp saturates the paper; the rest of the step is sufficient."""
     errors = []
     for seed in range(10):
         picture = black_square(spread=0.8, noise=2.0, seed=seed, bright=330.0)
@@ -226,6 +230,6 @@ def test_an_edge_that_is_bent_by_the_lens_is_found_along_its_bow() -> None:
     bows, widths = np.full((1, 4, 2), [0.8, 0.0]), np.full((1, 4), 6.2)
     locate_edges(image, SQUARE[None], bows, widths, rough)
     fit_edges(image, SQUARE[None], bows, widths, 8, rough, found)
-    # A bow of 0.8 f (1 - f) is 0.13 px outside of its chord on average.
+    # A bow of 0.8 f (1 - f) is 0.13 px outside its chord on average.
     gone = straight[:, OFFSET] - found[0, :, OFFSET]
     np.testing.assert_allclose(gone, 0.8 / 6.0, atol=0.03)

@@ -1,4 +1,4 @@
-"""Corners to hundredths of a pixel on images with exactly known corners."""
+"""Corners to hundredths of a pixel in images with known corners."""
 
 from __future__ import annotations
 
@@ -61,7 +61,9 @@ def only(printer: TagPrinter, image: np.ndarray, rough: Array) -> RefinedTag:
 
 
 @pytest.mark.parametrize("shift", [-2.0, -1.0, 1.0, 2.0])
-def test_the_result_does_not_hang_on_the_rough_corners(printer: TagPrinter, shift: float) -> None:
+def test_the_result_does_not_depend_on_the_approximate_corners(
+    printer: TagPrinter, shift: float
+) -> None:
     rng = np.random.default_rng(5)
     picture = printer.picture(facing(rng, 0.64, 0.4), rng)
     straight = only(printer, picture.image, picture.corners)
@@ -91,7 +93,7 @@ def test_a_hidden_edge_is_left_out_and_says_nothing(printer: TagPrinter) -> None
     along = (end - start) / np.linalg.norm(end - start)
     inward = np.array([-along[1], along[0]])
     depth = (columns - start[0]) * inward[0] + (rows - start[1]) * inward[1]
-    image[depth < 9.0] = 90.0  # something covers the first edge and what is beyond it
+    image[depth < 9.0] = 90.0  # the first edge and its surroundings are covered
     square = only(printer, image.astype(np.uint8), picture.corners)
     assert not square.edges[0]
     assert not square.whitening[:2].any()

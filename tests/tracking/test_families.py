@@ -17,7 +17,7 @@ from model.scene import Scene
 from simulation.camera.camera import SyntheticCamera
 from tests.tracking.hard_pictures import Condition, HardPrinter
 from tests.tracking.tag_pictures import FAMILY
-from tracking.camera_model import pixels_from_ideal
+from tracking.camera_model import distort_pixels
 from tracking.detection.detector import make_detector
 from tracking.detection.tags import modules_across
 from tracking.edges.refine import refine
@@ -35,7 +35,7 @@ def test_a_printed_tag_is_found_with_its_corners_in_order(family: str) -> None:
         corners = found[picture.number].corners[None]
         (square,) = refine(picture.image, printer.camera, corners, modules_across(family))
         assert square is not None
-        pixels = pixels_from_ideal(printer.camera, square.corners)
+        pixels = distort_pixels(printer.camera, square.corners)
         assert np.abs(pixels - picture.corners).max() < 0.1
 
 
@@ -65,7 +65,7 @@ def test_a_number_that_the_family_does_not_have_is_refused(rig: Rig) -> None:
         rig_from_document(small)
 
 
-def test_a_detector_nobody_knows_is_refused() -> None:
+def test_an_unknown_detector_is_refused() -> None:
     with pytest.raises(BadInput, match="unknown tag detector 'eyes'"):
         make_detector("eyes", FAMILY)
 
@@ -76,13 +76,13 @@ def test_the_apriltag_library_refuses_families_it_does_not_know(family: str) -> 
         make_detector("apriltag", family)
 
 
-def test_a_missing_apriltag_library_is_told_with_how_to_get_it(
+def test_a_missing_apriltag_library_is_reported_with_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyapriltags", None)
-    with pytest.raises(BadInput, match="not installed") as told:
+    with pytest.raises(BadInput, match="not installed") as caught:
         make_detector("apriltag", FAMILY)
-    assert "cdpr[apriltag]" in told.value.next_step
+    assert "cdpr[apriltag]" in caught.value.next_step
 
 
 @pytest.mark.parametrize("family", ["tag16h5", "tag25h9", "tag36h11"])
@@ -92,7 +92,7 @@ def test_the_apriltag_library_gives_the_same_corners(family: str) -> None:
     library, gaps = make_detector("apriltag", family), []
     for _ in range(8):
         picture = printer.picture(Condition(side_px=60), rng)
-        found = {d.id: d for d in library.detect(picture.image, thorough=True)}
+        found = {d.id: d for d in library.detect(picture.image, exhaustive=True)}
         gaps.append(found[picture.number].corners - picture.corners)
     assert np.abs(gaps).max() < 0.2
     assert np.abs(np.mean(gaps, axis=(0, 1))).max() < 0.03  # a shift of half a pixel would show

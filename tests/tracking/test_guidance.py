@@ -1,4 +1,4 @@
-"""Drives say where to look for the platform, and nothing of what is found there."""
+"""Encoder poses guide the search for the platform, but do not enter the result."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
 from tracking.measurement import NoPose, PoseMeasurement
-from tracking.tracker import MEMORY, DrivesAhead, EncoderPrior, Tracker
+from tracking.tracker import MEMORY, EncoderExtrapolator, EncoderPrior, Tracker
 
 Image = NDArray[np.uint8]
 
-#: The drives' own error: as cable lengths that are a little off make it.
+#: Error of the encoder pose, as from small cable length errors.
 OFF = Pose(np.array([1.5e-3, -1e-3, 1e-3]), matrix_from_rotation_vector(np.array([5e-3, 0, 3e-3])))
 
 NUMBERS = st.floats(-0.3, 0.3)
 POSES = st.builds(
-    lambda place, turn: Pose(np.array(place), matrix_from_rotation_vector(np.array(turn))),
+    lambda position, turn: Pose(np.array(position), matrix_from_rotation_vector(np.array(turn))),
     st.tuples(NUMBERS, NUMBERS, NUMBERS),
     st.tuples(NUMBERS, NUMBERS, NUMBERS),
 )
@@ -51,12 +51,12 @@ def barred(image: Image) -> Image:
     return covered
 
 
-def place(k: int) -> Pose:
+def pose_at(k: int) -> Pose:
     return Pose.level([0.05 + 0.002 * k, 0.05, 0.42])
 
 
 @given(measured=POSES, drives=POSES, later=POSES)
-def test_the_drives_motion_leads_on_from_where_the_camera_saw_the_platform(
+def test_encoder_motion_continues_from_the_last_camera_pose(
     measured: Pose, drives: Pose, later: Pose
 ) -> None:
     guidance = EncoderPrior()
@@ -79,15 +79,15 @@ def test_the_drives_pose_is_that_of_the_pictures_own_time(
     def at(time: float) -> Pose:
         return Pose.level(np.array([0.0, 0.0, 0.4]) + time * np.array(speed))
 
-    ahead = DrivesAhead()
+    ahead = EncoderExtrapolator()
     ahead.at(delay, 0.0, at(0.0))
     found = ahead.at(period + delay, period, at(period))
     assert found is not None
     assert found.distance_to(at(period + delay)) < 1e-12
 
 
-def test_drives_that_were_not_heard_for_long_are_not_carried_on() -> None:
-    ahead, here, there = DrivesAhead(), Pose.level([0, 0, 0.4]), Pose.level([0.1, 0, 0.4])
+def test_encoder_poses_after_a_long_gap_are_not_extrapolated() -> None:
+    ahead, here, there = EncoderExtrapolator(), Pose.level([0, 0, 0.4]), Pose.level([0.1, 0, 0.4])
     assert ahead.at(0.1, 0.0, here) is here
     assert ahead.at(2.1, 2.0, there) is there
     assert ahead.at(2.2, 2.1, None) is None
@@ -97,23 +97,23 @@ def test_drives_that_were_not_heard_for_long_are_not_carried_on() -> None:
 def test_tags_hidden_in_part_are_found_again_after_they_were_lost(
     rig: Rig, camera: Camera, eye: SyntheticCamera
 ) -> None:
-    """Nothing else finds them: the detector needs whole outlines."""
+    """The detector misses them: it needs complete outlines."""
     for guided in (False, True):
         tracker = Tracker(rig, camera)
 
         def observed(
             k: int, image: Image, tracker: Tracker = tracker, guided: bool = guided
         ) -> object:
-            return tracker.observe(image, 0.1 * k, by_drives(place(k)) if guided else None)
+            return tracker.observe(image, 0.1 * k, by_drives(pose_at(k)) if guided else None)
 
-        assert isinstance(observed(0, eye.render(place(0), 0)), PoseMeasurement)
-        dark = np.full_like(eye.render(place(1), 1), 90)
+        assert isinstance(observed(0, eye.render(pose_at(0), 0)), PoseMeasurement)
+        dark = np.full_like(eye.render(pose_at(1), 1), 90)
         assert isinstance(observed(1, dark), NoPose)
-        again = observed(20, barred(eye.render(place(20), 20)))
+        again = observed(20, barred(eye.render(pose_at(20), 20)))
         assert isinstance(again, PoseMeasurement if guided else NoPose)
         if isinstance(again, PoseMeasurement):
             assert again.status == "guided"
-            error = error_of(again, place(20))
+            error = error_of(again, pose_at(20))
             assert error @ np.linalg.solve(again.covariance, error) < 30.0
 
 
@@ -121,24 +121,24 @@ def test_tags_hidden_in_part_are_found_again_after_they_were_lost(
 def test_a_drum_that_slipped_leaves_the_cameras_pose_as_it_is(
     rig: Rig, camera: Camera, eye: SyntheticCamera, slip_mm: float
 ) -> None:
-    """Cable 3 slips on its drum while no tag is to be seen, and the drives do not know."""
+    """Cable 3 slips on its drum while no tag is visible; the encoders do not show it."""
     tracker, errors, apart = Tracker(rig, camera), [], []
     for k in range(12):
-        truth, slipped = place(k), k >= 3
+        truth, slipped = pose_at(k), k >= 3
         lengths = cable_lengths(rig, truth)
         lengths[2] += slip_mm * 1e-3 if slipped else 0.0
-        told = forward_kinematics(rig, lengths, truth).pose
+        encoder = forward_kinematics(rig, lengths, truth).pose
         picture = eye.render(truth, k)
         hidden = k in (2, 3, 6, 7)
         seen = np.full_like(picture, 90) if hidden else picture
-        found = tracker.observe(seen, 0.1 * k, told)
+        found = tracker.observe(seen, 0.1 * k, encoder)
         assert isinstance(found, NoPose if hidden else PoseMeasurement)
         if isinstance(found, PoseMeasurement) and slipped:
             alone = Tracker(rig, camera).observe(picture, 0.0)
             assert isinstance(alone, PoseMeasurement)
             error = error_of(found, truth)
             errors.append(error @ np.linalg.solve(found.covariance, error))
-            apart.append((told.distance_to(truth), found.pose.distance_to(alone.pose)))
+            apart.append((encoder.distance_to(truth), found.pose.distance_to(alone.pose)))
     assert len(errors) == 6
     assert np.mean(errors) < 14.0, "as far from the truth as it says: 6 on average"
     drives, camera_alone = np.max(apart, axis=0)

@@ -1,4 +1,4 @@
-"""Tracking against decoys, covers and blur, and what the stated covariance is worth."""
+"""Tracking with decoys, occlusion and blur, and the validity of the covariance."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from model.rig import Camera, Rig, Tag
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.estimator import TrackerSettings, agreeing
-from tracking.measurement import NoPose, PoseMeasurement, predicted
+from tracking.estimator import TrackerSettings, find_consensus
+from tracking.measurement import NoPose, PoseMeasurement, predict
 from tracking.pnp import TagView
 from tracking.tracker import Tracker
 
@@ -29,8 +29,8 @@ def empty(scene: Scene) -> Scene:
 
 
 def with_prints(rig: Rig, *prints: tuple[int, list[float]], size: float = 0.12) -> Rig:
-    """The rig with further tags lying on the floor, which its file does not know."""
-    more = tuple(Tag(number, size, Pose(np.array(place), FLAT)) for number, place in prints)
+    """The rig with further tags on the floor that are not in its file."""
+    more = tuple(Tag(number, size, Pose(np.array(position), FLAT)) for number, position in prints)
     return replace(rig, frame_tags=(*rig.frame_tags, *more))
 
 
@@ -38,7 +38,7 @@ def with_prints(rig: Rig, *prints: tuple[int, list[float]], size: float = 0.12) 
 def test_another_print_of_a_tag_does_not_move_the_pose(
     rig: Rig, camera: Camera, empty: Scene, number: int
 ) -> None:
-    """302 looks away from the camera, so only the decoy of it is seen."""
+    """Tag 302 faces away from the camera, so only its decoy is visible."""
     real = with_prints(rig, (number, [-0.30, 0.42, 0.0]), size=0.16)
     image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
     tracker = Tracker(rig, camera)
@@ -64,9 +64,7 @@ def test_a_decoy_alone_that_lies_as_no_platform_can_gives_no_pose(
     assert isinstance(found, NoPose)
 
 
-def test_two_prints_of_one_tag_are_told_apart_by_nothing(
-    rig: Rig, camera: Camera, empty: Scene
-) -> None:
+def test_two_prints_of_one_tag_are_ambiguous(rig: Rig, camera: Camera, empty: Scene) -> None:
     """A platform with a single tag, and the same print within the frame."""
     one = replace(rig, platform_tags=rig.platform_tags[4:5])
     real = with_prints(one, (305, [0.25, -0.1, 0.15]), size=0.096)
@@ -89,11 +87,11 @@ def test_another_print_of_a_frame_tag_does_not_move_the_camera(
 
 def test_no_squares_agree_on_nothing(camera: Camera) -> None:
     nothing: list[TagView] = []
-    assert agreeing(camera, nothing, lambda _: True).views == []
+    assert find_consensus(camera, nothing, lambda _: True).views == []
 
 
 def test_tags_covered_in_part_are_followed(rig: Rig, camera: Camera, empty: Scene) -> None:
-    """A bar over each tag hides them from the detector; their free edges go on to be used."""
+    """A bar over each tag hides it from the detector; its free edges are still used."""
     eye, tracker = SyntheticCamera(rig, empty, camera, seed=5), Tracker(rig, camera)
     first = tracker.observe(eye.render(HERE, 0), 0.0)
     assert isinstance(first, PoseMeasurement)
@@ -110,18 +108,18 @@ def test_tags_covered_in_part_are_followed(rig: Rig, camera: Camera, empty: Scen
     assert found.pose.distance_to(truth) < 2e-3
 
 
-def test_motion_is_carried_on() -> None:
+def test_motion_is_extrapolated() -> None:
     def at(time: float) -> PoseMeasurement:
         turn = matrix_from_rotation_vector(np.array([0.0, 0.3 * time, 0.0]))
         pose = Pose(np.array([0.1 * time, 0.0, 0.4]), turn)
         return PoseMeasurement(time, pose, np.eye(6), (301,), 0.1, "tracked")
 
-    ahead = predicted(at(0.2), at(0.1), 0.4)
+    ahead = predict(at(0.2), at(0.1), 0.4)
     assert ahead.distance_to(at(0.4).pose) < 1e-12
     assert ahead.angle_to(at(0.4).pose) < 1e-6
     long_ago = at(0.2)
-    assert predicted(long_ago, at(0.1), 9.0) is long_ago.pose
-    assert predicted(long_ago, None, 0.3) is long_ago.pose
+    assert predict(long_ago, at(0.1), 9.0) is long_ago.pose
+    assert predict(long_ago, None, 0.3) is long_ago.pose
 
 
 def test_a_fast_platform_is_followed_by_its_speed(rig: Rig, camera: Camera, empty: Scene) -> None:
@@ -148,7 +146,7 @@ PLAIN = Optics(noise=1.5, blur=0.6)
 def test_images_whose_edges_are_not_where_they_seem_are_refused_by_name(
     rig: Rig, camera: Camera, empty: Scene, optics: Optics, named: str
 ) -> None:
-    """Their intervals held the truth in one of three images."""
+    """Their intervals contained the truth in one of three images."""
     image = SyntheticCamera(rig, empty, camera, seed=3, optics=optics).render(HERE, 0)
     found = Tracker(rig, camera).observe(image, 0.0)
     assert isinstance(found, NoPose)
@@ -175,7 +173,7 @@ def test_a_smear_is_named_with_its_length(rig: Rig, camera: Camera, empty: Scene
     limits = replace(TrackerSettings(), position_deviation=1e-6)
     found = Tracker(rig, camera, limits).observe(image, 0.0)
     assert isinstance(found, NoPose)
-    smear = re.search(r"smeared by (\d+) px: shorten the exposure", found.reason)
+    smear = re.search(r"blurred by (\d+) px of motion: shorten the exposure", found.reason)
     assert smear is not None
     assert abs(int(smear[1]) - length) <= 1
 
@@ -185,14 +183,14 @@ def test_a_smear_is_named_with_its_length(rig: Rig, camera: Camera, empty: Scene
 def test_the_stated_covariance_is_that_of_the_errors(
     rig: Rig, camera: Camera, empty: Scene, blur: float
 ) -> None:
-    """Mean NEES over seeds and places; 6 where the covariance is exact."""
+    """Mean NEES over seeds and positions; 6 for an exact covariance."""
     rng, values = np.random.default_rng(12), []
     optics = Optics(noise=1.5, blur=blur)
     for seed in range(4):
         eye = SyntheticCamera(rig, empty, camera, seed=seed, optics=optics)
         for frame in range(15):
-            place = rng.uniform([-0.15, -0.15, 0.3], [0.15, 0.15, 0.55])
-            truth = Pose(place, matrix_from_rotation_vector(rng.normal(size=3) * 0.1))
+            position = rng.uniform([-0.15, -0.15, 0.3], [0.15, 0.15, 0.55])
+            truth = Pose(position, matrix_from_rotation_vector(rng.normal(size=3) * 0.1))
             found = Tracker(rig, camera).observe(eye.render(truth, frame), 0.0)
             assert isinstance(found, PoseMeasurement)
             error = error_of(found, truth)

@@ -1,4 +1,4 @@
-"""The uncertainty of a clearance follows from the pose's."""
+"""The uncertainty of a clearance follows from that of the pose."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_m
 from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene, load_scene
 from simulation.camera.camera import SyntheticCamera
-from tracking.camera_model import ideal_from_pixels, pixels_from_ideal, project_undistorted
+from tracking.camera_model import distort_pixels, project_undistorted, undistort_pixels
 from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
-from tracking.fusion import together
+from tracking.fusion import fuse_poses
 from tracking.measurement import PoseMeasurement
 from tracking.pnp import TagView, moved, solve_pnp
 from tracking.shared_errors import (
@@ -59,8 +59,8 @@ def test_uncertainty_agrees_with_distances_at_scattered_poses(
     steps = rng.multivariate_normal(np.zeros(6), covariance, size=300)
     distances = []
     for step in steps:
-        turned = matrix_from_rotation_vector(step[3:]) @ pose.rotation
-        near = model.obstacles(Pose(pose.position + step[:3], turned))
+        rotation = matrix_from_rotation_vector(step[3:]) @ pose.rotation
+        near = model.obstacles(Pose(pose.position + step[:3], rotation))
         distances.append([n.distance for n in near])
     scatter = np.std(np.array(distances), axis=0)
     predicted = stated.uncertainties / SURE
@@ -75,7 +75,7 @@ def test_the_smallest_distance_counts_the_others_uncertainty_too(rig: Rig, crowd
     first, second = replace(near[0], distance=0.010), replace(near[1], distance=0.011)
     measured = MeasuredClearance((first, second), np.array([0.001, 0.004]))
     assert measured.distance == pytest.approx(0.010)
-    assert measured.uncertainty == pytest.approx(0.003)  # the second may be as near as 7 mm
+    assert measured.uncertainty == pytest.approx(0.003)  # the second may be only 7 mm away
 
 
 def test_touching_bodies_take_the_worst_direction(rig: Rig, crowded: Scene) -> None:
@@ -94,14 +94,14 @@ def test_a_scene_without_obstacles_has_no_clearance(rig: Rig, crowded: Scene) ->
 
 
 def looking(rig: Rig, **said: object) -> Camera:
-    """The rig's camera, as a rig file with these keys makes it."""
+    """The rig's camera, from a rig file with these keys."""
     plain = rig.document.model_dump(mode="json", exclude_unset=True)
     plain["cameras"][0] |= said
     return rig_from_document(RigDocument.model_validate(plain)).cameras[0]
 
 
 def square(rig: Rig, camera: Camera, pose: Pose) -> list[TagView]:
-    """The platform's tags that face the camera, seen without an error."""
+    """The platform's tags that face the camera, observed without errors."""
     there = camera.world_from_camera.inverse().compose(pose)
     views = []
     for tag in rig.platform_tags:
@@ -118,14 +118,16 @@ def shared_of(rig: Rig, camera: Camera, pose: Pose) -> np.ndarray:
     return SharedErrors(rig, camera).of(pose, square(rig, camera, pose))
 
 
-PLACE = np.array([0.8, 0.5, 1.2, 0.06, 0.09, 0.03])
-"""Deviations of a camera's place, [mm] and [deg]."""
+POSE_DEVIATIONS = np.array([0.8, 0.5, 1.2, 0.06, 0.09, 0.03])
+"""Standard deviations of a camera's pose, [mm] and [deg]."""
 
 
-def test_errors_of_the_cameras_place_are_carried_to_the_clearance(rig: Rig, crowded: Scene) -> None:
-    """Cameras that are off by chance as stated put the platform where the clearance differs."""
+def test_errors_of_the_camera_pose_are_propagated_to_the_clearance(
+    rig: Rig, crowded: Scene
+) -> None:
+    """Cameras with random errors as stated measure clearances that scatter as stated."""
     rng = np.random.default_rng(5)
-    camera = looking(rig, pose_covariance=np.diag(PLACE**2).tolist(), error_mm=None)
+    camera = looking(rig, pose_covariance=np.diag(POSE_DEVIATIONS**2).tolist(), error_mm=None)
     known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
     camera = replace(camera, lens_covariance=np.zeros((8, 8)))
     model = ClearanceModel(rig, crowded)
@@ -138,10 +140,10 @@ def test_errors_of_the_cameras_place_are_carried_to_the_clearance(rig: Rig, crow
     stated = clearance_of(model, sure)
     assert stated is not None
     distances = []
-    for step in rng.normal(size=(300, 6)) * PLACE:
+    for step in rng.normal(size=(300, 6)) * POSE_DEVIATIONS:
         turn = matrix_from_rotation_vector(np.radians(step[3:]))
-        place = camera.world_from_camera
-        moved = Pose(place.position + step[:3] / 1e3, turn @ place.rotation)
+        here = camera.world_from_camera
+        moved = Pose(here.position + step[:3] / 1e3, turn @ here.rotation)
         distances.append([n.distance for n in model.obstacles(moved.compose(seen))])
     scatter = np.std(np.array(distances), axis=0)
     apart = np.array([n.distance > 0.005 for n in stated.nearest])
@@ -150,8 +152,8 @@ def test_errors_of_the_cameras_place_are_carried_to_the_clearance(rig: Rig, crow
     assert stated.uncertainties.max() > 1e-3  # where 0.5 mm were stated before, whatever was known
 
 
-def test_one_number_of_the_operator_stands_for_all_that_is_shared(rig: Rig, crowded: Scene) -> None:
-    """Also for the cables, unless calibrations state every part of the chain."""
+def test_one_value_by_the_operator_replaces_all_shared_errors(rig: Rig, crowded: Scene) -> None:
+    """For the cables too, unless calibrations state every part of the chain."""
     pose = Pose(np.array([0.05, -0.03, 0.55]), np.eye(3))
     shared = SharedErrors(rig, looking(rig, error_mm=1.96))
     one = np.diag([1e-6] * 3 + [0.0] * 3)
@@ -170,7 +172,7 @@ def test_one_number_of_the_operator_stands_for_all_that_is_shared(rig: Rig, crow
 
 
 def test_tags_that_are_off_as_stated_count_once(rig: Rig) -> None:
-    """Edges fit worse where tags are off: that is no reason to widen the pose's own scatter."""
+    """Tag errors make edges fit worse, which must not widen the pose's own scatter."""
     rng, scatter, values = np.random.default_rng(8), 0.03, []
     camera = looking(rig)
     count = 4 + camera.distortion.size
@@ -210,10 +212,10 @@ def test_tags_that_are_off_as_stated_count_once(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
-def test_a_lens_error_counts_by_what_it_does_to_place_and_pose_together(
+def test_a_lens_error_is_propagated_through_extrinsics_and_pose_together(
     rig: Rig, fisheye: bool
 ) -> None:
-    """Against poses that a lens off by a little gives, its camera's place found with it."""
+    """Against poses by a slightly wrong lens, with extrinsics found with it."""
     lens = {"lens": "fisheye", "distortion": [0.01, -0.004, 0.002, -0.001]} if fisheye else {}
     camera = looking(rig, **lens)
     pose = Pose(np.array([0.05, -0.03, 0.55]), matrix_from_rotation_vector([0.1, -0.05, 0.2]))
@@ -223,7 +225,7 @@ def test_a_lens_error_counts_by_what_it_does_to_place_and_pose_together(
     by_lens[3:, 2] = 1e-5, 2e-5, -1e-5
     deviations = np.array([0.3, 0.2, 0.5, 0.4, *[1e-3] * (count - 4)])
     known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
-    told = replace(
+    calibrated = replace(
         camera,
         error=None,
         lens_covariance=np.diag(deviations**2),
@@ -233,33 +235,34 @@ def test_a_lens_error_counts_by_what_it_does_to_place_and_pose_together(
     expected = np.zeros((6, 6))
     for k in range(count):
         step = by_lens[:, k] * deviations[k]
-        place = moved(camera.world_from_camera, step)
+        world_from_camera = moved(camera.world_from_camera, step)
         matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
         if k < 4:
             matrix[k % 2, k % 2 if k < 2 else 2] += deviations[k]
         else:
             distortion[k - 4] += deviations[k]
-        off = replace(camera, matrix=matrix, distortion=distortion, world_from_camera=place)
+        lens = {"matrix": matrix, "distortion": distortion}
+        off = replace(camera, **lens, world_from_camera=world_from_camera)
         views = []
         for view in square(rig, camera, pose):
-            corners = ideal_from_pixels(off, pixels_from_ideal(camera, view.seen.corners))
+            corners = undistort_pixels(off, distort_pixels(camera, view.seen.corners))
             whitening = view.seen.whitening
             seen = replace(view.seen, corners=corners, target=whitening @ corners.ravel())
             views.append(TagView(view.tag, seen))
         found = solve_pnp(off, views, camera.world_from_camera.inverse().compose(pose))
         assert found is not None
-        measured = place.compose(found.camera_from_body)
+        measured = world_from_camera.compose(found.camera_from_body)
         turn = rotation_vector_from_matrix(measured.rotation @ pose.rotation.T)
         change = np.concatenate([measured.position - pose.position, turn])
         expected += np.outer(change, change)
-    got = shared_of(known, told, pose)
+    got = shared_of(known, calibrated, pose)
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
         got / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03
     )
 
 
-def test_a_principal_point_that_is_off_is_a_camera_that_is_turned(rig: Rig) -> None:
+def test_an_error_of_the_principal_point_is_a_rotation_of_the_camera(rig: Rig) -> None:
     camera = looking(rig)
     by_lens = implied_rotation(camera)
     turn = camera.world_from_camera.rotation.T @ by_lens[:, 2]
@@ -275,18 +278,18 @@ def test_what_is_no_covariance_of_a_pose_is_refused(rig: Rig, rows: np.ndarray) 
 
 
 def test_a_mean_over_pictures_makes_no_shared_error_smaller(rig: Rig) -> None:
-    """Two cameras of one survey err alike: both together are no surer than one."""
-    place = np.diag(PLACE**2).tolist()
-    camera = replace(looking(rig, pose_covariance=place), lens_covariance=np.zeros((8, 8)))
+    """Two cameras of one survey have common errors: both are no more accurate than one."""
+    covariance = np.diag(POSE_DEVIATIONS**2).tolist()
+    camera = replace(looking(rig, pose_covariance=covariance), lens_covariance=np.zeros((8, 8)))
     pose = Pose(np.array([0.05, -0.03, 0.55]), np.eye(3))
     known = replace(rig, tag_error=0.0, outlet_error=0.0, anchor_error=0.0)
     shared = shared_of(known, camera, pose)
     one = replace(measurement(pose, np.eye(6) * 1e-8), shared=shared, unstated=False)
-    both = together({"a": one, "b": one})
+    both = fuse_poses({"a": one, "b": one})
     assert isinstance(both, PoseMeasurement)
     np.testing.assert_allclose(both.shared, shared, rtol=1e-9)
     assert not both.unstated
-    half = together({"a": one, "b": replace(one, unstated=True)})
+    half = fuse_poses({"a": one, "b": replace(one, unstated=True)})
     assert isinstance(half, PoseMeasurement)
     assert half.unstated
 
@@ -296,7 +299,7 @@ CABLES = {"outlets_error_mm": 1.0, "anchors_error_mm": 0.5}
 
 
 @pytest.mark.parametrize(
-    ("camera_says", "tags_say", "rig_says", "lacks"),
+    ("camera_says", "tags_say", "rig_says", "issues"),
     [
         ({}, None, {}, "lens_covariance.*pose_covariance.*tags.*outlets.*anchors"),
         (ALL, 0.1, {}, "outlets_error_mm"),
@@ -312,7 +315,7 @@ def test_no_clearance_is_measured_where_nothing_says_how_far_off_it_is(
     camera_says: dict,
     tags_say: float | None,
     rig_says: dict,
-    lacks: str,
+    issues: str,
 ) -> None:
     plain = rig.document.model_dump(mode="json", exclude_unset=True)
     plain["cameras"][0] |= {"error_mm": None} | camera_says
@@ -321,9 +324,9 @@ def test_no_clearance_is_measured_where_nothing_says_how_far_off_it_is(
     picture = SyntheticCamera(said, crowded, said.cameras[0], 3).render(said.home, 0)
     found = Tracker(said, said.cameras[0]).observe(picture, 0.0)
     assert isinstance(found, PoseMeasurement)
-    assert found.unstated is bool(lacks)
-    if lacks:
-        with pytest.raises(BadInput, match=f"(?s){lacks}"):
+    assert found.unstated is bool(issues)
+    if issues:
+        with pytest.raises(BadInput, match=f"(?s){issues}"):
             require_stated_errors(said, said.cameras)
         with pytest.raises(BadInput, match="error_mm"):
             clearance_of(ClearanceModel(said, crowded), found)

@@ -1,4 +1,4 @@
-"""Images of several cameras are put together by their times, and none is lost."""
+"""Images of several cameras are grouped by their times, and none is lost."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tracking.fusion import moments
+from tracking.fusion import synchronize_frames
 from tracking.measurement import NoPose
 from tracking.pose_log import LoggedPicture
 
@@ -22,12 +22,12 @@ def grouped(times: Mapping[str, Sequence[float]], within: float) -> list[dict[st
     }
     return [
         {name: one.observation.time for name, one in moment.items()}
-        for moment in moments(streams, within)
+        for moment in synchronize_frames(streams, within)
     ]
 
 
 @given(times=st.tuples(TIMES, TIMES, TIMES), within=st.integers(0, 20))
-def test_every_picture_is_in_one_moment_and_moments_are_in_order(
+def test_every_image_is_in_one_frame_set_and_frame_sets_are_in_order(
     times: tuple[list[int], list[int], list[int]], within: int
 ) -> None:
     cameras = dict(zip("abc", times, strict=True))

@@ -1,7 +1,6 @@
-"""A run is stopped, and does not pass, when an obstacle is too near whatever the camera is off by.
+"""A run is stopped and fails if an obstacle is too near even at the upper bound of its clearance.
 
-What is surely too near is asked obstacle by obstacle here; one that is known badly must not hide
-another that is known well.
+Here this is evaluated obstacle by obstacle; an uncertain one must not hide a certain one.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from executor.recording.verdict import distances
 from model.clearance import Nearest
 from tracking.clearance import MeasuredClearance
 
-#: The scene asks for so much, [mm].
+#: Clearance required by the scene, [mm].
 LIMIT_MM = 20.0
 
 #: Distance and uncertainty of each obstacle, [mm].
@@ -39,32 +38,32 @@ def measured(obstacles_mm: list[tuple[float, float]]) -> MeasuredClearance:
     return MeasuredClearance(nearest([d for d, _ in obstacles_mm]), uncertainties)
 
 
-def surely_too_near(obstacles_mm: list[tuple[float, float]]) -> bool:
+def certainly_too_near(obstacles_mm: list[tuple[float, float]]) -> bool:
     return any(d + u < LIMIT_MM for d, u in obstacles_mm)
 
 
 @given(obstacles_mm=OBSTACLES)
 @example(obstacles_mm=[(10.0, 1.0), (30.0, 30.0)])
 @example(obstacles_mm=[(10.0, 15.0), (12.0, 1.0)])
-def test_the_run_stops_exactly_when_one_obstacle_is_surely_too_near(
+def test_the_run_stops_exactly_when_one_obstacle_is_certainly_too_near(
     obstacles_mm: list[tuple[float, float]],
 ) -> None:
     watch = ClearanceMonitor(LIMIT_MM / 1e3)
-    told = [watch.take(measured(obstacles_mm)) for _ in range(NEAR_PICTURES)]
-    assert not any(told[:-1])
-    assert bool(told[-1]) is surely_too_near(obstacles_mm)
+    messages = [watch.take(measured(obstacles_mm)) for _ in range(NEAR_PICTURES)]
+    assert not any(messages[:-1])
+    assert bool(messages[-1]) is certainly_too_near(obstacles_mm)
 
 
 @given(obstacles_mm=OBSTACLES)
 @example(obstacles_mm=[(10.0, 1.0), (30.0, 30.0)])
 @example(obstacles_mm=[(10.0, 15.0), (12.0, 1.0)])
-def test_the_verdict_is_that_of_the_obstacle_that_is_surely_too_near(
+def test_the_verdict_is_that_of_the_obstacle_that_is_certainly_too_near(
     obstacles_mm: list[tuple[float, float]],
 ) -> None:
     row = ClearanceRow.at(1.0, "tag", measured(obstacles_mm), nearest([d for d, _ in obstacles_mm]))
     names = tuple(f"post {i}" for i in range(len(obstacles_mm)))
     required, against_plan = distances(clearance_table(names, [row]), LIMIT_MM / 1e3)
-    assert required.passed is not surely_too_near(obstacles_mm)
+    assert required.passed is not certainly_too_near(obstacles_mm)
     assert against_plan.passed
 
 
@@ -76,10 +75,10 @@ def test_nearer_than_planned_counts_the_upper_side_too() -> None:
     assert "its 95 % interval ends at 31.00 mm" in against_plan.text
 
 
-def test_what_is_told_names_the_obstacle_that_is_surely_too_near() -> None:
+def test_the_message_names_the_obstacle_that_is_certainly_too_near() -> None:
     watch = ClearanceMonitor(LIMIT_MM / 1e3)
-    told = [watch.take(measured([(10.0, 15.0), (12.0, 1.0)])) for _ in range(2)][-1]
-    assert told == "platform to post 1: 12.0 ± 1.0 mm (95 % interval); the scene requires 20 mm"
+    message = [watch.take(measured([(10.0, 15.0), (12.0, 1.0)])) for _ in range(2)][-1]
+    assert message == "platform to post 1: 12.0 ± 1.0 mm (95 % interval); the scene requires 20 mm"
 
 
 @given(obstacles_mm=OBSTACLES, shares=st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))

@@ -1,4 +1,4 @@
-"""A camera that takes images faster than they are asked for: none grows old in a queue."""
+"""A camera that takes images faster than they are read: none ages in a queue."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from model.rig import Camera
 
 
 class Queue:
-    """Images of a camera, waiting for whoever reads them.
+    """Queue of camera images.
 
     An image's brightness is its number. Reading one takes no time; when none waits, reading waits,
     as with a camera, for the next.
@@ -29,13 +29,13 @@ class Queue:
         self._gone = self.released = False
 
     def take(self, pictures: int) -> None:
-        """So many more were taken."""
+        """Adds new images."""
         with self._changed:
             self._come += pictures
             self._changed.notify_all()
 
     def wait_until_read(self) -> None:
-        """Returns when all were read, and the next one is waited for."""
+        """Returns when all are read and the reader waits for the next."""
         with self._changed:
             assert self._changed.wait_for(
                 lambda: self._wanting and self._taken == self._come, timeout=20.0
@@ -67,7 +67,7 @@ class Queue:
         self.released = True
 
     def clock(self) -> float:
-        """Each image arrives when it is read, a hundred a second."""
+        """Each image arrives when it is read, at 100 Hz."""
         return (self._taken - 1) / 100.0
 
 
@@ -104,16 +104,16 @@ def test_no_picture_is_answered_twice(queue: Queue, camera: Camera) -> None:
         queue.unplug()
 
 
-def test_a_camera_that_goes_is_told_by_its_name_and_source(queue: Queue, camera: Camera) -> None:
+def test_a_lost_camera_is_reported_by_its_name_and_source(queue: Queue, camera: Camera) -> None:
     queue.take(1)
     with LiveCamera("7", camera, queue.clock) as live:
         queue.unplug()
-        with pytest.raises(Fault, match=f"{LOST_PICTURES} times in a row") as told:
+        with pytest.raises(Fault, match=f"{LOST_PICTURES} times in a row") as caught:
             live.read()
-    assert told.value.where == f"camera {camera.name} (7)"
+    assert caught.value.where == f"camera {camera.name} (7)"
 
 
-def test_a_camera_that_never_gave_a_picture_or_another_size_is_let_go_of(
+def test_a_camera_without_images_or_of_another_size_is_released(
     queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     queue.unplug()
@@ -128,7 +128,7 @@ def test_a_camera_that_never_gave_a_picture_or_another_size_is_let_go_of(
     assert queue.released
 
 
-def test_who_closes_nothing_leaves_no_thread(queue: Queue, camera: Camera) -> None:
+def test_no_thread_is_left_without_a_close(queue: Queue, camera: Camera) -> None:
     queue.take(1)
     live = LiveCamera("0", camera, queue.clock)
     queue.take(1)

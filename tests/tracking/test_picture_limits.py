@@ -1,4 +1,4 @@
-"""Images that hurt: absurd sizes are refused before decoding; outputs are whole or none."""
+"""Harmful images: absurd sizes are refused before decoding; outputs are complete or absent."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_a_picture_of_900_megapixels_is_not_decoded(
 
 
 def test_opencv_itself_refuses_it_in_formats_whose_header_is_not_read(tmp_path: Path) -> None:
-    """With a lower limit, to have a small image beyond it; ours is set before OpenCV is there."""
+    """With a lower limit for a small image; ours is set before OpenCV is loaded."""
     assert os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] == str(MOST_PIXELS)
     cv2.imwrite(str(tmp_path / "a.pgm"), IMAGE[:, :, 0])
     reads = (
@@ -112,7 +112,7 @@ def test_a_video_has_its_name_once_it_is_whole(tmp_path: Path, name: str) -> Non
 
 
 def test_a_video_that_a_full_disk_cut_short_is_not_kept(tmp_path: Path) -> None:
-    """OpenCV does not say that an image was not written; the video is counted afterwards."""
+    """OpenCV does not report write failures; the video's images are counted afterwards."""
     out = PictureOutput(tmp_path / "a.avi", 10.0)
     for _ in range(3):
         out.write(IMAGE, "")

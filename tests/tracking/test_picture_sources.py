@@ -1,4 +1,4 @@
-"""Folders, videos and cameras as sources; what cannot be used is told by name."""
+"""Folders, videos and cameras as sources; what cannot be used is listed by name."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ TRUTH = [Pose.level([0.10 - 0.01 * k, 0.1, 0.4]) for k in range(4)]
 
 @pytest.fixture
 def folder(tmp_path: Path, synthetic: SyntheticCamera) -> Path:
-    """Images 8 to 11, so that the order of names is not that of letters."""
-    place = tmp_path / "some images"
-    place.mkdir()
+    """Images 8 to 11, so that numeric and alphabetic order differ."""
+    directory = tmp_path / "some images"
+    directory.mkdir()
     for k, pose in enumerate(TRUTH):
-        name = str(place / f"frame_{8 + k}.png")
+        name = str(directory / f"frame_{8 + k}.png")
         cv2.imwrite(name, synthetic.render(pose, k), [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    return place
+    return directory
 
 
 def test_a_folder_is_read_in_the_order_of_its_numbers(folder: Path, camera: Camera) -> None:
@@ -46,11 +46,11 @@ def test_a_broken_file_among_good_ones_is_named_and_skipped(
 ) -> None:
     (folder / "frame_9.png").write_bytes(b"\x89PNG\r\n\x1a\n cut short")
     (folder / "frame_10.png").write_bytes(b"")
-    told: dict[str, str] = {}
-    source = ImageFolder(folder, camera, on_unused=told.__setitem__)
+    unused: dict[str, str] = {}
+    source = ImageFolder(folder, camera, on_unused=unused.__setitem__)
     results = list(track(source, Tracker(rig, camera)))
-    assert list(told) == ["frame_9.png", "frame_10.png"]
-    assert told == source.unused
+    assert list(unused) == ["frame_9.png", "frame_10.png"]
+    assert unused == source.unused
     assert [r.name for r in results] == ["frame_8.png", "frame_11.png"]
     for result, truth in zip(results, (TRUTH[0], TRUTH[3]), strict=True):
         assert isinstance(result.observation, PoseMeasurement)
@@ -75,10 +75,10 @@ def test_a_picture_of_another_size_among_good_ones_is_named_and_skipped(
     folder: Path, camera: Camera
 ) -> None:
     cv2.imwrite(str(folder / "frame_9.png"), np.zeros((480, 640), dtype=np.uint8))
-    told: dict[str, str] = {}
-    source = ImageFolder(folder, camera, on_unused=told.__setitem__)
+    unused: dict[str, str] = {}
+    source = ImageFolder(folder, camera, on_unused=unused.__setitem__)
     assert [frame.name for frame in source] == ["frame_8.png", "frame_10.png", "frame_11.png"]
-    assert told == {"frame_9.png": "has 640 x 480 px, the camera has 1280 x 720 px"}
+    assert unused == {"frame_9.png": "has 640 x 480 px, the camera has 1280 x 720 px"}
 
 
 def test_pictures_that_are_all_of_another_size_are_refused_by_name(
@@ -86,10 +86,10 @@ def test_pictures_that_are_all_of_another_size_are_refused_by_name(
 ) -> None:
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((480, 640), dtype=np.uint8))
     (tmp_path / "broken.png").write_bytes(b"nothing")
-    with pytest.raises(BadInput, match="none of the 2 images has the camera's 1280 x 7") as told:
+    with pytest.raises(BadInput, match="none of the 2 images has the camera's 1280 x 7") as caught:
         list(ImageFolder(tmp_path, camera))
-    assert "small.png has 640 x 480 px" in told.value.why
-    assert "broken.png is not a readable image" in told.value.why
+    assert "small.png has 640 x 480 px" in caught.value.why
+    assert "broken.png is not a readable image" in caught.value.why
 
 
 def test_a_video_is_measured_picture_by_picture(
@@ -124,20 +124,20 @@ def test_a_file_that_is_no_video_is_refused(tmp_path: Path, camera: Camera) -> N
 
 
 def test_a_camera_that_is_not_there_is_hardware_missing(camera: Camera) -> None:
-    with pytest.raises(HardwareMissing, match="cannot be opened") as told:
+    with pytest.raises(HardwareMissing, match="cannot be opened") as caught:
         LiveCamera("97", camera)
-    assert told.value.exit_code == 4
-    assert told.value.where == "camera front (97)"
+    assert caught.value.exit_code == 4
+    assert caught.value.where == "camera front (97)"
 
 
 def test_pictures_without_tags_say_what_was_expected(rig: Rig, camera: Camera) -> None:
     blank = [Frame(k * 0.1, np.full((720, 1280), 90, np.uint8), f"p{k}") for k in range(3)]
     seen = track(blank, Tracker(rig, camera))
-    with pytest.raises(NoPlatformSeen) as told:
+    with pytest.raises(NoPlatformSeen) as caught:
         for _ in seen:
             pass
-    message = str(told.value)
-    assert told.value.exit_code == 2
+    message = str(caught.value)
+    assert caught.value.exit_code == 2
     assert "none of 3 images" in message
     assert "tag36h11 tags 301, 302, 303, 304, 305, 306" in message
     assert "no tag of any known family" in message
@@ -155,20 +155,18 @@ def test_pictures_with_other_tags_say_which(
 def test_a_camera_out_of_focus_is_named_and_no_size_is_doubted(
     rig: Rig, camera: Camera, synthetic: SyntheticCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Tags are read, but no edge of theirs is found."""
+    """Tags are decoded, but their edges are not found."""
     monkeypatch.setattr(
         "tracking.estimator.refine", lambda _image, _camera, rough, _m: [None] * len(rough)
     )
     picture = Frame(0.0, synthetic.render(TRUTH[0], 0), "first.png")
-    with pytest.raises(NoPlatformSeen, match="too blurred to be measured") as told:
+    with pytest.raises(NoPlatformSeen, match="too blurred to be measured") as caught:
         list(track([picture], Tracker(rig, camera)))
-    assert "focus" in told.value.next_step
-    assert "size_mm" not in told.value.next_step
+    assert "focus" in caught.value.next_step
+    assert "size_mm" not in caught.value.next_step
 
 
-def test_a_source_without_pictures_and_one_without_an_end_come_to_an_end(
-    rig: Rig, camera: Camera
-) -> None:
+def test_an_empty_source_and_an_endless_one_finish(rig: Rig, camera: Camera) -> None:
     with pytest.raises(NoPlatformSeen, match="no images"):
         list(track([], Tracker(rig, camera)))
 

@@ -1,4 +1,4 @@
-"""Cameras whose rows are exposed one after the other: rendered so, and measured as if at once."""
+"""Rolling-shutter cameras: rendered row by row, and measured with correction."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def flown(rig: Rig, camera: Camera, stated: float, velocity: list[float], images
 
 @pytest.mark.parametrize("readout", [0.03, -0.03])
 def test_a_row_shows_the_platform_at_its_own_time(rig: Rig, camera: Camera, readout: float) -> None:
-    """Around a tag's corner the image is that of a platform that stands where it is then."""
+    """Around a tag's corner the image is that of a platform at rest at that time's pose."""
     rolling = replace(camera, readout=readout)
     motion = PlatformMotion(np.array([0.1, 0.05, -0.1]), np.array([0.0, 0.0, 0.3]))
     eye = eye_of(rig, rolling, exposure=0.004)
@@ -76,18 +76,18 @@ def test_a_platform_at_rest_looks_the_same_by_any_shutter(rig: Rig, camera: Came
     assert np.array_equal(eye_of(rig, camera).render(rig.home, 0), at_once)
 
 
-@pytest.mark.parametrize("way", VELOCITY)
+@pytest.mark.parametrize("axis", VELOCITY)
 def test_a_moving_platform_is_measured_at_the_middle_rows_time(
-    rig: Rig, camera: Camera, way: str
+    rig: Rig, camera: Camera, axis: str
 ) -> None:
-    """From the second image on: the first one knows of no motion, and says so."""
-    found = list(flown(rig, camera, READOUT, VELOCITY[way]))
+    """From the second image on: for the first the motion is unknown, which it states."""
+    found = list(flown(rig, camera, READOUT, VELOCITY[axis]))
     poses = [one for one, _ in found if isinstance(one, PoseMeasurement)]
     assert len(poses) == len(found)
     off = [one.pose.distance_to(truth) for one, truth in found[1:]]
-    turned = [one.pose.angle_to(truth) for one, truth in found[1:]]
+    angles = [one.pose.angle_to(truth) for one, truth in found[1:]]
     assert max(off) < 0.15e-3
-    assert np.degrees(max(turned)) < 0.05
+    assert np.degrees(max(angles)) < 0.05
     unknown, known = (one.position_deviation.max() for one in poses[:2])
     assert unknown > 2.0 * known
 
@@ -98,7 +98,7 @@ def test_without_the_readout_the_same_images_measure_a_millimetre_wrong(rig, cam
     assert min(off) > 0.5e-3
 
 
-def test_a_platform_that_stands_still_is_measured_as_by_any_camera(rig, camera) -> None:
+def test_a_platform_at_rest_is_measured_as_by_any_camera(rig, camera) -> None:
     image = eye_of(rig, camera).render(rig.home, 0)
     by_rows, at_once = (
         Tracker(rig, replace(camera, readout=readout)) for readout in (READOUT, 0.0)
@@ -128,7 +128,7 @@ def test_a_motion_turns_and_shifts() -> None:
 
 
 def test_the_motion_of_a_swing_is_found_to_a_hundredth() -> None:
-    """Back and forth at 100 mm/s as in the benchmark: its acceleration changes all the time."""
+    """Oscillation at 100 mm/s as in the benchmark: its acceleration changes all the time."""
     recent, swing, speed = RecentMotion(READOUT), 0.04, 0.1
     off = []
     for number in range(60):

@@ -1,4 +1,4 @@
-"""The synthetic camera: exact places, right order of what hides what, the same image again."""
+"""The synthetic camera: exact positions, correct occlusion, reproducible images."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_lamps_shadows_and_a_cameras_own_processing_spoil_pictures_as_they_do(
         assert abs(more.mean()) < 1.0
 
 
-def test_a_picture_does_not_hang_on_the_ones_before(rig: Rig, synthetic: SyntheticCamera) -> None:
+def test_an_image_does_not_depend_on_earlier_ones(rig: Rig, synthetic: SyntheticCamera) -> None:
     before = synthetic.render(rig.home, 0)
     synthetic.render(Pose.level([0.2, -0.2, 0.3]), 1)
     np.testing.assert_array_equal(before, synthetic.render(rig.home, 0))
@@ -94,7 +94,7 @@ def test_a_picture_does_not_hang_on_the_ones_before(rig: Rig, synthetic: Synthet
 def test_what_is_redrawn_equals_a_picture_drawn_whole(
     rig: Rig, scene: Scene, camera: Camera
 ) -> None:
-    """Only the platform's surroundings are redrawn: nothing of it may lie outside of them."""
+    """Only the platform's surroundings are redrawn: none of it may be outside of them."""
     quiet = SyntheticCamera(rig, scene, camera, optics=Optics(noise=0.0))
     pose = Pose(np.array([0.1, 0.05, 0.4]), matrix_from_rotation_vector([0.1, -0.2, 0.4]))
     part = quiet.render(pose)
@@ -105,13 +105,13 @@ def test_what_is_redrawn_equals_a_picture_drawn_whole(
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda s: type(s).__name__)
 def test_every_shape_is_drawn_where_its_points_are(shape: Shape) -> None:
     camera = small_camera(())
-    place = Pose(np.array([0.05, -0.03, 1.2]), matrix_from_rotation_vector([0.7, 0.4, 0.2]))
+    pose = Pose(np.array([0.05, -0.03, 1.2]), matrix_from_rotation_vector([0.7, 0.4, 0.2]))
     canvas = Canvas.blank(camera, sample_rays(camera))
-    vertices = place.apply(surface_of(shape).vertices)
+    vertices = pose.apply(surface_of(shape).vertices)
     draw_triangles(canvas, vertices, np.full(vertices.shape[:2], 200.0))
     inside = np.argwhere(np.isfinite(canvas.depth))[:, ::-1] / 2.0 - 0.25
     radius = getattr(shape, "radius", 0.0)
-    points = place.apply(shape_points(shape))
+    points = pose.apply(shape_points(shape))
     pixels = points[:, :2] / points[:, 2:] * 400.0 + [159.5, 119.5]
     slack = radius * 400.0 / (points[:, 2].min() - radius) + 1.0
     assert np.all(inside.min(axis=0) >= pixels.min(axis=0) - slack)
@@ -125,15 +125,15 @@ def test_every_shape_is_drawn_where_its_points_are(shape: Shape) -> None:
     [
         ("pinhole", 300.0, [-0.12, 0.05, 0.0008, -0.0006, 0.01]),
         ("pinhole", 110.0, [0.42, 0.01, 0.001, -0.001, 0.0, 0.73, 0.07, 0.0]),
-        ("fisheye", 90.0, [0.03, -0.02, 0.015, -0.005]),  # wider than rays are looked for
+        ("fisheye", 90.0, [0.03, -0.02, 0.015, -0.005]),  # wider than the search for rays
     ],
 )
 def test_every_ray_is_that_of_its_sample(lens: str, focal: float, distortion: list[float]) -> None:
     matrix = np.array([[focal, 0.0, 159.5], [0.0, focal, 119.5], [0.0, 0.0, 1.0]])
     camera = replace(small_camera(()), lens=lens, matrix=matrix, distortion=np.array(distortion))
-    places = np.random.default_rng(3).integers(0, [640, 480], (2000, 2))
-    exact = rays_of(lens, matrix, camera.distortion, (places + 0.5) / 2.0 - 0.5)
-    off = np.abs(sample_rays(camera)[places[:, 1], places[:, 0]] - exact).max(axis=1)
+    coordinates = np.random.default_rng(3).integers(0, [640, 480], (2000, 2))
+    exact = rays_of(lens, matrix, camera.distortion, (coordinates + 0.5) / 2.0 - 0.5)
+    off = np.abs(sample_rays(camera)[coordinates[:, 1], coordinates[:, 0]] - exact).max(axis=1)
     assert (off < 2e-7 * (1.0 + np.sum(exact**2, axis=1))).all()
 
 
@@ -158,7 +158,7 @@ def test_a_ball_is_as_far_as_its_surface_on_every_ray(radius: float, x: float, y
     assert np.all(np.abs(canvas.depth - exact)[surely] < 0.03 * radius)
 
 
-def test_the_platform_hides_behind_an_obstacle_and_stands_before_one(
+def test_the_platform_is_hidden_by_an_obstacle_and_hides_another(
     rig: Rig, scene: Scene, camera: Camera
 ) -> None:
     toward = camera.world_from_camera.position - rig.home.position
@@ -166,14 +166,14 @@ def test_the_platform_hides_behind_an_obstacle_and_stands_before_one(
     wall = Box(np.array([0.2, 0.2, 0.2]))
     platform = _disk(camera, rig.home.position, 20)
 
-    def brightness_spread(place: np.ndarray) -> float:
-        obstacle = Obstacle("wall", wall, Pose.level(rig.home.position + place))
+    def brightness_spread(offset: np.ndarray) -> float:
+        obstacle = Obstacle("wall", wall, Pose.level(rig.home.position + offset))
         still = SyntheticCamera(
             rig, replace(scene, obstacles=(obstacle,)), camera, optics=Optics(noise=0.0)
         )
         return float(np.std(still.render(rig.home)[platform]))
 
-    assert brightness_spread(-0.6 * toward) > 40.0  # tags are to be seen
+    assert brightness_spread(-0.6 * toward) > 40.0  # tags are visible
     assert brightness_spread(0.6 * toward) < 25.0  # the wall covers them
 
 
@@ -208,9 +208,9 @@ def _sampled(camera: Camera, pose: Pose, number: int, samples: int) -> np.ndarra
 
     modules = official_modules(FAMILY, number)
     light = float(shade(pose.rotation[:, 2]))
-    places = (np.arange(camera.width * samples) + 0.5) / samples - 0.5
+    coordinates = (np.arange(camera.width * samples) + 0.5) / samples - 0.5
     heights = (np.arange(camera.height * samples) + 0.5) / samples - 0.5
-    x = (places - camera.matrix[0, 2]) / camera.matrix[0, 0]
+    x = (coordinates - camera.matrix[0, 2]) / camera.matrix[0, 0]
     y = (heights - camera.matrix[1, 2]) / camera.matrix[1, 1]
     rays = np.dstack([*np.meshgrid(x, y), np.ones((len(y), len(x)))]) @ pose.rotation
     origin = -pose.rotation.T @ pose.position

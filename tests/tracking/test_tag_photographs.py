@@ -1,4 +1,4 @@
-"""Tags in photographs that nobody rendered, beside what the AprilTag library finds in them."""
+"""Tags in real photographs, compared with the AprilTag library's detections."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ PHOTOGRAPHS = sorted((Path(__file__).parent / "photographs").glob("*.jpg"))
 FAMILY = "tag36h11"
 
 
-def _found(photograph: Path, *, thorough: bool) -> list[Array]:
+def _found(photograph: Path, *, exhaustive: bool) -> list[Array]:
     image = cv2.imread(str(photograph), cv2.IMREAD_GRAYSCALE)
     assert image is not None
-    found = TagDetector(FAMILY).detect_all(image, thorough=thorough)
+    found = TagDetector(FAMILY).detect_all(image, exhaustive=exhaustive)
     assert {d.id for d in found} == {0}, "a tag that is not on the cubes"
     return [d.corners for d in found]
 
 
 @pytest.mark.parametrize("photograph", PHOTOGRAPHS, ids=lambda path: path.stem)
-def test_a_thorough_look_finds_what_the_apriltag_library_finds(photograph: Path) -> None:
-    found = _found(photograph, thorough=True)
+def test_an_exhaustive_detection_finds_what_the_apriltag_library_finds(photograph: Path) -> None:
+    found = _found(photograph, exhaustive=True)
     reference = tags_found_by_apriltag(photograph.with_suffix(".txt"))
     missed = [corners for corners in reference if nearest_gap(corners, found) > 2.0]
     assert len(missed) <= 1  # of 12, 25 and 10
@@ -35,6 +35,6 @@ def test_a_thorough_look_finds_what_the_apriltag_library_finds(photograph: Path)
 
 @pytest.mark.parametrize("photograph", PHOTOGRAPHS, ids=lambda path: path.stem)
 def test_no_cube_is_seen_twice(photograph: Path) -> None:
-    middles = np.array([corners.mean(axis=0) for corners in _found(photograph, thorough=True)])
+    middles = np.array([corners.mean(axis=0) for corners in _found(photograph, exhaustive=True)])
     gaps = np.linalg.norm(middles[:, None] - middles[None], axis=2) + 1e3 * np.eye(len(middles))
     assert gaps.min() > 8.0

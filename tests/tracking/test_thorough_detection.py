@@ -1,4 +1,4 @@
-"""Tags that are small, blurred or faint, and squares that are none."""
+"""Tags that are small, blurred or faint, and squares that are not tags."""
 
 from __future__ import annotations
 
@@ -31,38 +31,40 @@ def detector() -> TagDetector:
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_a_thorough_look_finds_what_a_plain_one_misses(
+def test_exhaustive_detection_finds_what_standard_detection_misses(
     printer: HardPrinter, detector: TagDetector, name: str
 ) -> None:
-    rng, plain, thorough = np.random.default_rng(4), 0, 0
+    rng, plain, exhaustive = np.random.default_rng(4), 0, 0
     for _ in range(6):
         picture = printer.picture(HARD[name], rng)
         plain += len(detector.detect(picture.image))
-        found = detector.detect(picture.image, thorough=True)
+        found = detector.detect(picture.image, exhaustive=True)
         assert [d.id for d in found] in ([], [picture.number])
         for d in found:
-            thorough += 1
+            exhaustive += 1
             assert np.abs(d.corners - picture.corners).max() < 3.0
-    assert thorough == 6
+    assert exhaustive == 6
     assert plain < 6
 
 
-def test_a_tag_found_both_ways_is_told_once(printer: HardPrinter, detector: TagDetector) -> None:
+def test_a_tag_found_by_both_searches_is_listed_once(
+    printer: HardPrinter, detector: TagDetector
+) -> None:
     picture = printer.picture(Condition(side_px=60), np.random.default_rng(1))
-    assert len(detector.detect_all(picture.image, thorough=True)) == 1
+    assert len(detector.detect_all(picture.image, exhaustive=True)) == 1
 
 
-def test_a_region_is_searched_thoroughly_too(printer: HardPrinter, detector: TagDetector) -> None:
+def test_a_region_is_searched_exhaustively_too(printer: HardPrinter, detector: TagDetector) -> None:
     picture = printer.picture(Condition(side_px=40, contrast=12.0), np.random.default_rng(1))
     region = Region(40, 20, 280, 220)
-    (found,) = detector.detect(picture.image, region, thorough=True)
+    (found,) = detector.detect(picture.image, region, exhaustive=True)
     assert np.abs(found.corners - picture.corners).max() < 3.0
 
 
 def test_no_tag_that_can_be_read_is_in_a_blank_picture(
     printer: HardPrinter, detector: TagDetector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A blank picture is not searched: no tag that a search would find may look so."""
+    """A blank image is not searched: no detectable tag may count as blank."""
     rng, blank = np.random.default_rng(6), 0
     for _ in range(60):
         condition = Condition(
@@ -78,7 +80,7 @@ def test_no_tag_that_can_be_read_is_in_a_blank_picture(
             blank += 1
             with monkeypatch.context() as context:
                 context.setattr("tracking.detection.detector.is_blank", lambda _image: False)
-                assert detector.detect(picture.image, thorough=True) == [], condition
+                assert detector.detect(picture.image, exhaustive=True) == [], condition
     assert blank > 10
 
 
@@ -99,7 +101,7 @@ def test_squares_with_any_other_pattern_are_no_tags(detector: TagDetector) -> No
     rng = np.random.default_rng(2)
     for _ in range(30):
         pattern = np.pad(rng.random((6, 6)) < 0.5, 1)
-        assert detector.detect(square_picture(pattern), thorough=True) == []
+        assert detector.detect(square_picture(pattern), exhaustive=True) == []
 
 
 @pytest.mark.parametrize("turns", range(4))
@@ -121,7 +123,7 @@ def test_a_tag_without_white_around_it_or_without_contrast_is_not_read() -> None
     assert decoder.read(np.full_like(image, 128), corners) is None
 
 
-def test_the_pattern_of_a_given_tag_is_told_from_all_others() -> None:
+def test_the_pattern_of_a_given_tag_is_distinguished_from_all_others() -> None:
     image = square_picture(official_modules(FAMILY, 301))
     corners = (CORNER_SIGNS * [1, -1] + 1) * 40.0 + 19.5
     assert carries_tag(image, corners, FAMILY, 301)

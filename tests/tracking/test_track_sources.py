@@ -1,4 +1,4 @@
-"""Measuring whole sources from a script, as `cdpr track` does."""
+"""Measuring whole sources from a script, as with `cdpr track`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ TRUTH = [Pose.level([0.10 - 0.01 * k, 0.1, 0.4]) for k in range(3)]
 
 @pytest.fixture
 def folder(tmp_path: Path, synthetic: SyntheticCamera) -> Path:
-    """Three images, and a file that is no image."""
-    place = tmp_path / "pictures"
-    place.mkdir()
+    """Three images, and a file that is not an image."""
+    images = tmp_path / "pictures"
+    images.mkdir()
     for k, pose in enumerate(TRUTH):
-        cv2.imwrite(str(place / f"{k}.png"), synthetic.render(pose, k))
-    (place / "broken.png").write_bytes(b"cut short")
-    return place
+        cv2.imwrite(str(images / f"{k}.png"), synthetic.render(pose, k))
+    (images / "broken.png").write_bytes(b"cut short")
+    return images
 
 
 def test_a_folder_is_measured_and_saved(folder: Path, rig: Rig, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The tracker on rendered images: exact enough, honest, never mirrored, never silent."""
+"""The tracker on rendered images: accurate, with correct covariance, never mirrored."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def test_a_path_is_measured_to_half_a_millimetre(
     rig: Rig, camera: Camera, synthetic: SyntheticCamera
 ) -> None:
     tracker = Tracker(rig, camera)
-    way = [[0.18, 0.18, 0.3], [0.1, 0.0, 0.5], [0.0, -0.15, 0.55], [-0.18, -0.18, 0.4]]
+    waypoints = [[0.18, 0.18, 0.3], [0.1, 0.0, 0.5], [0.0, -0.15, 0.55], [-0.18, -0.18, 0.4]]
     errors, normalised, states = [], [], []
-    for frame, truth in enumerate(along(way, count=20)):
+    for frame, truth in enumerate(along(waypoints, count=20)):
         found = tracker.observe(synthetic.render(truth, frame), frame * 0.1)
         assert isinstance(found, PoseMeasurement), found
         error = error_of(found, truth)
@@ -57,7 +57,7 @@ def test_a_path_is_measured_to_half_a_millimetre(
     rotation = np.degrees(np.linalg.norm(by_pose[:, 3:], axis=1))
     assert np.sqrt(np.mean(position**2)) < 0.5e-3
     assert np.sqrt(np.mean(rotation**2)) < 0.1
-    assert np.mean(normalised) < 8.0  # 6 would be exact; more than that is too sure of itself
+    assert np.mean(normalised) < 8.0  # 6 would be exact
     assert np.all(position < 5e-3)
     assert states[0] == "found"
     assert states.count("tracked") >= len(states) - 3
@@ -65,14 +65,14 @@ def test_a_path_is_measured_to_half_a_millimetre(
     assert tracker.camera_check.error < 0.1
 
 
-def test_turned_poses_are_found_without_a_guess_and_never_mirrored(
+def test_rotated_poses_are_found_without_a_guess_and_never_mirrored(
     rig: Rig, camera: Camera, synthetic: SyntheticCamera
 ) -> None:
     rng, tracker = np.random.default_rng(5), Tracker(rig, camera)
     found_count = 0
     for frame in range(40):
-        place = rng.uniform([-0.2, -0.2, 0.2], [0.2, 0.2, 0.6])
-        truth = Pose(place, matrix_from_rotation_vector(rng.normal(size=3) * 0.15))
+        position = rng.uniform([-0.2, -0.2, 0.2], [0.2, 0.2, 0.6])
+        truth = Pose(position, matrix_from_rotation_vector(rng.normal(size=3) * 0.15))
         tracker.forget()
         found = tracker.observe(synthetic.render(truth, frame), float(frame))
         if isinstance(found, NoPose):
@@ -129,26 +129,28 @@ def test_tags_with_broken_outlines_are_still_used(
     assert found.pose.distance_to(truth) < 2e-3
 
 
-def test_a_moved_camera_is_told_with_how_far(rig: Rig, camera: Camera, scene: Scene) -> None:
+def test_a_moved_camera_is_reported_with_the_distance(
+    rig: Rig, camera: Camera, scene: Scene
+) -> None:
     turn = matrix_from_rotation_vector([0.0, np.radians(0.5), 0.0])
-    place = camera.world_from_camera
-    moved = Pose(place.position + np.array([0.006, 0.0, 0.0]), turn @ place.rotation)
+    here = camera.world_from_camera
+    moved = Pose(here.position + np.array([0.006, 0.0, 0.0]), turn @ here.rotation)
     real = SyntheticCamera(rig, scene, replace(camera, world_from_camera=moved), seed=1)
     tracker = Tracker(rig, camera)
-    with pytest.raises(CameraMoved) as told:
+    with pytest.raises(CameraMoved) as caught:
         tracker.observe(real.render(Pose.level([0.0, 0.0, 0.445]), 0), 0.0)
-    assert told.value.exit_code == 1
-    assert float(told.value.values["moved_mm"]) == pytest.approx(6.0, abs=1.0)
-    assert float(told.value.values["turned_deg"]) == pytest.approx(0.5, abs=0.05)
-    assert "world_from_camera" in told.value.next_step
+    assert caught.value.exit_code == 1
+    assert float(caught.value.values["moved_mm"]) == pytest.approx(6.0, abs=1.0)
+    assert float(caught.value.values["turned_deg"]) == pytest.approx(0.5, abs=0.05)
+    assert "world_from_camera" in caught.value.next_step
 
 
 def test_a_camera_moved_during_a_run_is_noticed(
     rig: Rig, camera: Camera, synthetic: SyntheticCamera, scene: Scene
 ) -> None:
-    place = camera.world_from_camera
+    here = camera.world_from_camera
     turn = matrix_from_rotation_vector([0.0, np.radians(0.2), 0.0])
-    moved = replace(camera, world_from_camera=Pose(place.position, turn @ place.rotation))
+    moved = replace(camera, world_from_camera=Pose(here.position, turn @ here.rotation))
     later = SyntheticCamera(rig, scene, moved, seed=1)
     tracker = Tracker(rig, camera, TrackerSettings(camera_check_period=2))
     truth = Pose.level([0.0, 0.0, 0.445])

@@ -1,1 +1,1 @@
-"""Finds and decodes tags in an image."""
+"""Detects and decodes tags in an image."""

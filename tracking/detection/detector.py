@@ -1,4 +1,4 @@
-"""Finding tags in an image, in all of it or in a part, by the detector that a rig file names."""
+"""Tag detection in an image or a region of it, with the detector that a rig file names."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from model.rig import Camera, Tag
 from tracking.camera_model import Image, Region, pixels_of
 from tracking.detection.tags import TagDecoder, dictionary, tag_corners, upright_corners
 
-# Squares in an image that may be tags, also small, faint and blurred ones.
+# Candidate squares for tags, including small, faint and blurred ones.
 
 
-#: Shortest outline of a square, [px].
+#: Smallest perimeter of a square, [px].
 LEAST_SQUARE_PERIMETER = 30.0
-#: Larger images are not enlarged: their tags have pixels enough, and time is short, [px].
+#: Larger images are not upscaled: their tags have enough pixels, and it takes too long, [px].
 MOST_PIXELS = 4_000_000
-#: Reduced so much, noise averages out and the smallest tag still spans two pixels.
+#: Reduction factor: noise averages out, and the smallest tag still spans two pixels.
 REDUCED = 4
-#: Least difference of ink and paper in the reduced image, [grey levels] and in units of its noise.
+#: Minimum contrast of ink and paper in the reduced image, [grey levels] and relative to noise.
 LEAST_CONTRAST, LEAST_SIGNAL = 6.0, 8.0
-#: Every so many rows of it show its noise.
+#: Row step for the noise estimate.
 NOISE_ROWS = 8
-#: Side of the surroundings in which they differ, [px of the reduced image].
+#: Side of the neighbourhood for the contrast, [px of the reduced image].
 NEIGHBOURS = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """One way to make dark squares stand out.
+    """Preprocessing for one search for dark squares.
 
     Attributes:
-        scale: How much the image is enlarged.
-        smoothing: Standard deviation of the smoothing before, [px].
-        step: How much darker than its surroundings ink is, [grey levels].
-        windows: Sides of the surroundings: smallest, largest, step, [px of the enlarged image].
+        scale: Upscaling factor of the image.
+        smoothing: Standard deviation of prior Gaussian smoothing, [px].
+        step: Threshold of ink below the mean of its surroundings, [grey levels].
+        windows: Sides of the surroundings: smallest, largest, step, [px of the upscaled image].
     """
 
     scale: int
@@ -51,7 +51,7 @@ class Pass:
     windows: tuple[int, int, int]
 
 
-#: Small ones; faint and noisy ones; blurred ones.
+#: For small tags; for faint and noisy ones; for blurred ones.
 PASSES = (
     Pass(1, 0.0, 2.0, (3, 23, 10)),
     Pass(2, 0.8, 2.0, (7, 47, 20)),
@@ -64,63 +64,63 @@ def squares_in(image: Image, family: str) -> list[Array]:
 
     Args:
         image: Grey image.
-        family: Whose tags are looked for.
+        family: Of the tags searched for.
     """
     found: list[Array] = []
     if is_blank(image):
         return found
-    for way in PASSES:
-        if way.scale == 1 or image.size <= MOST_PIXELS:
-            found += _squares(image, family, way)
+    for search in PASSES:
+        if search.scale == 1 or image.size <= MOST_PIXELS:
+            found += _squares(image, family, search)
     return found
 
 
 def is_blank(image: Image) -> bool:
-    """Whether it shows nothing but slow changes of brightness and noise."""
+    """Whether an image shows only slow brightness changes and noise."""
     high, wide = (length // REDUCED for length in image.shape)
-    whole = image[: high * REDUCED, : wide * REDUCED]  # OpenCV is slow where it does not divide
+    whole = image[: high * REDUCED, : wide * REDUCED]  # OpenCV is slow for sizes that do not divide
     reduced = np.asarray(cv2.resize(whole, (wide, high), interpolation=cv2.INTER_AREA))
     square = np.ones((NEIGHBOURS, NEIGHBOURS), dtype=np.uint8)
     contrast = float(cv2.subtract(cv2.dilate(reduced, square), cv2.erode(reduced, square)).max())
     steps = np.abs(np.diff(reduced[::NOISE_ROWS].astype(np.int16), axis=1))
-    noise = float(np.median(steps)) / 0.954  # of a difference of two, each normally distributed
+    noise = float(np.median(steps)) / 0.954  # of differences of two normal errors
     return contrast < max(LEAST_CONTRAST, LEAST_SIGNAL * noise)
 
 
-def _squares(image: Image, family: str, way: Pass) -> list[Array]:
-    if way.smoothing > 0.0:
-        image = np.asarray(cv2.GaussianBlur(image, (0, 0), way.smoothing), dtype=np.uint8)
-    if way.scale > 1:
-        size = (image.shape[1] * way.scale, image.shape[0] * way.scale)
+def _squares(image: Image, family: str, search: Pass) -> list[Array]:
+    if search.smoothing > 0.0:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), search.smoothing), dtype=np.uint8)
+    if search.scale > 1:
+        size = (image.shape[1] * search.scale, image.shape[0] * search.scale)
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-    parameters.adaptiveThreshConstant = way.step
-    parameters.adaptiveThreshWinSizeMin = way.windows[0]
-    parameters.adaptiveThreshWinSizeMax = way.windows[1]
-    parameters.adaptiveThreshWinSizeStep = way.windows[2]
-    parameters.minMarkerPerimeterRate = LEAST_SQUARE_PERIMETER * way.scale / max(image.shape)
+    parameters.adaptiveThreshConstant = search.step
+    parameters.adaptiveThreshWinSizeMin = search.windows[0]
+    parameters.adaptiveThreshWinSizeMax = search.windows[1]
+    parameters.adaptiveThreshWinSizeStep = search.windows[2]
+    parameters.minMarkerPerimeterRate = LEAST_SQUARE_PERIMETER * search.scale / max(image.shape)
     parameters.minOtsuStdDev = 1.0
     detector = cv2.aruco.ArucoDetector(dictionary(family), parameters)
     read, _, unread = detector.detectMarkers(image)
     squares = [np.asarray(s, dtype=np.float64).reshape(4, 2) for s in (*read, *unread)]
-    return [(square + 0.5) / way.scale - 0.5 for square in squares]
+    return [(square + 0.5) / search.scale - 0.5 for square in squares]
 
 
-#: Shortest outline of a tag that is looked for, [px].
+#: Smallest perimeter of a tag in standard detection, [px].
 LEAST_PERIMETER = 44.0
-#: Smallest side of a region that is searched, [px].
+#: Smallest side of a search region, [px].
 LEAST_SIDE = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detection:
-    """A tag that was seen.
+    """A detected tag.
 
     Attributes:
         id: Its number.
-        corners: Roughly, in the order of `tracking.detection.tags.CORNER_SIGNS`, shape (4, 2),
-            [px].
+        corners: Approximate, in the order of `tracking.detection.tags.CORNER_SIGNS`, shape
+            (4, 2), [px].
     """
 
     id: int
@@ -128,16 +128,16 @@ class Detection:
 
 
 class TagDetector:
-    """Finds the tags of one family with OpenCV, without its corner refinement.
+    """Detects the tags of one family with OpenCV, without its corner refinement.
 
     OpenCV's refinements are off by 0.26 px and more (sub-pixel) or biased by 0.45 px (AprilTag);
-    `tracking.edges.refine` does it instead.
+    `tracking.edges.refine` replaces them.
 
     Args:
         family: Such as ``tag36h11``.
 
     Raises:
-        BadInput: The family is not known.
+        BadInput: The family is unknown.
     """
 
     def __init__(self, family: str) -> None:
@@ -148,22 +148,22 @@ class TagDetector:
         self._detector = cv2.aruco.ArucoDetector(dictionary(family), parameters)
 
     def detect(
-        self, image: Image, region: Region | None = None, *, thorough: bool = False
+        self, image: Image, region: Region | None = None, *, exhaustive: bool = False
     ) -> list[Detection]:
         """Tags in the image or in a region of it, each number once (the largest).
 
         Args:
             image: Grey image.
-            region: Where to look; everywhere when left out.
-            thorough: Also finds small, faint and blurred tags, in about ten times the time.
+            region: Search region; the whole image when left out.
+            exhaustive: Also find small, faint and blurred tags, in about ten times the time.
         """
-        largest = {d.id: d for d in self.detect_all(image, region, thorough=thorough)}
+        largest = {d.id: d for d in self.detect_all(image, region, exhaustive=exhaustive)}
         return list(largest.values())
 
     def detect_all(
-        self, image: Image, region: Region | None = None, *, thorough: bool = False
+        self, image: Image, region: Region | None = None, *, exhaustive: bool = False
     ) -> list[Detection]:
-        """As `detect`, but every tag of a number that is seen more than once, the largest last."""
+        """As `detect`, but with all tags of a number detected more than once, largest last."""
         origin = np.zeros(2)
         if region is not None:
             image = image[region.top : region.bottom, region.left : region.right]
@@ -171,18 +171,18 @@ class TagDetector:
             if min(image.shape) < LEAST_SIDE:
                 return []
         image = np.ascontiguousarray(image)
-        found = self._plainly(image)
-        if thorough:
-            found += self._thoroughly(image, found)
+        found = self._standard(image)
+        if exhaustive:
+            found += self._exhaustive(image, found)
         return _sorted([Detection(d.id, read_only(d.corners + origin)) for d in found])
 
-    def look_again(self, image: Image, known: Sequence[Detection]) -> list[Detection]:
-        """As a thorough `detect_all` of an image in which a plain one found ``known``."""
+    def detect_exhaustively(self, image: Image, known: Sequence[Detection]) -> list[Detection]:
+        """Extends a standard `detect_all`, which found ``known``, to an exhaustive one."""
         image = np.ascontiguousarray(image)
-        return _sorted([*known, *self._thoroughly(image, known)])
+        return _sorted([*known, *self._exhaustive(image, known)])
 
-    def _plainly(self, image: Image) -> list[Detection]:
-        # OpenCV counts this limit in shares of the image: in a small region noise would pass it.
+    def _standard(self, image: Image) -> list[Detection]:
+        # OpenCV's limit is relative to the image size: in a small region noise would pass it.
         self._parameters.minMarkerPerimeterRate = LEAST_PERIMETER / max(image.shape)
         self._detector.setDetectorParameters(self._parameters)
         corners, numbers, _ = self._detector.detectMarkers(image)
@@ -194,8 +194,8 @@ class TagDetector:
             for number, square in zip(np.ravel(numbers), squares, strict=True)
         ]
 
-    def _thoroughly(self, image: Image, known: Sequence[Detection]) -> list[Detection]:
-        """Further tags, of squares that OpenCV does not find or cannot read."""
+    def _exhaustive(self, image: Image, known: Sequence[Detection]) -> list[Detection]:
+        """Further tags, in squares that OpenCV does not find or cannot decode."""
         readings = [self._decoder.read(image, square) for square in squares_in(image, self.family)]
         better = sorted((r for r in readings if r is not None), key=lambda r: -r.correlation)
         return _new((Detection(r.id, r.corners) for r in better), known)
@@ -206,7 +206,7 @@ class TagDetector:
 
 
 def _new(found: Iterable[Detection], known: Sequence[Detection]) -> list[Detection]:
-    """Those that lie on none of the known ones, nor on one before them."""
+    """Detections that overlap neither known ones nor each other."""
     new: list[Detection] = []
     for one in found:
         if not any(_overlap(one.corners, other.corners) for other in (*known, *new)):
@@ -219,7 +219,7 @@ def _sorted(found: list[Detection]) -> list[Detection]:
 
 
 def _overlap(a: Array, b: Array) -> bool:
-    """Whether the middle of one square lies in the other."""
+    """Whether the centre of one square is inside the other."""
     return any(
         cv2.pointPolygonTest(one.astype(np.float32), other.mean(axis=0).tolist(), False) >= 0
         for one, other in ((a, b), (b, a))
@@ -232,18 +232,18 @@ def _area(corners: Array) -> float:
     return abs(float(x[0] * y[1] - x[1] * y[0])) / 2.0
 
 
-# Where things of known place in the world lie in a camera's image: frame tags, the platform.
+# Expected positions in the image: frame tags, the platform.
 
 
-#: Nearer to the camera's plane nothing is seen, [m].
+#: Smallest visible distance from the camera's plane, [m].
 NEAREST = 0.02
 
 
 def region_around(camera: Camera, points: Array, slack: float) -> Region | None:
-    """The pixels around points of the world, or None out of view.
+    """The region around world points, or None if out of view.
 
     Args:
-        camera: Whose pixels they are.
+        camera: The camera.
         points: World frame, shape (n, 3), [m].
         slack: Border on each side, as a share of the larger side.
     """
@@ -260,10 +260,10 @@ def region_around(camera: Camera, points: Array, slack: float) -> Region | None:
     return Region(left, top, right, bottom)
 
 
-def near_places(
+def detect_expected(
     camera: Camera, tags: Mapping[int, Tag], detector: TagDetector, image: Image
 ) -> list[Detection]:
-    """Frame tags that are seen near where they should be."""
+    """Detects frame tags near their expected positions."""
     found = []
     for tag in tags.values():
         region = region_around(camera, tag_corners(tag), slack=0.5)
@@ -272,10 +272,10 @@ def near_places(
     return found
 
 
-def nearest_to(
+def nearest_to_expected(
     camera: Camera, tags: Mapping[int, Tag], detections: Sequence[Detection]
 ) -> list[Detection]:
-    """Of each frame tag the detection nearest to its place: others are of another print."""
+    """The detection of each frame tag nearest to its expected position: others are other prints."""
     nearest: dict[int, tuple[float, Detection]] = {}
     for found in detections:
         pixels = _pixels(camera, tag_corners(tags[found.id])) if found.id in tags else None
@@ -288,23 +288,23 @@ def nearest_to(
 
 
 def _pixels(camera: Camera, points: Array) -> Array | None:
-    """Pixels of points of the world, None when one is not in front of the camera."""
+    """Pixels of world points, or None if one is not in front of the camera."""
     in_camera = camera.world_from_camera.inverse().apply(points)
     return None if np.any(in_camera[:, 2] < NEAREST) else pixels_of(camera, in_camera)
 
 
-# The detector of tags that a rig file names.
+# Detector by name.
 
 
 def make_detector(name: str, family: str) -> TagDetector:
-    """A detector by its name in rig files.
+    """The detector of a name in rig files.
 
     Args:
         name: One of `model.files.rig_file.DETECTORS`.
         family: Such as ``tag36h11``.
 
     Raises:
-        BadInput: It is not known, not installed, or does not find the family.
+        BadInput: It is unknown, not installed, or does not support the family.
     """
     if name not in DETECTORS:
         raise BadInput(
@@ -315,7 +315,7 @@ def make_detector(name: str, family: str) -> TagDetector:
     return TagDetector(family)
 
 
-# Finding tags with pyapriltags, the AprilTag project's own detector (extra ``apriltag``).
+# Detection with pyapriltags, the AprilTag project's own detector (extra ``apriltag``).
 
 
 #: Its families among those of rig files.
@@ -323,9 +323,9 @@ FAMILIES = ("tag16h5", "tag25h9", "tag36h11")
 
 
 class AprilTagLibrary(TagDetector):
-    """As `TagDetector`, by pyapriltags: better at small and faint tags, some times slower.
+    """As `TagDetector`, with pyapriltags: better at small and faint tags, several times slower.
 
-    Plainly it looks at an image of half the size, thoroughly at the whole one.
+    Standard detection uses the image at half size, exhaustive detection at full size.
 
     Args:
         family: Such as ``tag36h11``.
@@ -354,10 +354,10 @@ class AprilTagLibrary(TagDetector):
         self._halved = Detector(families=family, nthreads=1, quad_decimate=2.0)
         self._full = Detector(families=family, nthreads=1, quad_decimate=1.0)
 
-    def _plainly(self, image: Image) -> list[Detection]:
+    def _standard(self, image: Image) -> list[Detection]:
         return _theirs(self._halved, image)
 
-    def _thoroughly(self, image: Image, known: Sequence[Detection]) -> list[Detection]:
+    def _exhaustive(self, image: Image, known: Sequence[Detection]) -> list[Detection]:
         return _new(_theirs(self._full, image), known)
 
 

@@ -1,4 +1,4 @@
-"""What is wrong with an image: other tags than expected, smear, sharpening, too much light."""
+"""Diagnosis of images: unexpected tags, motion blur, sharpening, overexposure."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ import numpy as np
 from model.files.camera_file import APRILTAG_FAMILIES
 from model.pose import Array
 from model.rig import Camera
-from tracking.camera_model import Image, pixels_from_ideal
+from tracking.camera_model import Image, distort_pixels
 from tracking.detection.detector import TagDetector
 from tracking.edges.refine import RefinedTag
 
-#: Families that identify a wrong one: of ArUco dictionaries of a size the largest holds the
-#: others. Those with 16 modules are left out: they are found by chance.
-TOLD = (*(f for f in APRILTAG_FAMILIES if f != "tag16h5"), "5X5_1000", "6X6_1000", "7X7_1000")
+#: Families that are tried to identify a wrong one. The largest ArUco dictionary of a size includes
+#: the others; families of 16 modules are left out, as they give false detections.
+DIAGNOSED = (*(f for f in APRILTAG_FAMILIES if f != "tag16h5"), "5X5_1000", "6X6_1000", "7X7_1000")
 
 
 def diagnose_tags(image: Image, family: str, expected: Sequence[int]) -> str:
-    """Says which tags an image shows that are not the expected ones, for an error message.
+    """Lists the unexpected tags in an image, for an error message.
 
-    Also whether the expected ones are there once it is flipped over.
+    Also states whether the expected ones appear mirrored.
     """
     seen = []
-    for other in (family, *(name for name in TOLD if not _same(name, family))):
+    for other in (family, *(name for name in DIAGNOSED if not _same(name, family))):
         wanted = set(expected) if other == family else set()
         numbers = [d.id for d in TagDetector(other).detect(image) if d.id not in wanted]
         if numbers:
             seen.append(f"{other} {', '.join(map(str, numbers))}")
-    told = "; ".join(seen) or "no tag of any known family"
+    text = "; ".join(seen) or "no tag of any known family"
     flipped = np.ascontiguousarray(image[:, ::-1])
     if any(d.id in expected for d in TagDetector(family).detect(flipped)):
-        told += "; the expected tags appear mirrored, so the images are mirrored"
-    return told
+        text += "; the expected tags appear mirrored, so the images are mirrored"
+    return text
 
 
-#: Wider edges are out of focus or smeared, [px].
+#: Wider edges are out of focus or blurred by motion, [px].
 SOFT = 4.5
 
 
@@ -53,38 +53,37 @@ def edge_width(image: Image) -> float:
     return float(high - low) / max(steepest, 1e-9)
 
 
-# What the edges of tags say of the image.
+# Image faults from the edges of tags.
 
 
-#: Places along an edge and distances from it at which brightness is read.
-_PLACES, _DISTANCES = 9, 4
-#: What sharpening adds lies between these distances from an edge, [px], and paper and ink alone
-#: between these shares of a module.
+#: Numbers of positions along an edge and of distances from it at which brightness is read.
+_POSITIONS, _DISTANCES = 9, 4
+#: Sharpening shows between these distances from an edge, [px]; plain paper and ink between these
+#: shares of a module.
 _NEAR, _FAR = (1.3, 2.6), (0.6, 0.85)
-#: Smaller modules leave no room for both, [px].
+#: Smaller modules have no room for both, [px].
 _LEAST_MODULE = 4.7
 #: Brighter pixels are clipped, [grey levels].
 _CLIPPED = 254.0
-#: Fewer edges do not show in which direction the image is smeared.
+#: Fewer edges do not show the direction of motion blur.
 _LEAST_EDGES = 6
-#: Shorter smears and smaller shares of overexposed edges are not worth a word, [px] and share;
-#: with larger shares of them no edge is left that shows where it is.
+#: Motion blur and share of overexposed edges from which they are reported, [px] and share; and the
+#: share above which no usable edge is left.
 LEAST_SMEAR, LEAST_CLIPPED, MOST_CLIPPED = 3.0, 0.3, 0.9
-#: Edges sharper than those of a pixel that is a perfect square, seen through a lens, [px], and
-#: brightness that goes beyond paper and ink by more than this share of the contrast, are a
-#: camera's doing. Black and white cut the rest off, and edges are not where they seem to be.
+#: Edges sharper than those of ideal pixels behind a lens, [px], and an overshoot above this share
+#: of the contrast mean that the camera sharpens. Clipping then shifts the edges.
 SHARP, OVERSHOOT = 0.385, 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeFaults:
-    """What is wrong with an image by the edges of its tags.
+    """Faults of an image, from the edges of its tags.
 
     Attributes:
-        smear: Length of a motion's smear, [px].
+        smear: Length of the motion blur, [px].
         spread: Median deviation of the blur across edges, [px].
-        overshoot: How far brightness goes beyond paper and ink beside edges, share of the contrast.
-        clipped: Share of the edges whose paper is as bright as a pixel can be.
+        overshoot: Overshoot of brightness beyond paper and ink, share of the contrast.
+        clipped: Share of edges with saturated paper.
     """
 
     smear: float
@@ -94,23 +93,23 @@ class EdgeFaults:
 
     @property
     def sharpened(self) -> bool:
-        """Whether the camera sharpened it until edges are not where they seem to be."""
+        """Whether the camera sharpened the image so much that edges are shifted."""
         return self.spread < SHARP and self.overshoot > OVERSHOOT
 
     @property
     def unusable(self) -> bool:
-        """Whether no interval of a pose by these edges can be trusted."""
+        """Whether pose intervals from these edges would be invalid."""
         return self.sharpened or self.clipped > MOST_CLIPPED
 
     def __str__(self) -> str:
-        """What is wrong and what to do, empty when nothing is."""
+        """The fault and its remedy; empty without a fault."""
         if self.sharpened:
             return (
                 f"the image is sharpened: edges overshoot by {self.overshoot:.0%} of the contrast;"
                 " switch off the camera's sharpening"
             )
         if self.smear > LEAST_SMEAR:
-            return f"the image is smeared by {self.smear:.0f} px: shorten the exposure"
+            return f"the image is blurred by {self.smear:.0f} px of motion: shorten the exposure"
         if self.clipped > LEAST_CLIPPED:
             return (
                 f"paper is overexposed at {self.clipped:.0%} of the edges: shorten the exposure, or"
@@ -122,15 +121,15 @@ class EdgeFaults:
 def edge_faults(
     image: Image, camera: Camera, squares: Sequence[RefinedTag], modules: int
 ) -> EdgeFaults:
-    """What is wrong with an image by the edges of tags.
+    """Diagnoses an image from the edges of its tags.
 
     Args:
         image: Grey.
-        camera: Whose image it is.
-        squares: The tags that were measured.
+        camera: The camera of the image.
+        squares: The measured tags.
         modules: Along the side of a tag's square.
     """
-    corners = pixels_from_ideal(camera, np.array([square.corners for square in squares]))
+    corners = distort_pixels(camera, np.array([square.corners for square in squares]))
     measured = np.array([square.edges for square in squares])
     starts, ends = corners[measured], np.roll(corners, -1, axis=1)[measured]
     along = ends - starts
@@ -144,7 +143,7 @@ def edge_faults(
 
 
 def _smear(normals: Array, spreads: Array) -> float:
-    """Length of a motion that blurs edges by their direction, [px].
+    """Length of the motion blur, from the blur of edges by direction, [px].
 
     A motion by b at an angle a to an edge's normal adds (b cos a)² / 12 to the blur's variance.
     """
@@ -159,12 +158,12 @@ def _smear(normals: Array, spreads: Array) -> float:
 def _beside_edges(
     image: Image, starts: Array, along: Array, outward: Array, widths: Array
 ) -> tuple[float, float]:
-    """Median overshoot, share of the contrast, and share of edges whose paper is clipped."""
+    """Median overshoot as a share of the contrast, and share of edges with clipped paper."""
     wide = widths >= _LEAST_MODULE
     if not wide.any():
         return 0.0, 0.0
     starts, along, outward, widths = (a[wide] for a in (starts, along, outward, widths))
-    share = np.linspace(0.2, 0.8, _PLACES)
+    share = np.linspace(0.2, 0.8, _POSITIONS)
     near = np.tile(np.linspace(*_NEAR, _DISTANCES), (len(widths), 1))
     far = np.linspace(*_FAR, _DISTANCES) * widths[:, None]
     away = np.concatenate([-far, -near, near, far], axis=1)
@@ -176,12 +175,12 @@ def _beside_edges(
     column = np.ascontiguousarray(points[..., 0]).reshape(len(points), -1)
     row = np.ascontiguousarray(points[..., 1]).reshape(len(points), -1)
     read = cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    lines = read.reshape(len(points), _PLACES, 4, _DISTANCES).mean(axis=3)
-    ink, dark, bright, paper = np.median(lines, axis=1).T  # blind to cables across an edge
+    lines = read.reshape(len(points), _POSITIONS, 4, _DISTANCES).mean(axis=3)
+    ink, dark, bright, paper = np.median(lines, axis=1).T  # robust against cables across an edge
     overshoot = np.median((bright - paper + ink - dark) / np.maximum(paper - ink, 1.0))
     return float(overshoot), float(np.mean(paper >= _CLIPPED))
 
 
 def _same(name: str, family: str) -> bool:
-    """Whether two families share their tags: ArUco dictionaries of one size do."""
+    """Whether two families share their tags, as ArUco dictionaries of one size do."""
     return name == family or ("X" in name and name.split("_")[0] == family.split("_")[0])

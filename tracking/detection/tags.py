@@ -1,12 +1,12 @@
-"""Tag families: their images, the corners of a tag, and which tag a square in an image shows.
+"""Tag families: their patterns, the corners of a tag, and decoding of squares in an image.
 
-OpenCV draws every AprilTag family turned by 180° against the images of the AprilTag project,
+OpenCV draws every AprilTag family rotated by 180° relative to the images of the AprilTag project,
 which labs print; ArUco markers are printed as OpenCV draws them. A tag's frame here is that of the
 printed image: x right, y up, z out of it.
 
-A tag is read by correlation of its brightness with all patterns. Unlike a decision module by module
-this reads tags whose modules run into each other: seen from far, out of focus, in motion, or with
-little contrast.
+A tag is decoded by correlating its brightness with all patterns. Unlike thresholding module by
+module, this works for tags whose modules are blurred together: far away, out of focus, in motion,
+or with low contrast.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def dictionary(family: str) -> cv2.aruco.Dictionary:
     """OpenCV's dictionary of a family.
 
     Raises:
-        BadInput: The family is not known.
+        BadInput: The family is unknown.
     """
     if family not in FAMILIES:
         raise BadInput(
@@ -66,23 +66,23 @@ def tag_corners(tag: Tag) -> Array:
     return tag.pose.apply(flat)
 
 
-# Which tag a square shows, by correlation of its brightness with all patterns.
+# Decoding by correlation with all patterns.
 
 
-#: Correlation with its pattern that a tag of 36 modules and more must reach. Patterns of a family
-#: correlate by about 0.4, and a square of anything with the best of them by 0.7 one time in a
-#: hundred. Fewer modules match by chance more often, so they must fit better.
+#: Minimum correlation of a tag of 36 or more modules with its pattern. Patterns of a family
+#: correlate by about 0.4, and an arbitrary square with the best of them by 0.7 in 1 % of cases.
+#: Fewer modules match by chance more often, so they need a higher correlation.
 LEAST_CORRELATION = 0.78
 LEAST_MODULES = 36
-#: By how much the second best number must be behind.
+#: Minimum lead over the second-best number.
 MARGIN = 0.1
-#: Share of the contrast inside a tag that its black border must have against the white around it.
+#: Minimum contrast of the black border to the white around it, relative to that inside a tag.
 BORDER_CONTRAST = 0.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """The tag that a square shows.
+    """The tag decoded in a square.
 
     Attributes:
         id: Its number.
@@ -96,30 +96,30 @@ class Reading:
 
 
 class TagDecoder:
-    """Knows all patterns of a family.
+    """Decoder with all patterns of a family.
 
     Args:
         family: Such as ``tag36h11``.
 
     Raises:
-        BadInput: The family is not known.
+        BadInput: The family is unknown.
     """
 
     def __init__(self, family: str) -> None:
         self._side = modules_across(family)
         inner = [official_modules(family, n)[1:-1, 1:-1] for n in range(tags_in(family))]
         patterns = np.array(inner, dtype=np.float64)
-        turned = [np.rot90(patterns, k, axes=(1, 2)).reshape(len(inner), -1) for k in range(4)]
-        self._book = _normalised(np.stack(turned, axis=1))  # (n, 4, modules)
+        rotated = [np.rot90(patterns, k, axes=(1, 2)).reshape(len(inner), -1) for k in range(4)]
+        self._book = _normalised(np.stack(rotated, axis=1))  # (n, 4, modules)
         modules = self._book.shape[-1]
         self.least = 1.0 - (1.0 - LEAST_CORRELATION) * min(1.0, modules / LEAST_MODULES)
 
     def read(self, image: Image, square: Array) -> Reading | None:
-        """The tag in a square, or None when it shows none for sure.
+        """Decodes the tag in a square; None if it is not certain.
 
         Args:
             image: Grey image.
-            square: Corners clockwise on the screen from any, shape (4, 2), [px].
+            square: Corners clockwise on the screen, from any, shape (4, 2), [px].
         """
         values = module_brightness(image, square, self._side, around=1)
         inner = values[2:-2, 2:-2].ravel()
@@ -133,18 +133,18 @@ class TagDecoder:
         found = float(scores.flat[best])
         if found < self.least or found - second < MARGIN:
             return None
-        # The pattern turned counter-clockwise by k quarters fits, so its top left is corner -k.
+        # The pattern rotated counter-clockwise by k quarters fits, so its top left is corner -k.
         return Reading(number, np.roll(square, turns, axis=0), found)
 
 
 def module_brightness(image: Image, square: Array, modules: int, around: int = 0) -> Array:
-    """Brightness in the middle of every module of a square.
+    """Brightness at the centre of every module of a square.
 
     Args:
         image: Grey image.
         square: Corners, the first at the upper left of the result, shape (4, 2), [px].
         modules: Along the side of the square.
-        around: Rings of modules outside the square that are read too.
+        around: Rings of modules outside the square to include.
 
     Returns:
         Shape (modules + 2 around, modules + 2 around).
@@ -154,14 +154,14 @@ def module_brightness(image: Image, square: Array, modules: int, around: int = 0
     middle = np.arange(-around, modules + around) + 0.5
     grid = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 1, 2)
     side = modules + 2 * around
-    places = cv2.perspectiveTransform(grid, turn).astype(np.float32).reshape(side, side, 2)
-    column, row = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
+    points = cv2.perspectiveTransform(grid, turn).astype(np.float32).reshape(side, side, 2)
+    column, row = np.ascontiguousarray(points[..., 0]), np.ascontiguousarray(points[..., 1])
     values = cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float64)
 
 
 def _has_border(values: Array, inner: Array) -> bool:
-    """Whether the square is dark all around and bright outside, as a tag is."""
+    """Whether the square has a dark border with white around it."""
     ring = np.concatenate([values[1, 1:-1], values[-2, 1:-1], values[2:-2, 1], values[2:-2, -2]])
     outside = np.concatenate([values[0, 1:-1], values[-1, 1:-1], values[1:-1, 0], values[1:-1, -1]])
     contrast = float(inner.max() - inner.min())
@@ -171,21 +171,21 @@ def _has_border(values: Array, inner: Array) -> bool:
 
 
 def _normalised(values: Array) -> Array:
-    """Of mean 0 and length 1 along the last axis."""
+    """Normalised to mean 0 and length 1 along the last axis."""
     centred = values - values.mean(axis=-1, keepdims=True)
     length = np.linalg.norm(centred, axis=-1, keepdims=True)
     return np.asarray(centred / np.maximum(length, 1e-12))
 
 
-# Whether a square in the image carries a given tag's pattern.
+# Verification of a known tag's pattern in a square.
 
 
-#: Least correlation of brightness and pattern; another tag's pattern reaches about 0.5.
+#: Minimum correlation of brightness and pattern; another tag's pattern reaches about 0.5.
 LEAST_KNOWN_CORRELATION = 0.75
 
 
 def carries_tag(image: Image, corners: Array, family: str, number: int) -> bool:
-    """Compares the inner modules of a square with a tag's.
+    """Whether the inner modules of a square match a tag's.
 
     Args:
         image: Grey image.

@@ -1,1 +1,1 @@
-"""Compiled passes over the pixels beside the edges of tags."""
+"""Compiled fits to the pixels beside the edges of tags."""

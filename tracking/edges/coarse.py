@@ -1,7 +1,7 @@
-"""Edges to a few tenths of a pixel: a robust line through where profiles rise most.
+"""Edges to a few tenths of a pixel: a robust line through the steepest points of profiles.
 
-White modules inside the border and cables in the white around it do not move the steepest place, as
-they would move a fit that starts pixels away from the edge.
+White modules inside the border and cables across the white around it do not move the steepest
+point, but would disturb a fit that starts pixels away from the edge.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from tracking.edges.sampling import (
 )
 
 PROFILES, TAPS = 16, 17
-#: Least rise over two taps that counts, [grey levels].
+#: Smallest usable rise over two taps, [grey levels].
 LEAST_RISE = 1.25
 
 
 @compiled
 def locate_edges(image: Image, quads: Array, bows: Array, widths: Array, found: Array) -> None:
-    """Finds the edges of tags.
+    """Locates the edges of tags.
 
     Args:
         image: Grey.
         quads: Corners, shape (t, 4, 2), [px].
         bows: Of the edges, shape (t, 4, 2), [px].
         widths: Of a module across each edge, shape (t, 4), [px].
-        found: Is written, shape (t, 4, `COLUMNS`); a share of 0 where there is no edge.
+        found: Written, shape (t, 4, `COLUMNS`); a share of 0 where there is no edge.
     """
     for tag in range(len(quads)):
         for edge in range(4):
@@ -55,14 +55,14 @@ def _find(image: Image, quad: Array, edge: int, shape: Array, width: float, foun
     x0, y0, ax, ay, length = edge_frame(quad, edge)
     half = min(max(0.95 * width, 1.5), 6.0)
     margin = min(2.0 + half, 0.3 * length)
-    middle, way = 0.5 * length, 0.5 * length - margin
-    places, offsets, slopes = np.empty(PROFILES), np.empty(PROFILES), np.empty(PROFILES)
+    middle, reach = 0.5 * length, 0.5 * length - margin
+    positions, offsets, slopes = np.empty(PROFILES), np.empty(PROFILES), np.empty(PROFILES)
     contrasts, values = np.empty(PROFILES), np.empty(TAPS)
     step = 2.0 * half / TAPS
     for n in range(PROFILES):
-        places[n] = (2.0 * n + 1.0) / PROFILES - 1.0
-        s = middle + places[n] * way
-        # The shift spreads the taps of an edge along the grid over its pixels.
+        positions[n] = (2.0 * n + 1.0) / PROFILES - 1.0
+        s = middle + positions[n] * reach
+        # The shift distributes the taps of an edge along the grid over its pixels.
         first = bow(shape, s / length) - half + step * ((n * 0.381966) % 1.0)
         for k in range(TAPS):
             u = first + k * step
@@ -75,29 +75,29 @@ def _find(image: Image, quad: Array, edge: int, shape: Array, width: float, foun
     for n in range(PROFILES):
         good = slopes[n] > 0.4 * usual and slopes[n] > LEAST_RISE
         weights[n] = 1.0 if good else 0.0
-    found[MIDDLE], found[HALF], found[BOXED] = middle, way, 0.5
-    # A bell rises by its whole step over 2.5 deviations, at its steepest; reading between pixels
-    # and over two taps blurs, too.
+    found[MIDDLE], found[HALF], found[BOXED] = middle, reach, 0.5
+    # A Gaussian blur rises by the whole step over 2.5 deviations at its steepest slope; reading
+    # between pixels and over two taps blurs, too.
     spread = contrast / max(usual, 1.0) * 2.0 * step / 2.5
     found[SPREAD] = math.sqrt(max(spread * spread - step * step / 3.0 - 1.0 / 6.0, 0.1))
-    _fit_line(places, offsets, weights, found)
+    _fit_line(positions, offsets, weights, found)
 
 
 @compiled
 def _steepest(values: Array) -> tuple[float, float, float]:
-    """Rise over two taps where it is steepest, that place in taps, and the whole contrast."""
+    """Largest rise over two taps, its position in taps, and the whole contrast."""
     low = high = values[0]
-    best, place = -1e9, 0.0
+    best, position = -1e9, 0.0
     for k in range(TAPS):
         low, high = min(low, values[k]), max(high, values[k])
         if k >= 2 and values[k] - values[k - 2] > best:
-            best, place = values[k] - values[k - 2], k - 1.0
-    return best, place, high - low
+            best, position = values[k] - values[k - 2], k - 1.0
+    return best, position, high - low
 
 
 @compiled
 def _brightness(image: Image, x: float, y: float) -> float:
-    """Between the pixels, bilinear."""
+    """Brightness between pixels, bilinear."""
     height, width = image.shape
     x, y = min(max(x, 0.0), width - 1.001), min(max(y, 0.0), height - 1.001)
     column, row = int(x), int(y)
@@ -108,8 +108,8 @@ def _brightness(image: Image, x: float, y: float) -> float:
 
 
 @compiled
-def _fit_line(places: Array, offsets: Array, good: Array, found: Array) -> None:
-    """A line through the good points, blind to those that do not lie on it."""
+def _fit_line(positions: Array, offsets: Array, good: Array, found: Array) -> None:
+    """Robust line fit to the good points (Tukey's weights)."""
     weights, errors = good.copy(), np.empty(PROFILES)
     sizes = np.empty(PROFILES)
     height = slope = mean = square = total = 0.0
@@ -117,18 +117,18 @@ def _fit_line(places: Array, offsets: Array, good: Array, found: Array) -> None:
         total = mean = height = square = slope = 0.0
         for n in range(PROFILES):
             total += weights[n]
-            mean += weights[n] * places[n]
+            mean += weights[n] * positions[n]
             height += weights[n] * offsets[n]
         total = max(total, 1e-9)
         mean, height = mean / total, height / total
         for n in range(PROFILES):
-            square += weights[n] * (places[n] - mean) ** 2
-            slope += weights[n] * (places[n] - mean) * offsets[n]
+            square += weights[n] * (positions[n] - mean) ** 2
+            slope += weights[n] * (positions[n] - mean) * offsets[n]
         square = max(square, 1e-9)
         slope /= square
         count = 0
         for n in range(PROFILES):
-            errors[n] = offsets[n] - height - slope * (places[n] - mean)
+            errors[n] = offsets[n] - height - slope * (positions[n] - mean)
             if good[n] > 0.0:
                 sizes[count] = abs(errors[n])
                 count += 1

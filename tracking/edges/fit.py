@@ -1,7 +1,7 @@
-"""Edges to thousandths of a pixel: the blurred step that fits the pixels beside each best.
+"""Edges to thousandths of a pixel: the best fit of a blurred step to the pixels near each edge.
 
-Levenberg and Marquardt's steps, over parts of an edge: a part in which a cable or a smudge crosses
-the edge fits much worse than the usual one and counts no more.
+Levenberg–Marquardt over parts of an edge: a part crossed by a cable or a smudge fits much worse
+than the others and is rejected.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from model.pose import Array
 from tracking.camera_model import Image
 from tracking.edges.sampling import (
     ACROSS,
-    ALIKE,
     BEYOND_PAPER,
     BOXED,
     BRIGHT,
@@ -25,6 +24,7 @@ from tracking.edges.sampling import (
     DARK_SLOPE,
     HALF,
     HIDDEN,
+    INFLATION,
     INK,
     INNER,
     MIDDLE,
@@ -41,14 +41,14 @@ from tracking.edges.sampling import (
     edge_frame,
     plane_of,
     sample_edge,
-    tell_ink,
-    tell_modules,
+    write_ink,
+    write_modules,
 )
 
 
 @compiled
 def ranked(values: Array, count: int, rank: int) -> float:
-    """The value that would stand at ``rank`` if the first ``count`` were sorted; reorders them."""
+    """The value of a rank among the first ``count`` (quickselect); reorders them."""
     low, high = 0, count - 1
     while low < high:
         pivot = values[(low + high) // 2]
@@ -71,15 +71,15 @@ def ranked(values: Array, count: int, rank: int) -> float:
     return float(values[rank])
 
 
-# Parts of an edge: a cable or a smudge that crosses it spoils some of them and not the others.
+# Parts of an edge: a cable or a smudge across it spoils only some of them.
 
-#: Parts that fit this much worse than the usual one (in squares) do not count.
+#: Parts whose mean square exceeds the typical one by this factor are rejected.
 FOREIGN = 9.0
 
 
 @compiled
 def weigh(squares: Array, counts: Array, allowed: float, weights: Array) -> None:
-    """Writes weights of parts: 0 for those that fit far worse than two thirds of them do."""
+    """Writes weights of parts: 0 for those that fit far worse than most."""
     parts = len(weights)
     means = np.empty(parts)
     for k in range(parts):
@@ -100,7 +100,7 @@ def weighted_sum(
     normal: Array,
     gradient: Array,
 ) -> tuple[float, float]:
-    """Writes the weighted sums over the parts; returns those of pixels and of squared errors."""
+    """Writes the weighted sums over the parts; returns those of pixels and of squares."""
     size = len(gradient)
     normal[:, :] = 0.0
     gradient[:] = 0.0
@@ -121,7 +121,7 @@ def weighted_sum(
 
 @compiled
 def factored(matrix: Array, size: int) -> bool:
-    """Cholesky's factor of a matrix, in place of its lower half; False if it is not positive."""
+    """Cholesky factorization in place, lower half; False if not positive definite."""
     for i in range(size):
         for j in range(i + 1):
             rest = matrix[i, j]
@@ -138,7 +138,7 @@ def factored(matrix: Array, size: int) -> bool:
 
 @compiled
 def solved(factor: Array, vector: Array, size: int) -> None:
-    """Solves with a factor, in place of the right-hand side."""
+    """Solves with a Cholesky factor, in place of the right-hand side."""
     for i in range(size):
         for k in range(i):
             vector[i] -= factor[i, k] * vector[k]
@@ -149,14 +149,14 @@ def solved(factor: Array, vector: Array, size: int) -> None:
         vector[i] /= factor[i, i]
 
 
-# What is known of an edge before a pixel is seen; it settles what the pixels leave open.
+# Prior of an edge, for what the pixels do not determine.
 
-#: The blur's kind and how far from it blurs are.
+#: Mean and deviation of the blur's shape.
 KIND, KIND_DEVIATION = 0.5, 0.3
-#: How far the spread of the blur is from what was found before, as a share of it.
+#: Relative deviation of the blur's spread from the earlier estimate.
 SPREAD_DEVIATION = 0.5
-#: How far brightness changes from the middle of an edge to its end, how white modules inside are
-#: and what lies beyond the paper is less white than it, as shares of the contrast.
+#: Deviations of the brightness change from the middle to the end of an edge, of the whiteness of
+#: modules inside (and its mean), and of the surroundings, as shares of the contrast.
 SLOPE_DEVIATION = 0.3
 MODULE, MODULE_DEVIATION = 0.4, 0.5
 BEYOND_DEVIATION = 0.25
@@ -166,7 +166,7 @@ BEYOND_DEVIATION = 0.25
 def add_prior(
     parameters: Array, usual_spread: float, variance: float, normal: Array, gradient: Array
 ) -> float:
-    """Adds what is known before a pixel is seen; returns its share of the cost."""
+    """Adds the prior; returns its share of the cost."""
     contrast = max(parameters[BRIGHT] - parameters[DARK], 1.0)
     spread_deviation = SPREAD_DEVIATION * usual_spread
     cost = _expect(SPREAD, usual_spread, spread_deviation, parameters, variance, normal, gradient)
@@ -195,7 +195,7 @@ def _expect(
     normal: Array,
     gradient: Array,
 ) -> float:
-    """Adds that a parameter is ``usual``, give or take a deviation."""
+    """Adds a normal prior of a parameter."""
     weight = variance / (deviation * deviation)
     error = usual - parameters[k]
     normal[k, k] += weight
@@ -203,22 +203,22 @@ def _expect(
     return float(weight * error * error)
 
 
-#: Pixels are read this far from an edge: deviations of its blur plus a number of pixels, but not
-#: beyond this share of a module.
+#: Pixels are read up to this distance from an edge: deviations of its blur plus pixels, but at
+#: most this share of a module.
 REACH_SPREADS, REACH, REACH_MODULES = 2.2, 1.5, 0.95
-#: And so far from its corners: pixels, and deviations of the neighbouring edges' blur.
+#: Distance kept from its corners: pixels, and deviations of the neighbouring edges' blur.
 CLEAR, CLEAR_SPREADS = 0.5, 1.5
-#: An edge is crowded when the next module is this many deviations of the blur from what is read.
+#: An edge is crowded if the next module is within this many deviations of the pixels read.
 CROWDED = 2.6
-#: Most pixels that are read beside an edge.
+#: Maximum number of pixels read per edge.
 MOST_PIXELS = 6000
-#: Length of a part of an edge [px], and how many parts there are at most.
+#: Length of a part of an edge, [px], and maximum number of parts.
 PART, MOST_PARTS = 2.0, 64
-#: What the model leaves undescribed, as a share of the contrast, and what rounding to whole grey
-#: levels leaves, [grey levels²].
-UNTOLD, ROUNDING = 0.02, 1.0 / 12.0
+#: Model error as a share of the contrast, and variance of rounding to grey levels,
+#: [grey levels²].
+UNMODELLED, ROUNDING = 0.02, 1.0 / 12.0
 MOST_STEPS = 14
-#: A pixel alone blurs by about this, [px].
+#: Blur of an ideal pixel, approximately, [px].
 LEAST_SPREAD = 0.25
 #: Smallest step of brightness that counts as an edge, [grey levels].
 LEAST_CONTRAST = 3.0
@@ -244,8 +244,8 @@ def fit_edges(
         bows: Of the edges, shape (t, 4, 2), [px].
         widths: Of a module across each edge, shape (t, 4), [px].
         modules: Along the side of a tag's square.
-        before: What is known of the edges, shape (t, 4, `COLUMNS`); only their blur is used.
-        found: Is written, shape (t, 4, `COLUMNS`); a share of 0 where there is no edge.
+        before: Earlier estimate of the edges, shape (t, 4, `COLUMNS`); only their blur is used.
+        found: Written, shape (t, 4, `COLUMNS`); a share of 0 where there is no edge.
     """
     for tag in range(len(quads)):
         for edge in range(4):
@@ -283,11 +283,11 @@ def _fit(
     crowded = width - reach < CROWDED * spread
     pixels = np.zeros((MODULES + (modules - 2 if crowded else 0), room))
     count = sample_edge(image, quad, edge, shape, span, reach, pixels)
-    tell_ink(quad, edge, pixels, count, found, spread_along)
+    write_ink(quad, edge, pixels, count, found, spread_along)
     if crowded:
         plane = np.empty(8)
         plane_of(quad, edge, plane)
-        tell_modules(quad, edge, plane, modules, pixels, count, found, spread_along)
+        write_modules(quad, edge, plane, modules, pixels, count, found, spread_along)
     parameters = np.zeros(INNER + modules - 2 if crowded else BEYOND_PAPER)
     if _begin(pixels, count, reach, found, parameters):
         _improve(pixels, count, parameters, 1.3 * width, found)
@@ -295,7 +295,7 @@ def _fit(
 
 @compiled
 def _span(quad: Array, edge: int, reach: float, clear: float) -> tuple[float, float]:
-    """The part of an edge beside which no pixel lies nearer than ``clear`` to a neighbour."""
+    """The part of an edge whose pixels are at least ``clear`` from the neighbouring edges."""
     _, _, ax, ay, length = edge_frame(quad, edge)
     _, _, bx, by, _ = edge_frame(quad, (edge + 3) % 4)
     _, _, cx, cy, _ = edge_frame(quad, (edge + 1) % 4)
@@ -307,7 +307,7 @@ def _span(quad: Array, edge: int, reach: float, clear: float) -> tuple[float, fl
 
 @compiled
 def _begin(pixels: Array, count: int, reach: float, found: Array, parameters: Array) -> bool:
-    """Writes the parameters to begin with; False if there is no step from ink to paper."""
+    """Writes the initial parameters; False if there is no step from ink to paper."""
     dark, bright = np.empty(count), np.empty(count)
     inside = outside = 0
     for n in range(count):
@@ -329,7 +329,7 @@ def _begin(pixels: Array, count: int, reach: float, found: Array, parameters: Ar
 
 @compiled
 def _improve(pixels: Array, count: int, best: Array, most_spread: float, found: Array) -> None:
-    """Improves the parameters as long as that helps, and writes what came out."""
+    """Refines the parameters until convergence and writes the result."""
     size, usual_spread = len(best), best[SPREAD]
     parts = min(max(4, int(2.0 * found[HALF] / PART)), MOST_PARTS)
     normals, gradients = np.empty((parts, size, size)), np.empty((parts, size))
@@ -341,9 +341,9 @@ def _improve(pixels: Array, count: int, best: Array, most_spread: float, found: 
     for turn in range(MOST_STEPS):
         compare(pixels, count, trial, normals, gradients, squares, counts)
         if turn < 3:
-            # Before the first steps all parts fit badly, and some by chance less so.
-            untold = UNTOLD * (4 >> turn) * (trial[BRIGHT] - trial[DARK])
-            weigh(squares, counts, ROUNDING + untold * untold, weights)
+            # Initially all parts fit badly, some less so by chance.
+            unmodelled = UNMODELLED * (4 >> turn) * (trial[BRIGHT] - trial[DARK])
+            weigh(squares, counts, ROUNDING + unmodelled * unmodelled, weights)
             best_cost = 1e300
         total, cost = weighted_sum(normals, gradients, squares, counts, weights, normal, gradient)
         if total < 14.0:
@@ -366,7 +366,7 @@ def _improve(pixels: Array, count: int, best: Array, most_spread: float, found: 
         solved(factor, step, size)
         share = min(1.0, 0.5 / max(abs(step[OFFSET]), 1e-9))
         trial[:] = best + share * step
-        # Too sharp a step sees no pixels, so it could not widen again.
+        # Too sharp a step is insensitive to pixels and could not widen again.
         trial[SPREAD] = max(trial[SPREAD], 0.6 * best[SPREAD], LEAST_SPREAD)
         trial[SPREAD] = min(trial[SPREAD], max(most_spread, 0.6))
         trial[BOXED] = min(max(trial[BOXED], -0.3), 1.3)
@@ -376,21 +376,21 @@ def _improve(pixels: Array, count: int, best: Array, most_spread: float, found: 
         _write(best, best_normal, best_variance, weights, gradients, found)
 
 
-#: Errors are taken to be alike over this many parts of an edge.
+#: Errors are assumed correlated over this many parts of an edge.
 LAGS = 3
-#: That errors are independent weighs as much as this many parts that show otherwise.
+#: Prior weight of independent errors, in parts.
 INDEPENDENT = 8.0
 
 
 @compiled
 def _correlated(column: Array, gradients: Array, weights: Array) -> float:
-    """A variance by what each part of the edge pulls, neighbouring parts together.
+    """Variance from the contribution of each part of an edge, with correlation between parts.
 
-    Errors that are alike in neighbouring parts (JPEG, enlarging, sharpening) are fewer independent
-    samples than there are pixels.
+    Errors correlated over neighbouring parts (JPEG, scaling, sharpening) are fewer independent
+    samples than pixels.
 
     Args:
-        column: Of the inverse of the normal matrix, times a factor; the result has its square.
+        column: Of the inverse normal matrix, times a factor; the result has its square.
         gradients: Of the parts, shape (b, p).
         weights: Of the parts, shape (b,).
 
@@ -413,7 +413,7 @@ def _correlated(column: Array, gradients: Array, weights: Array) -> float:
 def _write(
     best: Array, normal: Array, variance: float, weights: Array, gradients: Array, found: Array
 ) -> None:
-    """Writes the edge and how sure it is."""
+    """Writes the edge and its covariance."""
     size = len(best)
     column = np.empty(size)
     wider = 0.0
@@ -437,11 +437,11 @@ def _write(
     for weight in weights:
         used += 1 if weight > 0.1 else 0
     found[SHARE] = used / len(weights)
-    found[ALIKE] = 1.0
+    found[INFLATION] = 1.0
     if used > 2 * LAGS:
-        wider *= used / (used - LAGS - 1.0)  # the fit has taken off what all parts share
+        wider *= used / (used - LAGS - 1.0)  # the fit absorbs what all parts have in common
         wider = max(1.0, (INDEPENDENT + used * wider) / (INDEPENDENT + used))
         found[OFFSET_VARIANCE] *= wider
         found[COVARIANCE] *= wider
         found[TILT_VARIANCE] *= wider
-        found[ALIKE] = wider
+        found[INFLATION] = wider

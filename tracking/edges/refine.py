@@ -1,8 +1,8 @@
 """Tag corners to hundredths of a pixel: lines fitted to the four edges of the black square.
 
-A blurred step from ink to paper is fitted to the pixels beside each edge, freed of what its corners
-and the modules next to it add. Pixels show their noise themselves, so each line comes with what it
-may be off. The lines are freed of lens distortion and meet at the corners.
+A blurred step from ink to paper is fitted to the pixels near each edge, with the contributions of
+corners and adjacent modules. The residuals show the noise, so each line has a covariance. The lines
+are undistorted and intersect at the corners.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from model.pose import Array, read_only
 from model.rig import Camera
-from tracking.camera_model import Image, ideal_from_pixels, pixels_from_ideal
+from tracking.camera_model import Image, distort_pixels, undistort_pixels
 from tracking.edges.coarse import locate_edges
 from tracking.edges.fit import fit_edges
 from tracking.edges.sampling import (
-    ALIKE,
     COLUMNS,
     COVARIANCE,
     HALF,
     HIDDEN,
+    INFLATION,
     MIDDLE,
     OFFSET,
     OFFSET_VARIANCE,
@@ -32,12 +32,12 @@ from tracking.edges.sampling import (
     TILT_VARIANCE,
 )
 
-# Straight lines of edges, and where they meet.
+# Lines of edges and their intersections.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lines:
-    """Lines of edges in ideal pixels, four a tag."""
+    """Lines of edges in undistorted pixels, four per tag."""
 
     points: Array  # (e, 2) on the lines
     directions: Array  # (e, 2) unit
@@ -46,8 +46,8 @@ class Lines:
     good: NDArray[np.bool_]  # (e,)
 
 
-def meet(lines: Lines, rough: Array) -> Array:
-    """Corners where neighbouring good lines meet, else the rough ones; shape (t, 4, 2)."""
+def intersect(lines: Lines, rough: Array) -> Array:
+    """Intersections of neighbouring good lines, else the rough corners; shape (t, 4, 2)."""
     points, directions = lines.points.reshape(-1, 4, 2), lines.directions.reshape(-1, 4, 2)
     before_point, before = np.roll(points, 1, axis=1), np.roll(directions, 1, axis=1)
     cross = directions[..., 0] * before[..., 1] - directions[..., 1] * before[..., 0]
@@ -59,24 +59,23 @@ def meet(lines: Lines, rough: Array) -> Array:
     return np.where(good[..., None], points + share[..., None] * directions, rough)
 
 
-# Edges of tags as curves in the image, bent by the lens, and as lines in ideal pixels.
+# Edges of tags as curves in the distorted image, and as lines in undistorted pixels.
 
 
-#: An edge is used only if this share of it looks like one.
+#: Required share of an edge that fits the model.
 LEAST_SHARE = 0.4
-#: Where the brightness of pixels says so little that one pixel of its length places an edge no
-#: better than this, there is none, [px].
+#: An edge is rejected if one pixel of its length locates it worse than this, [px].
 MOST_SCATTER = 1.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeCurves:
-    """Where the edges of squares are looked for.
+    """Expected edges of squares in an image.
 
     Attributes:
-        camera: In whose image.
+        camera: Of the image.
         pixels: Corners, shape (t, 4, 2), [px], lens distortion included.
-        ideal: The same in ideal pixels.
+        undistorted: The same in undistorted pixels.
         lengths: Of the chords, shape (t, 4), [px].
         along: Unit directions of the chords, shape (t, 4, 2).
         bows: Shape (t, 4, 2): at a share f of its length a curve lies f (1 − f) (b₀ + f b₁) outside
@@ -85,7 +84,7 @@ class EdgeCurves:
 
     camera: Camera
     pixels: Array
-    ideal: Array
+    undistorted: Array
     lengths: Array
     along: Array
     bows: Array
@@ -93,14 +92,14 @@ class EdgeCurves:
     @classmethod
     def between(cls, camera: Camera, pixels: Array) -> EdgeCurves:
         """The edges between corners, shape (t, 4, 2), [px]."""
-        ideal = ideal_from_pixels(camera, pixels)
+        undistorted = undistort_pixels(camera, pixels)
         chords = np.roll(pixels, -1, axis=1) - pixels
         lengths = np.maximum(np.linalg.norm(chords, axis=2), 1e-6)
         along = chords / lengths[..., None]
         bows = np.zeros_like(pixels)
         if camera.distortion.size:
-            bows = _bows(camera, pixels, ideal, lengths, along)
-        return cls(camera, pixels, ideal, lengths, along, bows)
+            bows = _bows(camera, pixels, undistorted, lengths, along)
+        return cls(camera, pixels, undistorted, lengths, along, bows)
 
     @property
     def outward(self) -> Array:
@@ -113,45 +112,45 @@ class EdgeCurves:
         opposite = np.roll(middle, -2, axis=1) - middle
         return np.asarray(np.abs(np.sum(opposite * self.outward, axis=2)) / modules)
 
-    def lines(self, found: Array, doubt: Array) -> Lines:
-        """Straight lines in ideal pixels.
+    def lines(self, found: Array, model_error: Array) -> Lines:
+        """Fitted lines in undistorted pixels.
 
         Args:
-            found: What is known of each edge, shape (t, 4, `COLUMNS`).
-            doubt: What each edge may be off beside that, shape (t, 4), [px].
+            found: Columns of each edge, shape (t, 4, `COLUMNS`).
+            model_error: Further deviation of each edge, shape (t, 4), [px].
         """
-        # Where offset and tilt err independently.
+        # At the point where errors of offset and tilt are uncorrelated.
         tilt_variance = np.maximum(found[..., TILT_VARIANCE], 1e-12)
         centre = np.clip(-found[..., COVARIANCE] / tilt_variance, -1.0, 1.0)
         variance = found[..., OFFSET_VARIANCE] + centre * found[..., COVARIANCE]
         deviation = np.sqrt(np.maximum(variance, 0.0))
         ends = np.stack([self._points(found, np.full_like(centre, q)) for q in (-1.0, 1.0)])
         middle = self._points(found, centre)
-        points = ideal_from_pixels(self.camera, np.stack([*ends, middle, middle + self.outward]))
-        way = points[1] - points[0]
-        length = np.maximum(np.linalg.norm(way, axis=2), 1e-6)
-        ideal_pixel = np.linalg.norm(points[3] - points[2], axis=2)  # how long one pixel is there
+        points = undistort_pixels(self.camera, np.stack([*ends, middle, middle + self.outward]))
+        chord = points[1] - points[0]
+        length = np.maximum(np.linalg.norm(chord, axis=2), 1e-6)
+        scale = np.linalg.norm(points[3] - points[2], axis=2)  # length of one image pixel
         good = (found[..., SHARE] >= LEAST_SHARE) & (
             deviation * np.sqrt(2.0 * found[..., HALF]) < MOST_SCATTER
         )
-        more = np.hypot(deviation, doubt) / np.maximum(deviation, 1e-9)
-        tilt = np.sqrt(tilt_variance) * ideal_pixel / (length / 2.0)
+        more = np.hypot(deviation, model_error) / np.maximum(deviation, 1e-9)
+        tilt = np.sqrt(tilt_variance) * scale / (length / 2.0)
         return Lines(
             points=points[2].reshape(-1, 2),
-            directions=(way / length[..., None]).reshape(-1, 2),
-            offset_deviation=np.maximum(deviation * ideal_pixel * more, 1e-6).reshape(-1),
+            directions=(chord / length[..., None]).reshape(-1, 2),
+            offset_deviation=np.maximum(deviation * scale * more, 1e-6).reshape(-1),
             tilt_deviation=(tilt * more).reshape(-1),
             good=good.reshape(-1),
         )
 
-    def _points(self, found: Array, place: Array) -> Array:
-        """Points of the edges that were found, at q of `edge_kernels.columns`, [px]."""
-        way = found[..., MIDDLE] + place * found[..., HALF]
-        share = way / self.lengths
+    def _points(self, found: Array, q: Array) -> Array:
+        """Points of the fitted edges at q, see `tracking.edges.sampling`, [px]."""
+        distance = found[..., MIDDLE] + q * found[..., HALF]
+        share = distance / self.lengths
         aside = share * (1.0 - share) * (self.bows[..., 0] + share * self.bows[..., 1])
-        aside += found[..., OFFSET] + place * found[..., TILT]
+        aside += found[..., OFFSET] + q * found[..., TILT]
         return np.asarray(
-            self.pixels + way[..., None] * self.along + aside[..., None] * self.outward
+            self.pixels + distance[..., None] * self.along + aside[..., None] * self.outward
         )
 
 
@@ -159,11 +158,11 @@ def _outward(along: Array) -> Array:
     return np.stack([along[..., 1], -along[..., 0]], axis=-1)  # corners run clockwise on the screen
 
 
-def _bows(camera: Camera, pixels: Array, ideal: Array, lengths: Array, along: Array) -> Array:
-    """Through the images of two points of each straight edge."""
+def _bows(camera: Camera, pixels: Array, undistorted: Array, lengths: Array, along: Array) -> Array:
+    """Bows of the edges, through the images of two points of each."""
     share = np.array([1.0, 2.0])[:, None] / 3.0
-    way = np.roll(ideal, -1, axis=1) - ideal
-    inner = pixels_from_ideal(camera, ideal[:, :, None] + share * way[:, :, None])
+    chord = np.roll(undistorted, -1, axis=1) - undistorted
+    inner = distort_pixels(camera, undistorted[:, :, None] + share * chord[:, :, None])
     gap = inner - pixels[:, :, None]
     share = np.sum(gap * along[:, :, None], axis=3) / lengths[..., None]
     aside = np.sum(gap * _outward(along)[:, :, None], axis=3) / (share * (1.0 - share))
@@ -171,40 +170,39 @@ def _bows(camera: Camera, pixels: Array, ideal: Array, lengths: Array, along: Ar
     return np.stack([aside[..., 0] - slope * share[..., 0], slope], axis=-1)
 
 
-#: What an edge may be off beside noise, so that none claims to be exact: pixels are no mixture of a
-#: bell and a box, nor is paper flat, [px].
+#: Minimum deviation of an edge beside noise: blur is not exactly a mixture of a Gaussian and a box,
+#: and paper is not exactly flat, [px].
 FLOOR = 0.0015
-#: The second row of modules inside an edge is not modelled: this many times the share of it that
-#: the blur brings to the first row's middle, in deviations of the blur.
+#: Deviation from the second row of modules, which is not modelled: factor on its blurred share at
+#: the middle of the first row, in deviations of the blur.
 SECOND_ROW = 1.0
-#: Where paper is overexposed only the foot of the step is seen, and the blur's shape decides on
-#: where it lies: this many deviations of the blur, times the share that is hidden.
+#: Deviation from overexposed paper, where only the foot of the step is visible and the result
+#: depends on the blur's shape: factor on the hidden share, in deviations of the blur.
 OVEREXPOSED = 0.15
-#: Where the blur is wider than this share of a module, corners are fitted again as long as they
-#: move by more than `NEAR` and half of what an edge may be off: what the modules beside an edge add
-#: hangs on where they lie.
+#: If the blur is wider than this share of a module, the fit repeats as long as corners move by more
+#: than `NEAR` and half of an edge's deviation: the contributions of modules depend on the corners.
 CROWDED = 0.22
-#: Elsewhere they are fitted again only if they move by more than `FAR`, [px].
+#: Otherwise it repeats only if they move by more than `FAR`, [px].
 NEAR, FAR = 0.03, 0.3
-#: Largest number of fits.
+#: Maximum number of fits.
 MOST_FITS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedTag:
-    """The square of one tag in ideal (undistorted) pixels.
+    """The square of one tag in undistorted pixels.
 
-    For true corners c, flattened, ``whitening @ c - target`` holds eight independent errors of unit
-    variance: offset and tilt of the four edges in turn; both are nought for a hidden edge.
+    For true corners c, flattened, ``whitening @ c - target`` has eight independent errors of unit
+    variance: offset and tilt of each of the four edges; both are 0 for a hidden edge.
 
     Attributes:
-        corners: In the order of `tracking.detection.tags.CORNER_SIGNS`, shape (4, 2), [px]; rough
-            where an edge is hidden.
+        corners: In the order of `tracking.detection.tags.CORNER_SIGNS`, shape (4, 2), [px];
+            approximate where an edge is hidden.
         whitening: Shape (8, 8), [1/px].
         target: Shape (8,).
         edges: Which edges were measured, shape (4,).
         spreads: Standard deviations of the blur across them, shape (4,), [px].
-        alike: How many times the variance of independent errors they have, shape (4,).
+        inflation: Variance inflation from correlated errors, shape (4,).
     """
 
     corners: Array
@@ -212,7 +210,7 @@ class RefinedTag:
     target: Array
     edges: NDArray[np.bool_]
     spreads: Array = field(default_factory=lambda: np.zeros(4))
-    alike: Array = field(default_factory=lambda: np.ones(4))
+    inflation: Array = field(default_factory=lambda: np.ones(4))
 
     @property
     def whole(self) -> bool:
@@ -231,13 +229,13 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
 
     Args:
         image: Grey image, shape (h, w).
-        camera: Whose image it is.
-        corners: Roughly (to about a module), in the order of
+        camera: The camera of the image.
+        corners: Approximate (to about a module), in the order of
             `tracking.detection.tags.CORNER_SIGNS`, shape (t, 4, 2), [px], lens distortion included.
         modules: Modules along the side of the black square.
 
     Returns:
-        One entry a tag: None where it leaves the image or fewer than two edges are to be seen.
+        One entry per tag: None if it leaves the image or has fewer than two visible edges.
     """
     if not len(corners):
         return []
@@ -245,25 +243,25 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
     pixels.flags.writeable = False  # kernels are compiled for images that are read-only
     rough = np.array(corners, dtype=np.float64)
     inside = _inside(rough, image.shape)
-    curves = EdgeCurves.between(camera, np.where(inside, rough, _somewhere(image.shape)))
+    curves = EdgeCurves.between(camera, np.where(inside, rough, _dummy_square(image.shape)))
     found = np.zeros((len(rough), 4, COLUMNS))
     widths = curves.module_widths(modules)
     locate_edges(pixels, curves.pixels, curves.bows, widths, found)
-    final = meet(curves.lines(found, _doubt(found, widths)), curves.ideal)
+    final = intersect(curves.lines(found, _model_errors(found, widths)), curves.undistorted)
     again = inside.copy()
     for _ in range(MOST_FITS):
-        better = pixels_from_ideal(camera, final)
+        better = distort_pixels(camera, final)
         inside &= _inside(better, image.shape)
         again &= inside
         curves = EdgeCurves.between(camera, np.where(again, better, curves.pixels))
         widths, which = curves.module_widths(modules), np.flatnonzero(again)
         fit = np.empty((len(which), 4, COLUMNS))
-        places = curves.pixels[which], curves.bows[which], widths[which]
-        fit_edges(pixels, *places, modules, found[which], fit)
+        geometry = curves.pixels[which], curves.bows[which], widths[which]
+        fit_edges(pixels, *geometry, modules, found[which], fit)
         found[which] = fit
-        lines = curves.lines(found, _doubt(found, widths))
-        final = meet(lines, curves.ideal)
-        again = inside & _unsettled(final - curves.ideal, found, widths, lines)[:, None, None]
+        lines = curves.lines(found, _model_errors(found, widths))
+        final = intersect(lines, curves.undistorted)
+        again = inside & _unsettled(final - curves.undistorted, found, widths, lines)[:, None, None]
         if not again.any():
             break
     return [
@@ -272,47 +270,47 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
 
 
 def load_kernels() -> None:
-    """Loads the machine code of `refine`, or compiles it, so that no image waits for it."""
+    """Loads or compiles the machine code of `refine` in advance."""
     grey = np.zeros((16, 16), dtype=np.uint8)
     grey.flags.writeable = False
-    square, bows = _somewhere(grey.shape)[None], np.zeros((1, 4, 2))
+    square, bows = _dummy_square(grey.shape)[None], np.zeros((1, 4, 2))
     widths, found = np.ones((1, 4)), np.zeros((1, 4, COLUMNS))
     locate_edges(grey, square, bows, widths, found)
     fit_edges(grey, square, bows, widths, 8, found, np.zeros_like(found))
 
 
 def _inside(corners: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Which tags lie in the image, shape (t, 1, 1)."""
+    """Whether each tag is in the image, shape (t, 1, 1)."""
     limit = np.array([shape[1], shape[0]]) - 3.0
     return np.asarray(
         np.all((corners >= 2.0) & (corners <= limit), axis=(1, 2), keepdims=True), dtype=np.bool_
     )
 
 
-def _somewhere(shape: tuple[int, ...]) -> Array:
-    """A square in the image that stands in for unusable tags, so that arrays stay whole."""
+def _dummy_square(shape: tuple[int, ...]) -> Array:
+    """A square in the image that replaces unusable tags, so that arrays keep their shape."""
     return np.array([[4.0, 4.0], [14.0, 4.0], [14.0, 14.0], [4.0, 14.0]])
 
 
 def _unsettled(moved: Array, found: Array, widths: Array, lines: Lines) -> NDArray[np.bool_]:
-    """Which tags' corners moved so far that they are fitted again, shape (t,)."""
+    """Whether each tag's corners moved so far that the fit repeats, shape (t,)."""
     blurred = np.where(found[..., SHARE] > 0.0, found[..., SPREAD] / widths, 0.0).max(axis=1)
     unsure = lines.offset_deviation.reshape(-1, 4).max(axis=1)
     limit = np.where(blurred > CROWDED, np.maximum(NEAR, 0.5 * unsure), FAR)
     return np.asarray(np.abs(moved).max(axis=(1, 2)) > limit, dtype=np.bool_)
 
 
-def _doubt(found: Array, widths: Array) -> Array:
-    """What the edges may be off beside noise, shape (t, 4), [px]."""
+def _model_errors(found: Array, widths: Array) -> Array:
+    """Deviations of the edges beside noise, shape (t, 4), [px]."""
     spread = np.maximum(found[..., SPREAD], 1e-6)
     away = np.clip(widths / spread, 1.0, 20.0)
-    tail = np.exp(-0.5 * away**2) / (np.sqrt(2.0 * np.pi) * away)  # of a bell, beyond a module
+    tail = np.exp(-0.5 * away**2) / (np.sqrt(2.0 * np.pi) * away)  # of a Gaussian, beyond a module
     hidden = OVEREXPOSED * found[..., HIDDEN]
     return np.asarray(np.hypot(FLOOR, spread * np.hypot(SECOND_ROW * tail, hidden)))
 
 
 def _refined(corners: Array, lines: Lines, found: Array, tag: int) -> RefinedTag | None:
-    """Corners of a tag with the whitening that its lines' deviations give."""
+    """The refined tag with the whitening from its lines' deviations."""
     quad, edges = corners[tag], lines.good[4 * tag : 4 * tag + 4]
     if edges.sum() < 2:
         return None
@@ -336,5 +334,5 @@ def _refined(corners: Array, lines: Lines, found: Array, tag: int) -> RefinedTag
         read_only(target),
         edges.copy(),
         read_only(found[tag, :, SPREAD]),
-        read_only(found[tag, :, ALIKE]),
+        read_only(found[tag, :, INFLATION]),
     )

@@ -1,10 +1,10 @@
-"""The pixels on both sides of an edge: where they are, and how bright they should be.
+"""Brightness model of the pixels on both sides of an edge.
 
-Beside a blurred edge lie the square's two neighbouring edges, the modules within it, and what is
-beyond the white around it: all in reach of the blur when modules are small or the blur is wide.
+Near a blurred edge are the square's two neighbouring edges, the modules inside it, and whatever is
+beyond the white border: all within reach of the blur if modules are small or the blur is wide.
 
-Paper and ink are straight functions of the place along the edge; between them lies the blurred
-step, and beside it, where the blur reaches so far, the modules inside and what is outside.
+Brightness of paper and ink is linear along the edge, with the blurred step between; where the blur
+reaches them, modules inside and surroundings outside are added.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from model.jit import compiled
 from model.pose import Array
 from tracking.camera_model import Image
 
-# A tag's square in the image: its edges' frames, and where its modules lie beside an edge.
+# Geometry of a tag's square in the image: frames of its edges, positions of its modules.
 
 
 @compiled
 def edge_frame(quad: Array, edge: int) -> tuple[float, float, float, float, float]:
-    """Start (x, y), unit direction (x, y) and length of an edge; outward is (y, -x) of it."""
+    """Start (x, y), unit direction (x, y) and length of an edge; (y, -x) points outward."""
     x, y = quad[edge, 0], quad[edge, 1]
     after = (edge + 1) % 4
     dx, dy = quad[after, 0] - x, quad[after, 1] - y
@@ -32,15 +32,15 @@ def edge_frame(quad: Array, edge: int) -> tuple[float, float, float, float, floa
 
 @compiled
 def bow(shape: Array, share: float) -> float:
-    """How far the curve of an edge lies outside of its chord, at a share of its length, [px]."""
+    """Distance of an edge's curve outside its chord, at a share of its length, [px]."""
     return float(share * (1.0 - share) * (shape[0] + share * shape[1]))
 
 
 @compiled
 def plane_of(quad: Array, edge: int, plane: Array) -> None:
-    """Writes the map of places in the square to pixels, shape (8,).
+    """Writes the homography from square coordinates to pixels, shape (8,).
 
-    Places are (a, b) with a from 0 to 1 along the edge, b from 0 at the edge to 1 at the opposite.
+    Coordinates are (a, b): a from 0 to 1 along the edge, b from 0 at the edge to 1 at the opposite.
     """
     x0, y0 = quad[edge, 0], quad[edge, 1]
     x1, y1 = quad[(edge + 1) % 4, 0], quad[(edge + 1) % 4, 1]
@@ -57,7 +57,7 @@ def plane_of(quad: Array, edge: int, plane: Array) -> None:
 
 @compiled
 def beside(quad: Array, edge: int, plane: Array, a: float, b: float) -> tuple[float, float]:
-    """A place of the square, as distances along and outside of an edge, [px]."""
+    """Distances of a point (a, b) of the square along and outside an edge, [px]."""
     depth = plane[6] * a + plane[7] * b + 1.0
     x0, y0, ax, ay, _ = edge_frame(quad, edge)
     dx = (plane[0] * a + plane[1] * b + plane[2]) / depth - x0
@@ -65,46 +65,46 @@ def beside(quad: Array, edge: int, plane: Array, a: float, b: float) -> tuple[fl
     return dx * ax + dy * ay, dx * ay - dy * ax
 
 
-# What is known of one edge, as columns of an array.
+# Properties of one edge, as columns of an array.
 #
 # Positions on an edge are given by q, from -1 at the first pixel read to 1 at the last one.
 
 
 OFFSET = 0
-"""How far the edge lies outside of where it was looked for, at q = 0, [px]."""
+"""Offset of the edge outward from its expected position, at q = 0, [px]."""
 TILT = 1
-"""Change of that distance from q = 0 to q = 1, [px]."""
+"""Change of the offset from q = 0 to q = 1, [px]."""
 SPREAD = 2
 """Standard deviation of the blur across the edge, pixels included, [px]."""
 BOXED = 3
-"""Kind of that blur: 0 a bell (lens), 1 a box (motion, or one pixel along the grid)."""
+"""Shape of the blur: 0 Gaussian (lens), 1 box (motion, or one pixel along the grid)."""
 MIDDLE = 4
-"""Where q = 0 lies, from the edge's first corner, [px]."""
+"""Distance of q = 0 from the edge's first corner, [px]."""
 HALF = 5
-"""Half of the way that was read: from q = 0 to q = 1, [px]."""
+"""Half of the length read: from q = 0 to q = 1, [px]."""
 OFFSET_VARIANCE = 6
 COVARIANCE = 7
 TILT_VARIANCE = 8
 SHARE = 9
-"""Share of the edge that looks like one."""
-ALIKE = 10
-"""How many times the variance of independent errors it has, as they are alike along it."""
+"""Share of the edge that fits the model."""
+INFLATION = 10
+"""Variance inflation from errors correlated along the edge."""
 HIDDEN = 11
-"""Share of the step from ink to paper that is brighter than a pixel can be."""
+"""Share of the step from ink to paper above the pixels' saturation."""
 COLUMNS = 12
 
 
-# How brightness rises across a blurred edge.
+# Brightness profile across a blurred edge.
 
 
 #: Beyond this many standard deviations a blurred edge is flat.
 FLAT = 4.5
-_STEPS = 64  # of the table, a standard deviation
+_STEPS = 64  # of the table per standard deviation
 _ROOT_3 = math.sqrt(3.0)
 
 
 def _bell_table() -> Array:
-    """Integral and height of the bell at the table's steps, shape (n, 2)."""
+    """Integral and density of the Gaussian at the table's steps, shape (n, 2)."""
     x = np.arange(-FLAT * _STEPS, FLAT * _STEPS + 1.0) / _STEPS
     share = [0.5 + 0.5 * math.erf(v / math.sqrt(2.0)) for v in x.tolist()]
     return np.column_stack([share, np.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)])
@@ -114,14 +114,14 @@ _BELL = _bell_table()
 
 
 @compiled
-def rise(x: float, boxed: float) -> tuple[float, float, float]:
-    """Share of the step at ``x`` standard deviations behind the edge, to 1e-10.
+def blurred_step(x: float, boxed: float) -> tuple[float, float, float]:
+    """Share of the step at ``x`` standard deviations past the edge, to 1e-10.
 
-    A mixture of a step seen through a bell and of one seen through a box of the same deviation. As
-    it is symmetric, no symmetric blur moves an edge that is fitted with it, whatever its kind.
+    A mixture of steps blurred by a Gaussian and by a box of equal deviation. As it is symmetric, no
+    symmetric blur biases an edge fitted with it.
 
     Returns:
-        The share (0 dark, 1 bright), its change with ``x`` (to 1e-7), and that with ``boxed``.
+        The share (0 dark, 1 bright), its derivative by ``x`` (to 1e-7), and by ``boxed``.
     """
     if x <= -FLAT:
         return 0.0, 0.0, 0.0
@@ -142,8 +142,8 @@ def rise(x: float, boxed: float) -> tuple[float, float, float]:
     return bell + boxed * more, bell_slope + boxed * (box_slope - bell_slope), more
 
 
-#: Rows of what is known of each pixel; rows from `MODULES` on: share of each module along the edge.
-PLACE, ACROSS, VALUE, INK, WITHIN, BEYOND, MODULES = range(7)
+#: Rows of the pixel array; from `MODULES` on, the share of each module along the edge.
+ALONG, ACROSS, VALUE, INK, WITHIN, BEYOND, MODULES = range(7)
 
 
 @compiled
@@ -156,19 +156,19 @@ def sample_edge(
     reach: float,
     pixels: Array,
 ) -> int:
-    """Reads the pixels that lie within ``reach`` of an edge and within a span along it.
+    """Reads the pixels within ``reach`` of an edge and within a span along it.
 
     Args:
         image: Grey.
         quad: Corners, shape (4, 2), [px].
-        edge: Which edge of it.
-        shape: Of the edge's bow.
+        edge: Index of the edge.
+        shape: Coefficients of the edge's bow.
         span: Along the edge, [px].
         reach: On both sides, [px].
-        pixels: Rows `PLACE`, `ACROSS` and `VALUE` are written, shape (k, n).
+        pixels: Rows `ALONG`, `ACROSS` and `VALUE` are written, shape (k, n).
 
     Returns:
-        How many there are; no more than ``pixels`` holds, then evenly spread along the edge.
+        Number of pixels; limited by the size of ``pixels``, then evenly spread along the edge.
     """
     height, width = image.shape
     x0, y0, ax, ay, length = edge_frame(quad, edge)
@@ -189,7 +189,7 @@ def sample_edge(
             s = dx * ax + dy * ay
             if (every > 1 and int(s) % every) or count >= pixels.shape[1]:
                 continue
-            pixels[PLACE, count] = (s - middle) / half
+            pixels[ALONG, count] = (s - middle) / half
             pixels[ACROSS, count] = dx * ay - dy * ax - bow(shape, s / length)
             pixels[VALUE, count] = image[row, column]
             count += 1
@@ -198,7 +198,7 @@ def sample_edge(
 
 @compiled
 def _within(factor: float, start: float, low: float, high: float) -> tuple[float, float]:
-    """Where ``factor * x + start`` lies between two limits."""
+    """Interval of x in which ``factor * x + start`` is between two limits."""
     if abs(factor) < 1e-9:
         return (-1e9, 1e9) if low <= start <= high else (1e9, -1e9)
     one, other = (low - start) / factor, (high - start) / factor
@@ -206,32 +206,33 @@ def _within(factor: float, start: float, low: float, high: float) -> tuple[float
 
 
 @compiled
-def tell_ink(
+def write_ink(
     quad: Array, edge: int, pixels: Array, count: int, found: Array, spread: float
 ) -> None:
-    """Writes the share of ink that the blurred neighbouring edges leave beside an edge.
+    """Writes the share of ink that the blurred neighbouring edges leave near an edge.
 
     Args:
         quad: Corners, shape (4, 2), [px].
-        edge: Which edge of it.
+        edge: Index of the edge.
         pixels: Row `INK` is written.
         count: Of the pixels.
-        found: Of the edge; has the span that was read.
+        found: Columns of the edge, with the span read.
         spread: Of the neighbouring edges' blur, [px].
     """
     _, _, ax, ay, length = edge_frame(quad, edge)
     _, _, bx, by, _ = edge_frame(quad, (edge + 3) % 4)
     _, _, cx, cy, _ = edge_frame(quad, (edge + 1) % 4)
     for n in range(count):
-        s, u = found[MIDDLE] + found[HALF] * pixels[PLACE, n], pixels[ACROSS, n]
+        s, u = found[MIDDLE] + found[HALF] * pixels[ALONG, n], pixels[ACROSS, n]
         dx, dy = s * ax + u * ay, s * ay - u * ax
         before = dy * bx - dx * by
         after = (dy - length * ay) * cx - (dx - length * ax) * cy
-        pixels[INK, n] = rise(before / spread, 0.5)[0] * rise(after / spread, 0.5)[0]
+        ink = blurred_step(before / spread, 0.5)[0]
+        pixels[INK, n] = ink * blurred_step(after / spread, 0.5)[0]
 
 
 @compiled
-def tell_modules(
+def write_modules(
     quad: Array,
     edge: int,
     plane: Array,
@@ -241,16 +242,16 @@ def tell_modules(
     found: Array,
     spread: float,
 ) -> None:
-    """Writes what lies a module inside and a module outside of an edge.
+    """Writes the shares of modules inside and surroundings outside an edge.
 
     Args:
         quad: Corners, shape (4, 2), [px].
-        edge: Which edge of it.
-        plane: From places in the square to pixels.
+        edge: Index of the edge.
+        plane: Homography from square coordinates to pixels.
         modules: Along the side of the square.
         pixels: Rows `WITHIN`, `BEYOND` and those from `MODULES` on are written.
         count: Of the pixels.
-        found: Of the edge; has the span that was read.
+        found: Columns of the edge, with the span read.
         spread: Of the neighbouring edges' blur, [px].
     """
     module = 1.0 / modules
@@ -259,31 +260,31 @@ def tell_modules(
     s2, u2 = beside(quad, edge, plane, 0.0, -module)
     s3, u3 = beside(quad, edge, plane, 1.0, -module)
     for n in range(count):
-        s, u = found[MIDDLE] + found[HALF] * pixels[PLACE, n], pixels[ACROSS, n]
+        s, u = found[MIDDLE] + found[HALF] * pixels[ALONG, n], pixels[ACROSS, n]
         pixels[WITHIN, n] = u - u0 - (u1 - u0) * (s - s0) / (s1 - s0)
         pixels[BEYOND, n] = u - u2 - (u3 - u2) * (s - s2) / (s3 - s2)
     for k in range(modules - 1):
-        # The modules' sides are seen a little within the square.
+        # Sides of modules are taken slightly inside the square.
         side, _ = beside(quad, edge, plane, (k + 1) * module, 1.25 * module)
         for n in range(count):
-            s = found[MIDDLE] + found[HALF] * pixels[PLACE, n]
-            share = rise((s - side) / spread, 0.5)[0]
+            s = found[MIDDLE] + found[HALF] * pixels[ALONG, n]
+            share = blurred_step((s - side) / spread, 0.5)[0]
             if k < modules - 2:
                 pixels[MODULES + k, n] = share
             if k > 0:
                 pixels[MODULES + k - 1, n] -= share
 
 
-# How bright the pixels beside an edge should be, and how far they are from it.
+# Residuals of the pixels near an edge.
 
 
-#: Parameters are the first columns of an edge; ink and paper at its middle and how they change
-#: along it; and of a crowded edge what the paper's surroundings and each module inside add.
+#: Parameters are the first columns of an edge; ink and paper at its middle and their slopes along
+#: it; and for a crowded edge the contributions of surroundings and of each module inside.
 DARK, DARK_SLOPE, BRIGHT, BRIGHT_SLOPE, BEYOND_PAPER, INNER = 4, 5, 6, 7, 8, 9
 
 
 WHITE = 254.5
-"""Pixels from here on are clipped, [grey levels]."""
+"""Brighter pixels are clipped, [grey levels]."""
 
 
 @compiled
@@ -296,16 +297,16 @@ def compare(
     squares: Array,
     counts: Array,
 ) -> None:
-    """Sums errors and their changes with the parameters, for each part of an edge on its own.
+    """Sums residuals and their derivatives by the parameters, for each part of an edge.
 
     Args:
-        pixels: What is known of them, rows of `tracking.edges.sampling`.
+        pixels: Rows as in `tracking.edges.sampling`.
         count: Of the pixels.
-        parameters: Shape (p,), 8 or, of a crowded edge, more.
-        normals: Is written, lower halves, shape (b, p, p).
-        gradients: Is written, shape (b, p).
-        squares: Sums of squared errors, is written, shape (b,).
-        counts: Of pixels, is written, shape (b,).
+        parameters: Shape (p,); 8, or more for a crowded edge.
+        normals: Written, lower halves, shape (b, p, p).
+        gradients: Written, shape (b, p).
+        squares: Sums of squared residuals, written, shape (b,).
+        counts: Numbers of pixels, written, shape (b,).
     """
     parts, size = len(counts), len(parameters)
     normals[:, :, :] = 0.0
@@ -315,7 +316,7 @@ def compare(
     change = np.empty(size)
     for n in range(count):
         error = _error(pixels, n, parameters, change)
-        part = min(max(int(0.5 * (pixels[PLACE, n] + 1.0) * parts), 0), parts - 1)
+        part = min(max(int(0.5 * (pixels[ALONG, n] + 1.0) * parts), 0), parts - 1)
         squares[part] += error * error
         counts[part] += 1.0
         normal, gradient = normals[part], gradients[part]
@@ -328,13 +329,13 @@ def compare(
 
 @compiled
 def _error(pixels: Array, n: int, parameters: Array, change: Array) -> float:
-    """What a pixel is brighter than it should be; writes how that would change."""
-    q, ink, spread = pixels[PLACE, n], pixels[INK, n], parameters[SPREAD]
+    """Measured minus modelled brightness of a pixel; writes the model's derivatives."""
+    q, ink, spread = pixels[ALONG, n], pixels[INK, n], parameters[SPREAD]
     dark = parameters[DARK] + parameters[DARK_SLOPE] * q
     bright = parameters[BRIGHT] + parameters[BRIGHT_SLOPE] * q
     shift = parameters[OFFSET] + parameters[TILT] * q
     x = (pixels[ACROSS, n] - shift) / spread
-    share, slope, kind = rise(x, parameters[BOXED])
+    share, slope, kind = blurred_step(x, parameters[BOXED])
     black = (1.0 - share) * ink
     step = (bright - dark) * ink
     change[OFFSET], change[TILT] = -step * slope / spread, -step * slope / spread * q
@@ -344,7 +345,7 @@ def _error(pixels: Array, n: int, parameters: Array, change: Array) -> float:
     value = bright - (bright - dark) * black
     if len(parameters) > BEYOND_PAPER:
         value += _surroundings(pixels, n, shift, parameters, change)
-    if pixels[VALUE, n] >= WHITE and value >= WHITE:  # clipped: it is that bright or brighter
+    if pixels[VALUE, n] >= WHITE and value >= WHITE:  # clipped: at least this bright
         change[:] = 0.0
         return 0.0
     return float(pixels[VALUE, n] - value)
@@ -352,17 +353,17 @@ def _error(pixels: Array, n: int, parameters: Array, change: Array) -> float:
 
 @compiled
 def _surroundings(pixels: Array, n: int, shift: float, parameters: Array, change: Array) -> float:
-    """Brightness that reaches a pixel from beyond the paper and from the modules inside."""
+    """Contribution of the surroundings and of the modules inside to a pixel's brightness."""
     spread, boxed = parameters[SPREAD], parameters[BOXED]
     x = pixels[BEYOND, n] / spread
-    share, slope, kind = rise(x, boxed)
+    share, slope, kind = blurred_step(x, boxed)
     beyond = parameters[BEYOND_PAPER]
     value = beyond * share
     change[BEYOND_PAPER] = share
     change[SPREAD] -= beyond * slope * x / spread
     change[BOXED] += beyond * kind
     x = (pixels[WITHIN, n] - shift) / spread
-    share, slope, kind = rise(x, boxed)
+    share, slope, kind = blurred_step(x, boxed)
     modules = 0.0
     for k in range(len(parameters) - INNER):
         part = pixels[MODULES + k, n]

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from calibration.intrinsics.lens import LensChoice
-from calibration.pictures import take_pictures
+from calibration.pictures import capture_images
 from calibration.procedures import (
     calibrate_camera,
     calibrate_camera_from_corners,
@@ -137,7 +137,7 @@ def _take_pictures(
     """Takes images until enough are there, the video ends, or Ctrl-C."""
     requests = LocalRequests()
     with stop_requests(requests):
-        take_pictures(
+        capture_images(
             source,
             folder,
             board,

@@ -11,7 +11,7 @@ import typer
 
 from calibration.extrinsics.camera_pairs import locate_camera_by_another
 from calibration.extrinsics.surveyed_tags import Survey
-from calibration.pictures import USUAL_PICTURES, USUAL_TAG_PICTURES, Pictures, pictures_of
+from calibration.pictures import DEFAULT_IMAGES, DEFAULT_TAG_IMAGES, ImageSet, open_source
 from calibration.procedures import locate_camera, locate_tags
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.output import (
@@ -128,9 +128,9 @@ def extrinsics(
 
 
 def _opener(
-    source: str, camera: Camera, pictures: int | None, usual: int = USUAL_PICTURES
-) -> Callable[[], Pictures]:
-    return lambda: pictures_of(source, camera, pictures, usual)
+    source: str, camera: Camera, pictures: int | None, usual: int = DEFAULT_IMAGES
+) -> Callable[[], ImageSet]:
+    return lambda: open_source(source, camera, pictures, usual)
 
 
 # `cdpr calibrate tags`: where the tags are on the platform.
@@ -167,7 +167,7 @@ def tags(
     the_camera = the_rig.camera(camera)
     made = locate_tags(
         the_rig,
-        _opener(source, the_camera, pictures, USUAL_TAG_PICTURES),
+        _opener(source, the_camera, pictures, DEFAULT_TAG_IMAGES),
         camera=the_camera.name,
         fixed_tag=fixed_tag,
         wanted=wanted_mm / 1e3,
