@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.errors import BadInput, Fault
-from model.pose import Array, Pose, carried, read_only, skew
+from model.pose import Array, Pose, lever_arm_matrix, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import ideal_slopes, project_undistorted, ray_slopes, rays_of
 from tracking.detection.tags import tag_corners
@@ -33,7 +33,7 @@ def missing_errors(rig: Rig, camera: Camera) -> tuple[str, ...]:
     """
     stated = {
         "lens_covariance (`cdpr calibrate camera`)": camera.lens_covariance,
-        "pose_covariance (`cdpr calibrate extrinsics`)": camera.place_covariance,
+        "pose_covariance (`cdpr calibrate extrinsics`)": camera.pose_covariance,
         "tags: error_mm (`cdpr calibrate tags`)": rig.tag_error,
         "outlets_error_mm (`cdpr calibrate rig`)": rig.outlet_error,
         "anchors_error_mm (`cdpr calibrate rig`)": rig.anchor_error,
@@ -81,15 +81,15 @@ class SharedErrors:
         count = 4 + camera.distortion.size
         self._place = np.zeros((6, 6))
         self._lens, self._place_by_lens = np.zeros((count, count)), np.zeros((6, count))
-        if camera.place_covariance is not None:
-            self._place = camera.place_covariance
+        if camera.pose_covariance is not None:
+            self._place = camera.pose_covariance
         if camera.lens_covariance is None:
             return
         self._lens = camera.lens_covariance
-        if camera.place_by_lens is None:
+        if camera.pose_by_lens is None:
             self._place_by_lens[3:] = implied_rotation(camera)
         else:
-            by_lens = self._place_by_lens = camera.place_by_lens
+            by_lens = self._place_by_lens = camera.pose_by_lens
             self._place = _positive(self._place - by_lens @ self._lens @ by_lens.T)
 
     def of(self, pose: Pose, views: Sequence[TagView]) -> Array:
@@ -100,10 +100,10 @@ class SharedErrors:
             views: The tags that it rests on.
         """
         if self.whole is not None:
-            return read_only(np.diag([(self.whole / SURE) ** 2] * 3 + [0.0] * 3))
+            return read_only(np.diag([(self.whole / Z_95) ** 2] * 3 + [0.0] * 3))
         world_from_camera = self._camera.world_from_camera
         camera_from_body = world_from_camera.inverse().compose(pose)
-        by_place = carried(pose.position - world_from_camera.position)
+        by_place = lever_arm_matrix(pose.position - world_from_camera.position)
         steps = moved_by_pixels(
             self._camera,
             views,
@@ -170,8 +170,8 @@ def tag_error_slopes(tag: Tag, error: float) -> Array:
     """
     arms = tag_corners(tag) - tag.pose.position
     reach = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    shift = error / SURE / np.sqrt(6.0)
-    turn = error / SURE / (2.0 * reach)
+    shift = error / Z_95 / np.sqrt(6.0)
+    turn = error / Z_95 / (2.0 * reach)
     return np.array([np.hstack([shift * np.eye(3), -turn * skew(arm)]) for arm in arms])
 
 

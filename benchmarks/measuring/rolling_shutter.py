@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from model.pose import PlatformMotion, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, load_rig
-from model.scene import nothing_in_the_way
+from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics
 from tracking.measurement import PoseMeasurement
@@ -60,7 +60,7 @@ def errors(
     rig: Rig, camera: Camera, told: float, flight: Flight, images: int
 ) -> Iterator[tuple[float, float]]:
     """Distance to the truth [m] and NEES of each pose after the first, by a stated readout [s]."""
-    eye = SyntheticCamera(rig, nothing_in_the_way(rig), camera, 3, Optics(blur=0.6, exposure=2e-3))
+    eye = SyntheticCamera(rig, empty_scene(rig), camera, 3, Optics(blur=0.6, exposure=2e-3))
     tracker = Tracker(rig, replace(camera, readout=told))
     for number in range(images):
         time = number / camera.rate

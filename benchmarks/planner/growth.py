@@ -142,8 +142,8 @@ def with_cables(rig: Rig, count: int) -> Rig:
     """A rig with other cables: from a ring above to low anchors, from one below to high ones."""
     upper = np.arange(count) % 2 == 0
     angle = 2.0 * np.pi * (np.arange(count) + 0.25) / count
-    turned = angle + np.where(np.arange(count) // 2 % 2 == 0, TWIST, -TWIST)
-    around, near = (np.column_stack([np.cos(a), np.sin(a)]) for a in (angle, turned))
+    rotated = angle + np.where(np.arange(count) // 2 % 2 == 0, TWIST, -TWIST)
+    around, near = (np.column_stack([np.cos(a), np.sin(a)]) for a in (angle, rotated))
     side = np.max(np.abs(near), axis=1)[:, None]
     height = float(rig.half_size[2])
     anchors = np.column_stack([near / side * rig.half_size[:2], np.where(upper, -height, height)])

@@ -18,7 +18,7 @@ from model.files.scene_file import SceneDocument
 from model.pose import Array
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene, scene_from_document
-from planner.anytime_6d.moves import matrix_of, put_turned, turn_between
+from planner.anytime_6d.moves import matrix_of, put_rotated, turn_between
 from planner.anytime_6d.path import RotatingSearch, turning_problem
 from planner.anytime_6d.problem import RotatingProblem, move_allowed
 from planner.collision.rotating_edges import turning_edge_free
@@ -35,7 +35,7 @@ REPEATS = 20
 
 
 def hall() -> tuple[Rig, Scene]:
-    """The hall with a goal that is tilted and turned."""
+    """The hall with a goal that is tilted and rotated."""
     document = load_scene(CONFIGS / "hall_pillar.yaml").document.model_dump()
     tilt = [float(np.cos(0.05)), 0.0, float(np.sin(0.05)), 0.0]
     document["goal"]["rotation_wxyz"] = tilt
@@ -53,10 +53,10 @@ def allowed_moves(problem: RotatingProblem, count: int) -> list[tuple[Array, Arr
         start[:3], start[3] = random.uniform(*limits), 1.0
         tip, way, turn = random.normal(size=(3, 3))
         tip *= 0.5 * problem.tilt / np.linalg.norm(tip)
-        put_turned(start.copy(), (tip[0], tip[1], 0.0), start)
+        put_rotated(start.copy(), (tip[0], tip[1], 0.0), start)
         end[:3] = start[:3] + WAY * way / np.linalg.norm(way)
         turn *= ANGLE / np.linalg.norm(turn)
-        put_turned(start, (turn[0], turn[1], turn[2]), end)
+        put_rotated(start, (turn[0], turn[1], turn[2]), end)
         if move_allowed(problem, start, end, tallies):
             found.append((start, end))
     return found

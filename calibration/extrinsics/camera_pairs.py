@@ -34,9 +34,9 @@ from calibration.tag_map.observations import TagSights, platform_pose, sights_of
 from calibration.targets.boards import Board, Charuco, Seen
 from calibration.targets.grids import TagGrid
 from executor.kernels import ready_to_measure
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.errors import BadInput
-from model.pose import Array, Pose, carried, matrix_from_rotation_vector, read_only
+from model.pose import Array, Pose, lever_arm_matrix, matrix_from_rotation_vector, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from tracking.camera_model import Image, ideal_from_pixels, project_undistorted
@@ -154,7 +154,7 @@ def locate_by_pairs(
     if len(pairs) < GOOD_PAIRS:
         what = f"{len(pairs)} pairs of images were used; {GOOD_PAIRS} are required"
         lacks.append(Issue(what, "take more, all over what both cameras see"))
-    if reference.place_covariance is None:
+    if reference.pose_covariance is None:
         what = f"how far off the pose of camera {reference.name!r} is, is not stated"
         lacks.append(Issue(what, "calibrate its extrinsics, and pass that result's file too"))
     error = float(np.sqrt(np.mean([look.error**2 for look, _ in looks])))
@@ -163,7 +163,7 @@ def locate_by_pairs(
         by="another camera",
         covariance=read_only(relative + shared),
         by_lens=None,
-        half_widths=read_only(np.hypot(own_widths, SURE * np.sqrt(np.diag(shared)))),
+        half_widths=read_only(np.hypot(own_widths, Z_95 * np.sqrt(np.diag(shared)))),
         points=workspace_corners(rig),
         tag_errors={} if not rig.platform_tags else {rig.platform_tags[0].id: error},
         pictures=len(pairs),
@@ -175,10 +175,10 @@ def locate_by_pairs(
 
 def _by_place(reference: Camera, world_from_camera: Pose) -> Array:
     """Covariance of a pose by the place of the camera that measured it, (6, 6); 0 if unstated."""
-    if reference.place_covariance is None:
+    if reference.pose_covariance is None:
         return np.zeros((6, 6))
-    by_place = carried(world_from_camera.position - reference.world_from_camera.position)
-    return np.asarray(by_place @ reference.place_covariance @ by_place.T)
+    by_place = lever_arm_matrix(world_from_camera.position - reference.world_from_camera.position)
+    return np.asarray(by_place @ reference.pose_covariance @ by_place.T)
 
 
 def _fitted(looks: Sequence[tuple[BodyLook, BodyLook]]) -> tuple[Pose, Array, Array]:

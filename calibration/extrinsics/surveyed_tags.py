@@ -17,7 +17,7 @@ from calibration.extrinsics.result import ExtrinsicCalibration, workspace_corner
 from calibration.results import Issue
 from calibration.statistics import CONFIDENCE, widened
 from calibration.tag_map.observations import TagSights
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
 from model.rig import Camera, Rig, Tag
@@ -145,7 +145,7 @@ def locate_by_frame_tags(
         camera=replace(camera, world_from_camera=pose),
         by="frame tags",
         covariance=read_only(covariance),
-        half_widths=read_only(SURE * np.sqrt(np.diag(covariance))),
+        half_widths=read_only(Z_95 * np.sqrt(np.diag(covariance))),
         by_lens=by_lens,
         points=workspace_corners(rig),
         tag_errors={t.number: float(np.sqrt(np.mean(t.errors(camera, best) ** 2))) for t in tags},

@@ -35,7 +35,7 @@ from calibration.statistics import (
     widened,
 )
 from calibration.targets.boards import Board, Seen, mirrored
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
 from tracking.camera_model import Image
@@ -63,7 +63,7 @@ class Uncertainty:
 
         That of the scatter, as much wider as `widened` finds it; shape (n, n).
         """
-        quantile = _quantile(len(self.without)) / SURE
+        quantile = _quantile(len(self.without)) / Z_95
         return widened(self.covariance, self.without) * quantile**2
 
     def error_of(self, slopes: Array) -> float:
@@ -78,7 +78,7 @@ class Uncertainty:
         flat = slopes.reshape(-1, slopes.shape[-1])
         by_pictures = jackknife(self.without) * kept_share(*self.without.shape)
         larger = max(rms_bound(one, flat) for one in (self.covariance, by_pictures))
-        return _quantile(len(self.without)) / SURE * larger
+        return _quantile(len(self.without)) / Z_95 * larger
 
 
 def uncertainty_of(

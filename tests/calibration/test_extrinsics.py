@@ -19,7 +19,7 @@ from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, r
 from calibration.result_files import load_result
 from calibration.results import write_result
 from calibration.tag_map.observations import sights_of
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.errors import BadInput
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Rig, Tag, load_rig
@@ -337,7 +337,7 @@ def test_the_stated_error_of_a_place_is_exceeded_in_one_case_of_twenty(rig, seed
         camera=camera,
         by="frame tags",
         covariance=covariance,
-        half_widths=SURE * np.sqrt(np.diag(covariance)),
+        half_widths=Z_95 * np.sqrt(np.diag(covariance)),
         by_lens=None,
         points=workspace_corners(rig),
         tag_errors={},

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from model import jit as compiled
-from model.jit import UNUSED, throw_away_unused, use_folder
+from model.jit import UNUSED, delete_unused, use_folder
 
 NOW = 1.8e9
 OLD, RECENT = NOW - UNUSED - 1.0, NOW - UNUSED + 1.0
@@ -27,7 +27,7 @@ def test_only_versions_that_nobody_used_for_long_are_thrown_away(tmp_path: Path)
     old, recent = made(tmp_path, "a" * 16, OLD), made(tmp_path, "b" * 16, RECENT)
     other = made(tmp_path, "somebody-elses", OLD)
     left_over = made(tmp_path, "removed-x1_y2", OLD)
-    throw_away_unused(tmp_path, NOW)
+    delete_unused(tmp_path, NOW)
     assert not old.exists()
     assert not left_over.exists()
     assert sorted(tmp_path.iterdir()) == sorted([recent, other])
@@ -39,10 +39,10 @@ def test_a_version_in_use_is_kept_however_old_and_goes_when_it_is_let_go(tmp_pat
     lock = os.open(folder / "in-use", os.O_RDWR | os.O_CREAT)
     fcntl.flock(lock, fcntl.LOCK_SH)
     os.utime(folder, (OLD, OLD))
-    throw_away_unused(tmp_path, NOW)
+    delete_unused(tmp_path, NOW)
     assert (folder / "kernel.nbc").exists()
     os.close(lock)
-    throw_away_unused(tmp_path, NOW)
+    delete_unused(tmp_path, NOW)
     assert list(tmp_path.iterdir()) == []
 
 

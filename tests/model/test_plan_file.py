@@ -238,7 +238,7 @@ def test_a_plan_of_another_version_is_told_as_that_alone(tmp_path: Path) -> None
     error = refused(json.dumps({**DATA, "schema_version": 2, "newer": 1}), tmp_path)
     assert isinstance(error, InvalidFile)
     [problem] = error.problems
-    assert problem.what == "the file is of schema version 2; this program reads version 1"
+    assert problem.what == "the file has schema version 2; this program reads version 1"
 
 
 def test_keys_that_do_not_fit_are_told_by_path(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_each_value_stands_where_its_place_says(tree: Any, flow: bool | None) ->
     assert found.data == {"top": tree}
     assert found.faults == []
     lines = text.splitlines()
-    for path, (line, column) in found.places.items():
+    for path, (line, column) in found.positions.items():
         if path and isinstance(path[-1], str):
             assert lines[line - 1][column - 1 :].startswith((path[-1], "? "))
 
@@ -101,9 +101,9 @@ def test_a_key_that_a_merge_brings_may_be_overridden() -> None:
 
 
 def test_what_an_alias_repeats_has_the_place_of_the_alias() -> None:
-    places = parse_yaml("a: &a [1, 2]\nb: *a\n").places
-    assert places[("b",)] == (2, 1)
-    assert ("b", 0) not in places
+    positions = parse_yaml("a: &a [1, 2]\nb: *a\n").positions
+    assert positions[("b",)] == (2, 1)
+    assert ("b", 0) not in positions
 
 
 def levels(line: str) -> str:

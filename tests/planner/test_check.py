@@ -173,8 +173,8 @@ def test_a_winch_too_slow_for_the_path_speed_is_a_violation(gachon, scene_with) 
 
 
 def test_a_path_that_turns_the_platform_is_checked_too(gachon, scene_with) -> None:
-    turned = Pose(gachon.home.position, Rotation.from_euler("z", 1, degrees=True).as_matrix())
-    report = check_path(gachon, scene_with(), [gachon.home, turned, gachon.home])
+    rotated = Pose(gachon.home.position, Rotation.from_euler("z", 1, degrees=True).as_matrix())
+    report = check_path(gachon, scene_with(), [gachon.home, rotated, gachon.home])
     assert report.passed
     assert report.length == 0.0
     far = Pose(gachon.home.position, Rotation.from_euler("z", 150, degrees=True).as_matrix())

@@ -45,11 +45,13 @@ def test_many_edges_and_frozen_arrays_are_taken_as_one_by_one() -> None:
 
 def test_turning_edges_tell_their_reason_too() -> None:
     made = checks()
-    turned = Pose(HOME, matrix_from_rotation_vector([0.0, 0.0, 0.05]))
-    assert made.turning_problem(Pose.level(HOME), turned) == FREE
-    assert made.turning_problem(SCENE.start, Pose(SCENE.goal.position, turned.rotation)) == OBSTACLE
+    rotated = Pose(HOME, matrix_from_rotation_vector([0.0, 0.0, 0.05]))
+    assert made.turning_problem(Pose.level(HOME), rotated) == FREE
+    assert (
+        made.turning_problem(SCENE.start, Pose(SCENE.goal.position, rotated.rotation)) == OBSTACLE
+    )
     assert made.turning_problem(Pose.level(HOME), Pose.level([0.0, 0.0, 2.0])) == WORKSPACE
-    assert checks(self_clearance=0.05).turning_problem(Pose.level(HOME), turned) == SELF
+    assert checks(self_clearance=0.05).turning_problem(Pose.level(HOME), rotated) == SELF
 
 
 def test_importing_the_checks_compiles_nothing() -> None:

@@ -110,10 +110,10 @@ def test_a_free_straight_line_is_the_plan(gachon, scene_with, mode) -> None:
 
 
 def test_a_turned_platform_keeps_its_orientation(gachon, scene_with) -> None:
-    turned = [float(np.cos(np.radians(0.5))), 0.0, 0.0, float(np.sin(np.radians(0.5)))]
+    rotated = [float(np.cos(np.radians(0.5))), 0.0, 0.0, float(np.sin(np.radians(0.5)))]
     scene = scene_with(
-        start={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": turned},
-        goal={"position_mm": [60.0, 0.0, 445.0], "rotation_wxyz": turned},
+        start={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": rotated},
+        goal={"position_mm": [60.0, 0.0, 445.0], "rotation_wxyz": rotated},
     )
     plan = plan_from_document(proved(gachon, scene, QUICK))
     assert all(w.angle_to(scene.start) < 1e-9 for w in plan.waypoints)
@@ -163,8 +163,8 @@ def test_a_load_too_heavy_for_the_cables_is_bad_input(gachon, scene_with) -> Non
 
 
 def test_start_and_goal_turned_differently_are_bad_input(gachon, scene_with) -> None:
-    turned = [float(np.cos(0.05)), 0.0, 0.0, float(np.sin(0.05))]
-    scene = scene_with(goal={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": turned})
+    rotated = [float(np.cos(0.05)), 0.0, 0.0, float(np.sin(0.05))]
+    scene = scene_with(goal={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": rotated})
     with pytest.raises(BadInput, match=r"differ in orientation by 5\.73 deg"):
         make_plan(gachon, scene, QUICK)
 

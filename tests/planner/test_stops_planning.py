@@ -135,8 +135,8 @@ def test_a_load_picked_on_the_way_is_planned_for(gachon, scene_with) -> None:
             ["stop 'high' the cables cannot hold"],
         ),
         (
-            [stop("turned", 0, 0, 445, rotation_wxyz=[0.0, 0.0, 0.0, 1.0])],
-            ["start and stop 'turned' differ in orientation by 180 deg"],
+            [stop("rotated", 0, 0, 445, rotation_wxyz=[0.0, 0.0, 0.0, 1.0])],
+            ["start and stop 'rotated' differ in orientation by 180 deg"],
         ),
     ],
 )
@@ -157,7 +157,7 @@ def test_no_path_tells_the_leg(gachon, ready_scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stops", "why"), [([], "are its poses []"), ([2, 1], "[2, 1]"), ([1, 9], "between 0 and 3")]
+    ("stops", "why"), [([], "stops at poses []"), ([2, 1], "[2, 1]"), ([1, 9], "between 0 and 3")]
 )
 def test_stops_of_a_path_that_are_none_are_refused(gachon, scene_with, stops, why) -> None:
     scene = scene_with(stops=[stop("a", 0, 0, 445), stop("b", 0, 0, 445)])
@@ -175,7 +175,7 @@ def test_a_path_past_its_stop_fails_the_check(gachon, scene_with) -> None:
 
 def test_a_longest_path_and_wrong_rounds_are_refused_with_stops(gachon, scene_with) -> None:
     scene = scene_with(stops=[stop("a", 0, 0, 450)])
-    with pytest.raises(BadInput, match="limit of the path length"):
+    with pytest.raises(BadInput, match="limit on the path length"):
         make_plan(gachon, scene, OptimalSettings(longest=1.0))
     with pytest.raises(BadInput, match=r"rounds are given for 3 legs; the scene has 2"):
         make_plan(gachon, scene, OptimalSettings(), rounds=[1, 1, 1])
@@ -188,5 +188,5 @@ def test_a_report_of_legs_can_be_told_as_json(gachon, ready_scene) -> None:
     report = verify(plan).report
     assert json.dumps(report.as_dict(), allow_nan=False)
     motion = sum(a.distance_to(b) for a, b in pairwise(plan.waypoints))
-    assert 0.0 <= report.obstacle_clearance.place <= motion
+    assert 0.0 <= report.obstacle_clearance.at <= motion
     assert report.length == pytest.approx(motion)

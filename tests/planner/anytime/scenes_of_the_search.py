@@ -19,7 +19,7 @@ from planner.endpoints import require_usable_ends
 from planner.settings import Weights
 from tests.planner.collision.sampled_oracle import random_scene
 
-KINDS = ("box", "turned box", "sphere", "capsule", "cylinder", "hull")
+KINDS = ("box", "rotated box", "sphere", "capsule", "cylinder", "hull")
 LENGTH = Weights(length=1.0)
 
 

@@ -15,7 +15,7 @@ from model.rig import Rig, rig_from_document
 from model.scene import Scene, scene_from_document
 from model.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
 
-KINDS = ("box", "turned box", "sphere", "capsule", "cylinder", "hull", "convex mesh", "mesh")
+KINDS = ("box", "rotated box", "sphere", "capsule", "cylinder", "hull", "convex mesh", "mesh")
 
 
 def random_scene(rng: np.random.Generator, rig: Rig, count: int, kinds=KINDS) -> Scene:
@@ -45,7 +45,7 @@ def _shape(rng: np.random.Generator, kind: str, scale: float) -> dict[str, objec
     radius, length = scale * rng.uniform(0.03, 0.15), scale * rng.uniform(0.1, 0.6)
     cloud = scale * rng.uniform(-0.25, 0.25, (9, 3))
     match kind:
-        case "box" | "turned box":
+        case "box" | "rotated box":
             return {"box": {"size_mm": (scale * rng.uniform(0.05, 0.4, 3)).tolist()}}
         case "sphere":
             return {"sphere": {"radius_mm": radius}}

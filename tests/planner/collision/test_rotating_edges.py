@@ -14,7 +14,7 @@ from model.kinematics import cables_to
 from model.pose import Pose
 from model.rig import Rig, load_rig
 from planner.collision.edges import edge_clearance, edge_free
-from planner.collision.rotating_edges import turned_by, turning_edge_free
+from planner.collision.rotating_edges import rotated_by, turning_edge_free
 from planner.collision.world import build_world
 from planner.kernels.exit_points import exit_point, exit_travel
 from tests.planner.collision.sampled_oracle import KINDS, CoalScene, random_scene
@@ -30,7 +30,7 @@ def test_a_share_of_a_turn_is_scipys(seed: int) -> None:
     rng = np.random.default_rng(seed)
     start, turn, share = Rotation.random(rng=rng), rng.normal(size=3), rng.uniform()
     expected = (start * Rotation.from_rotvec(share * turn)).as_matrix()
-    assert np.allclose(turned_by(start.as_matrix(), turn, share), expected, rtol=0, atol=1e-14)
+    assert np.allclose(rotated_by(start.as_matrix(), turn, share), expected, rtol=0, atol=1e-14)
 
 
 @given(seeds)

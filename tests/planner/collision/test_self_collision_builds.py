@@ -47,8 +47,8 @@ def edges_of(rig: Rig, rng: np.random.Generator, count: int) -> tuple[Array, Arr
 
 
 def rotations_along(first: Rotation, turn: Array, shares: Array) -> Array:
-    turned: Array = (first * Rotation.from_rotvec(shares[:, None] * turn)).as_matrix()
-    return turned
+    rotated: Array = (first * Rotation.from_rotvec(shares[:, None] * turn)).as_matrix()
+    return rotated
 
 
 class Along:

@@ -153,8 +153,8 @@ def test_refusals_are_counted_and_named(searched, sampler) -> None:
     assert result.path is None
     assert result.iterations == 80
     assert result.refused["obstacle clearance"] > 0
-    assert all(obstacle.startswith("obstacle_") for _, obstacle in result.in_the_way)
-    assert sum(result.in_the_way.values()) == result.refused["obstacle clearance"]
+    assert all(obstacle.startswith("obstacle_") for _, obstacle in result.blocking_pairs)
+    assert sum(result.blocking_pairs.values()) == result.refused["obstacle clearance"]
 
 
 def test_algorithm_3_leaves_no_node_that_can_be_skipped_from_a_kept_one(searched) -> None:

@@ -80,7 +80,7 @@ def test_the_costs_are_the_planner_s(gachon, extremes):
 
 @pytest.mark.parametrize("rotation_vector", [(0.0, 0.0, 0.0), (0.1, -0.05, 0.2)])
 def test_every_value_is_that_of_its_pose(hall, ready_scene, rotation_vector):
-    """Pulleys, ten cables, payload, a disturbance and round obstacles, level and turned."""
+    """Pulleys, ten cables, payload, a disturbance and round obstacles, level and rotated."""
     scene = ready_scene("hall_pillar")
     rotation = matrix_from_rotation_vector(np.array(rotation_vector))
     random = np.random.default_rng(3)

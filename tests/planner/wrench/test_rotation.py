@@ -133,8 +133,8 @@ def test_columns_move_no_farther_than_their_bounds(seed: int) -> None:
     units = np.repeat([1.0, load.length], 3)[:, None]
 
     def columns(share: float) -> Array:
-        turned = first @ Rotation.from_rotvec(share * bend).as_matrix()
-        return structure_matrix(rig, Pose(middle + share * off, turned)) / units
+        rotated = first @ Rotation.from_rotvec(share * bend).as_matrix()
+        return structure_matrix(rig, Pose(middle + share * off, rotated)) / units
 
     still, tiny = columns(0.0), 1e-5
     tangent = (columns(tiny) - columns(-tiny)) / (2.0 * tiny)
