@@ -266,8 +266,8 @@ class ClearanceModel:
         """A lower bound of obstacle distances while the platform translates; point exits only.
 
         Args:
-            middle: A pose on the way; gives the orientation, and planes where the cached ones do
-                not suffice.
+            middle: A pose of the translation; gives the orientation, and planes where the cached
+                ones do not suffice.
             positions: The platform's origin stays in their hull, shape (k, 3), [m].
             wanted: Bound to prove; larger ones are not tried, [m].
 

@@ -195,7 +195,7 @@ def make_plan(
             each leg between stops.
         progress: Called with the progress of the search.
         clock: Seconds, for the planning time and the budget.
-        rounds: Of each leg, in place of those in the settings.
+        rounds: Of each leg, instead of those in the settings.
         done: Stops that an earlier run visited; the plan only records them.
 
     Returns:

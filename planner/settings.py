@@ -153,7 +153,7 @@ class AnytimeSettings:
         longest: Longest path allowed, [m]; infinite for no limit.
         seed: Of the random numbers.
         budget: Time to find and improve paths, [s]; preparation is not counted.
-        rounds: Exact number of rounds, in place of the budget; reproducible.
+        rounds: Exact number of rounds instead of the budget; reproducible.
     """
 
     weights: Weights = field(default_factory=lambda: OBJECTIVES["length"])
@@ -268,7 +268,7 @@ class PlanningOptions:
         cost: Objective; when left out ``length``, or ``kinematic`` for the paper's planners.
         weight: Weights of a sum of objectives, by name, or as texts ``NAME=NUMBER``.
         budget_ms: Optimal: time to find and improve a path.
-        rounds: Optimal: rounds in place of the budget, one number or one per leg; reproducible.
+        rounds: Optimal: rounds instead of the budget, one number or one per leg; reproducible.
         longest_mm: Optimal: length limit of the path.
         free_rotation: Optimal: the platform may rotate, within the scene's limits.
         mode: The paper's planners: RRT* (rewire), or stop at the first path (paper).

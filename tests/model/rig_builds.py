@@ -90,7 +90,7 @@ def ipanema() -> Rig:
 
 
 def poses_of(rig: Rig, largest_angle_deg: float = 25.0) -> st.SearchStrategy[Pose]:
-    """Poses in the middle four fifths of a rig's workspace, turned about any axis."""
+    """Poses in the middle four fifths of a rig's workspace, rotated about any axis."""
     share = st.floats(0.1, 0.9)
     part = st.floats(-1.0, 1.0)
     angle = np.radians(largest_angle_deg)

@@ -111,7 +111,7 @@ def test_text_that_cannot_be_encoded_is_written_as_its_escape(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == ["file.json"]
 
 
-def test_a_folder_that_may_not_be_written_is_told(
+def test_a_folder_that_may_not_be_written_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Root may write everywhere, so the system's answer is played."""

@@ -30,7 +30,7 @@ def agree(found: Pose, true: Pose) -> None:
 @settings(max_examples=25)
 @given(data=st.data())
 def test_the_pose_comes_back_without_a_guess(name: str, data: st.DataObject) -> None:
-    """Turned by up to 25°, from starts that are all level."""
+    """Rotated by up to 25°, from starts that are all level."""
     rig = RIGS[name]
     pose = data.draw(poses_of(rig))
     found = forward_kinematics(rig, cable_lengths(rig, pose))
@@ -65,8 +65,8 @@ def test_many_poses_near_known_ones_are_found_together(name: str) -> None:
     lengths = np.array([cable_lengths(rig, pose) for pose in poses])
     guesses = np.array([pose.position for pose in poses]) + rng.uniform(-0.003, 0.003, (9, 3))
     rotations = np.array([pose.rotation for pose in poses])
-    positions, turned = poses_near(rig, lengths, guesses, rotations)
-    for pose, position, rotation in zip(poses, positions, turned, strict=True):
+    positions, turns = poses_near(rig, lengths, guesses, rotations)
+    for pose, position, rotation in zip(poses, positions, turns, strict=True):
         agree(Pose(position, rotation), pose)
 
 

@@ -68,7 +68,7 @@ def test_a_csv_file_is_the_same_whatever_its_line_ends(tmp_path: Path, end: str)
     assert file.lines == [1, 2, 4], "as an editor counts them"
 
 
-def test_a_field_that_never_ends_is_told_with_its_line(tmp_path: Path) -> None:
+def test_a_field_that_never_ends_is_reported_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text('a,b\n1,"' + "x" * 200_000)
     for reader in (CsvFile, TableFile, lambda path: read_rig_data(path, 8)):
         with pytest.raises(BadInput, match="not valid CSV") as caught:
@@ -76,7 +76,7 @@ def test_a_field_that_never_ends_is_told_with_its_line(tmp_path: Path) -> None:
         assert caught.value.where.endswith("a.csv:2")
 
 
-def test_a_whole_number_past_64_bits_in_a_table_is_told(tmp_path: Path) -> None:
+def test_a_whole_number_past_64_bits_in_a_table_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("n\n" + "9" * 30 + "\n")
     with pytest.raises(BadInput, match="whole number"):
         TableFile(tmp_path / "a.csv").ints("n")
@@ -118,7 +118,7 @@ def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
     assert "100 bytes" in str(caught.value)
 
 
-def test_a_hull_with_a_point_of_two_numbers_is_told_with_its_place(tmp_path: Path) -> None:
+def test_a_hull_with_a_point_of_two_numbers_is_reported_with_its_position(tmp_path: Path) -> None:
     scene = tmp_path / "scene.yaml"
     scene.write_text(
         "schema_version: 1\nname: hull\nstart: {position_mm: [0, 0, 0]}\n"

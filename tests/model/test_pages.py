@@ -215,7 +215,7 @@ def test_the_floor_is_below_everything_with_round_lines() -> None:
     assert sunk.segments[..., 2].max() == pytest.approx(-0.8)
 
 
-def test_arrows_begin_and_end_where_they_are_told_and_vanish_without_length() -> None:
+def test_arrows_begin_and_end_where_they_are_given_and_vanish_without_length() -> None:
     ends = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     found = arrows("a", "limit", np.zeros((2, 3)), ends).segments
     assert len(found) == 5

@@ -181,14 +181,14 @@ def test_a_plan_with_a_key_less_or_more_is_refused(
     else:
         del holder_of(data, path)[path[-1]]
     folder = tmp_path_factory.mktemp("keys")
-    if add or not _stands_at_its_default(path):
+    if add or not _is_default(path):
         refused(json.dumps(data), folder)
     else:
         (folder / "plan.json").write_text(json.dumps(data))
         assert load_plan(folder / "plan.json").document == PlanDocument.model_validate(DATA)
 
 
-def _stands_at_its_default(path: tuple[Any, ...]) -> bool:
+def _is_default(path: tuple[Any, ...]) -> bool:
     if path[-1] in ("kind", "schema_version", "type"):  # they say what the file, or a part, is
         return False
     try:
@@ -198,7 +198,7 @@ def _stands_at_its_default(path: tuple[Any, ...]) -> bool:
 
 
 def test_a_plan_of_a_version_that_knew_less_is_read(tmp_path: Path) -> None:
-    """What it does not know stands at its default: the plan of a later version says the same."""
+    """What it does not know has its default: the plan of a later version says the same."""
     data = {**SAID, "kind": DATA["kind"], "schema_version": DATA["schema_version"]}
     assert len(json.dumps(data)) < 0.9 * len(json.dumps(DATA))
     (tmp_path / "plan.json").write_text(json.dumps(data))
@@ -229,11 +229,11 @@ def test_a_plan_cut_off_anywhere_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["[]", "1", '"plan"', "{}", '{"kind": "cdpr-run"}', "null"])
-def test_json_that_is_no_plan_is_told_in_one_sentence(text: str, tmp_path: Path) -> None:
+def test_json_that_is_not_a_plan_is_reported_in_one_sentence(text: str, tmp_path: Path) -> None:
     assert refused(text, tmp_path).what == "this is not a plan file"
 
 
-def test_a_plan_of_another_version_is_told_as_that_alone(tmp_path: Path) -> None:
+def test_a_plan_of_another_version_is_reported_as_that_alone(tmp_path: Path) -> None:
     """Whatever else the other version has: its keys are not mistakes."""
     error = refused(json.dumps({**DATA, "schema_version": 2, "newer": 1}), tmp_path)
     assert isinstance(error, InvalidFile)
@@ -241,7 +241,7 @@ def test_a_plan_of_another_version_is_told_as_that_alone(tmp_path: Path) -> None
     assert problem.what == "the file has schema version 2; this program reads version 1"
 
 
-def test_keys_that_do_not_fit_are_told_by_path(tmp_path: Path) -> None:
+def test_keys_that_do_not_fit_are_reported_by_path(tmp_path: Path) -> None:
     data = copy.deepcopy(DATA)
     data["waypoints"][1]["position_mm"] = [1.0, "x", 3.0]
     data["planner"]["sead"] = data["planner"].pop("seed")
@@ -256,7 +256,7 @@ def test_keys_that_do_not_fit_are_told_by_path(tmp_path: Path) -> None:
     assert "did you mean 'seed'" in str(error)
 
 
-def test_a_key_that_stands_twice_is_refused(tmp_path: Path) -> None:
+def test_a_duplicate_key_is_refused(tmp_path: Path) -> None:
     """Another program might read the first one."""
     text = json.dumps(DATA)
     text = text.replace('"seed": 1', '"seed": 2, "seed": 1')
@@ -279,7 +279,7 @@ def test_a_plan_sealed_over_a_wrong_part_hash_is_refused(key: str, tmp_path: Pat
     assert f"the plan's {key} does not match" in error.what
 
 
-def test_a_folder_is_no_plan_and_no_place_for_one(tmp_path: Path) -> None:
+def test_a_folder_is_not_a_plan_and_cannot_be_replaced_by_one(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="this is a folder"):
         load_plan(tmp_path)
     with pytest.raises(BadInput, match="this is a folder"):
@@ -287,14 +287,14 @@ def test_a_folder_is_no_plan_and_no_place_for_one(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_missing_folder_is_told(tmp_path: Path) -> None:
+def test_a_missing_folder_is_reported(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="cannot be written") as caught:
         save_plan(DOCUMENT, tmp_path / "nowhere" / "plan.json")
     assert "existing folder" in caught.value.next_step
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_read_only_folder_is_told_and_left_as_it_was(tmp_path: Path) -> None:
+def test_a_read_only_folder_is_reported_and_left_as_it_was(tmp_path: Path) -> None:
     folder = tmp_path / "locked"
     folder.mkdir()
     folder.chmod(0o555)

@@ -18,13 +18,13 @@ PRINTED_MM = {
 }
 
 
-@pytest.mark.parametrize(("place", "half_digit"), [("home", 5e-5), ("start", 5e-4), ("goal", 5e-4)])
-def test_the_papers_rig_has_the_printed_lengths(place: str, half_digit: float) -> None:
+@pytest.mark.parametrize(("name", "half_digit"), [("home", 5e-5), ("start", 5e-4), ("goal", 5e-4)])
+def test_the_papers_rig_has_the_printed_lengths(name: str, half_digit: float) -> None:
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     scene = load_scene(CONFIGS / "environment_1.yaml")
-    pose = {"home": rig.home, "start": scene.start, "goal": scene.goal}[place]
+    pose = {"home": rig.home, "start": scene.start, "goal": scene.goal}[name]
     lengths_mm = 1000.0 * cable_lengths(rig, pose)
-    np.testing.assert_allclose(lengths_mm, PRINTED_MM[place], rtol=0, atol=1.001 * half_digit)
+    np.testing.assert_allclose(lengths_mm, PRINTED_MM[name], rtol=0, atol=1.001 * half_digit)
 
 
 def test_ipanema_1_has_eight_equal_lengths_in_the_middle() -> None:

@@ -1,4 +1,4 @@
-"""Rig files: every kind of mistake is told with its place and in a plain sentence, all at once."""
+"""Rig files: all mistakes are reported at once, each with its position and a plain sentence."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_told_by_key_and_sentence(mistake: str, tmp_path: Path) -> None:
+def test_a_mistake_is_reported_by_key_and_sentence(mistake: str, tmp_path: Path) -> None:
     entry = MISTAKES[mistake]
     assert entry["old"] in PAPER
     text = PAPER.replace(entry["old"], entry["new"], 1)
     # A section that is renamed away for the example is itself an unknown key.
-    told = [problem for problem in problems_in(text, tmp_path) if problem[2] != "x"]
-    assert [problem[2] for problem in told] == [entry["key"]], told
-    assert entry["sentence"] in told[0][3]
-    assert 1 <= told[0][0] <= text.count("\n") + 1
+    found = [problem for problem in problems_in(text, tmp_path) if problem[2] != "x"]
+    assert [problem[2] for problem in found] == [entry["key"]], found
+    assert entry["sentence"] in found[0][3]
+    assert 1 <= found[0][0] <= text.count("\n") + 1
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,9 @@ def test_line_and_column_are_those_of_the_key(old: str, new: str, key: str, tmp_
     assert [(p[0], p[1]) for p in problems_in(text, tmp_path)] == [(line, column)]
 
 
-def test_every_problem_of_a_file_is_told_at_once_in_the_order_of_the_file(tmp_path: Path) -> None:
+def test_every_problem_of_a_file_is_reported_at_once_in_the_order_of_the_file(
+    tmp_path: Path,
+) -> None:
     """Also those between parts, as far as the parts that they compare are sound."""
     text = PAPER
     for old, new in (
@@ -136,12 +138,12 @@ def test_pulleys_are_checked(
     change: tuple[str, str], key: str, sentence: str, tmp_path: Path
 ) -> None:
     assert change[0] in HALL
-    [(_, _, told, what)] = problems_in(HALL.replace(*change, 1), tmp_path)
-    assert told == f"pulleys.{key}"
+    [(_, _, found, what)] = problems_in(HALL.replace(*change, 1), tmp_path)
+    assert found == f"pulleys.{key}"
     assert sentence in what
 
 
-def test_two_cameras_of_one_name_are_told(tmp_path: Path) -> None:
+def test_two_cameras_of_one_name_are_reported(tmp_path: Path) -> None:
     start = PAPER.index("  - name: front")
     [(_, _, key, what)] = problems_in(PAPER + PAPER[start:], tmp_path)
     assert (key, what) == ("cameras[1].name", "camera name 'front' appears twice")
@@ -174,11 +176,11 @@ def test_five_cables_are_too_few(tmp_path: Path) -> None:
         ("[" * 3000, 1, "nested too deeply"),
     ],
 )
-def test_text_that_is_no_rig_at_all_is_told_with_its_line(
+def test_text_that_is_not_a_rig_at_all_is_reported_with_its_line(
     text: str, line: int, sentence: str, tmp_path: Path
 ) -> None:
-    [(told_line, _, _, what)] = problems_in(text, tmp_path)
-    assert told_line == line
+    [(found_line, _, _, what)] = problems_in(text, tmp_path)
+    assert found_line == line
     assert sentence in what
 
 
@@ -191,7 +193,7 @@ def test_text_that_is_no_rig_at_all_is_told_with_its_line(
         (lambda path: path.write_bytes("a: 1".encode("utf-16")), "not UTF-8"),
     ],
 )
-def test_a_file_that_cannot_be_read_is_told(
+def test_a_file_that_cannot_be_read_is_reported(
     make: Callable[[Path], object], words: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "rig.yaml"
@@ -203,7 +205,7 @@ def test_a_file_that_cannot_be_read_is_told(
     assert "Errno" not in str(caught.value)
 
 
-def test_a_path_through_a_file_is_told(tmp_path: Path) -> None:
+def test_a_path_through_a_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match="cannot be read"):
         load_rig(tmp_path / "file" / "rig.yaml")
@@ -353,7 +355,7 @@ ODD = st.one_of(
 
 @settings(max_examples=150)
 @given(path=st.sampled_from(leaves(paper_data())), value=ODD)
-def test_whatever_stands_in_a_file_makes_a_rig_or_one_of_our_errors(
+def test_any_content_of_a_file_makes_a_rig_or_one_of_our_errors(
     path: tuple[Any, ...], value: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """No exception of a library ever reaches the user."""
@@ -364,9 +366,9 @@ def test_whatever_stands_in_a_file_makes_a_rig_or_one_of_our_errors(
     inner[path[-1]] = value
     file = tmp_path_factory.mktemp("odd") / "rig.yaml"
     file.write_text(yaml.safe_dump(changed, allow_unicode=True), encoding="utf-8")
-    told = ""
+    found = ""
     try:
         load_rig(file)
     except CdprError as error:
-        told = str(error)
-    assert not JARGON.search(told), told
+        found = str(error)
+    assert not JARGON.search(found), found

@@ -96,11 +96,11 @@ def problems_with(obstacles: list[dict[str, Any]], tmp_path: Path) -> list[tuple
         ),
     ],
 )
-def test_a_wrong_obstacle_is_told_by_key(
+def test_a_wrong_obstacle_is_reported_by_key(
     obstacle: dict[str, Any], key: str, sentence: str, tmp_path: Path
 ) -> None:
-    [(told, what)] = problems_with([{"name": "o", **obstacle}], tmp_path)
-    assert told == key
+    [(found, what)] = problems_with([{"name": "o", **obstacle}], tmp_path)
+    assert found == key
     assert sentence in what
 
 
@@ -115,13 +115,13 @@ def test_a_wrong_obstacle_is_told_by_key(
 def test_an_obstacle_larger_than_distances_are_proved_for_is_refused(
     parts: dict[str, Any], tmp_path: Path
 ) -> None:
-    [(told, what)] = problems_with([{"name": "floor", **parts}], tmp_path)
-    assert told == "obstacles[0]"
+    [(found, what)] = problems_with([{"name": "floor", **parts}], tmp_path)
+    assert found == "obstacles[0]"
     assert "'floor' reaches" in what
     assert "make it as large as the room" in what
 
 
-def test_two_obstacles_of_one_name_are_told_beside_other_problems(tmp_path: Path) -> None:
+def test_two_obstacles_of_one_name_are_reported_beside_other_problems(tmp_path: Path) -> None:
     box = {"size_mm": [1, 1, 1]}
     found = problems_with(
         [{"name": "a", "box": box}, {"name": "a", "box": {"size_mm": [1]}}, {"name": "b"}],
@@ -145,7 +145,7 @@ def test_two_obstacles_of_one_name_are_told_beside_other_problems(tmp_path: Path
         ("goal", "rotation_wxyz", [1, 0, 0, 1], "must be a unit quaternion"),
     ],
 )
-def test_a_wrong_number_in_a_section_is_told(
+def test_a_wrong_number_in_a_section_is_reported(
     section: str, key: str, value: object, sentence: str, tmp_path: Path
 ) -> None:
     data = scene_data()
@@ -159,7 +159,7 @@ def test_a_wrong_number_in_a_section_is_told(
     assert sentence in problem.what
 
 
-def test_every_shape_arrives_in_metres_and_in_its_place() -> None:
+def test_every_shape_arrives_in_metres_and_at_its_pose() -> None:
     data = scene_data()
     mesh = {"points_mm": TETRAHEDRON, "triangles": FACES[1:]}  # open: a surface
     shapes: list[tuple[str, dict[str, Any]]] = [

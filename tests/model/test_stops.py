@@ -63,7 +63,7 @@ def problems(stops: list[dict[str, Any]], path: Path, **parts: Any) -> dict[str,
         ([stop("a", payload_kg=1.0)], "stops[0].payload_kg", "unknown key 'payload_kg'"),
     ],
 )
-def test_a_stop_that_does_not_fit_is_told_with_its_place(
+def test_a_stop_that_does_not_fit_is_reported_with_its_position(
     stops: list[dict[str, Any]], key: str, words: str, tmp_path: Path
 ) -> None:
     found = problems(stops, tmp_path / "scene.yaml")
@@ -71,7 +71,7 @@ def test_a_stop_that_does_not_fit_is_told_with_its_place(
     assert words in found[key]
 
 
-def test_problems_of_stops_are_told_beside_others(tmp_path: Path) -> None:
+def test_problems_of_stops_are_reported_beside_others(tmp_path: Path) -> None:
     wrong = {"clearance": {"obstacle_mm": -1}}
     found = problems([stop("a", mass_kg=1.0)], tmp_path / "scene.yaml", **wrong)
     assert set(found) == {"clearance.obstacle_mm", "stops[0].mass_kg"}
@@ -110,7 +110,7 @@ def test_putting_down_what_was_picked_last_leaves_what_was_there_before(
     np.testing.assert_allclose(after.centre_mm, before.centre_mm, atol=2e-6 * ratio + 1e-6)
 
 
-def test_a_place_without_a_centre_takes_from_all_that_is_carried_alike() -> None:
+def test_a_placed_mass_without_a_centre_takes_from_all_that_is_carried_alike() -> None:
     carried = Payload(2.0, (10.0, 20.0, 30.0))
     assert carried.without_mass(0.5, None) == Payload(1.5, (10.0, 20.0, 30.0))
     assert carried.without_mass(2.0, None) == Payload(0.0, (0.0, 0.0, 0.0))

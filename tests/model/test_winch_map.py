@@ -1,4 +1,4 @@
-"""From cable lengths to drive counts: home, directions, stretch, and the way back."""
+"""From cable lengths to drive counts: home, directions, stretch, and back."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ each = pytest.mark.parametrize("name", RIGS)
 
 
 @each
-def test_at_home_under_working_tensions_each_drive_stands_at_its_home_counts(name: str) -> None:
+def test_at_home_under_working_tensions_each_drive_is_at_its_home_counts(name: str) -> None:
     rig, winches = RIGS[name], MAPS[name]
     tensions = working_tensions(rig, rig.home).tensions
     unstrained = winches.unstrained(cable_lengths(rig, rig.home), tensions)
@@ -78,8 +78,8 @@ def test_more_tension_means_less_cable_paid_out(name: str) -> None:
     slack = winches.unstrained(lengths, np.full(rig.cable_count, rig.min_tension))
     taut = winches.unstrained(lengths, np.full(rig.cable_count, rig.max_tension))
     assert np.all(taut < slack)
-    turned = winches.counts(taut) - winches.counts(slack)
-    assert np.all(turned * np.sign([w.counts_per_metre for w in rig.winches]) < 0.0)
+    moved = winches.counts(taut) - winches.counts(slack)
+    assert np.all(moved * np.sign([w.counts_per_metre for w in rig.winches]) < 0.0)
 
 
 @each

@@ -1,4 +1,4 @@
-"""YAML as people mean it: numbers of YAML 1.2, and the place of everything."""
+"""YAML as users mean it: numbers of YAML 1.2, and the position of everything."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ trees = st.recursive(
 
 
 @given(trees, st.sampled_from([True, False, None]))
-def test_each_value_stands_where_its_place_says(tree: Any, flow: bool | None) -> None:
+def test_each_value_is_at_its_stated_position(tree: Any, flow: bool | None) -> None:
     text = yaml.safe_dump({"top": tree}, default_flow_style=flow, width=60)
     found = parse_yaml(text)
     assert found.data == {"top": tree}
@@ -89,7 +89,7 @@ def test_each_value_stands_where_its_place_says(tree: Any, flow: bool | None) ->
             assert lines[line - 1][column - 1 :].startswith((path[-1], "? "))
 
 
-def test_a_key_twice_is_told_at_its_second_place() -> None:
+def test_a_key_twice_is_reported_at_its_second_position() -> None:
     [fault] = parse_yaml("a:\n  x: 1\n  y: 2\n  x: 3\n").faults
     assert (fault.key, fault.line, fault.column) == (("a", "x"), 4, 3)
 
@@ -100,7 +100,7 @@ def test_a_key_that_a_merge_brings_may_be_overridden() -> None:
     assert tree.data["b"] == {"x": 5, "y": 2}
 
 
-def test_what_an_alias_repeats_has_the_place_of_the_alias() -> None:
+def test_what_an_alias_repeats_has_the_position_of_the_alias() -> None:
     positions = parse_yaml("a: &a [1, 2]\nb: *a\n").positions
     assert positions[("b",)] == (2, 1)
     assert ("b", 0) not in positions
@@ -151,10 +151,10 @@ def test_a_tag_makes_nothing(text: str) -> None:
 
 
 @given(st.text(st.sampled_from("ab:-[]{},&*!?#'\"|> \n\t%@`1.~<\x00\u2028é"), max_size=25))
-def test_any_text_is_read_or_refused_with_a_place(text: str) -> None:
-    told = None
+def test_any_text_is_read_or_refused_with_a_position(text: str) -> None:
+    found = None
     try:
         parse_yaml(text)
     except YamlSyntaxError as error:
-        told = error
-    assert told is None or (told.line >= 0 and told.what.startswith("not valid"))
+        found = error
+    assert found is None or (found.line >= 0 and found.what.startswith("not valid"))

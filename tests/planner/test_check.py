@@ -199,7 +199,7 @@ def test_margin_and_self_clearance_change_no_faster_than_their_slopes(
         )
         ends = [Pose.level(position), near]
         check = _Check(rig, scene, PosePath(rig, ends))
-        motion = check.track.marks[-1]
+        motion = check.path.marks[-1]
         margins = [capacity_margins(rig, scene, p.position[None], p.rotation)[0] for p in ends]
         assert abs(margins[1] - margins[0]) <= check._margin_slope() * motion
         own = [check.model.self_clearance(p).distance for p in ends]

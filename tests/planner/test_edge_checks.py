@@ -24,7 +24,7 @@ def checks(**changes: float) -> ExactChecks:
     return ExactChecks(GACHON, SCENE, np.eye(3), **(limits | changes))
 
 
-def test_every_reason_is_told() -> None:
+def test_every_reason_is_reported() -> None:
     aside = HOME + np.array([0.1, 0.0, 0.0])
     assert checks().problem(HOME, aside) == FREE
     assert checks().problem(HOME, HOME + np.array([0.0, 0.0, 1.0])) == WORKSPACE
@@ -43,7 +43,7 @@ def test_many_edges_and_frozen_arrays_are_taken_as_one_by_one() -> None:
     assert (round(distance, 4), body, obstacle) == (0.0322, 6, 0)
 
 
-def test_turning_edges_tell_their_reason_too() -> None:
+def test_turning_edges_report_their_reason_too() -> None:
     made = checks()
     rotated = Pose(HOME, matrix_from_rotation_vector([0.0, 0.0, 0.05]))
     assert made.turning_problem(Pose.level(HOME), rotated) == FREE

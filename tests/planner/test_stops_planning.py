@@ -44,15 +44,15 @@ def test_a_plan_meets_every_stop_exactly_and_passes_its_check(
     plan = load_plan(tmp_path / "plan.json")
     assert verify(plan).report.passed
     assert [mark.name for mark in plan.document.stops] == [s.name for s in scene.stops]
-    for place, at in zip(plan.stops, scene.stops, strict=True):
-        assert plan.waypoints[place].distance_to(at.pose) < 1e-9
+    for index, at in zip(plan.stops, scene.stops, strict=True):
+        assert plan.waypoints[index].distance_to(at.pose) < 1e-9
     assert plan.waypoints[0].distance_to(scene.start) < 1e-9
     assert plan.waypoints[-1].distance_to(scene.goal) < 1e-9
     tree = plan.document.tree
     assert tree.parents.count(-1) == len(scene.stops) + 1, "a root for each leg"
     nodes = np.array([*tree.positions_mm, [np.nan] * 3])
-    for place in (*plan.stops, len(plan.waypoints) - 1):
-        ends = plan.waypoints[place].position * 1000.0
+    for index in (*plan.stops, len(plan.waypoints) - 1):
+        ends = plan.waypoints[index].position * 1000.0
         assert np.nanmin(np.linalg.norm(nodes - ends, axis=1)) < 0.002
 
 
@@ -99,7 +99,7 @@ def test_a_leg_is_the_plan_that_its_ends_alone_would_have(gachon, ready_scene) -
 
 
 def test_a_leg_that_only_its_own_load_makes_impossible_fails_the_check(gachon, scene_with) -> None:
-    """12 kg are held at home and at the goal, but not at [200, 200, 600] mm on the way."""
+    """12 kg are held at home and at the goal, but not at [200, 200, 600] mm in between."""
     ends = {"start": {"position_mm": [0, 0, 300]}, "goal": {"position_mm": [200, 200, 300]}}
     high = Pose.level(np.array([0.2, 0.2, 0.6]))
     loaded = scene_with(**ends, stops=[pick("heavy", (0, 0, 445), 12.0)])
@@ -114,7 +114,7 @@ def test_a_leg_that_only_its_own_load_makes_impossible_fails_the_check(gachon, s
     assert check_path(gachon, late, before, [1, 2]).passed, "the mass is picked after it"
 
 
-def test_a_load_picked_on_the_way_is_planned_for(gachon, scene_with) -> None:
+def test_a_load_picked_in_between_is_planned_for(gachon, scene_with) -> None:
     scene = scene_with(
         start={"position_mm": [0, 0, 300]},
         goal={"position_mm": [200, 200, 300]},
@@ -147,7 +147,7 @@ def test_a_stop_that_cannot_be_used_is_named(gachon, scene_with, stops, words) -
     assert all(word in str(refusal.value) for word in words)
 
 
-def test_no_path_tells_the_leg(gachon, ready_scene) -> None:
+def test_no_path_names_the_leg(gachon, ready_scene) -> None:
     scene = ready_scene("environment_3")
     near = StopDocument(name="near", position_mm=scene.document.start.position_mm)
     through = scene.changed(stops=[near])
@@ -183,7 +183,7 @@ def test_a_longest_path_and_wrong_rounds_are_refused_with_stops(gachon, scene_wi
         make_plan(gachon, scene, PlannerSettings(), rounds=[1, 1])
 
 
-def test_a_report_of_legs_can_be_told_as_json(gachon, ready_scene) -> None:
+def test_a_report_of_legs_can_be_written_as_json(gachon, ready_scene) -> None:
     plan = plan_from_document(make_plan(gachon, ready_scene("pick_and_place"), OPTIMAL))
     report = verify(plan).report
     assert json.dumps(report.as_dict(), allow_nan=False)

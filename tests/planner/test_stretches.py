@@ -1,4 +1,4 @@
-"""Clearances proved a whole stretch at a time, against distances at dense poses."""
+"""Clearances proved over whole intervals, against distances at dense poses."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ from tests.planner.collision.sampled_oracle import CoalScene
 
 ROOT = Path(__file__).parents[3]
 LAST_VERTEX_PRICE = 1e-4
-"""What a vertex of the best path is worth at least, part of the straight way."""
+"""What a vertex of the best path is worth at least, part of the straight distance."""
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_another_process_finds_the_same_path(asked) -> None:
 @pytest.mark.parametrize("name", ["length", "kinematic", "clearance"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_more_rounds_never_give_a_worse_path(asked, name, seed) -> None:
-    """Worse by cost and a hundredth of a percent of the straight way for every vertex."""
+    """Worse by cost and a hundredth of a percent of the straight distance for every vertex."""
     question, scene = asked(3, name)
     search, last = new_search(*ends_of(scene), seed), np.inf
     unit = OBJECTIVES[name].length + OBJECTIVES[name].kinematic * float(question.kinematic.mean())

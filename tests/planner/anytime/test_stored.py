@@ -42,11 +42,11 @@ def test_an_array_is_computed_once_for_a_key(folder, made) -> None:
     assert len(list(folder.glob("margins-*.npy"))) == 2
 
 
-def test_only_so_many_arrays_are_kept_and_the_oldest_go(folder, made, monkeypatch) -> None:
+def test_the_oldest_arrays_beyond_the_limit_are_deleted(folder, made, monkeypatch) -> None:
     monkeypatch.setattr(stored, "_MOST_FILES", 3)
     for number in range(6):
         take(made, key=[number])
-        for file in folder.glob("*.npy"):  # the clock of files is too coarse to tell them apart
+        for file in folder.glob("*.npy"):  # the clock of files is too coarse to distinguish them
             os.utime(file, (0, file.stat().st_mtime - 1))
     assert len(list(folder.glob("margins-*.npy"))) == 3
     take(made, key=[5])

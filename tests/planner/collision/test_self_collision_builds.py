@@ -29,8 +29,8 @@ SAMPLES = 129
 CLOSE = 2e-6
 """How near to its clearance an edge is asked for more or less, [m]."""
 CLOSE_IF_BOUNDED = 1e-4
-"""Likewise where exits move on pulleys or the platform turns: motion is then only bounded, and an
-edge along which the room is small all the way would take more pieces than are tried."""
+"""As `CLOSE`, where exits move on pulleys or the platform rotates: motion is then only bounded, and
+an edge with little room all along would take more intervals than are tried."""
 
 
 def open_frame() -> Rig:
@@ -95,9 +95,9 @@ def test_rigs_with_anchors_off_the_box_of_their_platform_have_free_edges() -> No
     ends = home + np.array([[0.0, 0.0, 6e-6], [0.02, 0.0, 0.0], [-0.05, 0.04, 0.03]])
     model = ClearanceModel(rig, EMPTY)
     for end in ends:
-        way = home + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (end - home)
+        positions = home + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (end - home)
         level = np.broadcast_to(np.eye(3), (SAMPLES, 3, 3))
-        assert model.self_clearances(way, level).min() > 0.005
+        assert model.self_clearances(positions, level).min() > 0.005
     assert self_edges_free(world, robot, np.tile(home, (3, 1)), ends).all()
     turn = np.array([0.0, 0.0, 0.01])
     assert self_turning_edge_free(world, robot, home, ends[1], np.eye(3), turn)

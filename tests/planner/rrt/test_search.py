@@ -138,13 +138,13 @@ def test_the_same_random_numbers_give_the_same_tree(searched) -> None:
 
 def test_a_search_in_portions_for_its_progress_is_the_same_search(searched, ready_scene) -> None:
     planner, whole = searched(3, PAPER, seed=2)
-    scene, told = ready_scene("environment_3"), []
+    scene, reports = ready_scene("environment_3"), []
     start, goal = np.array(scene.start.position), np.array(scene.goal.position)
-    told_of = planner.search(
-        start, goal, np.random.default_rng(2), lambda *state: told.append(state)
+    reported = planner.search(
+        start, goal, np.random.default_rng(2), lambda *state: reports.append(state)
     )
-    assert np.array_equal(whole.points, told_of.points)
-    assert told
+    assert np.array_equal(whole.points, reported.points)
+    assert reports
 
 
 @pytest.mark.parametrize("sampler", ["adaptive", "goal-bias"])

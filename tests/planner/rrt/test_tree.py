@@ -62,7 +62,7 @@ def test_nearest_within_and_mean_agree_with_brute_force(seed: int, dimension: in
     assert np.allclose(tree.total / tree.size[0], tree.points.mean(axis=0))
 
 
-def test_the_way_to_a_node_runs_from_the_root() -> None:
+def test_the_path_to_a_node_runs_from_the_root() -> None:
     tree = new_tree(np.zeros(3), 4)
     first = add(tree, np.ones(3), 0, 1.0)
     add(tree, np.full(3, 5.0), 0, 1.0)

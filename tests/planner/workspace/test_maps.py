@@ -139,8 +139,8 @@ def test_other_workers_and_parts_change_no_value(gachon, extremes, monkeypatch):
         assert shared.values[name] == pytest.approx(values, rel=1e-9, abs=1e-12)
 
 
-def test_work_that_nobody_waits_for_is_cancelled(gachon, extremes, monkeypatch):
-    """Ctrl-C ends after the parts under way, not after all of them."""
+def test_work_without_a_caller_is_cancelled(gachon, extremes, monkeypatch):
+    """Ctrl-C ends after the running parts, not after all of them."""
     monkeypatch.setattr(computing, "POINTS_IN_A_PART", 8)
     question = Question.about(gachon)
     grid = volume("box", gachon.workspace_lower, gachon.workspace_upper, 0.02)

@@ -78,7 +78,7 @@ def poses_on(edge: tuple[Array, Array, Array, Array], count: int) -> list[Pose]:
 
 
 @BOTH
-def test_the_compiled_margin_of_a_turned_platform_is_that_of_the_statics(
+def test_the_compiled_margin_of_a_rotated_platform_is_that_of_the_statics(
     rig: Rig, scene: Scene
 ) -> None:
     rig, scene = loaded(rig, scene)
@@ -127,8 +127,8 @@ def test_columns_move_no_farther_than_their_bounds(seed: int) -> None:
     middle, off, bend = (start + end) / 2.0, (end - start) / 2.0, turn / 2.0
     changes, bends = np.empty(rig.cable_count), np.empty(rig.cable_count)
     spin = tuple((first @ bend).tolist())
-    places = tuple(middle.tolist()), tuple(off.tolist())
-    if not column_motion(world, load, *places, first, spin, changes, bends):
+    interval = tuple(middle.tolist()), tuple(off.tolist())
+    if not column_motion(world, load, *interval, first, spin, changes, bends):
         return
     units = np.repeat([1.0, load.length], 3)[:, None]
 
@@ -167,7 +167,7 @@ def test_a_turn_that_is_not_a_number_is_never_held() -> None:
 
 
 def test_a_turn_too_far_for_the_cables_is_refused() -> None:
-    """At both ends the cables hold; in between, upside down on the way, they do not."""
+    """At both ends the cables hold; in between, upside down, they do not."""
     world, load = made(GACHON, PAPER)
     home = GACHON.home.position
     once_around = np.array([2.0 * np.pi, 0.0, 0.0])
