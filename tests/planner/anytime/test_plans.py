@@ -1,4 +1,4 @@
-"""Plans of the default planner: checked, repeatable, good by their objective, in narrow gaps too."""
+"""Plans of the default planner: checked, repeatable, good by their objective, in narrow gaps."""
 
 from __future__ import annotations
 
