@@ -1,4 +1,4 @@
-"""Rigs and scenes for the tests of this folder, from the ready files and by changes to them."""
+"""Rigs and scenes for the tests of this folder, from the example files and changes to them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ IPANEMA_ANCHORS = [
 
 
 def plain(name: str) -> dict[str, Any]:
-    """The keys and values of a ready file."""
+    """The keys and values of an example file."""
     data: dict[str, Any] = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))
     return data
 

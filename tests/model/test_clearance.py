@@ -129,7 +129,7 @@ def test_a_distance_proves_itself_and_its_points_lie_that_far_apart(seed: int) -
 
 
 @given(seeds)
-def test_moving_out_by_the_depth_parts_overlapping_bodies(seed: int) -> None:
+def test_moving_out_by_the_depth_separates_overlapping_bodies(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size, at = rng.uniform(0.05, 0.2, 3), random_pose(rng, 0.1)
     for shape, _ in obstacle_kinds(rng):
@@ -219,7 +219,7 @@ def test_crossing_cables_pass_at_11_to_16_mm_over_the_workspace(position) -> Non
 
 
 @pytest.mark.parametrize("name", ["environment_3", "hall_pillar"])
-def test_what_is_remembered_from_other_poses_does_not_change_the_answer(name: str) -> None:
+def test_planes_cached_from_other_poses_do_not_change_the_result(name: str) -> None:
     rig = HALL if name.startswith("hall") else GACHON
     scene = load_scene(CONFIGS / f"{name}.yaml")
     used = ClearanceModel(rig, scene)
@@ -302,7 +302,7 @@ def test_cables_that_share_an_anchor_are_compared_beyond_a_stub() -> None:
     assert shared == pytest.approx(2 * model.stub * np.sin(angle / 2))
 
 
-def test_a_cable_radius_takes_off_every_distance() -> None:
+def test_the_cable_radius_reduces_every_distance() -> None:
     document = GACHON.document
     thick = document.cables.model_copy(update={"radius_mm": 2.0})
     rig = rig_from_document(document.model_copy(update={"cables": thick}))

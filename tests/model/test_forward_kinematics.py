@@ -73,7 +73,7 @@ def test_many_poses_near_known_ones_are_found_together(name: str) -> None:
 @any_rig
 @pytest.mark.parametrize("cable", [0, 5])
 def test_one_wrong_length_shows_in_the_residual(name: str, cable: int) -> None:
-    """More cables than freedoms: a cable that is 10 mm off cannot hide."""
+    """With redundant cables, one cable that is 10 mm off cannot hide."""
     rig = RIGS[name]
     lengths = cable_lengths(rig, rig.home)
     lengths[cable] += 0.01
@@ -102,12 +102,12 @@ def test_the_solution_is_the_least_squares_pose() -> None:
 @pytest.mark.parametrize(
     "lengths", [[0.7] * 7, [0.7] * 9, [0.7] * 7 + [np.nan], [0.7] * 7 + [np.inf], []]
 )
-def test_lengths_that_are_not_one_finite_number_a_cable_are_refused(lengths: list[float]) -> None:
+def test_lengths_that_are_not_one_finite_number_per_cable_are_refused(lengths: list[float]) -> None:
     with pytest.raises(BadInput, match="each of 8 cables"):
         forward_kinematics(RIGS["point exits"], np.array(lengths))
 
 
-def test_a_guess_where_no_cable_can_run_is_a_fault_with_a_next_step() -> None:
+def test_a_guess_where_cables_have_no_path_is_a_fault_with_a_next_step() -> None:
     rig: Rig = RIGS["point exits"]
     guess = Pose.level(rig.outlets[0] - rig.anchors[0])  # anchor 1 in outlet 1
     with pytest.raises(Fault, match="no pose fits") as caught:

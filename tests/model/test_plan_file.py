@@ -1,4 +1,4 @@
-"""Plan files: they come back as they were written, and nothing else is taken for a plan."""
+"""Plan files: a round trip changes nothing, and nothing else is accepted as a plan."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.model.rig_builds import paper_data, rig_of, scene_data, scene_of
 
 
 def a_plan() -> PlanDocument:
-    """Two waypoints between the ends of environment 3; not free of collisions, but whole."""
+    """Two waypoints between the ends of environment 3; not collision-free, but intact."""
     rig, scene = rig_of(paper_data()), scene_of(scene_data())
     nearest = {
         "first": "cable 1",
@@ -75,7 +75,7 @@ SAID = DOCUMENT.model_dump(mode="json", exclude_defaults=True)
 
 
 def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Paths of all that is neither a section nor a list."""
+    """Paths of all scalar values."""
     if isinstance(value, dict):
         return [p for key, part in value.items() for p in leaves(part, (*path, key))]
     if isinstance(value, list):
@@ -172,7 +172,7 @@ def test_a_plan_edited_anywhere_is_refused(
 
 @settings(max_examples=60)
 @given(path=st.sampled_from([p for p in leaves(DATA) if isinstance(p[-1], str)]), add=st.booleans())
-def test_a_plan_with_a_key_less_or_more_is_refused(
+def test_a_plan_with_a_missing_or_extra_key_is_refused(
     path: tuple[Any, ...], add: bool, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     data = copy.deepcopy(DATA)
@@ -197,8 +197,8 @@ def _is_default(path: tuple[Any, ...]) -> bool:
         return True
 
 
-def test_a_plan_of_a_version_that_knew_less_is_read(tmp_path: Path) -> None:
-    """What it does not know has its default: the plan of a later version says the same."""
+def test_a_plan_of_a_version_with_fewer_keys_is_read(tmp_path: Path) -> None:
+    """Missing keys have their defaults, as in the plan of a later version."""
     data = {**SAID, "kind": DATA["kind"], "schema_version": DATA["schema_version"]}
     assert len(json.dumps(data)) < 0.9 * len(json.dumps(DATA))
     (tmp_path / "plan.json").write_text(json.dumps(data))
@@ -214,13 +214,13 @@ def test_waypoints_moved_or_dropped_are_refused(key: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("constant", ["NaN", "Infinity", "-Infinity", "1e999"])
-def test_a_number_that_is_none_is_refused(constant: str, tmp_path: Path) -> None:
+def test_nan_and_infinity_are_refused(constant: str, tmp_path: Path) -> None:
     text = json.dumps(DATA).replace("600.0", constant)
     error = refused(text, tmp_path)
     assert "NaN" in str(error) or "Infinity" in str(error) or "finite" in str(error)
 
 
-def test_a_plan_cut_off_anywhere_is_refused(tmp_path: Path) -> None:
+def test_a_plan_truncated_anywhere_is_refused(tmp_path: Path) -> None:
     text = json.dumps(DATA)
     for end in (0, 1, len(text) // 3, len(text) // 2, len(text) - 1):
         error = refused(text[:end], tmp_path)

@@ -24,7 +24,7 @@ JARGON = re.compile(r"(?i)input should|valid (dictionary|list|string)|value erro
 
 
 def problems_in(text: str, tmp_path: Path) -> list[tuple[int, int, str, str]]:
-    """Line, column, key and sentence of everything that is wrong."""
+    """Line, column, key and sentence of every problem."""
     path = tmp_path / "rig.yaml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InvalidFile) as caught:
@@ -77,7 +77,7 @@ def test_line_and_column_are_those_of_the_key(old: str, new: str, key: str, tmp_
 def test_every_problem_of_a_file_is_reported_at_once_in_the_order_of_the_file(
     tmp_path: Path,
 ) -> None:
-    """Also those between parts, as far as the parts that they compare are sound."""
+    """Also those between parts, as far as the parts that they compare are valid."""
     text = PAPER
     for old, new in (
         ("size_mm: [130, 130, 130]", "size_mm: [130, 130]"),
@@ -114,7 +114,7 @@ def test_every_problem_of_a_file_is_reported_at_once_in_the_order_of_the_file(
     assert [problem[:2] for problem in found] == sorted(problem[:2] for problem in found)
 
 
-def test_a_part_that_is_unsound_is_not_judged_against_others(tmp_path: Path) -> None:
+def test_an_invalid_part_is_not_compared_with_others(tmp_path: Path) -> None:
     """One mistake is one message: no home "outside" a workspace that is not a number."""
     text = PAPER.replace("upper_mm: [250, 250, 650]", "upper_mm: [250, x, 100]")
     text = text.replace("node_id: 1,", "node_id: x,").replace("node_id: 2,", "node_id: x,")
@@ -281,7 +281,7 @@ def with_floats(value: Any) -> Any:
     return float(value) if type(value) is int and value not in whole and value > 8 else value
 
 
-def test_the_hash_is_of_the_content_not_of_its_spelling() -> None:
+def test_the_hash_is_of_the_content_not_of_its_layout() -> None:
     data = paper_data()
     rig = rig_of(data)
     assert rig_of(shuffled(data, np.random.default_rng(1))).hash == rig.hash
@@ -311,7 +311,7 @@ def test_spelling_out_a_default_does_not_change_the_hash() -> None:
         ("motion", "speed_mm_s", 21, False),
     ],
 )
-def test_a_plan_rests_on_geometry_and_limits_only(
+def test_a_plan_depends_on_geometry_and_limits_only(
     section: str, key: str, value: object, in_plan: bool
 ) -> None:
     """So that a plan may be run over another bus, and never on another robot."""
@@ -322,7 +322,7 @@ def test_a_plan_rests_on_geometry_and_limits_only(
     assert (changed.plan_hash != rig.plan_hash) == in_plan
 
 
-def test_a_document_whose_parts_disagree_makes_no_rig() -> None:
+def test_a_document_whose_parts_disagree_is_refused() -> None:
     data = paper_data()
     data["anchors_mm"].pop()
     data["winches"][1]["node_id"] = 1

@@ -201,7 +201,7 @@ def test_every_shape_arrives_in_metres_and_at_its_pose() -> None:
     ],
     ids=["closed", "closed, seen from inside", "open", "closed, and a fin"],
 )
-def test_a_mesh_about_a_convex_volume_is_solid(faces: list[list[int]], kind: type) -> None:
+def test_a_mesh_around_a_convex_volume_is_solid(faces: list[list[int]], kind: type) -> None:
     data = scene_data()
     mesh = {"points_mm": [*TETRAHEDRON, [0, 0, 200]], "triangles": faces}
     data["obstacles"] = [{"name": "mesh", "mesh": mesh, "position_mm": [0, 0, 0]}]
@@ -211,7 +211,7 @@ def test_a_mesh_about_a_convex_volume_is_solid(faces: list[list[int]], kind: typ
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(4, 30))
-def test_a_hull_holds_its_points_and_looks_outward(seed: int, count: int) -> None:
+def test_a_hull_contains_its_points_and_faces_outward(seed: int, count: int) -> None:
     points = np.random.default_rng(seed).normal(size=(count, 3))
     hull = convex_hull(points)
     corners = hull.vertices[hull.triangles]
@@ -227,7 +227,7 @@ def test_a_hull_holds_its_points_and_looks_outward(seed: int, count: int) -> Non
     [Box(np.array([1.0, 2.0, 3.0])), Sphere(2.0), Cylinder(1.0, 4.0), Capsule(1.0, 4.0)],
     ids=lambda shape: type(shape).__name__,
 )
-def test_the_points_of_a_shape_grown_by_its_radius_hold_it(shape: Any) -> None:
+def test_the_points_of_a_shape_grown_by_its_radius_contain_it(shape: Any) -> None:
     points = shape_points(shape)
     radius = getattr(shape, "radius", 0.0)
     rng = np.random.default_rng(3)
@@ -274,6 +274,6 @@ def test_a_scene_cannot_be_changed_into_an_invalid_one(change: dict[str, Any]) -
 
 
 @pytest.mark.parametrize("name", ["environment_1", "environment_2", "environment_3", "hall_pillar"])
-def test_the_ready_scenes_load_alike_twice(name: str) -> None:
+def test_the_example_scenes_load_the_same_twice(name: str) -> None:
     path = CONFIGS / f"{name}.yaml"
     assert load_scene(path).hash == load_scene(path).hash

@@ -1,4 +1,4 @@
-"""Stops of a scene: what their kinds ask for, and which load every leg is run with."""
+"""Stops of a scene: requirements of their kinds, and the load of every leg."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ points = st.tuples(*[st.floats(-200.0, 200.0)] * 3)
 
 
 @given(st.lists(st.tuples(masses, points), min_size=1, max_size=6))
-def test_what_is_carried_is_the_sum_and_the_mean_of_what_was_picked(
+def test_the_payload_is_the_sum_and_the_mean_of_the_masses_picked(
     parts: list[tuple[float, tuple[float, float, float]]],
 ) -> None:
     stops = [
@@ -99,7 +99,7 @@ def test_what_is_carried_is_the_sum_and_the_mean_of_what_was_picked(
 
 
 @given(st.tuples(masses, points), st.tuples(masses, points))
-def test_putting_down_what_was_picked_last_leaves_what_was_there_before(
+def test_placing_the_last_mass_restores_the_payload_before_it(
     first: tuple[float, tuple[float, float, float]],
     second: tuple[float, tuple[float, float, float]],
 ) -> None:
@@ -161,7 +161,7 @@ def test_a_payload_that_does_not_fit_the_stops_is_refused() -> None:
 def test_a_plan_whose_marks_are_not_the_scenes_stops_is_refused(
     marks: list[tuple[str, int]], words: str, tmp_path: Path
 ) -> None:
-    """Sealed with a right hash by another program."""
+    """Sealed with a correct hash by another program."""
     x, y, z = DOCUMENT.waypoints[1].position_mm
     at = StopDocument(name="a", position_mm=[x + 1.0, y, z])
     scene = scene_of({**DOCUMENT.scene.model_dump(mode="json"), "stops": [at.model_dump()]})

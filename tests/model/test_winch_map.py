@@ -65,7 +65,7 @@ def test_lengths_and_tensions_come_back_from_rounded_counts(name: str, data: st.
     assert np.all(np.abs(back - lengths) <= half_count)
 
 
-def test_a_winch_may_have_a_cable_of_its_own_stiffness() -> None:
+def test_each_winch_may_have_its_own_cable_stiffness() -> None:
     found, of_all = RIGS["cables that differ"].cable_stiffness, RIGS["paper"].cable_stiffness
     assert found.tolist() == [of_all[0], *(5000.0 * np.arange(1, len(found)))]
 
@@ -130,7 +130,7 @@ def test_working_tensions_hold_the_weight_within_the_limits(name: str, data: st.
     assert np.all(tensions <= rig.max_tension + 1e-9)
 
 
-def test_the_weight_of_a_payload_off_the_middle_turns_the_platform() -> None:
+def test_the_weight_of_a_payload_off_centre_rotates_the_platform() -> None:
     """A payload on +x pulls down: a moment about +y, whatever the position."""
     from model.scene import Load
 

@@ -123,12 +123,12 @@ def levels(line: str) -> str:
         "- " * 100,
     ],
 )
-def test_what_would_become_too_much_is_refused_before_it_does(text: str) -> None:
+def test_a_text_that_would_expand_too_far_is_refused_first(text: str) -> None:
     with pytest.raises(YamlSyntaxError, match=r"too much to read: (more than|nested too deeply)"):
         parse_yaml(text)
 
 
-def test_a_text_that_holds_itself_is_read_without_end() -> None:
+def test_a_text_that_contains_itself_is_read_in_finite_time() -> None:
     data = parse_yaml("a: &a [*a]").data
     assert data["a"][0] is data["a"]
 
@@ -144,7 +144,7 @@ def test_a_text_that_holds_itself_is_read_without_end() -> None:
         "{? [!!int x] : 1}",
     ],
 )
-def test_a_tag_makes_nothing(text: str) -> None:
+def test_a_tag_constructs_nothing(text: str) -> None:
     tree = parse_yaml(f"a: {text}")
     assert tree.data is None
     assert "is not allowed" in tree.faults[0].what or "is not text" in tree.faults[0].what

@@ -72,7 +72,7 @@ def test_an_edited_plan_through_an_obstacle_is_refused(document, ready_scene) ->
     assert refusal.value.exit_code == 3
 
 
-def test_a_thread_thin_obstacle_between_samples_is_found(gachon, scene_with) -> None:
+def test_a_needle_thin_obstacle_between_samples_is_found(gachon, scene_with) -> None:
     """A needle a cable sweeps over in passing: dense samples of the ends alone would miss it."""
     start, goal = Pose.level([0, 0, 0.40]), Pose.level([0, 0, 0.4049])
     exits = gachon.outlets[0]
@@ -90,7 +90,7 @@ def test_a_thread_thin_obstacle_between_samples_is_found(gachon, scene_with) -> 
     assert near.smallest(goal).distance > 0.0005
 
 
-def test_clearance_a_hair_below_what_is_asked_is_refused_and_a_hair_above_is_proved(
+def test_clearance_just_below_the_limit_is_refused_and_just_above_is_proved(
     gachon, document
 ) -> None:
     plan = plan_from_document(document)

@@ -194,7 +194,7 @@ def test_no_path_within_the_limit_states_the_best_distance_and_why(
         ({"seed": -1}, "seed"),
     ],
 )
-def test_settings_that_no_search_could_use_are_refused(wrong, word) -> None:
+def test_unusable_settings_are_refused(wrong, word) -> None:
     with pytest.raises(BadInput, match=word):
         PlannerSettings(**wrong)
 

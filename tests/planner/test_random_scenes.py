@@ -1,4 +1,4 @@
-"""A slice of `benchmarks/random_scenes.py`, and whether its second opinion sees what it is for."""
+"""A slice of `benchmarks/random_scenes.py`, and whether its second opinion detects violations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_path_through_an_obstacle_is_reported_with_the_pair(gachon, ready_scen
     assert any("not proved" in problem for problem in opinion.problems)
 
 
-def test_a_path_that_keeps_its_clearance_by_a_hair_passes_and_one_that_misses_it_does_not(
+def test_a_path_that_barely_keeps_its_clearance_passes_and_one_that_misses_it_does_not(
     gachon, ready_scene
 ) -> None:
     """Beside the obstacle for a while, with the clearance taken from the path itself."""

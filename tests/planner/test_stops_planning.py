@@ -159,7 +159,7 @@ def test_no_path_names_the_leg(gachon, ready_scene) -> None:
 @pytest.mark.parametrize(
     ("stops", "why"), [([], "stops at poses []"), ([2, 1], "[2, 1]"), ([1, 9], "between 0 and 3")]
 )
-def test_stops_of_a_path_that_are_none_are_refused(gachon, scene_with, stops, why) -> None:
+def test_invalid_stops_of_a_path_are_refused(gachon, scene_with, stops, why) -> None:
     scene = scene_with(stops=[stop("a", 0, 0, 445), stop("b", 0, 0, 445)])
     with pytest.raises(BadInput) as refusal:
         check_path(gachon, scene, [gachon.home] * 4, stops)

@@ -88,7 +88,7 @@ def test_shifted_bodies_reach_as_far_as_the_robot_at_any_of_the_positions(gachon
     assert (RobotBodies(gachon, between).reach(directions) <= reach + 1e-12).all()
 
 
-def test_a_distance_that_is_no_number_proves_nothing(gachon, scene_with, monkeypatch) -> None:
+def test_a_nan_distance_proves_nothing(gachon, scene_with, monkeypatch) -> None:
     model, path, _ = random_case(gachon, scene_with, 1)
     monkeypatch.setattr(ClearanceModel, "smallest", lambda _model, _pose: None)
     with pytest.raises(Fault, match="unknown"):

@@ -128,7 +128,7 @@ def test_least_norm_is_the_optimum_of_the_quadratic_program_over_tensions(seed, 
 @settings(max_examples=40)
 @given(seed=seeds)
 def test_centroid_is_the_mean_of_all_feasible_tensions(seed):
-    """Oracle: a fine grid over the feasible polygon, which knows nothing of corners."""
+    """Oracle: a fine grid over the feasible polygon, which does not use corners."""
     matrix, low, high, wrench = feasible_problem(seed, 8)
     tensions = solve_tensions(matrix, wrench, low, high, method="centroid").tensions
     null_basis = np.linalg.svd(matrix)[2][6:].T
@@ -157,7 +157,7 @@ def test_centroid_is_the_mean_of_all_feasible_tensions(seed):
         assert (np.abs(inside.mean(axis=0)) < 0.005 * extent).all()
 
 
-def test_one_cable_more_than_freedoms_takes_the_middle_of_the_interval():
+def test_one_redundant_cable_takes_the_middle_of_the_interval():
     matrix, low, high, wrench = feasible_problem(3, 7)
     tensions = solve_tensions(matrix, wrench, low, high, method="centroid").tensions
     direction = np.linalg.svd(matrix)[2][6]
@@ -227,7 +227,7 @@ def test_tensions_of_ten_cables_are_continuous_in_the_wrench():
 @settings(max_examples=40)
 @given(seed=seeds, cables=cable_counts)
 def test_the_last_wrench_that_can_be_held_is_held(seed, cables):
-    """At the edge of the wrench set one vector of tensions is left; round-off must not lose it."""
+    """On the boundary of the wrench set one tension vector remains; round-off must not lose it."""
     matrix, low, high, _ = feasible_problem(seed, cables)
     away = np.random.default_rng(seed).normal(size=6)
     only = np.where(away @ matrix > 0.0, high, low)

@@ -226,7 +226,7 @@ def test_progress_is_reported_in_seconds_or_rounds(gachon, ready_scene) -> None:
         ({"longest": math.nan}, "longest"),
     ],
 )
-def test_settings_that_no_search_could_use_are_refused(wrong, words) -> None:
+def test_unusable_settings_are_refused(wrong, words) -> None:
     with pytest.raises(BadInput, match=words):
         OptimalSettings(**wrong)
 
@@ -241,6 +241,6 @@ def test_settings_that_no_search_could_use_are_refused(wrong, words) -> None:
         ({"clearance": 1.0}, "give length a small weight"),
     ],
 )
-def test_weights_that_leave_nothing_to_make_small_are_refused(wrong, words) -> None:
+def test_weights_that_leave_nothing_to_minimise_are_refused(wrong, words) -> None:
     with pytest.raises(BadInput, match=words):
         Weights(**wrong)

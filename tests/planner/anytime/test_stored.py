@@ -1,4 +1,4 @@
-"""Arrays kept in the user's cache, whatever has become of it."""
+"""Arrays kept in the user's cache, damaged or not."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_oldest_arrays_beyond_the_limit_are_deleted(folder, made, monkeypatc
 
 
 @pytest.mark.parametrize("damage", ["cut off", "empty", "text", "pickled", "other shape"])
-def test_a_damaged_file_is_not_believed_and_is_replaced(folder, made, damage) -> None:
+def test_a_damaged_file_is_ignored_and_replaced(folder, made, damage) -> None:
     take(made)
     (file,) = folder.iterdir()
     content = file.read_bytes()
@@ -73,7 +73,7 @@ def test_a_damaged_file_is_not_believed_and_is_replaced(folder, made, damage) ->
 
 
 @pytest.mark.parametrize("failing", ["NamedTemporaryFile", "replace"])
-def test_a_cache_that_cannot_be_written_is_done_without(folder, made, monkeypatch, failing) -> None:
+def test_a_cache_that_cannot_be_written_is_ignored(folder, made, monkeypatch, failing) -> None:
     def refuse(*_args, **_options):
         raise OSError(30, "Read-only file system")
 

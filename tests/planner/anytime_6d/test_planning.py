@@ -52,7 +52,7 @@ def proved(rig: Rig, scene: Scene, settings: TurningSettings) -> PlanDocument:
     return document
 
 
-def test_the_ready_scene_is_planned_and_an_independent_judge_finds_nothing() -> None:
+def test_the_example_scene_is_planned_and_an_independent_judge_finds_no_fault() -> None:
     document = proved(GACHON, RAMP, ROUNDS)
     judge, poses = Judge(GACHON, RAMP), plan_from_document(document).waypoints
     for start, end in itertools.pairwise(poses):
@@ -182,6 +182,6 @@ def test_a_plan_survives_its_file(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"budget": 0.0}, {"rounds": 0}])
-def test_settings_that_no_search_can_use_are_refused(wrong) -> None:
+def test_unusable_settings_are_refused(wrong) -> None:
     with pytest.raises(BadInput):
         TurningSettings(**wrong)

@@ -1,4 +1,4 @@
-"""Edges ask for what is open in the cells they pass, no less and hardly more."""
+"""Edges check what is open in the cells they pass, no less and hardly more."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def test_algorithm_3_leaves_no_node_that_can_be_skipped_from_a_kept_one(searched
             assert not planner.edge(result.path[here], result.path[skipped])
 
 
-def test_algorithm_3_takes_no_dearer_shortcut_under_the_kinematic_cost(searched, cost) -> None:
+def test_algorithm_3_takes_no_costlier_shortcut_under_the_kinematic_cost(searched, cost) -> None:
     planner, result = searched(1, replace(PAPER, cost="kinematic"), seed=4)
     kept = planner.shortcut(result.path)
     field = planner.field
@@ -203,6 +203,6 @@ def test_compiled_costs_are_those_of_the_plain_definition(cost) -> None:
         {"spacing": float("nan")},
     ],
 )
-def test_readings_that_do_not_exist_are_refused(wrong) -> None:
+def test_unknown_readings_are_refused(wrong) -> None:
     with pytest.raises(BadInput):
         AlgorithmVariant(**wrong)

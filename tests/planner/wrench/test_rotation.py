@@ -34,7 +34,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def loaded(rig: Rig, scene: Scene) -> tuple[Rig, Scene]:
-    """With centres of mass off the origin, and disturbances, which turn the wrench asked for."""
+    """With centres of mass off the origin, and disturbances, which rotate the required wrench."""
     platform = rig.document.platform.model_copy(update={"centre_of_mass_mm": [12.0, -8.0, 20.0]})
     load = scene.document.load.model_copy(
         update={
@@ -112,7 +112,7 @@ def test_turning_edges_that_are_held_keep_the_reserve_at_every_sample(
             assert least >= reserve - 1e-9 * rig.max_tension
         else:
             refused += 1
-            # It is short of the reserve somewhere, or but a little above it.
+            # It is short of the reserve somewhere, or only slightly above it.
             assert least <= reserve * 1.02 + 0.003 * rig.max_tension
     assert held_count >= 2
     assert refused >= 3 or share == 0.0
