@@ -131,7 +131,7 @@ class PosePath:
         """Measures the moves.
 
         Raises:
-            BadInput: There is no pose.
+            BadInput: There are no poses.
         """
         if not poses:
             raise BadInput("a path without poses cannot be checked")

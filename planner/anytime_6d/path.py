@@ -47,7 +47,7 @@ _TO_THE_BEST = 0.5
 
 @dataclass(slots=True, eq=False)
 class _Kept:
-    """A path under improvement, and what it costs."""
+    """A path under improvement, and its cost."""
 
     line: Line
     cost: float

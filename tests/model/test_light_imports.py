@@ -114,6 +114,6 @@ def test_what_neither_searches_nor_measures_nor_sends_loads_no_library_for_it(mo
 
 
 def test_the_real_time_process_of_a_real_bus_loads_no_compiler_and_no_camera() -> None:
-    """What it loads it loads before the drives are set up, while the operator waits."""
+    """It loads everything before the drives are set up, while the operator waits."""
     code = "import executor.realtime.child, executor.control.path_job, executor.drives"
     assert not loaded_by(code) & {"numba", "cv2", "matplotlib", "mcap"}

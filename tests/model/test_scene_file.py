@@ -183,7 +183,7 @@ def test_every_shape_arrives_in_metres_and_at_its_pose() -> None:
     assert ball.radius == 0.05
     assert (cylinder.radius, cylinder.length) == (0.02, 0.09)
     assert (capsule.radius, capsule.length) == (0.02, 0.09)
-    assert len(hull.vertices) == 4  # the inner point is no vertex
+    assert len(hull.vertices) == 4  # the inner point is not a vertex
     for body in (hull, surface):
         assert not body.vertices.flags.writeable
         assert not body.triangles.flags.writeable

@@ -1,4 +1,4 @@
-"""The proof that there is no path: given for a post that divides, never where a path is known."""
+"""The proof that no path exists: given for a dividing post, never where a path is known."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Self clearance of rigs of every build: edges and regions against `ClearanceModel`, sampled.
 
-The clearance asked for is set next to the one that an edge has, so that each answer is a close one.
+The required clearance is set next to the one that an edge has, so that each decision is close.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tests.planner.collision.sampled_oracle import changed_rig, random_scene
 EMPTY = random_scene(np.random.default_rng(0), GACHON, 0)
 SAMPLES = 129
 CLOSE = 2e-6
-"""How near to its clearance an edge is asked for more or less, [m]."""
+"""Distance of the required clearance from that of an edge, [m]."""
 CLOSE_IF_BOUNDED = 1e-4
 """As `CLOSE`, where exits move on pulleys or the platform rotates: motion is then only bounded, and
 an edge with little room all along would take more intervals than are tried."""
@@ -125,7 +125,7 @@ def test_edges_of_every_build_are_free_up_to_touching_and_no_further(turns: bool
     assert min(tested.values()) > 60
 
 
-def test_edges_are_decided_alike_with_and_without_what_is_proved_beforehand() -> None:
+def test_edges_are_decided_the_same_with_and_without_precomputed_proofs() -> None:
     rng = np.random.default_rng(12)
     answers: list[bool] = []
     for _, rig in builds(10, 6):
