@@ -27,7 +27,7 @@ from model.files.documents import (
     document_hash,
     write_atomic,
 )
-from model.files.output import make_place, require_new_file
+from model.files.output import make_missing_folder, require_new_file
 from model.files.rig_file import RigDocument
 from model.pages.page import html_table
 
@@ -377,4 +377,4 @@ class Destination:
         if self.folder.is_dir():
             for file in (result, result.with_suffix(".html")):
                 require_new_file(file, self.replace)
-        make_place(self.folder)
+        make_missing_folder(self.folder)

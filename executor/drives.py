@@ -26,7 +26,7 @@ from model.kinematics import forward_kinematics
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
-from model.scene import Load, nothing_in_the_way
+from model.scene import Load, empty_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
@@ -132,7 +132,7 @@ def left_alone(document: RigDocument) -> str:
         return ""
     time.sleep(ALONE)
     try:
-        told = look_at(rig, rig.home, nothing_in_the_way(rig).load)
+        told = look_at(rig, rig.home, empty_scene(rig).load)
     except CdprError as error:
         return f"it is not known whether the drives hold: {error.what}"
     words = told.status_words.tolist()
@@ -237,7 +237,7 @@ def unreferenced_drives_of(
         require_below(rig, told, limit)
         return counted_here(rig, told.positions.tolist(), about), limit
 
-    load = nothing_in_the_way(rig).load
+    load = empty_scene(rig).load
     return open_drives(
         rig, about, load, lost_power=lost_power, set_up_as=set_up_as, listener=listener
     )
@@ -253,7 +253,7 @@ def resting_drives_of(
         to_reset: Also takes drives in fault, which are going to be reset.
     """
     rig = rig_from_document(document)
-    load = nothing_in_the_way(rig).load
+    load = empty_scene(rig).load
     set_up_as = partial(set_up_here, rig)
     return open_drives(rig, rig.home, load, to_reset=to_reset, set_up_as=set_up_as)
 

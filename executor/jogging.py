@@ -29,7 +29,7 @@ from model.plan import plan_from_document
 from model.pose import Array, Pose, largest_rotations
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
-from model.scene import Scene, nothing_in_the_way, scene_from_document
+from model.scene import Scene, empty_scene, scene_from_document
 from planner.kernels.jit import KERNELS
 from planner.planning import make_plan
 from planner.settings import OptimalSettings, TurningSettings
@@ -83,7 +83,7 @@ def jog(
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     require_distance(by, to_home=to_home)
-    around = nothing_in_the_way(slow) if scene is None else scene.changed(stops=())
+    around = empty_scene(slow) if scene is None else scene.changed(stops=())
     output = free_folder("jog") if folder is None else Path(folder)
     RunFolder.require_free(output)
     interlock = MotionInterlock(slow)

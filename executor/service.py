@@ -33,7 +33,7 @@ from model.files.documents import PoseDocument
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig
-from model.scene import nothing_in_the_way
+from model.scene import empty_scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +240,7 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
     if not reference.counts:
         return read
     as_referenced = interlock.referenced_rig()
-    load = nothing_in_the_way(as_referenced).load
+    load = empty_scene(as_referenced).load
     try:
         pose = current_pose(as_referenced, np.array(positions, dtype=np.float64), load)
     except CdprError as error:

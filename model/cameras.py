@@ -1,4 +1,4 @@
-"""Cameras and tags of a rig, and how far off what is known of them may be."""
+"""Cameras and tags of a rig, with the uncertainty of their calibration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from model.pose import Array, Pose, read_only
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tag:
-    """A fiducial tag in the frame of what carries it (x right, y up, z out of the print).
+    """A fiducial tag in the frame of its carrier (x right, y up, z out of the print).
 
     Attributes:
         id: Number in its family.
@@ -25,8 +25,8 @@ class Tag:
     pose: Pose
 
 
-SURE = 1.96
-"""Standard deviations that hold 95 % of a normal error."""
+Z_95 = 1.96
+"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,23 +35,23 @@ class Camera:
 
     Attributes:
         name: Name in the rig file.
-        width: Picture width, [px].
-        height: Picture height, [px].
+        width: Image width, [px].
+        height: Image height, [px].
         matrix: Camera matrix, shape (3, 3), [px].
         distortion: OpenCV coefficients of the lens, shape (k,).
         world_from_camera: Pose; x right, y down, z along the view.
-        rate: Pictures a second, [Hz].
+        rate: Frame rate, [Hz].
         lens: One of `model.files.camera_file.LENSES`.
-        place_covariance: Of ``world_from_camera``: position [m] and rotation vector [rad] along the
-            world's axes, shape (6, 6); None where the rig file does not say.
+        pose_covariance: Of ``world_from_camera``: position [m] and rotation vector [rad] along the
+            world's axes, shape (6, 6); None where the rig file does not state it.
         lens_covariance: Of its n numbers fx, fy, cx, cy [px] and distortion, shape (n, n); None
-            where the rig file does not say.
-        place_by_lens: How errors of these numbers move ``world_from_camera``, which was found with
-            them, shape (6, n), [m, rad]; None where that is not known.
-        error: How far off platform and cables are measured with it, 95 %, by all errors that
-            pictures share, [m]; None where the operator does not say.
+            where the rig file does not state it.
+        pose_by_lens: Derivatives of ``world_from_camera``, which was calibrated with them, by
+            these numbers, shape (6, n), [m, rad]; None where unknown.
+        error: Error of measured platform and cables, 95 %, from everything that images share,
+            [m]; None where the operator does not state it.
         readout: From the exposure of the top row to that of the bottom row, [s]; images are stamped
-            with the time of the middle one.
+            with the time of the middle row.
     """
 
     name: str
@@ -62,14 +62,14 @@ class Camera:
     world_from_camera: Pose
     rate: float
     lens: str = "pinhole"
-    place_covariance: Array | None = None
+    pose_covariance: Array | None = None
     lens_covariance: Array | None = None
-    place_by_lens: Array | None = None
+    pose_by_lens: Array | None = None
     error: float | None = None
     readout: float = 0.0
 
     def row_times(self, pixels: Array) -> Array:
-        """When rows are exposed, after the middle one.
+        """Exposure times of rows relative to the middle row.
 
         Args:
             pixels: Shape (..., 2), [px].
@@ -101,9 +101,9 @@ def camera_from(document: CameraDocument) -> Camera:
         world_from_camera=document.world_from_camera.pose(),
         rate=document.rate_hz,
         lens=document.lens,
-        place_covariance=_scaled(document.pose_covariance, np.outer(_SCALES, _SCALES)),
+        pose_covariance=_scaled(document.pose_covariance, np.outer(_SCALES, _SCALES)),
         lens_covariance=_scaled(document.lens_covariance, np.ones(1)),
-        place_by_lens=_scaled(document.pose_by_lens, _SCALES[:, None]),
+        pose_by_lens=_scaled(document.pose_by_lens, _SCALES[:, None]),
         error=None if document.error_mm is None else document.error_mm / 1e3,
         readout=document.readout_ms / 1e3,
     )

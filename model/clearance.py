@@ -1,9 +1,9 @@
-"""How far cables and platform are from obstacles and from each other, at one pose.
+"""Distances of cables and platform from obstacles and from each other, at one pose.
 
 A cable is the straight segment from its exit to its anchor, with the rig's cable radius; the
 platform is its box; pulley wheels are not bodies. Distances are between surfaces. Where bodies
-overlap they are negative: minus a way that suffices to part them. Each is proved by a separating
-plane (`model.distances`) and is at most 0.1 µm less than the true one, never more.
+overlap they are negative: minus a translation that separates them. Each is proved by a separating
+plane (`model.distances`) and is at most 0.1 µm below the true one, never above.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
 
-# How far cables are from each other and from the platform, for one pose or many at once.
+# Distances of cables from each other and from the platform, for one pose or many at once.
 #
 # At its anchor a cable touches the platform, so the platform is compared with the part of each
-# cable farther than a stub from its anchor. The stub is geometry alone: a quarter of the platform's
-# shortest side; a clearance c then means that the cable leaves the platform at an angle of at least
-# arcsin(c / stub). Two cables whose anchors (or outlets) are nearer to each other than a stub are
-# compared without a stub at that end, for the same reason.
+# cable farther than a stub from its anchor. The stub is a quarter of the platform's shortest side;
+# a clearance c then means that the cable leaves the platform at an angle of at least
+# arcsin(c / stub). For the same reason, two cables whose anchors (or outlets) are nearer to each
+# other than a stub are compared without a stub at that end.
 
 
 _STUB_SHARE = 0.25
@@ -49,7 +49,7 @@ class Gaps:
     Attributes:
         distances: Shape (..., k), [m]; negative where they overlap.
         first_points: On the first body, world frame, shape (..., k, 3), [m].
-        second_points: On the second body, likewise.
+        second_points: On the second body, world frame, shape (..., k, 3), [m].
     """
 
     distances: Array
@@ -58,7 +58,7 @@ class Gaps:
 
 
 class SelfModel:
-    """What is compared with what on one rig.
+    """The pairs of bodies compared on one rig.
 
     Attributes:
         pairs: The cables of each compared pair, counted from 0, shape (p, 2).
@@ -75,7 +75,7 @@ class SelfModel:
         self._at_exit = self._stubs_where_near(rig.outlets)
 
     def cable_pairs(self, cables: Cables) -> Gaps:
-        """Cable to cable, for `pairs`; ``cables`` of one pose or a batch."""
+        """Distances of the cable pairs in `pairs`; ``cables`` of one pose or a batch."""
         radius = self.rig.cable_radius
         a, b = (self._parts(cables, self.pairs[:, side]) for side in (0, 1))
         on_a, on_b = segment_pair_points(*a, *b)
@@ -83,7 +83,7 @@ class SelfModel:
         return Gaps(distances, on_a, on_b)
 
     def to_platform(self, cables: Cables, positions: Array, rotations: Array) -> Gaps:
-        """Each cable beyond its stub to the platform.
+        """Distances of each cable, beyond its stub, to the platform.
 
         Args:
             cables: Of one pose or a batch.
@@ -99,11 +99,11 @@ class SelfModel:
         apart = np.linalg.norm(on_cable - in_box, axis=-1)
         inside = np.minimum(np.max(np.abs(on_cable) - half, axis=-1), 0.0)
         distances = np.where(apart > 0.0, apart, inside) - radius
-        turned = np.swapaxes(rotations, -1, -2)
-        return Gaps(distances, on_cable @ turned + origin, in_box @ turned + origin)
+        rotated = np.swapaxes(rotations, -1, -2)
+        return Gaps(distances, on_cable @ rotated + origin, in_box @ rotated + origin)
 
     def _stubs_where_near(self, ends: Array) -> Array:
-        """The length to leave out at an end of both cables of each pair, shape (p, 1), [m]."""
+        """The length left out at one end of both cables of each pair, shape (p, 1), [m]."""
         apart = np.linalg.norm(ends[self.pairs[:, 0]] - ends[self.pairs[:, 1]], axis=-1)
         return np.where(apart < self.stub, self.stub, 0.0)[:, None]
 
@@ -118,7 +118,7 @@ PLATFORM = "platform"
 
 
 def cable_name(index: int) -> str:
-    """Name of a cable: counted from 1 for people, ``index`` counts from 0."""
+    """Displayed name of a cable: it counts from 1, ``index`` from 0."""
     return f"cable {index + 1}"
 
 
@@ -149,7 +149,7 @@ class RobotBodies:
     """
 
     def __init__(self, rig: Rig, pose: Pose) -> None:
-        """Places the robot at ``pose`` (``world_from_platform``)."""
+        """The robot at ``pose`` (``world_from_platform``)."""
         self.rig = rig
         self.pose = pose
         self.cables = cables_at(rig, pose)
@@ -178,7 +178,7 @@ class RobotBodies:
         return np.concatenate([ends, platform[..., None]], axis=-1)
 
     def body(self, index: int) -> ConvexBody:
-        """Body ``index``: a cable (as a line), or for m the platform."""
+        """Body ``index``: a cable (as a line), or the platform for index m."""
         if index not in self._made:
             self._made[index] = (
                 box_body(self.rig.half_size, self.pose)
@@ -189,13 +189,13 @@ class RobotBodies:
 
 
 class ShiftedBodies:
-    """The robot at one orientation wherever its origin is in the hull of some positions.
+    """The robot at one orientation with its origin anywhere in the hull of some positions.
 
-    Its exits must not move with it: point exits alone.
+    For point exits only, which do not move with the platform.
     """
 
     def __init__(self, rig: Rig, rotation: Array, positions: Array) -> None:
-        """Holds what reaches farthest.
+        """Stores the extreme points.
 
         Args:
             rig: The robot, with point exits.
@@ -208,9 +208,9 @@ class ShiftedBodies:
         self._positions = positions
 
     def reach(self, directions: Array) -> Array:
-        """As `RobotBodies.reach`, of all that the bodies pass over.
+        """As `RobotBodies.reach`, over all positions.
 
-        A cable's ends reach farthest at one of the positions, and with its ends the cable does.
+        A cable's ends reach farthest at one of the positions, and so does the cable.
         """
         shifts = np.max(directions @ self._positions.T, axis=-1)
         along = directions[..., :-1, :]
@@ -225,9 +225,9 @@ class ShiftedBodies:
 class ClearanceModel:
     """Distances of one rig in one scene.
 
-    It remembers the separating planes of the last pose: a plane bounds the distance from below at
-    the next pose too, so that most bodies are ruled out without asking for their distance. The
-    bounds are exact; what is remembered changes the time, not the answer.
+    It caches the separating planes of the last pose: a plane bounds the distance from below at the
+    next pose too, so most bodies are ruled out without computing their distance. The bounds are
+    exact; the cache changes the time, not the result.
     """
 
     def __init__(self, rig: Rig, scene: Scene) -> None:
@@ -247,7 +247,7 @@ class ClearanceModel:
         ]
 
     def obstacles(self, pose: Pose) -> tuple[Nearest, ...]:
-        """For every obstacle, in the order of the scene, the body nearest to it.
+        """The body nearest to each obstacle, in the order of the scene.
 
         Args:
             pose: ``world_from_platform``.
@@ -263,16 +263,16 @@ class ClearanceModel:
         return min(self.obstacles(pose), key=lambda n: n.distance, default=None)
 
     def at_least(self, middle: Pose, positions: Array, wanted: float) -> float:
-        """A distance that every obstacle keeps while the platform shifts; for point exits alone.
+        """A lower bound of obstacle distances while the platform translates; point exits only.
 
         Args:
-            middle: A pose among those passed; gives the orientation, and planes where the last ones
-                do not suffice.
+            middle: A pose of the translation; gives the orientation, and planes where the cached
+                ones do not suffice.
             positions: The platform's origin stays in their hull, shape (k, 3), [m].
-            wanted: No more than this is tried to be proved, [m].
+            wanted: Bound to prove; larger ones are not tried, [m].
 
         Returns:
-            A lower bound of the distances, [m]; ``wanted`` or more if they could be proved to.
+            The bound, [m]; ``wanted`` or more where the proof succeeds.
         """
         bodies = RobotBodies(self.rig, middle)
         shifted = ShiftedBodies(self.rig, middle.rotation, positions)
@@ -299,7 +299,7 @@ class ClearanceModel:
         return min(between, to_platform, key=lambda n: n.distance)
 
     def self_clearances(self, positions: Array, rotations: Array) -> Array:
-        """The smallest such distances at many poses, shape (k,), [m].
+        """`self_clearance` at many poses, shape (k,), [m].
 
         Args:
             positions: Of the platform, shape (k, 3), [m].
@@ -349,7 +349,7 @@ class _ObstacleDistances:
         )
 
     def nearest(self, bodies: RobotBodies, radii: Array) -> tuple[int, Separation]:
-        """The nearest body and its distance; cable radii rank the bodies but are not taken off."""
+        """The nearest body and its distance; cable radii count for the order only."""
         bounds = self._bounds(bodies, radii)
         order = np.argsort(bounds, axis=None).tolist()
         count = bounds.shape[1]
@@ -367,7 +367,7 @@ class _ObstacleDistances:
     def at_least(
         self, bodies: RobotBodies, shifted: ShiftedBodies, radii: Array, wanted: float
     ) -> float:
-        """A lower bound of the distance to all shifted bodies, by one plane for each pair."""
+        """A lower bound of the distance to all shifted bodies, from one plane per pair."""
         bounds = self._bounds(shifted, radii)
         for piece, body in np.argwhere(bounds < wanted).tolist():
             self._distance(bodies, piece, body)
@@ -377,7 +377,7 @@ class _ObstacleDistances:
         return float(bounds.min())
 
     def _bounds(self, bodies: RobotBodies | ShiftedBodies, radii: Array) -> Array:
-        """What the last plane of each pair proves of its distance, shape (pieces, bodies), [m]."""
+        """Lower bounds of distances from the last planes, shape (pieces, bodies), [m]."""
         bounds: Array = -self._reach - bodies.reach(self._planes) - radii
         return bounds
 

@@ -1,12 +1,12 @@
 """Exact distances: of straight segments and boxes, many at once, and of two convex bodies.
 
-Distances of segments are in closed form. Those of convex bodies are found by FCL and proved by a
-separating plane: FCL's are right to round-off nearly always, and once in some thousand cases wrong
-by millimetres to the unsafe side. So no distance is taken on trust. The two points that FCL names
-give a direction, and along any direction the gap between the bodies' extents (their support
-functions, in closed form) can be no larger than the distance: a gap as large as FCL's distance
-proves it. Where the proof fails, the distance is computed again by a min-norm-point search (Wolfe),
-which has the same proof as its stopping rule.
+Distances of segments are in closed form. Those of convex bodies come from FCL and are proved by a
+separating plane: FCL is nearly always right to round-off, but about once in a thousand cases wrong
+by millimetres to the unsafe side, so every distance is verified. FCL's two nearest points give a
+direction, and along any direction the gap between the bodies' extents (their support functions, in
+closed form) is at most the distance: a gap as large as FCL's distance proves it. Where the proof
+fails, the distance is recomputed by a min-norm-point search (Wolfe) with the same proof as its
+stopping rule.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ def segment_pair_points(
 ) -> tuple[Array, Array]:
     """The nearest points of pairs of segments, shape (..., 3) each, [m].
 
-    The nearest points are either inside both segments, where the joining line is perpendicular to
-    both, or at an end of one of them; all five cases are tried and the nearest is taken, so that
-    parallel and crossing segments need no tolerance.
+    The nearest points are either interior to both segments, where the joining line is perpendicular
+    to both, or an end of one of them; all five cases are tried, so parallel and crossing segments
+    need no tolerance.
 
     Args:
-        start_a: Shape (..., 3), [m]; the others likewise.
-        end_a: Other end of the first segment.
+        start_a: Start of the first segment.
+        end_a: End of the first segment.
         start_b: Start of the second segment.
-        end_b: Other end of the second segment.
+        end_b: End of the second segment.
     """
     along_a, along_b, gap = end_a - start_a, end_b - start_b, start_a - start_b
     aa, bb = _dot(along_a, along_a), _dot(along_b, along_b)
@@ -67,12 +67,12 @@ def segment_pair_points(
 def segment_box_points(start: Array, end: Array, half_size: Array) -> tuple[Array, Array]:
     """The nearest points of segments and a box about the origin, shape (..., 3) each, [m].
 
-    Along a segment the squared distance to the box is convex and made of parabolas that meet where
-    the segment crosses the planes of the box's faces; each parabola is minimised exactly.
+    Along a segment the squared distance to the box is convex and piecewise quadratic, with knots
+    where the segment crosses the planes of the box's faces; each piece is minimised exactly.
 
     Args:
         start: Frame of the box, shape (..., 3), [m].
-        end: Likewise.
+        end: Frame of the box, shape (..., 3), [m].
         half_size: Half extents of the box, shape (3,), [m].
 
     Returns:
@@ -125,9 +125,9 @@ def _clamped_ratio(numerator: Array, denominator: Array) -> Array:
 # Convex bodies, and the distance of two of them with a separating plane as its proof.
 
 
-#: A distance is proved when the separating plane leaves no more than this of it open, [m].
+#: A distance is proved when the separating plane's gap falls short of it by at most this, [m].
 PROOF_TOLERANCE = 1e-7
-#: Radius of the capsule or ball that stands for a segment or point in FCL, [m]; far less than the
+#: Radius of the capsule or ball that represents a segment or point in FCL, [m]; far below the
 #: proof's tolerance, and the proof is for the segment or point itself.
 _THREAD = 1e-8
 _NOWHERE = fcl.Transform()
@@ -141,12 +141,13 @@ class ConvexBody:
 
     Attributes:
         points: Shape (k, 3), [m].
-        radius: The hull is grown by a ball of this radius, [m].
-        disc_axis: Unit normal of a disc that the hull is grown by too, shape (3,); cylinders only.
+        radius: Radius of the ball by which the hull is grown, [m].
+        disc_axis: Unit normal of the disc by which the hull is grown too, shape (3,); cylinders
+            only.
         disc_radius: [m]; 0 for everything but cylinders.
         collision: FCL's object, without the growth by `radius` where `points` are one or two.
-        faces: Normals of faces, shape (f, 3), and
-        edges: directions of edges, shape (e, 3): candidates for the shortest way apart.
+        faces: Normals of faces, shape (f, 3), candidates for separating directions.
+        edges: Directions of edges, shape (e, 3), whose cross products are candidates too.
     """
 
     points: Array
@@ -191,7 +192,7 @@ class Separation:
     """The distance of two convex bodies.
 
     Attributes:
-        distance: [m]; where they overlap, minus a way that suffices to part them.
+        distance: [m]; where they overlap, minus a translation that separates them.
         first_point: On the first body, shape (3,), [m].
         second_point: On the second body, shape (3,), [m].
         normal: Unit vector from the first to the second body; the gap along it is the distance.
@@ -204,7 +205,7 @@ class Separation:
 
 
 def convex_bodies(shape: Shape, pose: Pose) -> tuple[ConvexBody, ...]:
-    """The convex bodies that make up a shape in the world; a mesh is one body a triangle."""
+    """The convex bodies that make up a shape in the world; a mesh has one per triangle."""
     points = pose.apply(shape_points(shape))
     transform = fcl.Transform(np.array(pose.rotation), np.array(pose.position))
     match shape:
@@ -287,7 +288,7 @@ def separation(first: ConvexBody, second: ConvexBody) -> Separation:
     """The proved distance of two convex bodies.
 
     Raises:
-        Fault: The search did not settle; never seen, and no distance is given then.
+        Fault: The search did not converge; never seen so far, and no distance is returned then.
     """
     named = _named_by_fcl(first, second)
     if named is None:
@@ -301,7 +302,7 @@ def separation(first: ConvexBody, second: ConvexBody) -> Separation:
 
 
 def _named_by_fcl(first: ConvexBody, second: ConvexBody) -> tuple[Array, Array, Array] | None:
-    """FCL's nearest points and the unit vector between them; None where it sees them touch."""
+    """FCL's nearest points and the unit vector between them; None where FCL reports contact."""
     result = fcl.DistanceResult()
     if fcl.distance(first.collision, second.collision, _REQUEST, result) <= PROOF_TOLERANCE:
         return None
@@ -328,8 +329,8 @@ def _apart(
 def _searched(first: ConvexBody, second: ConvexBody, guess: Array) -> Separation:
     """Wolfe's min-norm-point search over the differences of points of the two bodies.
 
-    Source: P. Wolfe, "Finding the nearest point in a polytope", 1976; with a support function in
-    place of a list of points it is the search of Gilbert, Johnson & Keerthi.
+    Source: P. Wolfe, "Finding the nearest point in a polytope", 1976; with a support function
+    instead of a list of points it is the search of Gilbert, Johnson & Keerthi.
     """
     direction = guess if np.any(guess) else first.points[0] - second.points[0]
     if not np.any(direction):
@@ -368,7 +369,7 @@ def _repeats(added: tuple[Array, Array], pairs: list[tuple[Array, Array]]) -> bo
 def _nearest_face(
     pairs: list[tuple[Array, Array]], weights: Array
 ) -> tuple[list[tuple[Array, Array]], Array]:
-    """The point of the corners' hull nearest to the origin, by the corners that carry it."""
+    """The point of the corners' hull nearest to the origin, as weights of supporting corners."""
     while True:
         corners = np.array([b - a for a, b in pairs])
         wanted = _affine_nearest(corners)
@@ -394,9 +395,10 @@ def _affine_nearest(corners: Array) -> Array:
 
 
 def _overlap(first: ConvexBody, second: ConvexBody) -> Separation:
-    """The shortest way apart among faces' normals and crossed edges, exact for polytopes.
+    """The shortest separating translation along face normals and crossed edges.
 
-    Source: the separating axis theorem; for round bodies the way suffices but may not be shortest.
+    Source: the separating axis theorem. Exact for polytopes; for round bodies it separates but may
+    not be the shortest.
     """
     crossed = np.cross(first.edges[:, None, :], second.edges[None, :, :]).reshape(-1, 3)
     to_second = second.points.mean(axis=0) - first.points.mean(axis=0)

@@ -1,4 +1,4 @@
-"""The errors a user may see: each says what, where, why and what to do next."""
+"""The errors a user may see: each states what, where, why and what to do next."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ class CdprError(Exception):
     """Base of every error of this project.
 
     Args:
-        what: One sentence that says what is wrong, with measured value, unit and limit.
-        where: File and place, or device, that it is about.
-        why: The likely cause, where it is known.
+        what: One sentence that states what is wrong, with measured value, unit and limit.
+        where: File and position, or device, concerned.
+        why: The likely cause, where known.
         next_step: What the user can do now.
         values: The numbers behind the text, by name (unit in the name).
     """
@@ -38,7 +38,7 @@ class CdprError(Exception):
         self.values = dict(values or {})
 
     def __str__(self) -> str:
-        """The whole message on as many lines as it has parts."""
+        """The whole message, one line per part."""
         head = f"{self.where}: {self.what}" if self.where else self.what
         parts = [head]
         if self.why:
@@ -48,7 +48,7 @@ class CdprError(Exception):
         return "\n".join(parts)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Travels between processes whole, whatever arguments a subclass takes."""
+        """Keeps all attributes when pickled, whatever arguments a subclass takes."""
         return _restored, (type(self), self.args, self.__dict__)
 
     def as_dict(self) -> dict[str, object]:
@@ -95,7 +95,7 @@ class AlreadyExists(BadInput):
 
 
 class Refused(CdprError):
-    """A safety check said no before anything moved."""
+    """A safety check refused before anything moved."""
 
     code = "refused"
     exit_code = 3
@@ -117,7 +117,7 @@ class StoppedByOperator(CdprError):
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing wrong in an input file.
+    """One problem of an input file.
 
     Attributes:
         key: Path of the key, such as ``winches[2].node_id``.
@@ -148,16 +148,16 @@ class InvalidFile(BadInput):
         )
 
     def __str__(self) -> str:
-        """A line a problem, each with file:line:column."""
+        """One line per problem, each with file:line:column."""
         lines = [self._line(problem) for problem in self.problems]
         return "\n".join([*lines, f"  next: {self.next_step}"])
 
     def _line(self, problem: Problem) -> str:
-        place = self.path
+        position = self.path
         if problem.line:
-            place += f":{problem.line}:{problem.column}"
+            position += f":{problem.line}:{problem.column}"
         key = f" {problem.key}:" if problem.key else ""
-        return f"{place}:{key} {problem.what}"
+        return f"{position}:{key} {problem.what}"
 
     def as_dict(self) -> dict[str, object]:
         """The same message for `--json`, with the list of problems."""

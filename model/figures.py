@@ -1,7 +1,7 @@
-"""Figures of rigs and paths by matplotlib; imported only when a figure is asked for.
+"""Matplotlib figures of rigs and paths; imported only when a figure is requested.
 
-Axes are in millimetres, world frame. Figures are those of `matplotlib.pyplot`, so that a notebook
-shows them and a script can call `matplotlib.pyplot.show`.
+Axes are in millimetres, world frame. Figures come from `matplotlib.pyplot`, so a notebook shows
+them and a script can call `matplotlib.pyplot.show`.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""How kernels are compiled, and where the machine code is kept.
+"""Compilation of kernels, and the cache of their machine code.
 
 Numba recompiles a cached function when its own file changes, not when a function it calls does. So
-the cache lies in a folder named after the content of all files beside the function, and of those in
-the folders of kernels that it calls: any change begins a new one. The folder is the user's
-(``NUMBA_CACHE_DIR``, else ``XDG_CACHE_HOME`` or ``~/.cache``), which lets a read-only installation
-work. Where no folder can be written, kernels live as long as the process.
+the cache folder is named after the content of all files beside the function and in the folders of
+kernels that it calls: any change starts a new one. It is in the user's cache (``NUMBA_CACHE_DIR``,
+else ``XDG_CACHE_HOME`` or ``~/.cache``), so a read-only installation works. Where no folder can be
+written, kernels last as long as the process.
 """
 
 from __future__ import annotations
@@ -28,24 +28,23 @@ import numba
 
 from model.progress import Listener
 
-# Where machine code is kept between runs, and when old code is thrown away.
+# The folders of machine code, and the deletion of old ones.
 #
-# Every state of the kernels has a folder of its own (`model.jit`). A process holds a
-# shared lock in each folder it uses until it ends; beginning a new one throws away those that
-# no process holds and none began to use for two days. Folders that the user named
-# (``NUMBA_CACHE_DIR``) are left alone.
+# Every state of the kernels has its own folder. A process holds a shared lock in each folder it
+# uses until it ends. Creating a folder deletes those that no process holds and none has started to
+# use for two days. Folders named by the user (``NUMBA_CACHE_DIR``) are left alone.
 
 
 UNUSED = 2 * 24 * 3600.0
 """How long a folder must be unused before it is deleted, [s]."""
 _LOCK = "in-use"
 _OURS = re.compile(r"[0-9a-f]{16}|removed-\w+")
-"""Names of versions, and of what a process that was ended did not get to remove."""
+"""Names of versions, and of folders whose removal was interrupted."""
 _ATTEMPTS = 10
 
 
 def use_folder(version: str) -> Path | None:
-    """The folder of a version, held until the process ends; None where none can be written."""
+    """The folder of a version, locked until the process ends; None where none can be written."""
     given = os.environ.get("NUMBA_CACHE_DIR")
     try:
         if given:
@@ -56,15 +55,15 @@ def use_folder(version: str) -> Path | None:
             is_new = not folder.exists()
             _hold(folder)
             if is_new:
-                throw_away_unused(folder.parent, time.time())
+                delete_unused(folder.parent, time.time())
         with tempfile.TemporaryFile(dir=folder):
             return folder
-    except OSError:  # read-only or full: compiled code is then not kept
+    except OSError:  # read-only or full: compiled code is then not cached
         return None
 
 
-def throw_away_unused(parent: Path, now: float) -> None:
-    """Removes the folders of versions that no process holds and none used for `UNUSED`.
+def delete_unused(parent: Path, now: float) -> None:
+    """Deletes the folders of versions that no process holds and none used for `UNUSED`.
 
     Args:
         parent: Of the folders.
@@ -73,8 +72,8 @@ def throw_away_unused(parent: Path, now: float) -> None:
     for folder in parent.iterdir():
         try:
             if _OURS.fullmatch(folder.name) and now - folder.stat().st_mtime > UNUSED:
-                _throw_away(folder)
-        except OSError:  # another process was faster, or it is not ours to remove
+                _delete(folder)
+        except OSError:  # another process was faster, or the folder is not ours
             continue
 
 
@@ -85,10 +84,10 @@ def _own_folder() -> Path:
 
 
 def _hold(folder: Path) -> None:
-    """Makes the folder, marks it as used now, and holds it as long as the process lives.
+    """Creates the folder, marks it as used now, and locks it as long as the process lives.
 
     Raises:
-        OSError: It cannot be made or locked.
+        OSError: It cannot be created or locked.
     """
     for _ in range(_ATTEMPTS):
         folder.mkdir(parents=True, exist_ok=True)
@@ -97,11 +96,11 @@ def _hold(folder: Path) -> None:
         if _is_same(lock, folder / _LOCK):
             os.utime(folder)
             return  # the file stays open, and the lock with it
-        os.close(lock)  # thrown away in between
-    raise OSError(f"{folder} is deleted again and again")
+        os.close(lock)  # deleted in between
+    raise OSError(f"{folder} is deleted repeatedly")
 
 
-def _throw_away(folder: Path) -> None:
+def _delete(folder: Path) -> None:
     lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -127,22 +126,22 @@ _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "fastmath": F
 def compiled(
     function: Function, *called: Path, counts_arrays: bool = True, is_inlined: bool = False
 ) -> Function:
-    """Compiles a pure function when it is first called; exact IEEE arithmetic, no GIL.
+    """Compiles a pure function at its first call; exact IEEE arithmetic, no GIL.
 
     Args:
-        function: What is compiled.
+        function: The function.
         called: Folders of the kernels that it calls, beside its own.
-        counts_arrays: Whether it makes or keeps arrays, whose owners are then counted.
-        is_inlined: Whether it becomes part of its callers.
+        counts_arrays: Whether it creates or keeps arrays, whose references are then counted.
+        is_inlined: Whether it is inlined into its callers.
     """
-    # All said, or they come from whichever caller was first.
+    # All explicit, or they would come from the first caller.
     options = {**_OPTIONS, "_nrt": counts_arrays, "forceinline": is_inlined}
     folder = cache_folder(Path(function.__code__.co_filename).parent, *called)
     if folder is None:
         return cast(Function, numba.njit(**options)(function))
     config: Any = numba.config
     before = config.CACHE_DIR
-    config.CACHE_DIR = str(folder)  # read while the decorator runs, hence put back after it
+    config.CACHE_DIR = str(folder)  # read while the decorator runs, hence restored after it
     try:
         return cast(Function, numba.njit(cache=True, **options)(function))
     finally:
@@ -151,7 +150,7 @@ def compiled(
 
 @cache
 def cache_folder(sources: Path, *called: Path) -> Path | None:
-    """The folder of the machine code of kernels in ``sources`` that call those in ``called``.
+    """The folder for the machine code of kernels in ``sources`` that call those in ``called``.
 
     None where none can be written.
     """
@@ -168,34 +167,33 @@ def _version(folders: frozenset[Path]) -> str:
     return digest.hexdigest()[:16]
 
 
-# Whether the machine code that a task needs waits in the user's cache, or must be compiled first.
+# Whether the machine code of a task is in the user's cache, or must be compiled first.
 #
-# Numba finds machine code by the path and the date of a kernel's file, in a folder that is named
-# after the content of all kernels. So another copy of the program, or a file that was only touched,
-# compiles again; hence the stamp of a task is named after path, date and size of every kernel's
-# file.
+# Numba finds machine code by the path and date of a kernel's file, in a folder named after the
+# content of all kernels. Another copy of the program, or a file that was only touched, compiles
+# again; hence the stamp of a task is named after path, date and size of every kernel's file.
 
 
 @dataclass(frozen=True, slots=True)
 class KernelSet:
-    """What runs kernels.
+    """The kernels of a task.
 
     Attributes:
-        name: Of what was done once when its code is there.
-        kernels: Folders of the kernels; the code's stamp lies in their cache.
+        name: Of the task; once it has run, its code is cached.
+        kernels: Folders of the kernels; the task's stamp is in their cache.
     """
 
     name: str
     kernels: tuple[Path, ...]
 
 
-def can_be_kept(task: KernelSet) -> bool:
+def can_be_cached(task: KernelSet) -> bool:
     """Whether there is a folder in which a task's code outlives the process."""
     return cache_folder(*task.kernels) is not None
 
 
 def is_compiled(task: KernelSet) -> bool:
-    """Whether a task was done before with the very files that lie here.
+    """Whether a task has run before with exactly these files.
 
     False too where no folder can be written: then every process compiles for itself.
     """
@@ -204,33 +202,33 @@ def is_compiled(task: KernelSet) -> bool:
 
 
 def note_compiled(task: KernelSet) -> None:
-    """Notes that a task was done, where that can be noted."""
+    """Records that a task has run, where a folder can be written."""
     stamp = _stamp(task)
     if stamp is None:
         return
     try:
         stamp.touch()
-    except OSError:  # read-only since it was made: the next process looks again
+    except OSError:  # read-only since it was created: the next process checks again
         return
 
 
 @contextmanager
 def compilation(task: KernelSet, what: str, duration: str, listener: Listener) -> Iterator[bool]:
-    """Around what compiles the code of a task when it is done for the first time.
+    """Context for a task that compiles its code when it runs for the first time.
 
     Args:
-        task: It uses the kernels.
-        what: That is compiled, such as ``the planner``.
-        duration: That it takes, such as ``about ten seconds``.
-        listener: Receives that it is compiled.
+        task: The task with its kernels.
+        what: What is compiled, such as ``the planner``.
+        duration: How long it takes, such as ``about ten seconds``.
+        listener: Receives a remark when code is compiled.
 
     Yields:
-        Whether the code was there.
+        Whether the code was in the cache.
     """
     if is_compiled(task):
         yield True
         return
-    if can_be_kept(task):
+    if can_be_cached(task):
         listener.remark(f"compiling {what} for this machine (once, {duration}) …")
     else:
         listener.remark(

@@ -1,4 +1,4 @@
-"""Kinematics of the platform: cable lengths, structure matrix, pose from lengths.
+"""Kinematics of the platform: cable lengths, structure matrix, forward kinematics.
 
 Source: paper, section 2, Eqs. 1–3 with the corrections of docs/paper.md.
 """
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 # Cables between outlets and anchors: exit points, lengths and directions.
 #
 # Two kinds of outlet. A point exit is the outlet point itself (paper, Eq. 1). A swivelling pulley
-# of radius r turns about its feed direction k through the outlet A, where the cable enters it; the
-# cable wraps the pulley, leaves it tangentially at T and runs straight to the anchor B (A. Pott,
-# "Cable-Driven Parallel Robots", 2018, section 3.5). The length is then the wrapped arc and the
-# straight part; its derivative with respect to B is the unit vector from T to B, as for a point
-# exit.
+# of radius r swivels about its feed direction k through the outlet A, where the cable enters it;
+# the cable wraps the pulley, leaves it tangentially at T and runs straight to the anchor B
+# (A. Pott, "Cable-Driven Parallel Robots", 2018, section 3.5). The length is then the wrapped arc
+# plus the straight part; its derivative with respect to B is the unit vector from T to B, as for a
+# point exit.
 
 
 class NoCable(BadInput, ValueError):
-    """A pose at which a cable cannot run: its anchor lies at its outlet or inside its pulley."""
+    """A pose at which a cable has no path: its anchor is at its outlet or inside its pulley."""
 
     code = "no_cable"
 
@@ -69,13 +69,13 @@ def cables_to(rig: Rig, anchors_in_world: Array) -> Cables:
     if rig.pulley_radius == 0.0:
         straight = rig.outlets - anchors_in_world
         lengths = np.linalg.norm(straight, axis=-1)
-        _demand(lengths > 0.0, "its anchor is at its outlet")
+        _require(lengths > 0.0, "its anchor is at its outlet")
         exits = np.broadcast_to(rig.outlets, anchors_in_world.shape)
         return Cables(exits, anchors_in_world, straight / lengths[..., None], lengths)
-    return _over_pulleys(rig, anchors_in_world)
+    return _on_pulleys(rig, anchors_in_world)
 
 
-def _over_pulleys(rig: Rig, anchors_in_world: Array) -> Cables:
+def _on_pulleys(rig: Rig, anchors_in_world: Array) -> Cables:
     radius, feed = rig.pulley_radius, rig.feed_directions
     offset = anchors_in_world - rig.outlets
     along = np.sum(offset * feed, axis=-1)
@@ -83,8 +83,8 @@ def _over_pulleys(rig: Rig, anchors_in_world: Array) -> Cables:
     reach = np.linalg.norm(radial, axis=-1)
     outward = reach - radius  # from the pulley's centre, in the pulley's plane
     centre_distance = np.hypot(outward, along)
-    _demand(reach > 0.0, "its anchor is on the swivel axis of its pulley")
-    _demand(centre_distance > radius, "its anchor is inside its pulley")
+    _require(reach > 0.0, "its anchor is on the swivel axis of its pulley")
+    _require(centre_distance > radius, "its anchor is inside its pulley")
     swivel = radial / reach[..., None]
     straight = np.sqrt(centre_distance**2 - radius**2)
     # The tangent point, as an angle about the pulley's centre from the swivel direction to k.
@@ -96,13 +96,13 @@ def _over_pulleys(rig: Rig, anchors_in_world: Array) -> Cables:
     return Cables(exits, anchors_in_world, directions, radius * wrap + straight)
 
 
-def _demand(sound: NDArray[np.bool_], what: str) -> None:
+def _require(sound: NDArray[np.bool_], what: str) -> None:
     """Raises `NoCable` for the first cable, along the last axis, that is not sound."""
     if sound.all():
         return
     number = int(np.argwhere(~sound)[0][-1]) + 1
     raise NoCable(
-        f"cable {number} cannot run: {what}",
+        f"cable {number} has no path: {what}",
         why="the pose is out of the rig's reach, or a value is not a number",
         next_step="choose a pose inside the workspace",
         values={"cable": number},
@@ -110,7 +110,7 @@ def _demand(sound: NDArray[np.bool_], what: str) -> None:
 
 
 LEAST_DAMPING = 1e-12
-"""Keeps the steps of forward kinematics defined at poses where the platform is not held."""
+"""Keeps the steps of forward kinematics defined at singular poses."""
 
 
 def cable_lengths(rig: Rig, pose: Pose) -> Array:
@@ -138,12 +138,12 @@ def structure_matrix_of(cables: Cables, position: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForwardSolution:
-    """A pose found from cable lengths.
+    """A pose computed from cable lengths.
 
     Attributes:
         pose: ``world_from_platform``.
-        residual: Length of the pose's cables less the given lengths, shape (m,), [m].
-        iterations: Steps it took.
+        residual: Lengths of the pose's cables minus the given lengths, shape (m,), [m].
+        iterations: Number of steps.
     """
 
     pose: Pose
@@ -152,25 +152,25 @@ class ForwardSolution:
 
     @property
     def worst(self) -> float:
-        """Largest disagreement of one cable, [m]."""
+        """Largest absolute residual of a cable, [m]."""
         return float(np.max(np.abs(self.residual)))
 
 
 def forward_kinematics(
     rig: Rig, lengths: Array, guess: Pose | None = None, *, tolerance: float = 1e-10
 ) -> ForwardSolution:
-    """Pose whose cable lengths come nearest to the given ones (least squares).
+    """Pose whose cable lengths are nearest to the given ones (least squares).
 
     Args:
         rig: The robot, with point exits or pulleys.
         lengths: Shape (m,), [m].
-        guess: A pose near the solution (warm); without one (cold) the search starts from several
-            poses of the workspace and the best solution is taken.
+        guess: A pose near the solution (warm start); without one (cold start) the search starts
+            from several poses of the workspace and returns the best solution.
         tolerance: Size of the last step at which the search ends, [m] and [rad].
 
     Raises:
-        BadInput: Not a finite length for each cable.
-        Fault: No start led to a stationary pose.
+        BadInput: There is not a finite length for each cable.
+        Fault: No start converged to a stationary pose.
     """
     wanted = np.asarray(lengths, dtype=np.float64)
     if wanted.shape != (rig.cable_count,) or not np.all(np.isfinite(wanted)):
@@ -229,7 +229,7 @@ def poses_near(
 
 
 def _cold_starts(rig: Rig) -> list[Pose]:
-    """Home first, then the centres of the eighths of the workspace."""
+    """Home, the workspace centre, and the centres of its octants."""
     centre = (rig.workspace_lower + rig.workspace_upper) / 2.0
     quarter = (rig.workspace_upper - rig.workspace_lower) / 4.0
     corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
@@ -243,7 +243,7 @@ def _cold_starts(rig: Rig) -> list[Pose]:
 def _levenberg_marquardt(
     rig: Rig, lengths: Array, start: Pose, tolerance: float
 ) -> ForwardSolution | None:
-    """Damped Gauss–Newton on the pose; None when it does not settle."""
+    """Damped Gauss–Newton on the pose; None when it does not converge."""
     pose, damping = start, 1e-6
     scale = _step_scale(rig)
     residual = _residual(rig, pose, lengths)
@@ -267,7 +267,7 @@ def _levenberg_marquardt(
 
 
 def _step_scale(rig: Rig) -> Array:
-    """Makes a unit of rotation move the anchors as far as a unit of translation."""
+    """Scale with which a unit of rotation moves the anchors as far as a unit of translation."""
     radius = rms_anchor_radius(rig.anchors)
     return np.array([1.0, 1.0, 1.0, 1.0 / radius, 1.0 / radius, 1.0 / radius])
 

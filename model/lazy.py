@@ -1,4 +1,4 @@
-"""Public names of a package that are loaded when they are first used (PEP 562)."""
+"""Public names of a package that are loaded on first use (PEP 562)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def lazy_names(
 
     Args:
         package: Its ``__name__``.
-        origins: Modules, and which of their names are public, separated by spaces.
+        origins: Public names of each module, separated by spaces.
     """
     module_of = {name: module for module, names in origins.items() for name in names.split()}
 

@@ -1,4 +1,4 @@
-"""Plans: written with a hash over their content, and refused when it does not match."""
+"""Plans: written with a hash of their content, and refused when it does not match."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ STOP_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """A path whose file is whole: its hashes match its content.
+    """A path whose file is intact: its hashes match its content.
 
     Attributes:
         document: The file it was made from.
         rig: The rig it was made for.
         scene: The scene it was made for.
         waypoints: ``world_from_platform`` at the corners, start, stops and goal included.
-        stops: Which of the waypoints are at the scene's stops.
+        stops: Indices of the waypoints at the scene's stops.
         raw_path: The path before post-processing.
     """
 
@@ -62,11 +62,11 @@ class Plan:
 
     @property
     def quality(self) -> QualityDocument:
-        """What the planner found: length, clearances, tensions, cost; units in the names."""
+        """Length, clearances, tensions and cost from the planner; units in the names."""
         return self.document.quality
 
     def save(self, path: str | Path) -> Path:
-        """Writes the plan file, whole or not at all; returns it.
+        """Writes the plan file atomically; returns its path.
 
         Raises:
             BadInput: The folder cannot be written to.
@@ -111,7 +111,7 @@ def sealed(fields: dict[str, Any]) -> PlanDocument:
 
 
 def save_plan(document: PlanDocument, path: Path) -> None:
-    """Writes a plan file whole or not at all.
+    """Writes a plan file atomically.
 
     Raises:
         BadInput: The folder cannot be written to.
@@ -123,7 +123,7 @@ def load_plan(path: str | Path) -> Plan:
     """Reads a plan file.
 
     Raises:
-        BadInput: It cannot be read, is no JSON, holds NaN, or its hash does not match.
+        BadInput: It cannot be read, is not JSON, holds NaN, or its hash does not match.
         InvalidFile: With every key that does not fit.
     """
     path = Path(path)
@@ -144,17 +144,17 @@ def load_plan(path: str | Path) -> Plan:
 
 
 def _check_stops(plan: Plan, path: Path) -> None:
-    """The marked waypoints are the scene's stops, in its order."""
+    """Checks that the marked waypoints are the scene's stops, in order."""
     marks, stops = plan.document.stops, plan.scene.stops
-    places = [mark.waypoint for mark in marks]
+    indices = [mark.waypoint for mark in marks]
     if [mark.name for mark in marks] != [stop.name for stop in stops]:
         what = f"marks the stops {[m.name for m in marks]}; its scene has {[s.name for s in stops]}"
-    elif places != sorted(set(places)) or not all(0 < p < len(plan.waypoints) for p in places):
-        what = f"marks the waypoints {places} of {len(plan.waypoints)} as stops, out of order"
+    elif indices != sorted(set(indices)) or not all(0 < p < len(plan.waypoints) for p in indices):
+        what = f"marks the waypoints {indices} of {len(plan.waypoints)} as stops, out of order"
     else:
-        away = [plan.waypoints[p].distance_to(s.pose) for p, s in zip(places, stops, strict=True)]
-        turned = [plan.waypoints[p].angle_to(s.pose) for p, s in zip(places, stops, strict=True)]
-        if max([*away, *turned], default=0.0) <= STOP_TOLERANCE:
+        away = [plan.waypoints[p].distance_to(s.pose) for p, s in zip(indices, stops, strict=True)]
+        rotated = [plan.waypoints[p].angle_to(s.pose) for p, s in zip(indices, stops, strict=True)]
+        if max([*away, *rotated], default=0.0) <= STOP_TOLERANCE:
             return
         what = f"misses a stop by {max(away) * 1000.0:.4g} mm"
     why = "the file was not made by `cdpr plan`"
@@ -202,11 +202,11 @@ def require_same_rig(plan: Plan, rig: Rig, plan_path: Path | str) -> None:
     )
 
 
-# What a plan is, for programs and for people.
+# Summaries of a plan.
 
 
 def plan_as_dict(document: PlanDocument) -> dict[str, Any]:
-    """What a plan is, for programs: its file without waypoints, rig and scene."""
+    """Machine-readable summary: the plan file without waypoints, rig and scene."""
     return {
         "hash": document.hash,
         "rig": document.rig.name,
@@ -220,7 +220,7 @@ def plan_as_dict(document: PlanDocument) -> dict[str, Any]:
 
 
 def plan_facts(document: PlanDocument) -> list[tuple[str, str]]:
-    """What a plan is, for people: name and value."""
+    """Human-readable summary: name and value."""
     quality = document.quality
     facts = [
         ("rig, scene", f"{document.rig.name}, {document.scene.name}"),
@@ -251,17 +251,17 @@ def _before(document: PlanDocument) -> str:
 
 
 def _rotation(document: PlanDocument) -> list[tuple[str, str]]:
-    """One line for a plan on which the platform turns; none for others."""
+    """One line for a plan that rotates the platform; none for others."""
     poses = [waypoint.pose() for waypoint in document.waypoints]
     if all(pose.angle_to(poses[0]) == 0.0 for pose in poses):
         return []
     found = [largest_rotations(a.quaternion, b.quaternion) for a, b in pairwise(poses)]
     tilt, turn = (math.degrees(max(values)) for values in zip(*found, strict=True))
     radius = rms_anchor_radius(np.array(document.rig.anchors_mm))
-    way = sum(
+    length = sum(
         math.hypot(a.distance_to(b) * 1e3, radius * a.angle_to(b)) for a, b in pairwise(poses)
     )
-    text = f"tilted up to {tilt:.2f}°, rotated up to {turn:.2f}°; {way:.1f} mm with rotation"
+    text = f"tilted up to {tilt:.2f}°, rotated up to {turn:.2f}°; {length:.1f} mm with rotation"
     return [("rotation", text)]
 
 

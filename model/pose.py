@@ -3,9 +3,9 @@
 Rotation limits hold exactly along whole moves. Every orientation is a turn about the vertical
 followed by a tilt, a rotation about a horizontal axis. With the unit quaternion (w, x, y, z) the
 tilt is 2 asin √(x² + y²), the angle of the platform's z axis from the vertical, and the turn
-2 atan(z / w). Along a move at a constant axis the quaternion goes on a circle: x² + y² is then a
-constant and a wave of the angle, the largest value of which is known in closed form, and z / w goes
-one way only, from end to end.
+2 atan(z / w). Along a move about a constant axis the quaternion moves on a circle: x² + y² is then
+a constant plus a sinusoid of the angle, whose maximum is known in closed form, and z / w is
+monotonic.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def skew(vector: ArrayLike) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def carried(arm: Array) -> Array:
-    """How errors of a frame move a body in it, shape (6, 6): shift and turn, world axes.
+def lever_arm_matrix(arm: Array) -> Array:
+    """Maps the error twist of a frame to that of a body in it, shape (6, 6), world axes.
 
     Args:
         arm: From the frame's origin to the body's, world axes, shape (3,), [m].
@@ -186,7 +186,7 @@ class PlatformMotion:
 
     Attributes:
         velocity: Of its origin, world frame, shape (3,), [m/s].
-        turning: Along the world's axes, shape (3,), [rad/s].
+        turning: Angular velocity, world axes, shape (3,), [rad/s].
     """
 
     velocity: Array
@@ -194,7 +194,7 @@ class PlatformMotion:
 
     @classmethod
     def between(cls, before: Pose, after: Pose, seconds: float) -> PlatformMotion:
-        """The motion from one pose to another in a time that is not 0."""
+        """The motion from one pose to another in a non-zero time."""
         turn = rotation_vector_from_matrix(after.rotation @ before.rotation.T)
         return cls((after.position - before.position) / seconds, turn / seconds)
 
@@ -204,43 +204,43 @@ class PlatformMotion:
         return Pose(pose.position + self.velocity * seconds, turn @ pose.rotation)
 
 
-# How far the platform may be tilted and turned, exact along whole moves.
+# Limits on the platform's tilt and turn, exact along whole moves.
 
 
 _AT_LIMIT = 1e-7
-"""By how much a limit may be exceeded, [rad]: round-off of quaternions in files."""
+"""Tolerance of a limit, [rad]: round-off of quaternions in files."""
 
 
 @dataclass(frozen=True, slots=True)
 class RotationLimits:
-    """The orientations that a scene allows, measured from level and not turned, in the world.
+    """The orientations that a scene allows, measured from the level, unrotated platform.
 
     Attributes:
         tilt: Largest angle between the platform's z axis and the vertical, [rad], at most π/2.
-        turn: Largest turn about the vertical, either way, [rad]; π for any.
+        turn: Largest turn about the vertical, in either direction, [rad]; π for any.
     """
 
     tilt: float
     turn: float
 
     def excess(self, start: Pose, end: Pose) -> Excess | None:
-        """What a straight move between two poses exceeds; None where it keeps the limits."""
+        """The limit that a straight move between two poses exceeds; None where it keeps both."""
         tilt, turn = largest_rotations(start.quaternion, end.quaternion)
         if not tilt <= self.tilt + _AT_LIMIT:
             return Excess("tilted", tilt, self.tilt)
         if not turn <= self.turn + _AT_LIMIT:
-            return Excess("turned", turn, self.turn)
+            return Excess("rotated", turn, self.turn)
         return None
 
 
 @dataclass(frozen=True, slots=True)
 class Excess:
-    """A limit that a move does not keep.
+    """A rotation limit that a move exceeds.
 
     Attributes:
-        how: "tilted" or "turned".
-        measured: The largest on the move, [rad].
-        limit: That the scene allows, [rad].
+        how: "tilted" or "rotated".
+        measured: Largest value on the move, [rad].
+        limit: Limit of the scene, [rad].
     """
 
     how: str
@@ -254,23 +254,23 @@ class Excess:
 
 
 def largest_rotations(start: Array, end: Array) -> tuple[float, float]:
-    """The largest tilt and the largest turn on the shorter way between two orientations, [rad].
+    """The largest tilt and turn on the shortest rotation between two orientations, [rad].
 
     Args:
         start: Unit quaternion (w, x, y, z), shape (4,).
-        end: Likewise.
+        end: Unit quaternion (w, x, y, z), shape (4,).
     """
     first = start if start[0] >= 0.0 else -start
     last = end if float(first @ end) >= 0.0 else -end
     across = last - (first @ last) * first
     sine = float(np.linalg.norm(across))
-    way = 2.0 * math.atan2(sine, float(first @ last))  # of the angle that x² + y² depends on
+    span = 2.0 * math.atan2(sine, float(first @ last))  # of the angle that x² + y² depends on
     squares = [float(q[1] ** 2 + q[2] ** 2) for q in (first, last)]
     if sine > 0.0:
         across = across / sine
         mean = (squares[0] + float(across[1] ** 2 + across[2] ** 2)) / 2.0
         cosine_part, sine_part = squares[0] - mean, float(first[1:3] @ across[1:3])
-        if 0.0 <= math.atan2(sine_part, cosine_part) % (2.0 * math.pi) <= way:
+        if 0.0 <= math.atan2(sine_part, cosine_part) % (2.0 * math.pi) <= span:
             squares.append(mean + math.hypot(cosine_part, sine_part))
     tilt = 2.0 * math.asin(min(math.sqrt(max(squares)), 1.0))
     if last[0] <= 0.0:

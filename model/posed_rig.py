@@ -1,4 +1,4 @@
-"""A rig at one pose: cable lengths, structure matrix, tensions and how well they hold it."""
+"""A rig at one pose: cable lengths, structure matrix, tensions and margins."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedRig:
-    """What follows from a rig's geometry at one pose; the arrays are read-only.
+    """Kinematics and statics of a rig at one pose; the arrays are read-only.
 
     Attributes:
         rig: The robot with m cables.
@@ -31,13 +31,12 @@ class PosedRig:
         lengths: Free cable lengths from outlet to anchor, shape (m,), [m].
         structure_matrix: J of J t + w = 0 for tensions t and the external wrench w, shape (6, m);
             force rows [-], moment rows about the platform's origin [m].
-        tensions: Those that the drives are commanded, shape (m,), [N]; NaN where no tensions
-            within the limits hold the weight.
-        capacity_margin: Distance of the wrenches to hold from the boundary of those that the cables
-            can give, [N]; negative where they cannot, minus infinity where they act in too few
-            directions.
+        tensions: Commanded tensions, shape (m,), [N]; NaN where no tensions within the limits hold
+            the weight.
+        capacity_margin: Distance of the required wrenches from the boundary of the available set,
+            [N]; negative outside it, minus infinity where the cables act in too few directions.
         condition_number: σ_max / σ_min of the structure matrix, moments divided by the RMS anchor
-            radius; 1 at best, infinite where it has no full rank.
+            radius; 1 at best, infinite where it is rank-deficient.
     """
 
     rig: Rig
@@ -61,7 +60,7 @@ class PosedRig:
         return 1.0 / self.condition_number
 
     def __repr__(self) -> str:
-        """Position and what decides about it."""
+        """Position, feasibility and margins."""
         x, y, z = self.pose.position * 1000.0
         held = "feasible" if self.is_wrench_feasible else "not feasible"
         return (
@@ -79,7 +78,7 @@ def posed_rig(rig: Rig, pose: Pose, load: Load | None = None) -> PosedRig:
         load: Payload and external wrenches; only the platform's weight when left out.
 
     Raises:
-        NoCable: A cable cannot run at this pose.
+        NoCable: A cable has no path at this pose.
     """
     cables = cables_at(rig, pose)
     matrix = structure_matrix_of(cables, pose.position)

@@ -35,7 +35,7 @@ __all__ = [
     "rig_from_document",
 ]
 
-#: Parts of a rig file that a plan's proof does not rest on; they may change under a plan.
+#: Parts of a rig file that a plan's proof does not depend on; they may change after planning.
 NOT_IN_PLAN_HASH = (
     *("description", "bus", "drives", "tags", "cameras", "motion", "winches"),
     *("simulation", "outlets_error_mm", "anchors_error_mm"),
@@ -44,19 +44,19 @@ NOT_IN_PLAN_HASH = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Winch:
-    """A winch: how cable length becomes drive counts.
+    """A winch: conversion of cable length to drive counts, and limits.
 
     Attributes:
         node_id: Node of its drive on the bus.
         counts_per_metre: Signed counts for one metre of cable paid out.
         home_counts: Drive position with the platform at home.
-        absolute: The drive knows its position after its power was gone.
+        absolute: The drive keeps its position without power.
         drum_to_outlet: Cable between drum and outlet, [m].
         max_speed: Cable speed limit, [m/s].
         torque_constant: Cable tension at rated torque, [N].
-        counts_per_turn: Counts of one turn of the motor shaft.
+        counts_per_turn: Counts per turn of the motor shaft.
         rated_torque: Of the motor at `torque_constant`, [N·m].
-        brake: It has one that closes by itself when its drive has no torque.
+        brake: It has a brake that closes when the drive has no torque.
     """
 
     node_id: int
@@ -86,11 +86,11 @@ class Motion:
 
 
 class CalibrationResult(Protocol):
-    """What `Rig.with_calibration` takes: a result of `calibration`."""
+    """A result of `calibration`, as `Rig.with_calibration` accepts it."""
 
     @property
     def order(self) -> int:
-        """Results of lower order are applied first: those of higher order rest on them."""
+        """Results of lower order are applied first: those of higher order depend on them."""
         ...
 
     @property
@@ -105,11 +105,11 @@ class CalibrationResult(Protocol):
 
     @property
     def date(self) -> str:
-        """When, ISO 8601."""
+        """Date of the calibration, ISO 8601."""
         ...
 
     def corrected(self, rig: RigDocument) -> RigDocument:
-        """The rig file's content with this result in place."""
+        """The rig file's content with this result applied."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,10 +123,10 @@ class Rig:
         pulley_radius: [m]; 0 for point exits.
         feed_directions: Travel of the cable entering each pulley, world frame, shape (m, 3).
         half_size: Half extents of the platform box, shape (3,), [m].
-        tag_error: How far off corners of the platform's tags are, 95 %, [m]; None where the rig
-            file does not say.
-        outlet_error: How far off outlets are along any axis, 95 %, [m]; None as above.
-        anchor_error: As `outlet_error`, of anchors.
+        tag_error: Position error of the platform's tag corners, 95 %, [m]; None where the rig file
+            does not state it.
+        outlet_error: Error of outlets along any axis, 95 %, [m]; None as above.
+        anchor_error: As `outlet_error`, for anchors.
         cable_stiffness: Axial, E·A of each cable, shape (m,), [N].
     """
 
@@ -173,10 +173,9 @@ class Rig:
 
     @cached_property
     def drive_names(self) -> dict[int, str]:
-        """What drives are called, by node id, in the order of the cables: ``cable 1 (drive 11)``.
+        """Displayed drive names by node id, in cable order: ``cable 1 (drive 11)``.
 
-        Cables and winches are counted from 1 in the order of the file; a drive's number is its
-        node id.
+        Cables and winches count from 1 in the order of the file; a drive's number is its node id.
         """
         nodes = [winch.node_id for winch in self.winches]
         return {node: f"cable {k} (drive {node})" for k, node in enumerate(nodes, start=1)}
@@ -197,7 +196,7 @@ class Rig:
 
     @cached_property
     def plan_hash(self) -> str:
-        """Hash of the parts of the rig that a plan's proof rests on."""
+        """Hash of the parts of the rig that a plan's proof depends on."""
         return document_hash(self.document, NOT_IN_PLAN_HASH)
 
     @cached_property
@@ -219,7 +218,7 @@ class Rig:
             load: Payload and external wrenches, as ``scene.load``; none when left out.
 
         Raises:
-            NoCable: A cable cannot run at this pose.
+            NoCable: A cable has no path at this pose.
         """
         return posed_rig(self, pose, load)
 
@@ -243,7 +242,7 @@ class Rig:
         return self.cameras[names.index(name)]
 
     def with_bus(self, interface: str | None = None, channel: str | None = None) -> Rig:
-        """The same rig on another CAN bus, in memory only; the plan of a rig fits it on any bus.
+        """The same rig on another CAN bus, in memory only; a plan does not depend on the bus.
 
         Args:
             interface: As python-can names it: ``virtual``, ``udp_multicast``, ``socketcan`` …; that
@@ -256,14 +255,13 @@ class Rig:
         return rig_from_document(self.document.model_copy(update={"bus": bus}))
 
     def with_calibration(self, *results: CalibrationResult) -> Rig:
-        """The rig with calibration results in place of its file's numbers, in memory only.
+        """The rig with its file's numbers replaced by calibration results, in memory only.
 
         Args:
-            results: From the functions that calibrate or from `calibration.load_result`; their
-                order does not matter.
+            results: From calibration functions or `calibration.load_result`, in any order.
 
         Raises:
-            BadInput: A result is not about this rig, or two are of the same thing.
+            BadInput: A result does not fit this rig, or two calibrate the same thing.
         """
         seen: dict[tuple[str, str], str] = {}
         for result in results:
@@ -311,7 +309,7 @@ def load_rig(path: str | Path) -> Rig:
 
     Raises:
         BadInput: The file cannot be read.
-        InvalidFile: With every problem and its place.
+        InvalidFile: With every problem and its position.
     """
     return rig_from_document(load_yaml(Path(path), RigDocument))
 

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Load:
-    """What the cables carry beside the platform's own weight.
+    """What the cables carry besides the platform's own weight.
 
     Attributes:
         payload_mass: [kg].
@@ -73,13 +73,13 @@ class Load:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop:
-    """A pose that is met exactly on the way; the platform comes to rest there.
+    """An intermediate pose that is met exactly; the platform comes to rest there.
 
     Attributes:
-        name: No other stop has it.
+        name: Unique name.
         kind: ``pass``, or ``pick`` and ``place``, at which the load changes.
         pose: ``world_from_platform``.
-        dwell: How long the platform stands still, [s].
+        dwell: Time at rest, [s].
     """
 
     name: str
@@ -100,9 +100,9 @@ class Scene:
         start: ``world_from_platform`` at the start.
         goal: ``world_from_platform`` at the goal.
         load: What the cables carry from the start on.
-        stops: Intermediate stops in order; `model.scene` gives the loads between them.
-        rotation_limits: How far the platform may be tilted and turned; None where the scene does
-            not say, and the platform then keeps its orientation.
+        stops: Intermediate stops in order; `legs_of` gives the loads between them.
+        rotation_limits: Limits of the platform's tilt and turn; None where the scene has none, and
+            the platform then keeps its orientation.
     """
 
     document: SceneDocument
@@ -126,7 +126,7 @@ class Scene:
         return document_hash(self.document)
 
     def stop_facts(self) -> list[tuple[str, str]]:
-        """Stops with what happens there and what is carried on, for people; none without stops."""
+        """Human-readable summary of the stops and the load after each; empty without stops."""
         carried = [leg.scene.load.payload_mass for leg in legs_of(self)]
         shown = []
         for stop, before, after in zip(self.stops, carried[:-1], carried[1:], strict=True):
@@ -196,7 +196,7 @@ def load_scene(path: str | Path) -> Scene:
 
     Raises:
         BadInput: The file cannot be read.
-        InvalidFile: With every problem and its place.
+        InvalidFile: With every problem and its position.
     """
     return scene_from_document(load_yaml(Path(path), SceneDocument))
 
@@ -223,8 +223,8 @@ def scene_from_document(document: SceneDocument) -> Scene:
     )
 
 
-def nothing_in_the_way(rig: Rig) -> Scene:
-    """Nothing but the rig, at home."""
+def empty_scene(rig: Rig) -> Scene:
+    """A scene without obstacles and load, with the platform at home."""
     home = PoseDocument.of(rig.home)
     return scene_from_document(
         SceneDocument(schema_version=1, name="no scene", start=home, goal=home)
@@ -280,17 +280,17 @@ def _shape(key: str, document: Document) -> Shape:
             raise ValueError(f"unknown shape {key!r}")
 
 
-# A scene with stops as legs, each of which is a scene from one stop to the next.
+# A scene with stops as legs, each a scene from one stop to the next.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Leg:
-    """A part of the way, run with one load.
+    """A part of the path, run with one load.
 
     Attributes:
-        scene: The whole scene but for its ends and its load, which are the leg's, without stops.
-        begin: What it begins at, for people: ``start`` or ``stop 'shelf'``.
-        end: What it ends at, likewise; ``goal`` for the last.
+        scene: The whole scene with the leg's start, goal and load, without stops.
+        begin: Displayed name of its start: ``start`` or ``stop 'shelf'``.
+        end: Displayed name of its end; ``goal`` for the last.
     """
 
     scene: Scene
@@ -299,7 +299,7 @@ class Leg:
 
 
 def legs_of(scene: Scene) -> tuple[Leg, ...]:
-    """The legs of a scene in their order: one more than it has stops."""
+    """The legs of a scene in order: one more than it has stops."""
     document = scene.document
     ends: list[tuple[str, PoseDocument]] = [
         ("start", document.start),

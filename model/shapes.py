@@ -13,7 +13,7 @@ from model.pose import Array, Pose, read_only
 Indices = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 _FLAT = 1e-9
-"""Of the size of a mesh: heights up to this are round-off."""
+"""Heights up to this part of a mesh's size are round-off."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ class ConvexHull:
 class TriangleMesh:
     """A surface of triangles: ``vertices`` shape (n, 3), [m]; ``triangles`` shape (t, 3).
 
-    What it encloses is free. A scene's mesh about a convex volume is read as a `ConvexHull`.
+    The enclosed volume is free. A scene's mesh around a convex volume is read as a `ConvexHull`.
     """
 
     vertices: Array
@@ -69,9 +69,9 @@ Shape = Box | Sphere | Cylinder | Capsule | ConvexHull | TriangleMesh
 
 
 def shape_points(shape: Shape) -> Array:
-    """Points whose hull, grown by the shape's ``radius`` where it has one, holds the shape.
+    """Points whose hull, grown by the shape's ``radius`` where it has one, contains the shape.
 
-    For boxes, hulls and meshes the vertices; for round shapes points of their axis; shape (n, 3).
+    Vertices of boxes, hulls and meshes; points on the axis of round shapes; shape (n, 3).
     """
     match shape:
         case Box(half_size=half):
@@ -93,7 +93,7 @@ def encloses_convex(vertices: Array, triangles: Indices) -> bool:
 
     Args:
         vertices: Shape (n, 3), [m].
-        triangles: Numbers of their corners, shape (t, 3).
+        triangles: Indices of their corners, shape (t, 3).
     """
     sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     _, counts = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
@@ -115,7 +115,7 @@ def encloses_convex(vertices: Array, triangles: Indices) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Obstacle:
-    """A named shape at a place in the world (``pose`` is ``world_from_shape``)."""
+    """A named shape at a pose in the world (``pose`` is ``world_from_shape``)."""
 
     name: str
     shape: Shape
@@ -123,7 +123,7 @@ class Obstacle:
 
 
 def read_only_indices(triangles: Sequence[Sequence[int]]) -> Indices:
-    """Corner numbers of triangles, shape (t, 3), in an array that cannot be written to."""
+    """Corner indices of triangles, shape (t, 3), in a read-only array."""
     array = np.array(triangles, dtype=np.int64)
     array.setflags(write=False)
     return array
@@ -158,8 +158,8 @@ def convex_hull(points: Array) -> ConvexHull:
 
 Face = tuple[int, ...]
 _SIDES = 24
-_STEP = 15.0  # degrees of a round profile to a ring
-#: Neighbouring faces that bend less than this are one smooth surface, whose edge is not drawn.
+_STEP = 15.0  # degrees of a round profile per ring
+#: Neighbouring faces at a smaller angle form one smooth surface, whose edge is not drawn.
 _SMOOTH = np.cos(np.radians(20.0))
 
 
@@ -201,10 +201,10 @@ def _surface(shape: Shape) -> tuple[Array, tuple[Face, ...]]:
         case Box(half_size=half):
             return _box(half)
         case Sphere(radius=radius):
-            return _turned(_arc(radius, 0.0, -90.0, 90.0))
+            return _revolved(_arc(radius, 0.0, -90.0, 90.0))
         case Cylinder(radius=radius, length=length):
             half_length = length / 2.0
-            return _turned(
+            return _revolved(
                 [
                     (0.0, -half_length),
                     (radius, -half_length),
@@ -214,7 +214,7 @@ def _surface(shape: Shape) -> tuple[Array, tuple[Face, ...]]:
             )
         case Capsule(radius=radius, length=length):
             below = _arc(radius, -length / 2.0, -90.0, 0.0)
-            return _turned([*below, *_arc(radius, length / 2.0, 0.0, 90.0)])
+            return _revolved([*below, *_arc(radius, length / 2.0, 0.0, 90.0)])
         case ConvexHull(vertices=vertices, triangles=triangles):
             return vertices, _as_faces(triangles)
         case TriangleMesh(vertices=vertices, triangles=triangles):
@@ -243,8 +243,8 @@ def _arc(radius: float, height: float, start: float, end: float) -> list[tuple[f
     return [(radius * float(np.cos(a)), height + radius * float(np.sin(a))) for a in angles]
 
 
-def _turned(profile: Sequence[tuple[float, float]]) -> tuple[Array, tuple[Face, ...]]:
-    """The surface of a profile of (radius, height), its ends on the axis, turned about z."""
+def _revolved(profile: Sequence[tuple[float, float]]) -> tuple[Array, tuple[Face, ...]]:
+    """The surface of revolution about z of a (radius, height) profile with ends on the axis."""
     angles = np.arange(_SIDES) * 2.0 * np.pi / _SIDES
     rings = [
         np.column_stack([r * np.cos(angles), r * np.sin(angles), np.full(_SIDES, h)])
@@ -261,7 +261,7 @@ def _turned(profile: Sequence[tuple[float, float]]) -> tuple[Array, tuple[Face, 
 
 
 def _caps(profile: Sequence[tuple[float, float]]) -> list[Face]:
-    """The flat polygons that close a turned profile at the rings next to its two poles."""
+    """The flat polygons that close a surface of revolution at the rings next to its poles."""
     last = (len(profile) - 2) * _SIDES
     return [tuple(range(2 * _SIDES - 1, _SIDES - 1, -1)), tuple(range(last, last + _SIDES))]
 

@@ -1,9 +1,9 @@
 """From cable lengths to drive counts and back: elastic cables on drums.
 
-A cable of axial stiffness EA that is wound off to the unstrained length L0 and carries the tension
-t is L0 (1 + t / EA) long; that length is the free cable from outlet to anchor and the part between
-drum and outlet. Counts are zero-referenced at home: with the platform at the home pose under the
-working tensions, each drive stands at its ``home_counts``.
+A cable of axial stiffness EA, unwound to the unstrained length L0 and under the tension t, is
+L0 (1 + t / EA) long; that length is the free cable from outlet to anchor plus the part between drum
+and outlet. Counts are referenced at home: with the platform at the home pose under the working
+tensions, each drive is at its ``home_counts``.
 """
 
 from __future__ import annotations

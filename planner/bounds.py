@@ -1,7 +1,7 @@
 """The smallest value of a function along a path, proved from how fast it can change.
 
 A function that changes by no more than ``slope`` per unit of path is, between two samples v and w
-at a distance d, at least (v + w - slope d) / 2. Intervals are halved, all undecided ones at a time,
+at a distance d, at least (v + w - slope d) / 2. All undecided intervals are bisected together
 until none can hold a value that matters.
 """
 
@@ -28,9 +28,9 @@ class Smallest:
 
     Attributes:
         value: The smallest sample.
-        at: Its place on the path.
-        proved: No value anywhere on the path is below this.
-        samples: How many were taken.
+        at: Its position along the path.
+        proved: Lower bound of the value everywhere on the path.
+        samples: Number of samples.
     """
 
     value: float
@@ -40,28 +40,28 @@ class Smallest:
 
 
 def smallest_along(
-    places: Array,
+    positions: Array,
     evaluate: Callable[[Array], Array],
     slope: float,
     required: float,
     tolerance: float,
 ) -> Smallest:
-    """Finds the smallest value to a tolerance, and finer where that is needed to prove a limit.
+    """Finds the smallest value to a tolerance, or finer where a limit is otherwise not proved.
 
     Args:
-        places: Where to sample first, increasing, both ends of the path among them, shape (k,).
-        evaluate: Values at places, shape (k,) → (k,).
+        positions: First samples along the path, increasing, with both ends, shape (k,).
+        evaluate: Values at positions, shape (k,) → (k,).
         slope: Largest change of the value per unit of path.
-        required: The limit: where every sample keeps it, the proof is to keep it too.
-        tolerance: Wanted of ``value - proved``.
+        required: Limit of the value; if every sample keeps it, the proof must as well.
+        tolerance: Largest ``value - proved``.
 
     Raises:
-        Fault: A value is no number.
+        Fault: A value is NaN.
     """
-    values = _known(evaluate(places))
+    values = _known(evaluate(positions))
     best = int(np.argmin(values))
-    smallest, at, samples = float(values[best]), float(places[best]), len(places)
-    low, high = places[:-1], places[1:]
+    smallest, at, samples = float(values[best]), float(positions[best]), len(positions)
+    low, high = positions[:-1], positions[1:]
     low_values, high_values = values[:-1], values[1:]
     proved = smallest
     while len(low):
@@ -88,55 +88,55 @@ def smallest_along(
 
 
 def to_be_proved(smallest: float, required: float, tolerance: float) -> float:
-    """What the rest of a path must be shown to reach, beside its smallest sample."""
+    """The bound to prove for the rest of a path, given its smallest sample."""
     target = smallest - tolerance
     return max(target, required) if smallest >= required else target
 
 
 def _known(values: Array) -> Array:
-    """Values as they are; one that is no number would prove whatever stands beside it."""
+    """The values; a NaN would pass every comparison and so prove anything."""
     if np.isnan(values).any():
         raise Fault("a value along the path is not a number, so nothing can be proved")
     return values
 
 
-# The smallest obstacle clearance of a path in translation, proved a whole stretch at a time.
+# The smallest obstacle clearance of a path in translation, proved over whole intervals.
 #
-# A plane between an obstacle and the robot at one pose still parts them, by a gap in closed form,
-# while the platform shifts. Where that gap is large enough over a stretch of the path, all of it is
-# proved; else the stretch is halved. Far fewer poses are looked at than where only the speed of
-# change is known (`planner.bounds`), most of all where a path passes along an obstacle.
+# A plane that separates an obstacle from the robot at one pose still separates them, by a gap in
+# closed form, while the platform translates. Where that gap is large enough over an interval of the
+# path, the interval is proved; else it is bisected. This takes far fewer poses than a bound on the
+# rate of change (`smallest_along`), above all where a path runs along an obstacle.
 
 
 FIRST = 0.040
-"""Longest stretch to begin with, [m] of motion."""
+"""Longest interval at first, [m] of motion."""
 
 
-def smallest_over_stretches(
-    model: ClearanceModel, track: PosePath, required: float, tolerance: float
+def smallest_over_intervals(
+    model: ClearanceModel, path: PosePath, required: float, tolerance: float
 ) -> Smallest:
-    """Finds the smallest obstacle clearance to a tolerance, and finer to prove a limit.
+    """Finds the smallest obstacle clearance to a tolerance, or finer to prove a limit.
 
     Args:
         model: Of a rig with point exits, in a scene with obstacles.
-        track: A path on which the platform does not turn.
-        required: The limit: where every sample keeps it, the proof is to keep it too, [m].
-        tolerance: Wanted of ``value - proved``, [m].
+        path: A path on which the platform does not rotate.
+        required: Limit of the clearance; if every sample keeps it, the proof must as well, [m].
+        tolerance: Largest ``value - proved``, [m].
 
     Raises:
-        Fault: A distance is no number.
+        Fault: A distance is NaN.
     """
-    places = track.places(FIRST).tolist()
-    values = [_distance(model, track.pose(place)) for place in places]
-    smallest, at = min(zip(values, places, strict=True))
-    waiting = list(pairwise(places))
-    samples, proved = len(places), smallest
+    positions = path.samples(FIRST).tolist()
+    values = [_distance(model, path.pose(position)) for position in positions]
+    smallest, at = min(zip(values, positions, strict=True))
+    waiting = list(pairwise(positions))
+    samples, proved = len(positions), smallest
     while waiting:
         low, high = waiting.pop()
         target = to_be_proved(smallest, required, tolerance)
         middle = (low + high) / 2.0
-        pose = track.pose(middle)
-        bound = model.at_least(pose, track.positions(low, high), target)
+        pose = path.pose(middle)
+        bound = model.at_least(pose, path.positions(low, high), target)
         if bound >= target or high - low < SHORTEST or samples > MOST_SAMPLES:
             proved = min(proved, bound)
             continue
@@ -149,7 +149,7 @@ def smallest_over_stretches(
 
 
 def _distance(model: ClearanceModel, pose: Pose) -> float:
-    """The smallest distance; one that is no number would prove whatever stands beside it."""
+    """The smallest distance; a NaN would pass every comparison and so prove anything."""
     found = model.smallest(pose)
     if found is None or found.distance != found.distance:
         raise Fault("a distance along the path is unknown, so nothing can be proved")

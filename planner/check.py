@@ -1,16 +1,17 @@
 """The independent check: distances of primitive shapes at dense poses, with proved bounds between.
 
 It shares neither the swept hulls nor the rules of the search, only the model. Every quantity is
-sampled along the path, and between samples bounded by how fast it can change (`planner.bounds`):
+sampled along the path, and bounded between samples by how fast it can change (`planner.bounds`):
 
 * obstacle clearance: no faster than the motion, as no point of the robot moves farther; without
-  turning and pulleys by separating planes over whole stretches (`planner.bounds`);
-* self clearance: with level point exits no faster than the motion, else by a stated multiple;
+  rotation and pulleys by separating planes over whole intervals;
+* self clearance: no faster than the motion in translation with point exits, else by a stated
+  multiple;
 * capacity margin: by the sum of what each cable's wrench can change at its largest tension.
 
-Tensions and cable speeds are those at the samples, at most 5 mm apart; that there are tensions
-within the limits everywhere between is what the capacity margin proves. Where the platform turns,
-the scene's rotation limits are compared in closed form.
+Tensions and cable speeds are those at the samples, at most 5 mm apart; the capacity margin proves
+that tensions within the limits exist everywhere between. Where the platform rotates, the scene's
+rotation limits are compared in closed form.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import STANDARD_GRAVITY, weight_wrench, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
 from model.statics.wrench_sets import rms_anchor_radius
-from planner.bounds import Smallest, smallest_along, smallest_over_stretches
+from planner.bounds import Smallest, smallest_along, smallest_over_intervals
 from planner.check_report import (
     CheckReport,
     Closest,
@@ -45,9 +46,9 @@ from planner.path import PosePath
 
 SPACING = 0.005
 CLEARANCE_TOLERANCE = 0.1e-3
-"""How exactly the smallest clearances are found, [m]."""
+"""Tolerance of the smallest clearances, [m]."""
 MARGIN_TOLERANCE = 0.02
-"""How exactly the smallest capacity margin is found, part of the largest tension."""
+"""Tolerance of the smallest capacity margin, as part of the largest tension."""
 END_TOLERANCE = 1e-6
 """How far a path may pass from the scene's start, stops and goal, [m] and [rad]."""
 
@@ -57,10 +58,10 @@ def verify(plan: Plan, rig: Rig | None = None) -> VerifiedPlan:
 
     Args:
         plan: The plan.
-        rig: The rig as it is now, when its winches or motion may differ from the plan's own.
+        rig: The rig as it is now, where its winches or motion may differ from the plan's own.
 
     Raises:
-        PlanRejected: With every violation, what by how much and where.
+        PlanRejected: With every violation: what, by how much and where.
     """
     report = check_path(rig or plan.rig, plan.scene, plan.waypoints, plan.stops)
     if not report.passed:
@@ -80,37 +81,37 @@ def check_path(
     *,
     ends: bool = True,
 ) -> CheckReport:
-    """Checks a path, whether a few corners or thousands of poses of an executed curve.
+    """Checks a path, from a few corners to the thousands of poses of an executed curve.
 
-    Between two stops it is checked with the load that is carried there. Where the load changes,
-    both are: all between them is then held as well.
+    Each leg from stop to stop is checked with the load carried on it. Where the load changes, both
+    loads are checked; every load between them is then held as well.
 
     Args:
         rig: The robot.
         scene: Obstacles, clearances, load, start, stops and goal.
         poses: ``world_from_platform``; between two the platform moves straight.
-        stops: Which of the poses are at the scene's stops, one for each.
+        stops: Index of the pose at each of the scene's stops.
         ends: Whether the path must begin at the scene's start, meet its stops and end at its goal.
 
     Raises:
-        BadInput: There is no pose, or not one in order for each stop.
+        BadInput: There are no poses, or ``stops`` does not match the scene's stops in order.
     """
     legs = legs_of(scene)
-    tracks = [PosePath(rig, part) for part in parted(poses, stops, len(legs) - 1)]
+    paths = [PosePath(rig, part) for part in parted(poses, stops, len(legs) - 1)]
     reports = [
-        _Check(rig, leg.scene, track).report((leg.begin, leg.end) if ends else None)
-        for leg, track in zip(legs, tracks, strict=True)
+        _Check(rig, leg.scene, path).report((leg.begin, leg.end) if ends else None)
+        for leg, path in zip(legs, paths, strict=True)
     ]
-    return joined(reports, [float(track.marks[-1]) for track in tracks])
+    return joined(reports, [float(path.marks[-1]) for path in paths])
 
 
 def parted(poses: Sequence[Pose], stops: Sequence[int], count: int) -> list[Sequence[Pose]]:
-    """The poses from stop to stop; that of a stop ends one part and begins the next.
+    """The poses from stop to stop; a stop's pose ends one part and begins the next.
 
     Args:
         poses: Of the whole path.
-        stops: Which of them are at stops.
-        count: How many stops there must be.
+        stops: Indices of those at stops.
+        count: Number of stops required.
 
     Raises:
         BadInput: There are more or fewer stops, or they are not in order.
@@ -118,8 +119,8 @@ def parted(poses: Sequence[Pose], stops: Sequence[int], count: int) -> list[Sequ
     bounds = [0, *stops, len(poses) - 1]
     if len(stops) != count or any(a > b for a, b in pairwise(bounds)):
         raise BadInput(
-            f"the path's stops are its poses {list(stops)}; required are {count} in order"
-            f" between 0 and {len(poses) - 1}",
+            f"the path has its stops at poses {list(stops)}; required are {count} in ascending"
+            f" order between 0 and {len(poses) - 1}",
             where="stops of a path",
         )
     return [poses[a : b + 1] for a, b in pairwise(bounds)]
@@ -128,16 +129,16 @@ def parted(poses: Sequence[Pose], stops: Sequence[int], count: int) -> list[Sequ
 class _Check:
     """One check of one path."""
 
-    def __init__(self, rig: Rig, scene: Scene, track: PosePath) -> None:
-        self.rig, self.scene, self.track = rig, scene, track
+    def __init__(self, rig: Rig, scene: Scene, path: PosePath) -> None:
+        self.rig, self.scene, self.path = rig, scene, path
         self.model = ClearanceModel(rig, scene)
-        self.places = track.places(SPACING)
+        self.samples = path.samples(SPACING)
         self.violations: list[Violation] = []
         self.length_unit = rms_anchor_radius(rig.anchors)
-        self._poses = {place: track.pose(place) for place in self.places.tolist()}
+        self._poses = {sample: path.pose(sample) for sample in self.samples.tolist()}
 
     def report(self, ends: tuple[str, str] | None) -> CheckReport:
-        """Figures and violations; ``ends`` are the names of what it must begin and end at."""
+        """Figures and violations; ``ends`` names the poses that it must begin and end at."""
         self._check_workspace()
         if ends is not None:
             self._check_ends(ends)
@@ -148,7 +149,7 @@ class _Check:
         margin = self._margin()
         tensions, speed = self._tensions(), self._cable_speed()
         return CheckReport(
-            length=self.track.length,
+            length=self.path.length,
             samples=obstacle_proof.samples if obstacle_proof else own_proof.samples,
             obstacle_clearance=obstacle,
             proved_obstacle_clearance=obstacle_proof.proved if obstacle_proof else float("inf"),
@@ -164,11 +165,11 @@ class _Check:
             violations=tuple(self.violations),
         )
 
-    def _pose(self, place: float) -> Pose:
-        return self._poses.get(place) or self.track.pose(place)
+    def _pose(self, position: float) -> Pose:
+        return self._poses.get(position) or self.path.pose(position)
 
     def _check_workspace(self) -> None:
-        positions = np.array([pose.position for pose in self.track.poses])
+        positions = np.array([pose.position for pose in self.path.poses])
         outside = np.maximum(
             self.rig.workspace_lower - positions, positions - self.rig.workspace_upper
         ).max(axis=1)
@@ -178,24 +179,24 @@ class _Check:
             self._violation(what, float(outside[worst]), 0.0, "mm", positions[worst])
 
     def _check_ends(self, ends: tuple[str, str]) -> None:
-        scene, poses = self.scene, self.track.poses
+        scene, poses = self.scene, self.path.poses
         for name, pose, wanted in (
             (ends[0], poses[0], scene.start),
             (ends[1], poses[-1], scene.goal),
         ):
             what = f"the path does not meet the scene's {name}"
-            away, turned = pose.distance_to(wanted), pose.angle_to(wanted)
+            away, rotated = pose.distance_to(wanted), pose.angle_to(wanted)
             if not away <= END_TOLERANCE:
                 self._violation(what, away, END_TOLERANCE, "mm", pose.position)
-            if not turned <= END_TOLERANCE:
-                self._violation(what, turned, END_TOLERANCE, "°", pose.position)
+            if not rotated <= END_TOLERANCE:
+                self._violation(what, rotated, END_TOLERANCE, "°", pose.position)
 
     def _check_rotations(self) -> None:
         """The scene's limits along every move, in closed form."""
         limits = self.scene.rotation_limits
         if limits is None:
             return
-        for start, end in pairwise(self.track.poses):
+        for start, end in pairwise(self.path.poses):
             excess = limits.excess(start, end)
             if excess is not None:
                 what = f"the platform is {excess.how} too far"
@@ -203,21 +204,21 @@ class _Check:
                 return
 
     def _check_pulleys(self) -> None:
-        """Anchors four pulley radii from the swivel axis, so that exits move half as fast at most.
+        """Anchors stay four pulley radii off the swivel axis: exits move at most half as fast.
 
         An anchor's motion dB moves its exit by at most 2 r dB / ρ about the axis and r dB / l along
-        the pulley, ρ its distance from the axis and l the free length, which is then over 2.8 r.
+        the pulley, with ρ the anchor's distance from the axis and l the free length, then > 2.8 r.
         """
         radius = self.rig.pulley_radius
         if radius == 0.0:
             return
-        for place in self.places.tolist():
-            pose = self._pose(place)
+        for sample in self.samples.tolist():
+            pose = self._pose(sample)
             offset = pose.apply(self.rig.anchors) - self.rig.outlets
             along = np.sum(offset * self.rig.feed_directions, axis=-1, keepdims=True)
             reach = np.linalg.norm(offset - along * self.rig.feed_directions, axis=-1)
             k = int(np.argmin(reach))
-            nearest = float(reach[k]) - SPACING  # between two places it may come nearer
+            nearest = float(reach[k]) - SPACING  # it may come nearer between samples
             if not nearest >= 4.0 * radius:
                 what = f"cable {k + 1} is too close to its pulley's axis to bound its motion"
                 self._violation(what, nearest, 4.0 * radius, "mm", pose.position)
@@ -234,15 +235,15 @@ class _Check:
             return found
 
         required = self.scene.obstacle_clearance
-        if self.track.turns or self.rig.pulley_radius > 0.0:
+        if self.path.turns or self.rig.pulley_radius > 0.0:
 
             def distances(poses: Sequence[Pose]) -> Array:
                 return np.array([nearest(pose).distance for pose in poses])
 
             closest, proof = self._closest(nearest, distances, 1.0, required)
         else:
-            proof = smallest_over_stretches(self.model, self.track, required, CLEARANCE_TOLERANCE)
-            pose = self.track.pose(proof.at)
+            proof = smallest_over_intervals(self.model, self.path, required, CLEARANCE_TOLERANCE)
+            pose = self.path.pose(proof.at)
             closest = Closest(nearest(pose), pose, proof.at)
         self._clearance_violation("obstacle clearance", closest, proof, required)
         return closest, proof
@@ -259,17 +260,17 @@ class _Check:
         return closest, proof
 
     def _self_slope(self) -> float:
-        """How fast self clearance can change, per unit of motion.
+        """Largest change of self clearance per unit of motion.
 
-        Two points of cables whose anchors move alike part by at most the motion; exits on pulleys
-        add half of it each; turning adds the levers of anchors and, to the platform, of exits.
+        Between two cables whose anchors move alike it is 1; exits on pulleys add a half each;
+        rotation adds the lever arms of anchors and, for the platform, of exits.
         """
         slope = 1.0 if self.rig.pulley_radius == 0.0 else 2.0
-        if self.track.turns:
-            positions = np.array([pose.position for pose in self.track.poses])
+        if self.path.turns:
+            positions = np.array([pose.position for pose in self.path.poses])
             levers = np.linalg.norm(self.rig.outlets - positions[:, None, :], axis=-1)
             farthest = float(levers.max()) + 2.0 * self.rig.pulley_radius
-            slope = max(2.0 * slope, 2.0 + farthest / self.track.radius)
+            slope = max(2.0 * slope, 2.0 + farthest / self.path.radius)
         return slope
 
     def _closest(
@@ -279,12 +280,12 @@ class _Check:
         slope: float,
         required: float,
     ) -> tuple[Closest, Smallest]:
-        """Where ``nearest`` is closest, of ``distances``, which are those of many poses at once."""
+        """The closest pose; ``distances`` is ``nearest`` for many poses at once."""
 
-        def evaluate(places: Array) -> Array:
-            return distances([self._pose(p) for p in places.tolist()])
+        def evaluate(positions: Array) -> Array:
+            return distances([self._pose(p) for p in positions.tolist()])
 
-        proof = smallest_along(self.places, evaluate, slope, required, CLEARANCE_TOLERANCE)
+        proof = smallest_along(self.samples, evaluate, slope, required, CLEARANCE_TOLERANCE)
         pose = self._pose(proof.at)
         return Closest(nearest(pose), pose, proof.at), proof
 
@@ -303,8 +304,8 @@ class _Check:
         load = self.scene.load
         disturbance = np.concatenate([load.force, load.moment])
 
-        def evaluate(places: Array) -> Array:
-            poses = [self._pose(p) for p in places.tolist()]
+        def evaluate(positions: Array) -> Array:
+            poses = [self._pose(p) for p in positions.tolist()]
             matrices = np.array([structure_matrix(self.rig, pose) for pose in poses])
             weights = np.array([weight_wrench(self.rig, pose, load) for pose in poses])
             spread = np.broadcast_to(disturbance, weights.shape)
@@ -314,24 +315,24 @@ class _Check:
             )
 
         tolerance = MARGIN_TOLERANCE * self.rig.max_tension
-        found = smallest_along(self.places, evaluate, self._margin_slope(), 0.0, tolerance)
+        found = smallest_along(self.samples, evaluate, self._margin_slope(), 0.0, tolerance)
         if not found.proved >= 0.0:
             what = "the cables cannot hold every required load: capacity margin"
-            place = self._pose(found.at).position
-            self._violation(what, min(found.value, found.proved), 0.0, "N", place)
+            position = self._pose(found.at).position
+            self._violation(what, min(found.value, found.proved), 0.0, "N", position)
         return found
 
     def _margin_slope(self) -> float:
-        """How fast the set of wrenches can change, [N] per metre of motion.
+        """Largest change of the available wrench set, [N] per metre of motion.
 
-        A cable's direction turns by at most the motion of its ends over its free length; its wrench
-        changes by that, with its arm over the unit of length for the moment; and the arm itself
-        turns with the platform, as does the weight's.
+        A cable's direction rotates by at most the motion of its ends over its free length. Its
+        force changes by that, its moment by that times its lever arm over the unit of length. The
+        lever arms of cables and weight rotate with the platform.
         """
         free = np.min(
             [
                 np.linalg.norm(c.exits - c.anchors, axis=-1)
-                for c in (cables_at(self.rig, self._pose(p)) for p in self.places.tolist())
+                for c in (cables_at(self.rig, self._pose(p)) for p in self.samples.tolist())
             ],
             axis=0,
         )
@@ -340,19 +341,19 @@ class _Check:
         turn = ends / np.maximum(free - SPACING * ends, 1e-6)
         change = turn * np.sqrt(1.0 + arms**2)
         slope = float(np.sum(self.rig.max_tension * change))
-        if self.track.turns:
+        if self.path.turns:
             load = self.scene.load
             moment = self.rig.mass * float(np.linalg.norm(self.rig.centre_of_mass))
             moment += load.payload_mass * float(np.linalg.norm(load.payload_centre))
             levers = self.rig.max_tension * float(arms.sum())
             levers += moment * STANDARD_GRAVITY / self.length_unit
-            slope += levers / self.track.radius
+            slope += levers / self.path.radius
         return slope
 
     def _tensions(self) -> tuple[float, float]:
         low, high = np.inf, -np.inf
-        for place in self.places.tolist():
-            pose = self._pose(place)
+        for sample in self.samples.tolist():
+            pose = self._pose(sample)
             try:
                 tensions = working_tensions(self.rig, pose, self.scene.load).tensions
             except TensionInfeasible as error:
@@ -364,16 +365,16 @@ class _Check:
 
     def _cable_speed(self) -> float:
         """The largest speed of a cable at the rig's path speed, [m/s]."""
-        twists = self.rig.motion.speed * self.track.twists(self.places, self.length_unit)
+        twists = self.rig.motion.speed * self.path.twists(self.samples, self.length_unit)
         limits = np.array([winch.max_speed for winch in self.rig.winches])
         largest = 0.0
-        for place, twist in zip(self.places.tolist(), twists, strict=True):
-            pose = self._pose(place)
+        for sample, twist in zip(self.samples.tolist(), twists, strict=True):
+            pose = self._pose(sample)
             speeds = np.abs(structure_matrix(self.rig, pose).T @ twist)
             largest = max(largest, float(speeds.max()))
             over = int(np.argmax(speeds - limits))
             if not speeds[over] <= limits[over]:
-                what = f"cable {over + 1} would have to move faster than its winch"
+                what = f"cable {over + 1} would have to move faster than its winch can"
                 self._violation(what, speeds[over], limits[over], "mm/s", pose.position)
                 break
         return largest

@@ -1,4 +1,4 @@
-"""What a check found: figures with pair and place, violations, and the plan that passed."""
+"""Result of a check: figures with pair and pose, violations, and the plan that passed."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ class Closest:
     Attributes:
         nearest: The two bodies and their distance.
         pose: Of the platform there.
-        place: Motion from the path's start to there, [m].
+        at: Motion from the path's start to there, [m].
     """
 
     nearest: Nearest
     pose: Pose
-    place: float
+    at: float
 
     def sentence(self, proved: float, required: float) -> str:
-        """The distance with its place, and what is proved and required, [m]."""
+        """The distance, where it occurs, and the proved and required distances, [m]."""
         near = self.nearest
         x, y, z = self.pose.position * 1000
         return (
@@ -55,10 +55,10 @@ class Closest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Violation:
-    """One thing that a path does not keep.
+    """One limit that a path violates.
 
     Attributes:
-        what: What it is, without figures.
+        what: The violation, without figures.
         measured: SI.
         limit: SI.
         unit: Unit of display: "mm", "mm/s", "°" or "N".
@@ -72,7 +72,7 @@ class Violation:
     position: Array
 
     def sentence(self) -> str:
-        """The violation in words, with figures and place."""
+        """The violation in words, with figures and platform position."""
         scale = _SCALE[self.unit]
         x, y, z = (float(c) * 1000.0 for c in self.position)
         return (
@@ -86,11 +86,11 @@ class Violation:
 class CheckReport:
     """The figures of a checked path, SI.
 
-    A ``proved`` value holds everywhere on the path, between samples too; it is at most the smallest
-    sample, which stands beside it with its place.
+    A ``proved`` value is a lower bound everywhere on the path, between samples too; the smallest
+    sample is given beside it with its pose.
 
     Attributes:
-        length: Way of the platform's origin, [m].
+        length: Distance travelled by the platform's origin, [m].
         samples: Poses at which distances were computed.
         obstacle_clearance: The smallest; None in a scene without obstacles.
         proved_obstacle_clearance: [m]; infinite without obstacles.
@@ -99,11 +99,11 @@ class CheckReport:
         proved_self_clearance: [m].
         required_self_clearance: [m].
         min_tension: Smallest working tension at samples, [N]; NaN where there are none.
-        max_tension: Largest, likewise.
+        max_tension: Largest working tension at samples, [N]; NaN where there are none.
         capacity_margin: The smallest at samples, [N].
         proved_capacity_margin: [N].
         max_cable_speed: At the rig's path speed, at samples, [m/s].
-        violations: What the path does not keep; empty when it passed.
+        violations: Limits that the path violates; empty when it passed.
     """
 
     length: float
@@ -123,7 +123,7 @@ class CheckReport:
 
     @property
     def passed(self) -> bool:
-        """Whether the path keeps everything that was asked."""
+        """Whether the path keeps every limit."""
         return not self.violations
 
     @property
@@ -147,7 +147,7 @@ class CheckReport:
         return "passed" if self.passed else f"rejected: {len(self.violations)} violations"
 
     def facts(self) -> list[tuple[str, str]]:
-        """What the check found, for people: name and value."""
+        """Human-readable figures of the check: name and value."""
         own = self.self_clearance
         facts = [
             ("length", f"{self.length * 1000:.1f} mm, {self.samples} poses checked"),
@@ -201,15 +201,15 @@ def _finite(value: float) -> float | None:
 
 
 class PlanRejected(Refused):
-    """A path that its check does not pass.
+    """A path that failed its check.
 
     Args:
-        report: What the check found, with at least one violation.
+        report: Report of the check, with at least one violation.
         where: Which path.
         next_step: What the user can do now.
 
     Attributes:
-        report: What the check found.
+        report: Report of the check.
     """
 
     def __init__(self, report: CheckReport, *, where: str, next_step: str) -> None:
@@ -224,7 +224,7 @@ class PlanRejected(Refused):
 
     @property
     def violations(self) -> tuple[Violation, ...]:
-        """Every violation, what by how much and where."""
+        """Every violation: what, by how much and where."""
         return self.report.violations
 
 
@@ -233,11 +233,11 @@ _PROOF = object()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VerifiedPlan:
-    """A plan that `planner.check.verify` has passed; nothing else makes one.
+    """A plan that passed `planner.check.verify`, which alone makes one.
 
     Attributes:
         plan: The plan.
-        report: What the check found.
+        report: Report of the check.
     """
 
     plan: Plan
@@ -245,7 +245,7 @@ class VerifiedPlan:
     proof: object
 
     def __post_init__(self) -> None:
-        """Refuses to exist without the check."""
+        """Refuses construction without the check."""
         if self.proof is not _PROOF or not self.report.passed:
             raise TypeError("a VerifiedPlan comes only from planner.check.verify")
 
@@ -262,8 +262,8 @@ def joined(reports: Sequence[CheckReport], motions: Sequence[float]) -> CheckRep
     """One report: sums of lengths, extremes of everything else, all violations.
 
     Args:
-        reports: Of the legs in their order, all of one rig and of the same clearances.
-        motions: Of the legs, to which positions on the path refer, [m].
+        reports: Of the legs in order, all of one rig and with the same clearances.
+        motions: Of the legs, [m]; offsets for positions on the path.
     """
     if len(reports) == 1:
         return reports[0]
@@ -282,7 +282,7 @@ def joined(reports: Sequence[CheckReport], motions: Sequence[float]) -> CheckRep
         proved_obstacle_clearance=min(r.proved_obstacle_clearance for r in reports),
         self_clearance=min(own, key=_distance),
         proved_self_clearance=min(r.proved_self_clearance for r in reports),
-        # NaN stands for tensions that do not exist, and stays.
+        # NaN where no tensions exist; NumPy's min and max keep it.
         min_tension=float(np.min([r.min_tension for r in reports])),
         max_tension=float(np.max([r.max_tension for r in reports])),
         capacity_margin=min(r.capacity_margin for r in reports),
@@ -293,7 +293,7 @@ def joined(reports: Sequence[CheckReport], motions: Sequence[float]) -> CheckRep
 
 
 def _moved(closest: Closest, begin: float) -> Closest:
-    return replace(closest, place=begin + closest.place)
+    return replace(closest, at=begin + closest.at)
 
 
 def _distance(closest: Closest) -> float:

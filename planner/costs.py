@@ -31,12 +31,12 @@ from planner.space import Lattice, corners_and_weights
 
 _SAMPLING = 0.010
 _MODULES = (kinematics, wrench_sets, space)
-"""What the indices on the lattice follow from, beside this module."""
+"""The indices on the lattice depend on these and on this module."""
 
 
 @cache
 def _version() -> str:
-    """A hash of the code that computes the lattice, so that a change forgets what it computed."""
+    """A hash of the code that computes the lattice; a change invalidates the cache."""
     digest = hashlib.sha256(Path(__file__).read_bytes())
     for module in _MODULES:
         digest.update(Path(str(module.__file__)).read_bytes())
@@ -73,7 +73,7 @@ class KinematicCost:
 
     The extremes for the scaling, and the values that the search interpolates between, are those on
     a lattice over the workspace box. They depend on rig and orientation alone and are kept in the
-    user's cache: the ready rigs take 80 to 200 ms to compute them, and below 1 ms to read them.
+    user's cache: for the rigs in `configs/` they take 80 to 200 ms to compute, under 1 ms to read.
 
     Attributes:
         lattice: Points over the workspace box.
@@ -117,9 +117,9 @@ class KinematicCost:
         return self.mean_along_poses([Pose(point, self._rotation) for point in waypoints])
 
     def mean_along_poses(self, poses: Sequence[Pose]) -> float:
-        """Mean of c over the length of a path on which the platform may turn, exact at samples.
+        """Mean of c over the length of a path that may rotate the platform, exact at samples.
 
-        The scaling stays that of the one orientation.
+        The scaling stays that of the orientation given to the constructor.
         """
         total, length = 0.0, 0.0
         for start, end in pairwise(poses):
@@ -158,11 +158,11 @@ class KinematicCost:
         return total
 
 
-# Wrench feasibility: weight, payload and the box of disturbances within the tensions.
+# Wrench feasibility: weight, payload and the box of disturbances, within the tension limits.
 
 
 def external_wrenches(rig: Rig, scene: Scene, rotation: Array) -> WrenchBox:
-    """The wrenches that must be held at an orientation, shape (3, 3): weight and disturbances."""
+    """The required wrenches at an orientation, shape (3, 3): weight and disturbances."""
     load = scene.load
     weight = weight_wrench(rig, Pose(rig.home.position, rotation), load)
     return WrenchBox(weight, np.concatenate([load.force, load.moment]))

@@ -1,4 +1,4 @@
-"""All that an edge must keep, asked at once: the exact checks as the planner calls them."""
+"""All limits of an edge in one call: the exact checks as the planner calls them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OBSTACLE: Final = 2
 SELF: Final = 3
 WRENCH: Final = 4
 REASONS: Final = ("", "workspace", "obstacle clearance", "self clearance", "wrench feasibility")
-"""Why edges are refused, in words, by these numbers."""
+"""Reasons why edges are refused, indexed by these numbers."""
 
 
 @kernel
@@ -36,15 +36,15 @@ def edge_problem(
 ) -> int:
     """What forbids a translation: `FREE`, `WORKSPACE`, `OBSTACLE`, `SELF` or `WRENCH`.
 
-    Never `FREE` where anything is not kept somewhere along the edge.
+    Never `FREE` where any limit is violated anywhere along the edge.
 
     Args:
         world: Rig, orientation and obstacles.
         robot: Self clearance.
         load: What the cables must hold.
-        holding: Where that is proved beforehand.
+        holding: Where that is already proved.
         start: World frame, shape (3,), [m].
-        end: Likewise.
+        end: World frame, shape (3,), [m].
     """
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
     if not (in_workspace(world, before) and in_workspace(world, after)):
@@ -80,7 +80,7 @@ def turning_edge_problem(
     rotation: Array,
     turn: Array,
 ) -> int:
-    """What forbids a straight way with a steady turn; see `edge_problem`.
+    """What forbids a straight move with a steady rotation; see `edge_problem`.
 
     Args:
         world: Rig and obstacles.
@@ -88,7 +88,7 @@ def turning_edge_problem(
         load: What the cables must hold.
         reserve: Smallest capacity margin, [N].
         start: World frame, shape (3,), [m].
-        end: Likewise.
+        end: World frame, shape (3,), [m].
         rotation: ``world_from_platform`` at the start, shape (3, 3).
         turn: Rotation vector from start to end, platform frame, shape (3,), [rad].
     """
@@ -108,8 +108,8 @@ class ExactChecks:
     """The exact checks of one rig in one scene, for callers that are not compiled.
 
     Attributes:
-        world: For compiled callers; so are the others.
-        robot: Self clearance, proved over the workspace as far as that goes.
+        world: Rig and obstacles; this and the others are for compiled callers.
+        robot: Self clearance, proved over the workspace as far as possible.
         load: What the cables must hold.
         holding: The cells of the workspace in which that is proved.
     """
@@ -124,11 +124,11 @@ class ExactChecks:
         self_clearance: float,
         margin_reserve: float,
     ) -> None:
-        """Makes planes and proofs once.
+        """Computes planes and proofs once.
 
         Args:
             rig: The robot.
-            scene: Its obstacles and its load.
+            scene: Obstacles and load.
             rotation: Orientation under translation, ``world_from_platform``, shape (3, 3).
             obstacle_clearance: Of cables and platform to obstacles, [m].
             self_clearance: Between cables and of cables to the platform, [m].
@@ -158,7 +158,7 @@ class ExactChecks:
         return float(distance), int(body), int(obstacle)
 
     def turning_problem(self, start: Pose, end: Pose) -> int:
-        """What forbids a straight way with a steady turn; see `edge_problem`."""
+        """What forbids a straight move with a steady rotation; see `edge_problem`."""
         turn = _own(rotation_vector_from_matrix(start.rotation.T @ end.rotation))
         poses = (_own(start.position), _own(end.position), _own(start.rotation), turn)
         args = (self.world, self.robot, self.load, self.holding.reserve)

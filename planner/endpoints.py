@@ -1,4 +1,4 @@
-"""Whether start, stops and goal can be planned from and to, and the reasons when they cannot."""
+"""Whether a path can begin and end at start, stops and goal, with the reasons where it cannot."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
 
 def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) -> None:
-    """Refuses a start, stop or goal that no path can begin or end at.
+    """Refuses a start, stop or goal at which no path can begin or end.
 
-    A stop must be held with the load that is brought to it and with the one taken on from it.
+    The cables must hold the platform at a stop with the load it brings and the load it leaves with.
 
     Args:
         rig: The robot.
         scene: Start, stops and goal.
-        free_rotation: Whether they may be turned differently.
+        free_rotation: Whether they may differ in orientation.
 
     Raises:
-        BadInput: One of them is outside the workspace box, too near to an obstacle, too near to
-            itself or cannot be held; or they are turned differently.
+        BadInput: One of them is outside the workspace box, violates an obstacle or self clearance,
+            or cannot be held; or they differ in orientation.
     """
     model = ClearanceModel(rig, scene)
     for leg in legs_of(scene):
@@ -37,11 +37,11 @@ def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) 
             _require_holdable(rig, leg.scene, name, pose)
 
 
-def require_room_for_the_way(scene: Scene, longest: float) -> None:
-    """Refuses a longest path, [m], that is shorter than the straight way from start to goal.
+def require_feasible_length(scene: Scene, longest: float) -> None:
+    """Refuses a longest path, [m], below the straight distance from start to goal.
 
     Raises:
-        BadInput: It is.
+        BadInput: The longest path is too short.
     """
     straight = scene.start.distance_to(scene.goal)
     if longest >= straight - 1e-9:
@@ -93,10 +93,10 @@ def _require_clear(scene: Scene, model: ClearanceModel, name: str, pose: Pose) -
     for near, asked, key in pairs:
         needed = asked + CLEARANCE_RESERVE
         if near.distance < needed:
-            raise _too_near(name, near, needed, key)
+            raise _clearance_error(name, near, needed, key)
 
 
-def _too_near(name: str, near: Nearest, needed: float, key: str) -> BadInput:
+def _clearance_error(name: str, near: Nearest, needed: float, key: str) -> BadInput:
     distance, limit = near.distance * 1e3, needed * 1e3
     if near.distance <= 0.0:
         depth = f" ({-distance:.1f} mm inside)" if distance < -0.05 else ""

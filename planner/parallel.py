@@ -1,4 +1,4 @@
-"""Work on all cores or on a Dask cluster."""
+"""Work spread over all cores or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Count:
-    """Adds up what is done for a progress bar."""
+    """Sums finished work for a progress bar."""
 
     def __init__(self, advance: Callable[[float], None]) -> None:
         """Reports sums to ``advance``."""
@@ -20,14 +20,14 @@ class Count:
         self._done = 0
 
     def more(self, done: int) -> None:
-        """Counts what is newly done."""
+        """Adds newly finished work."""
         self._done += done
         self._advance(self._done)
 
 
 @contextmanager
 def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
-    """What does the work: a Dask cluster, processes of this computer, or this process alone.
+    """Executor of a Dask cluster or of local processes; None for this process alone.
 
     Args:
         workers: Number of processes; with 1 there is no pool.
@@ -54,7 +54,7 @@ def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
 
 
 def _begin_worker() -> None:
-    """Ctrl-C is for the process that was started; a worker ends when that does, however it ends."""
+    """Ignores Ctrl-C, which the parent handles, and ends the worker however its parent ends."""
     import signal
     from threading import Thread
 

@@ -1,4 +1,4 @@
-"""What a planner hands over: a path, the path it was made from, and how it was found."""
+"""The result of a planner: a path, the raw path before post-processing, and search statistics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from model.pose import Array, Pose, interpolate, rotation_vector_from_matrix
 from model.rig import Rig
 
 Progress = Callable[[float, float, float], None]
-"""Reported by a search: work done, its limit, and how close or how good it is so far."""
+"""Called by a search: work done, its limit, and the distance to the goal or the cost so far."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,10 +24,10 @@ class Route:
     Attributes:
         path: The finished path, shape (k, n).
         raw: The path before post-processing, shape (j, n).
-        nodes: Of the search tree, shape (i, n); both paths' ends are among them.
+        nodes: Of the search tree, shape (i, n); they include the ends of both paths.
         parents: Of each node, -1 for the root, shape (i,).
-        iterations: How many samples were drawn.
-        edge_checks: How many edges were asked about, post-processing included.
+        iterations: Number of samples drawn.
+        edge_checks: Number of edges checked, post-processing included.
     """
 
     path: Array
@@ -38,26 +38,25 @@ class Route:
     edge_checks: int
 
 
-# The best path that is no longer than asked: a price λ of length is raised until it holds.
+# The best path within a length limit: a price λ of length is raised until the limit is kept.
 #
-# With the objective plus λ times the length, a higher λ gives a shorter path. After every few
-# rounds λ is moved by halving towards the least that keeps the limit; the best path that did is
-# kept.
+# With the objective plus λ times the length, a higher λ gives a shorter path. Every few rounds λ is
+# bisected towards the smallest value that keeps the limit; the best path within the limit is kept.
 
 
 LEAST_ROUNDS_WITH_LIMIT = 80
-"""Done whatever the clock says: the price is found in steps of some rounds."""
+"""Done whatever the clock says: λ changes only every few rounds."""
 _ROUNDS = 6
 """Between changes of λ."""
 _MOST = 64.0
-"""λ with which the length is practically all that counts, in units of the objective."""
+"""λ at which practically only the length counts, in units of the objective."""
 
 
 class LengthLimit:
     """The search for λ, updated after every round.
 
     Attributes:
-        price: λ, what a metre costs beside the objective.
+        price: λ, cost of a metre on top of the objective.
         path: The best path found that is short enough, shape (k, n); None without one.
     """
 
@@ -66,7 +65,7 @@ class LengthLimit:
 
         Args:
             longest: Longest path allowed, [m].
-            unit: What a metre of a usual path costs by the objective.
+            unit: Typical cost of a metre by the objective.
         """
         self.price = 0.0
         self.path: Array | None = None
@@ -76,15 +75,15 @@ class LengthLimit:
         self._least = math.inf
 
     def after_round(self, path: Array, length: float, cost: Callable[[], float]) -> bool:
-        """Looks at the best path at this price, and changes the price when it is time to.
+        """Records the best path at this price; changes the price every few rounds.
 
         Args:
-            path: Of the round before, shape (k, n).
+            path: Best path of the round, shape (k, n).
             length: Its length, [m].
             cost: Computes its cost by the objective alone.
 
         Returns:
-            Whether the price is another now.
+            Whether the price has changed.
         """
         short_enough = length <= self._longest
         if short_enough:
@@ -110,20 +109,21 @@ class LengthLimit:
         return True
 
 
-# A sequence of poses as one curve, measured by how far anything on the platform can have moved.
+# A sequence of poses as one curve, parametrised by a bound on the motion of any platform point.
 
 
 class PosePath:
     """Straight moves from pose to pose.
 
-    Its measure is motion: the way of the platform's origin and, where it turns, the angle times the
-    radius of its farthest point. No point of the platform, and no point of a cable (which moves no
-    faster than its faster end), moves farther than the motion between two places of the track.
+    Its parameter is the motion: the distance travelled by the platform's origin plus, where it
+    rotates, the angle times the radius of its farthest point. No point of the platform, and no
+    point of a cable (which moves no faster than its faster end), moves farther than the motion
+    between two positions on the path.
 
     Attributes:
         poses: The poses, at least one.
         marks: The motion from the first to each pose, shape (k,), [m].
-        length: The way of the platform's origin, [m].
+        length: Distance travelled by the platform's origin, [m].
         turns: Whether the orientation changes.
     """
 
@@ -131,7 +131,7 @@ class PosePath:
         """Measures the moves.
 
         Raises:
-            BadInput: There is no pose.
+            BadInput: There are no poses.
         """
         if not poses:
             raise BadInput("a path without poses cannot be checked")
@@ -141,21 +141,21 @@ class PosePath:
             float(np.linalg.norm(rig.anchors, axis=1).max()),
         )
         self._positions = np.array([pose.position for pose in self.poses])
-        ways = np.linalg.norm(np.diff(self._positions, axis=0), axis=1)
+        lengths = np.linalg.norm(np.diff(self._positions, axis=0), axis=1)
         rotations = np.array([pose.rotation for pose in self.poses])
         moved = np.any(rotations[1:] != rotations[:-1], axis=(1, 2))
-        angles = np.zeros(len(ways))
+        angles = np.zeros(len(lengths))
         for k in np.flatnonzero(moved).tolist():
             angles[k] = self.poses[k].angle_to(self.poses[k + 1])
         self.turns = bool(angles.any())
-        self.length = float(ways.sum())
-        self.marks: Array = np.append(0.0, np.cumsum(ways + self.radius * angles))
+        self.length = float(lengths.sum())
+        self.marks: Array = np.append(0.0, np.cumsum(lengths + self.radius * angles))
 
-    def places(self, spacing: float) -> Array:
-        """Places at most ``spacing`` apart, both ends and every corner of a coarse path included.
+    def samples(self, spacing: float) -> Array:
+        """Positions at most ``spacing`` apart, with both ends and every corner of a coarse path.
 
-        Poses nearer to each other than half the spacing are not all places: where they lie on the
-        curve between two places is part of what the motion bounds.
+        Of poses nearer to each other than half the spacing some are left out: the motion between
+        two samples bounds them too.
         """
         kept = [0.0]
         for mark in self.marks[1:].tolist():
@@ -166,34 +166,35 @@ class PosePath:
             kept.append(float(self.marks[-1]))
         return np.array(kept)
 
-    def pose(self, place: float) -> Pose:
-        """The pose at a place."""
-        k = int(np.searchsorted(self.marks, place, side="right")) - 1
+    def pose(self, position: float) -> Pose:
+        """The pose at a position along the path, [m] of motion."""
+        k = int(np.searchsorted(self.marks, position, side="right")) - 1
         if k >= len(self.poses) - 1:
             return self.poses[-1]
         start, end = self.poses[k], self.poses[k + 1]
-        share = (place - self.marks[k]) / (self.marks[k + 1] - self.marks[k])
+        share = (position - self.marks[k]) / (self.marks[k + 1] - self.marks[k])
         return interpolate(start, end, float(share))
 
     def positions(self, low: float, high: float) -> Array:
-        """Positions whose hull holds the track between two places, shape (k, 3), [m]."""
+        """Platform positions whose hull contains the path from ``low`` to ``high``, (k, 3), [m]."""
         inner = slice(*np.searchsorted(self.marks, (low, high), side="right"))
         ends = self.pose(low).position, self.pose(high).position
         return np.vstack([ends[0], self._positions[inner], ends[1]])
 
-    def twists(self, places: Array, turn_radius: float) -> Array:
-        """Motion at places per unit of path as it is executed, shape (k, 6); zero at rest.
+    def twists(self, positions: Array, turn_radius: float) -> Array:
+        """Twists per unit of executed path, shape (k, 6); zero at rest.
 
         Args:
-            places: Shape (k,), [m].
-            turn_radius: Metres of executed path for a radian of turning.
+            positions: Along the path, shape (k,), [m] of motion.
+            turn_radius: Metres of executed path for a radian of rotation.
 
         Returns:
             Velocity of the origin [-] and angular velocity [rad/m], world axes.
         """
         if len(self.poses) == 1:
-            return np.zeros((len(places), 6))
-        k = np.clip(np.searchsorted(self.marks, places, side="right") - 1, 0, len(self.poses) - 2)
+            return np.zeros((len(positions), 6))
+        found = np.searchsorted(self.marks, positions, side="right") - 1
+        k = np.clip(found, 0, len(self.poses) - 2)
         moves = np.array([self._move(int(i), turn_radius) for i in np.unique(k)])
         return np.asarray(moves[np.searchsorted(np.unique(k), k)])
 
@@ -202,6 +203,6 @@ class PosePath:
         start, end = self.poses[k], self.poses[k + 1]
         turn = start.rotation @ rotation_vector_from_matrix(start.rotation.T @ end.rotation)
         twist = np.concatenate([end.position - start.position, turn])
-        way = float(np.hypot(np.linalg.norm(twist[:3]), turn_radius * np.linalg.norm(turn)))
-        moved: Array = twist / way if way > 0.0 else np.zeros(6)
-        return moved
+        length = float(np.hypot(np.linalg.norm(twist[:3]), turn_radius * np.linalg.norm(turn)))
+        per_metre: Array = twist / length if length > 0.0 else np.zeros(6)
+        return per_metre

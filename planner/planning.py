@@ -25,7 +25,7 @@ from model.scene import Leg, Scene, legs_of
 from planner.check import check_path
 from planner.check_report import CheckReport, PlanRejected
 from planner.costs import KinematicCost
-from planner.endpoints import require_room_for_the_way, require_usable_ends
+from planner.endpoints import require_feasible_length, require_usable_ends
 from planner.kernels.jit import planner_compilation
 from planner.path import Progress, Route
 from planner.rrt.variants import AlgorithmVariant
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from planner.anytime_6d.path import TurningRoute
 
 
-# The whole way through a scene: its legs planned one after the other, and joined.
+# The whole path through a scene: its legs planned one after the other, and joined.
 
 
 _LONG = 1000.0
@@ -56,8 +56,8 @@ class MultiSegmentPath:
 
     Attributes:
         route: From start to goal; its tree has a root for each leg.
-        stops: Which points of the route's path are at stops.
-        rounds: Of each leg, which find it again; none of the paper's planners.
+        stops: Indices of the path's points at stops.
+        rounds: Of each leg, to reproduce it; empty for the paper's planners.
         search_time: Of the legs together, [s]; None for the paper's planners.
     """
 
@@ -79,20 +79,20 @@ def plan_segments(
 
     Args:
         rig: The robot.
-        legs: In their order.
-        settings: Which planner, and its settings, for each leg.
+        legs: In order.
+        settings: Planner and settings of each leg.
         kinematic: The cost of poses at the legs' orientation.
         progress: Called with the progress of each leg's search.
         clock: Seconds.
 
     Raises:
-        NoSolution: A leg has no path, or its search ended at its limit; it is named.
+        NoSolution: A leg has no path, or its search ended at its limit; the error names the leg.
     """
     routes: list[Route] = []
     found: list[OptimalRoute | TurningRoute] = []
     for leg, own in zip(legs, settings, strict=True):
         try:
-            # Each planner is imported when it is asked for: its kernels take a while to load.
+            # Planners are imported only when used: their kernels take long to load.
             if isinstance(own, OptimalSettings):
                 from planner.anytime.path import optimal_route
 
@@ -119,11 +119,11 @@ def plan_segments(
 
 
 def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> Sequence[Settings]:
-    """The settings of each leg: all alike, but for rounds that are given for each.
+    """The settings of each leg; they differ only in rounds given for each.
 
     Raises:
-        BadInput: Rounds are not one number for each leg, or are for a planner that has none; or a
-            longest path is asked for with stops.
+        BadInput: Rounds are not one number for each leg, or the planner has none; or the scene has
+            stops and the path a length limit.
     """
     if isinstance(settings, PlannerSettings):
         if rounds:
@@ -131,7 +131,7 @@ def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> S
         return [settings] * count
     if count > 1 and settings.longest < np.inf:
         raise BadInput(
-            "a scene with stops cannot have a limit of the path length",
+            "a scene with stops cannot have a limit on the path length",
             why="each leg is planned on its own, without knowing the others' lengths",
             next_step="leave out --longest-mm, or plan from stop to stop",
         )
@@ -146,7 +146,7 @@ def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> S
 
 
 def _joined(routes: Sequence[Route]) -> tuple[Route, tuple[int, ...]]:
-    """The routes end to end, and which points of the path are where two of them meet."""
+    """The routes end to end, and the indices of the points where two of them meet."""
     lengths = [len(route.path) - 1 for route in routes]
     before = [0, *accumulate(len(route.nodes) for route in routes[:-1])]
     joined = Route(
@@ -154,7 +154,7 @@ def _joined(routes: Sequence[Route]) -> tuple[Route, tuple[int, ...]]:
         raw=_end_to_end([route.raw for route in routes]),
         nodes=np.concatenate([route.nodes for route in routes]),
         parents=np.concatenate(
-            [_later(route.parents, n) for route, n in zip(routes, before, strict=True)]
+            [_offset(route.parents, n) for route, n in zip(routes, before, strict=True)]
         ),
         iterations=sum(route.iterations for route in routes),
         edge_checks=sum(route.edge_checks for route in routes),
@@ -162,13 +162,13 @@ def _joined(routes: Sequence[Route]) -> tuple[Route, tuple[int, ...]]:
     return joined, tuple(accumulate(lengths[:-1]))
 
 
-def _later(parents: NDArray[np.int64], before: int) -> NDArray[np.int64]:
-    """Parents of nodes that come after others."""
+def _offset(parents: NDArray[np.int64], before: int) -> NDArray[np.int64]:
+    """Parents after ``before`` other nodes; roots stay -1."""
     return np.where(parents < 0, -1, parents + before)
 
 
 def _end_to_end(paths: Sequence[Array]) -> Array:
-    """Paths whose ends meet as one; each point where two meet stands once."""
+    """Paths whose ends meet as one path, each shared point once."""
     return np.concatenate([paths[0], *(path[1:] for path in paths[1:])])
 
 
@@ -184,19 +184,19 @@ def make_plan(
 ) -> PlanDocument:
     """Plans a path from the scene's start through its stops to its goal.
 
-    The same rig, scene and settings give the same path on every machine of the same libraries. The
-    clock is read for the statistics alone; except that settings without a number of rounds
-    continue until a budget is spent: the plan then states the rounds, which reproduce its path.
+    The same rig, scene and settings give the same path on every machine with the same libraries.
+    The clock only fills the statistics; but settings without a number of rounds continue until the
+    budget is spent, and the plan then states the rounds that reproduce its path.
 
     Args:
         rig: The robot.
         scene: Obstacles, clearances, load, start, stops and goal.
-        settings: Which planner, and its settings; the planner we recommend when left out. A budget
-            is that of each leg between stops.
+        settings: Planner and settings; the recommended planner when left out. A budget applies to
+            each leg between stops.
         progress: Called with the progress of the search.
         clock: Seconds, for the planning time and the budget.
-        rounds: Of each leg, in place of those in the settings.
-        done: Stops that a run before visited; the plan only remembers them.
+        rounds: Of each leg, instead of those in the settings.
+        done: Stops that an earlier run visited; the plan only records them.
 
     Returns:
         The plan, sealed with its hash, which has passed `planner.check.check_path`.
@@ -204,22 +204,22 @@ def make_plan(
     Raises:
         BadInput: Start, goal or a stop cannot be used, or settings do not fit the legs.
         NoSolution: There is no path, or the search ended at its limit.
-        Fault: The finished path failed its check; that is a fault of this program.
+        Fault: The finished path failed its check, which is a fault of this program.
     """
     began = clock()
     settings = settings or OptimalSettings()
     turns = isinstance(settings, TurningSettings)
     require_usable_ends(rig, scene, free_rotation=turns)
     if isinstance(settings, AnytimeSettings) and not scene.stops:
-        require_room_for_the_way(scene, settings.longest)
+        require_feasible_length(scene, settings.longest)
     space: Space = PoseSpace(rig) if turns else TranslationSpace(rig, scene.start.rotation)
     kinematic = KinematicCost(rig, scene.start.rotation)
     legs = legs_of(scene)
     of_legs = settings_of_legs(settings, rounds, len(legs))
-    way = plan_segments(rig, legs, of_legs, kinematic, progress, clock)
-    route = way.route
+    path = plan_segments(rig, legs, of_legs, kinematic, progress, clock)
+    route = path.route
     poses = [space.pose(point) for point in route.path]
-    report = check_path(rig, scene, poses, way.stops)
+    report = check_path(rig, scene, poses, path.stops)
     if not report.passed:
         raise Fault(
             "the planned path failed its own check: "
@@ -233,11 +233,11 @@ def make_plan(
             "scene_hash": scene.hash,
             "rig": rig.document,
             "scene": scene.document,
-            "planner": _planner(of_legs[0], way),
+            "planner": _planner(of_legs[0], path),
             "waypoints": [PoseDocument.of(pose) for pose in poses],
             "stops": [
                 {"name": stop.name, "waypoint": waypoint}
-                for stop, waypoint in zip(scene.stops, way.stops, strict=True)
+                for stop, waypoint in zip(scene.stops, path.stops, strict=True)
             ],
             "done": list(done),
             "raw_path": [PoseDocument.of(space.pose(point)) for point in route.raw],
@@ -247,7 +247,7 @@ def make_plan(
                 "iterations": route.iterations,
                 "edge_checks": route.edge_checks,
                 "planning_time_s": max(0.0, clock() - began),
-                "search_time_s": way.search_time,
+                "search_time_s": path.search_time,
             },
             "quality": _quality(report, route.raw, kinematic.mean_along_poses(poses)),
         }
@@ -263,9 +263,9 @@ def plan_path(
     rounds: Sequence[int] = (),
     done: Sequence[StopDocument] = (),
 ) -> PlanDocument:
-    """As `make_plan`, reporting how far it is, and when the planner must be compiled first.
+    """As `make_plan`, with progress reports, also while the planner is compiled.
 
-    After compiling, a short search is made and thrown away, so that no figure of the plan counts
+    After compiling, a short search is made and discarded, so that the plan's figures do not count
     the compiler.
     """
     settings = settings or OptimalSettings()
@@ -288,7 +288,7 @@ def plan_path(
 
 
 def _short(settings: Settings) -> Settings:
-    """The settings of a search that only compiles what a longer one needs."""
+    """The settings of a short search that compiles all that a longer one needs."""
     if isinstance(settings, PlannerSettings):
         return replace(settings, max_iterations=min(settings.max_iterations, 200))
     return replace(settings, rounds=1)
@@ -308,22 +308,22 @@ def plan_from_waypoints(
     stops: Sequence[int] = (),
     author: str = "",
 ) -> Plan:
-    """A plan from the waypoints of another planner, proved like one of ours.
+    """A plan from the waypoints of another planner, proved by the same check as ours.
 
     Args:
         rig: The robot.
         scene: Obstacles, clearances, load, start, stops and goal.
         waypoints: ``world_from_platform``, from the scene's start to its goal; between two the
-            platform moves straight, and its orientation changes evenly.
-        stops: Which of the waypoints are at the scene's stops, one for each.
-        author: The planner, in its user's words; kept in the plan file.
+            platform moves straight and rotates at a steady rate.
+        stops: Index of the waypoint at each of the scene's stops.
+        author: Free text that names the planner; kept in the plan file.
 
     Returns:
         The plan, which has passed `planner.check.check_path`.
 
     Raises:
-        BadInput: There are fewer than two waypoints, or not one in order for each stop.
-        PlanRejected: With every violation, what by how much and where.
+        BadInput: There are fewer than two waypoints, or ``stops`` does not match the scene's stops.
+        PlanRejected: With every violation: what, by how much and where.
     """
     if len(waypoints) < 2:
         raise BadInput(
@@ -369,9 +369,9 @@ def plan_from_waypoints(
     )
 
 
-def _planner(settings: Settings, way: MultiSegmentPath) -> dict[str, Any]:
+def _planner(settings: Settings, path: MultiSegmentPath) -> dict[str, Any]:
     if isinstance(settings, AnytimeSettings):
-        return _improving_planner(settings, way)
+        return _anytime_planner(settings, path)
     return {
         "name": settings.sampler,
         "cost": settings.cost,
@@ -385,7 +385,7 @@ def _planner(settings: Settings, way: MultiSegmentPath) -> dict[str, Any]:
     }
 
 
-def _improving_planner(settings: AnytimeSettings, way: MultiSegmentPath) -> dict[str, Any]:
+def _anytime_planner(settings: AnytimeSettings, path: MultiSegmentPath) -> dict[str, Any]:
     weights, longest = settings.weights, settings.longest
     return {
         "name": "turning" if isinstance(settings, TurningSettings) else "optimal",
@@ -396,7 +396,7 @@ def _improving_planner(settings: AnytimeSettings, way: MultiSegmentPath) -> dict
             "capacity": weights.capacity,
         },
         "seed": settings.seed,
-        "rounds": list(way.rounds),
+        "rounds": list(path.rounds),
         "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,
         "longest_mm": longest * 1000.0 if longest < float("inf") else None,
     }

@@ -1,4 +1,4 @@
-"""Settings of a search: sampler, cost, mode, seed and sizes; also from options by name."""
+"""Settings of a search: sampler, cost, mode, seed and sizes; also built from named options."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ CostName = Literal["kinematic", "length"]
 Mode = Literal["rewire", "paper"]
 
 CLEARANCE_RESERVE = 0.05e-3
-"""Added to every clearance the scene asks for, [m], so that round-off in a plan's file (1 nm) and
-between the planner's distances and those of `check` can never turn a plan into a refused one."""
+"""Added to every clearance the scene requires, [m], so that round-off in a plan file (1 nm), and
+between the distances of planner and check, never makes the check refuse a plan."""
 
 ATTEMPT_WITH_ROOM = 0.25
-"""Part of the iterations after which the rewiring mode no longer insists on room for the blends."""
+"""Part of the iterations after which the rewiring mode no longer requires room for blends."""
 
 MARGIN_RESERVE = 0.002
-"""Part of the largest tension by which required wrenches must lie inside the available ones."""
+"""Capacity margin that edges must keep, as part of the largest tension."""
 
 IMPROVING_ITERATIONS = 500
-"""How long the rewiring mode goes on after its first path. Source: measured on the paper's scenes;
-after as many more the paths were 1 % cheaper, as post-processing does the rest."""
+"""Iterations of the rewiring mode after its first path. Source: measured on the paper's scenes;
+twice as many made the paths 1 % cheaper, as post-processing does the rest."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannerSettings:
-    """Settings of the search; the sizes are the paper's (Table 2), SI.
+    """Settings of the paper's planners; sizes from its Table 2, SI.
 
     Attributes:
         sampler: "adaptive" (paper, section 4.2) or "goal-bias" (the goal with probability 0.5).
@@ -41,9 +41,9 @@ class PlannerSettings:
         seed: Of the random generator.
         step: Length η of an edge, [m].
         neighbour_radius: r_c, [m].
-        goal_radius: r_g, from which the goal itself is tried, [m].
+        goal_radius: r_g, within which a node tries the goal itself, [m].
         max_iterations: After which the search gives up.
-        readings: Of the text where it is open.
+        readings: Of the paper where its text is ambiguous.
     """
 
     sampler: SamplerName = "adaptive"
@@ -57,7 +57,7 @@ class PlannerSettings:
     readings: AlgorithmVariant = TEXT
 
     def __post_init__(self) -> None:
-        """Refuses what no search could use.
+        """Refuses unusable settings.
 
         Raises:
             BadInput: A name is unknown or a size is not positive.
@@ -78,17 +78,17 @@ class PlannerSettings:
             raise BadInput(f"the seed must not be negative, it is {self.seed}")
 
 
-# What a search makes small: a weighted sum of length, kinematic cost, clearance and margin.
+# The objective of a search: a weighted sum of length, kinematic cost, clearance and margin.
 
 
 _TIE = 0.02
-"""Cost of a metre beside an objective that leaves most of the path open: 1 mm of clearance is worth
-50 mm of way, and 1 N of margin as much."""
+"""Cost of a metre added to an objective that leaves most of the path undetermined: 1 mm of
+clearance or 1 N of margin is worth 50 mm of path."""
 
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """What is made small: a weighted sum, of which the last two are made large.
+    """Weights of a sum: the first two terms are minimised, the last two maximised.
 
     Attributes:
         length: Of the length, [m].
@@ -103,7 +103,7 @@ class Weights:
     capacity: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuses weights that leave nothing to make small.
+        """Refuses weights that leave nothing to minimise.
 
         Raises:
             BadInput: A weight is negative or not finite, or neither the length nor the kinematic
@@ -124,7 +124,7 @@ class Weights:
 
     @property
     def is_length(self) -> bool:
-        """Whether nothing but the length counts."""
+        """Whether only the length counts."""
         return self.kinematic + self.clearance + self.capacity == 0.0
 
 
@@ -134,14 +134,14 @@ OBJECTIVES = {
     "clearance": Weights(clearance=1.0, length=_TIE),
     "capacity": Weights(capacity=1e-3, length=_TIE),
 }
-"""What the objectives that have a name make small."""
+"""Weights of the named objectives."""
 
 
-# Searches that go on improving: what they are to make small, and how long they may go on.
+# Anytime searches: objective and budget.
 
 
 LEAST_ROUNDS = 12
-"""Done whatever the clock says, so that a busy machine finds a path, too."""
+"""Done whatever the clock says, so that a busy machine finds a path too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,11 +149,11 @@ class AnytimeSettings:
     """Settings of every search in rounds.
 
     Attributes:
-        weights: What is made small.
-        longest: Longest path allowed, [m]; infinite for any.
+        weights: The objective.
+        longest: Longest path allowed, [m]; infinite for no limit.
         seed: Of the random numbers.
-        budget: How long paths are sought and improved, [s]; what is prepared before is not in it.
-        rounds: Instead of the budget, for reproducible paths: the exact number of rounds.
+        budget: Time to find and improve paths, [s]; preparation is not counted.
+        rounds: Exact number of rounds instead of the budget; reproducible.
     """
 
     weights: Weights = field(default_factory=lambda: OBJECTIVES["length"])
@@ -163,7 +163,7 @@ class AnytimeSettings:
     rounds: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuses what no search could use.
+        """Refuses unusable settings.
 
         Raises:
             BadInput: The seed is negative, or a limit is not positive.
@@ -173,18 +173,18 @@ class AnytimeSettings:
         if not 0.0 < self.budget < math.inf:
             raise BadInput(f"the budget must be above 0 ms, it is {self.budget * 1e3:g} ms")
         if self.rounds is not None and self.rounds < 1:
-            raise BadInput(f"there must be at least one round, not {self.rounds}")
+            raise BadInput(f"rounds must be at least 1, not {self.rounds}")
         if not self.longest > 0.0:
             raise BadInput(f"the longest path must be above 0 mm, not {self.longest * 1e3:g} mm")
 
     def is_over(self, rounds: int, spent: float, least: int = LEAST_ROUNDS) -> bool:
-        """Whether a search may end after these rounds and seconds; ``least`` for the clock."""
+        """Whether a search may end after these rounds and seconds, ``least`` rounds at least."""
         if self.rounds is not None:
             return rounds >= self.rounds
         return rounds >= least and spent >= self.budget
 
-    def tell(self, progress: Progress, rounds: int, spent: float, cost: float) -> None:
-        """Progress of a search, in rounds where their number is given, else in seconds."""
+    def report(self, progress: Progress, rounds: int, spent: float, cost: float) -> None:
+        """Reports progress, in rounds where their number is given, else in seconds."""
         if self.rounds is not None:
             progress(float(rounds), float(self.rounds), cost)
         else:
@@ -192,11 +192,11 @@ class AnytimeSettings:
 
     @property
     def longer(self) -> str:
-        """What a user does for a longer search."""
+        """How a user makes the search longer."""
         return "raise --budget-ms" if self.rounds is None else "raise --rounds"
 
     def not_found(self, rounds: int, gap: float) -> str:
-        """Message after a number of rounds without a path; ``gap`` between the trees, [m]."""
+        """Message after rounds without a path; ``gap`` between the trees, [m]."""
         of_budget = f" of the {self.budget * 1e3:g} ms budget" if self.rounds is None else ""
         return (
             f"no path after {rounds} rounds{of_budget}; the trees from start and goal come within"
@@ -206,12 +206,13 @@ class AnytimeSettings:
     def too_long(
         self, where: str, found: float, straight: float, values: dict[str, float | str]
     ) -> NoSolution:
-        """The error where no path is short enough; the best path's length and the least, [m]."""
+        """The error where no path is short enough; lengths of best path and straight line, [m]."""
         limit, length = self.longest * 1e3, found * 1e3
         return NoSolution(
             f"no path of at most {limit:.1f} mm was found",
             where=where,
-            why=f"the path found has {length:.1f} mm, the straight line {straight * 1e3:.1f} mm",
+            why=f"the path found is {length:.1f} mm long, the straight line"
+            f" {straight * 1e3:.1f} mm",
             next_step=f"allow a longer path, or {self.longer}; `--cost length` without a limit"
             " shows how short paths can be",
             values={**values, "longest_mm": limit, "found_mm": length},
@@ -231,7 +232,7 @@ class OptimalSettings(AnytimeSettings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TurningSettings(AnytimeSettings):
-    """Settings of the search that may turn the platform; its moves take longer to decide."""
+    """Settings of the search that may rotate the platform; its moves take longer to check."""
 
     budget: float = 0.500
 
@@ -240,17 +241,17 @@ Settings = PlannerSettings | OptimalSettings | TurningSettings
 """Of any planner."""
 
 
-# Settings of a planner from what a caller asks for by name; contradictions are refused.
+# Settings of a planner from named options; contradictions are refused.
 
 
 PlannerName = Literal["optimal", "adaptive", "goal-bias"]
-"""The one we recommend; the paper's; or half of all samples at the goal."""
+"""The one we recommend; the paper's; or the paper's with half of all samples at the goal."""
 Objective = Literal["length", "kinematic", "clearance", "capacity"]
-"""What makes a path good."""
+"""Named objectives."""
 
 _OPTIMAL = ("weight", "budget_ms", "rounds", "longest_mm", "free_rotation")
 _PAPER = ("mode", "max_iterations", "steer", "spacing_mm", "goal_sight")
-_HEEDED = {
+_OPTIONS = {
     "optimal": _OPTIMAL,
     "adaptive": (*_PAPER, "failure_rate", "focus", "cone_draw"),
     "goal-bias": _PAPER,
@@ -259,24 +260,24 @@ _HEEDED = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanningOptions:
-    """What is asked for; None, or nothing, where an option was left out.
+    """Options of a plan; None, or empty, where one was left out.
 
     Attributes:
-        planner: Which one searches.
+        planner: Which planner searches.
         seed: Of the random numbers.
-        cost: What to optimise; ``length``, or ``kinematic`` for the paper's planners.
+        cost: Objective; when left out ``length``, or ``kinematic`` for the paper's planners.
         weight: Weights of a sum of objectives, by name, or as texts ``NAME=NUMBER``.
-        budget_ms: Optimal: how long it goes on improving.
-        rounds: Optimal: rounds instead, for each leg or one number for all: the same path again.
-        longest_mm: Optimal: the best path that is no longer.
-        free_rotation: Optimal: the platform may turn, within the scene's limits.
+        budget_ms: Optimal: time to find and improve a path.
+        rounds: Optimal: rounds instead of the budget, one number or one per leg; reproducible.
+        longest_mm: Optimal: length limit of the path.
+        free_rotation: Optimal: the platform may rotate, within the scene's limits.
         mode: The paper's planners: RRT* (rewire), or stop at the first path (paper).
         max_iterations: The paper's planners: give up after this number of samples.
         failure_rate: See `AlgorithmVariant`, as for all below.
         focus: The node x_c.
         cone_draw: How points of the forward cone are drawn.
-        steer: How far a new node is from the one it grows from.
-        spacing_mm: New nodes nearer to another are rejected.
+        steer: How far a new node is from its parent.
+        spacing_mm: New nodes nearer than this to another are rejected.
         goal_sight: Every new node tries the goal.
     """
 
@@ -302,25 +303,25 @@ def settings_from_options(options: PlanningOptions) -> Settings:
     """The settings of the planner chosen.
 
     Raises:
-        BadInput: An option was given that the planner would not heed, options contradict each
-            other, or a value cannot be used.
+        BadInput: An option does not apply to the planner, options contradict each other, or a
+            value cannot be used.
     """
-    if options.planner not in _HEEDED:
+    if options.planner not in _OPTIONS:
         raise BadInput(
-            f"unknown planner {options.planner!r}", next_step=f"use one of: {', '.join(_HEEDED)}"
+            f"unknown planner {options.planner!r}", next_step=f"use one of: {', '.join(_OPTIONS)}"
         )
-    _refuse_unheeded(options)
+    _refuse_unused(options)
     if options.planner == "optimal":
         return _optimal_settings(options)
     return _paper_settings(options)
 
 
-def _refuse_unheeded(options: PlanningOptions) -> None:
-    heeded = _HEEDED[options.planner]
-    asked = {name for heard in _HEEDED.values() for name in heard}
-    left = [name for name in sorted(asked - set(heeded)) if _is_given(getattr(options, name))]
-    if left:
-        named = ", ".join("--" + name.replace("_", "-") for name in left)
+def _refuse_unused(options: PlanningOptions) -> None:
+    own = _OPTIONS[options.planner]
+    known = {name for names in _OPTIONS.values() for name in names}
+    unused = [name for name in sorted(known - set(own)) if _is_given(getattr(options, name))]
+    if unused:
+        named = ", ".join("--" + name.replace("_", "-") for name in unused)
         raise BadInput(
             f"--planner {options.planner} does not take {named}",
             next_step="leave it out, or choose another planner; see `cdpr plan --help`",
@@ -410,7 +411,7 @@ def _paper_settings(options: PlanningOptions) -> PlannerSettings:
 
 
 def _readings(options: PlanningOptions) -> AlgorithmVariant:
-    """Those of the text, but for what was asked for otherwise."""
+    """The text's readings, except for those that options change."""
     given: dict[str, Any] = {
         name: choice
         for name in ("failure_rate", "focus", "cone_draw", "steer")

@@ -1,4 +1,4 @@
-"""The space that is searched: which numbers stand for a pose, and their bounds."""
+"""The search space: the coordinates of a pose, and their bounds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from model.rig import Rig
 class Space(Protocol):
     """A bounded box of n coordinates, each point of which is a pose.
 
-    The tree, the samplers and the post-processing know no more of poses than this.
+    Tree, samplers and post-processing access poses only through this interface.
 
     Attributes:
         lower: Smallest coordinates, shape (n,).
@@ -37,11 +37,11 @@ class Space(Protocol):
 class PoseSpace:
     """Positions [m] and unit quaternions (w, x, y, z); n = 7.
 
-    The bounds of the quaternion are those of its numbers; the scene's rotation limits are narrower.
+    The quaternion's bounds are those of its components; the scene's rotation limits are narrower.
     """
 
     def __init__(self, rig: Rig) -> None:
-        """The workspace of ``rig`` with the platform turned in any way."""
+        """The workspace of ``rig`` with the platform in any orientation."""
         self.lower = np.append(rig.workspace_lower, np.full(4, -1.0))
         self.upper = np.append(rig.workspace_upper, np.full(4, 1.0))
 
@@ -58,7 +58,7 @@ class TranslationSpace:
     """Positions of the platform's origin in the workspace box at one orientation; n = 3, [m]."""
 
     def __init__(self, rig: Rig, rotation: Array) -> None:
-        """The workspace of ``rig`` with the platform turned by ``rotation``, shape (3, 3)."""
+        """The workspace of ``rig`` with the platform at orientation ``rotation``, shape (3, 3)."""
         self.lower = rig.workspace_lower
         self.upper = rig.workspace_upper
         self.rotation = rotation
@@ -76,8 +76,8 @@ class TranslationSpace:
 
 
 _CELLS = 20
-"""Cells along the longest side. Source: measured on both ready rigs, where the kinematic cost
-between lattice points is then within 1 % of the exact one."""
+"""Cells along the longest side. Source: measured on the first two rigs of `configs/`, where the
+kinematic cost between lattice points is then within 1 % of the exact one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +96,7 @@ class Lattice:
 
     @classmethod
     def over(cls, lower: Array, upper: Array) -> Lattice:
-        """A lattice over a box, both ends included, cells about as wide as high."""
+        """A lattice over a box, both ends included, with nearly cubic cells."""
         size = upper - lower
         cells = np.maximum(1, np.ceil(_CELLS * size / size.max() - 1e-9)).astype(int)
         x, y, z = (int(c) + 1 for c in cells)
@@ -108,14 +108,14 @@ class Lattice:
         return int(np.prod(self.shape))
 
     def points(self, numbers: NDArray[np.int64]) -> Array:
-        """The points with given numbers, shape (k,) → (k, 3), [m]."""
+        """The points of given indices, shape (k,) → (k, 3), [m]."""
         index = np.stack(np.unravel_index(numbers, self.shape), axis=-1)
         points: Array = self.lower + index * self.spacing
         return points
 
 
 def corners_and_weights(lattice: Lattice, points: Array) -> tuple[NDArray[np.int64], Array]:
-    """Numbers of the eight points around each point, and their trilinear weights.
+    """Indices of the eight lattice points around each point, and their trilinear weights.
 
     Args:
         lattice: The lattice.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.clearance import ClearanceModel, Nearest, cable_name
 from model.errors import BadInput
 from model.kinematics import Cables, cables_at
@@ -111,9 +111,9 @@ def clearance_at(
     cables = cables_at(model.rig, pose)
     names = {cable_name(i): i for i in range(model.rig.cable_count)}
     at_ends = (model.rig.outlet_error or 0.0, model.rig.anchor_error or 0.0)
-    ends = np.array((cable_error, 0.0) if cable_error > 0.0 else at_ends) / SURE
+    ends = np.array((cable_error, 0.0) if cable_error > 0.0 else at_ends) / Z_95
     variances = [_variance(n, names.get(n.first), cables, pose, covariance, ends) for n in nearest]
-    return MeasuredClearance(nearest, read_only(SURE * np.sqrt(variances) + allowance))
+    return MeasuredClearance(nearest, read_only(Z_95 * np.sqrt(variances) + allowance))
 
 
 def _variance(

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
 from model.rig import Camera, Tag
 from tracking.camera_model import project_undistorted
@@ -80,7 +80,7 @@ class BundlePose:
         usual = (PRIOR_WEIGHT + self.cost) / (PRIOR_WEIGHT + expected)
         if self.cost <= CHANCE * expected:
             return usual
-        factor = stdtrit(max(expected, FEWEST), 0.5 + COVERAGE / 2.0) / SURE
+        factor = stdtrit(max(expected, FEWEST), 0.5 + COVERAGE / 2.0) / Z_95
         return max(usual, self.cost / max(expected, 1.0) * float(factor) ** 2)
 
     @property

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.pose import (
     Array,
     PlatformMotion,
@@ -200,7 +200,7 @@ class RollingShutter:
             recent: Recent motion of the platform.
         """
         self._camera, self._recent = camera, recent
-        speed = rig.motion.speed / SURE
+        speed = rig.motion.speed / Z_95
         turning = speed / float(np.linalg.norm(rig.half_size))
         self._unknown = np.diag([speed**2] * 3 + [turning**2] * 3)
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.errors import BadInput, Fault
-from model.pose import Array, Pose, carried, read_only, skew
+from model.pose import Array, Pose, lever_arm_matrix, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import project_undistorted, ray_slopes, rays_of, undistorted_slopes
 from tracking.detection.tags import tag_corners
@@ -33,7 +33,7 @@ def missing_errors(rig: Rig, camera: Camera) -> tuple[str, ...]:
     """
     stated = {
         "lens_covariance (`cdpr calibrate camera`)": camera.lens_covariance,
-        "pose_covariance (`cdpr calibrate extrinsics`)": camera.place_covariance,
+        "pose_covariance (`cdpr calibrate extrinsics`)": camera.pose_covariance,
         "tags: error_mm (`cdpr calibrate tags`)": rig.tag_error,
         "outlets_error_mm (`cdpr calibrate rig`)": rig.outlet_error,
         "anchors_error_mm (`cdpr calibrate rig`)": rig.anchor_error,
@@ -170,8 +170,8 @@ def tag_error_slopes(tag: Tag, error: float) -> Array:
     """
     arms = tag_corners(tag) - tag.pose.position
     reach = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    shift = error / SURE / np.sqrt(6.0)
-    turn = error / SURE / (2.0 * reach)
+    shift = error / Z_95 / np.sqrt(6.0)
+    turn = error / Z_95 / (2.0 * reach)
     return np.array([np.hstack([shift * np.eye(3), -turn * skew(arm)]) for arm in arms])
 
 

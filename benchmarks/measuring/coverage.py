@@ -261,8 +261,8 @@ class Lab:
         return replace(
             camera,
             world_from_camera=found.world_from_camera,
-            place_covariance=found.stated_covariance,
-            place_by_lens=found.by_lens,
+            pose_covariance=found.stated_covariance,
+            pose_by_lens=found.by_lens,
         )
 
     def _platform(self, camera: Camera, tally: Tally) -> None:

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from model.pose import PlatformMotion, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, load_rig
-from model.scene import nothing_in_the_way
+from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics
 from tracking.measurement import PoseMeasurement

@@ -1,12 +1,12 @@
-"""Our planner against OMPL's, in one process and one run, and both checkers told apart.
+"""Our planner against OMPL's, in one process and one run, with both checkers shown separately.
 
     pip install ompl==2.0.1   # for this benchmark only
     python benchmarks/planner/against_ompl.py -o results          # all of it: about half an hour
     python benchmarks/planner/against_ompl.py --runs 5 --checkers exact
 
-Writes a table (Markdown, CSV, JSON), what is claimed as ratios of this very run, and a plot.
-Everything is measured in processor time of this process, one run after the other; machine code is
-made before the first run. Lengths are given over the best known ones at 10 mm clearance.
+Writes a table (Markdown, CSV, JSON), the claims as ratios from this run, and a plot. All times are
+processor time of this process, one run after the other; machine code is compiled before the first
+run. Lengths are given relative to the best known ones at 10 mm clearance.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene
 
 OMPL_RANGE = 0.2
-"""Steps of OMPL's planners unless told otherwise, as part of the space's extent."""
+"""OMPL's default range, as part of the space's extent."""
 CONFIGS = Path(__file__).parents[2] / "configs"
 BEST_MM = {1: 628.5, 2: 661.0, 3: 813.5}
 """Source: a fine reference search, polished; see docs/paper.md."""
@@ -42,7 +42,7 @@ BEST_MM = {1: 628.5, 2: 661.0, 3: 813.5}
 
 @dataclass(frozen=True)
 class Run:
-    """One run. Lengths are those of the best path at each mark, None while there is none."""
+    """One run. Lengths are those of the best path at each mark, None without one."""
 
     environment: int
     checker: str
@@ -56,50 +56,50 @@ class Run:
 
 
 def main() -> None:
-    """Runs everything that was asked for."""
-    wishes = _wishes()
-    ompl_runs.seed(wishes.seed)
+    """Runs everything requested."""
+    options = _options()
+    ompl_runs.seed(options.seed)
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     runs: list[Run] = []
     inside_us: dict[int, list[float]] = {}
     with Progress(disable=not sys.stderr.isatty()) as bar:
-        contests = 1 + len(ompl_runs.PLANNERS) * len(wishes.checkers)
-        total = contests * wishes.runs * len(wishes.environments)
+        contests = 1 + len(ompl_runs.PLANNERS) * len(options.checkers)
+        total = contests * options.runs * len(options.environments)
         task = bar.add_task("running", total=total)
-        for environment in wishes.environments:
+        for environment in options.environments:
             scene = load_scene(CONFIGS / f"environment_{environment}.yaml")
-            for run in contest(rig, scene, environment, wishes, inside_us):
+            for run in contest(rig, scene, environment, options, inside_us):
                 runs.append(run)
                 bar.advance(task)
-    rows = [row for group in _groups(runs) for row in [summarised(group, wishes.marks_ms)]]
-    text = table(rows, wishes.marks_ms) + "\n\n" + claims(rows, wishes.marks_ms, inside_us)
+    rows = [row for group in _groups(runs) for row in [summarised(group, options.marks_ms)]]
+    text = table(rows, options.marks_ms) + "\n\n" + claims(rows, options.marks_ms, inside_us)
     print(text)
-    if wishes.output:
-        write(wishes.output, runs, rows, text, wishes.marks_ms)
+    if options.output:
+        write(options.output, runs, rows, text, options.marks_ms)
 
 
 def contest(
-    rig: Rig, scene: Scene, environment: int, wishes: argparse.Namespace,
+    rig: Rig, scene: Scene, environment: int, options: argparse.Namespace,
     inside_us: dict[int, list[float]],
 ) -> Iterator[Run]:  # fmt: skip
     """All runs in one environment; also writes mean times to a first path in compiled code.
 
     Ours, and those of RRTConnect at OMPL's default range and without a limit of steps.
     """
-    marks_s = tuple(mark / 1e3 for mark in wishes.marks_ms)
+    marks_s = tuple(mark / 1e3 for mark in options.marks_ms)
     exact = exact_edges(rig, scene)
     contestant = ours.Contestant(rig, scene)
     rivals = [contestant.mean_rival_us(share) for share in (OMPL_RANGE, 1.0)]
     inside_us[environment] = [contestant.mean_first_us(), *rivals]
-    for number in range(wishes.runs):
-        result = contestant.run(wishes.seed + number, marks_s)
+    for number in range(options.runs):
+        result = contestant.run(options.seed + number, marks_s)
         yield _run(result, environment, "exact", ours.NAME, number, exact)
-    for checker in wishes.checkers:
+    for checker in options.checkers:
         question = ompl_runs.Question(rig, scene, exact if checker == "exact" else
                                       FclStates(rig, scene))  # fmt: skip
         question.run("RRTConnect", (0.05,))
         for planner in ompl_runs.PLANNERS:
-            for number in range(wishes.runs):
+            for number in range(options.runs):
                 result = question.run(planner, marks_s)
                 yield _run(result, environment, checker, planner, number, exact)
 
@@ -195,7 +195,7 @@ def write(
         figure.savefig(folder / f"against_ompl.{ending}", dpi=150)
 
 
-def _wishes() -> argparse.Namespace:
+def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--environments", type=int, nargs="+", default=[1, 2, 3], choices=BEST_MM)
     parser.add_argument("--runs", type=int, default=30, help="runs of every planner")

@@ -1,6 +1,6 @@
-"""Two edge checkers for the same question: does the robot keep the scene's clearance to obstacles?
+"""Two edge checkers for the same question: whether the robot keeps the scene's clearance.
 
-(a) python-fcl as a user would write it: distances at poses a few millimetres apart along the edge.
+(a) python-fcl as a user would call it: distances at poses a few millimetres apart along the edge.
 (b) our compiled checker, exact from end to end.
 """
 
@@ -24,9 +24,9 @@ from planner.kernels.scene_arrays import World
 
 EdgeCheck = Callable[[float, float, float, float, float, float], bool]
 SPACING = 0.005
-"""Between the poses that python-fcl looks at, [m]."""
+"""Spacing of the poses that python-fcl checks, [m]."""
 _THREAD = 1e-4
-"""Radius of the capsule that stands for a cable without thickness, [m]."""
+"""Radius of the capsule that represents a cable of zero thickness, [m]."""
 
 
 def exact_edges(rig: Rig, scene: Scene) -> EdgeCheck:
@@ -49,7 +49,7 @@ class FclStates:
     """Distances of all bodies to all obstacles at one position."""
 
     def __init__(self, rig: Rig, scene: Scene) -> None:
-        """Makes the collision objects once."""
+        """Builds the collision objects once."""
         self._rig = rig
         self._rotation = scene.start.rotation
         self._clearance = scene.obstacle_clearance
@@ -66,9 +66,9 @@ class FclStates:
         cables = cables_at(self._rig, pose)
         radius = max(self._rig.cable_radius, _THREAD)
         needed = self._clearance - (radius - self._rig.cable_radius)
-        ways = cables.anchors - cables.exits
-        lengths = np.linalg.norm(ways, axis=1)
-        frames, middles = _frames(ways / lengths[:, None]), (cables.anchors + cables.exits) / 2.0
+        spans = cables.anchors - cables.exits
+        lengths = np.linalg.norm(spans, axis=1)
+        frames, middles = _frames(spans / lengths[:, None]), (cables.anchors + cables.exits) / 2.0
         for frame, middle, length in zip(frames, middles, lengths.tolist(), strict=True):
             thread = fcl.CollisionObject(fcl.Capsule(radius, length), fcl.Transform(frame, middle))
             if not self._apart(thread, needed):
@@ -83,7 +83,7 @@ class FclStates:
 
 
 def _frames(axes: Array) -> Array:
-    """Rotations that turn z onto unit vectors, shape (k, 3) → (k, 3, 3)."""
+    """Rotations that map z to unit vectors, shape (k, 3) → (k, 3, 3)."""
     helpers = np.where(np.abs(axes[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     x = np.cross(axes, helpers)
     x /= np.linalg.norm(x, axis=1)[:, None]
@@ -106,4 +106,4 @@ def _shape(obstacle: Obstacle) -> Any:
         case Capsule(radius=radius, length=length):
             return fcl.Capsule(radius, length)
         case other:
-            raise SystemExit(f"this benchmark knows no {type(other).__name__}")
+            raise SystemExit(f"this benchmark does not support {type(other).__name__}")

@@ -1,4 +1,4 @@
-"""What is claimed of our planner against OMPL's, as ratios of figures of the same run."""
+"""Claims about our planner against OMPL's, as ratios of figures of the same run."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import ours
 
 FIRST_COMPILED, FIRST_FCL = 1.0, 1000.0
-"""How many times as fast our first path is to be as RRTConnect's: both compiled and with our
-checker, or as a user has it from OMPL and python-fcl."""
+"""Claimed speed ratio of our first path to RRTConnect's: both compiled with our checker, and as a
+user gets it from OMPL and python-fcl."""
 OURS_AT_MS, THEIRS_AT_MS = 10.0, 1000.0
 _FIRST = "RRTConnect"
 
@@ -23,7 +23,7 @@ def claims(
 
     Args:
         rows: Of the run, medians.
-        marks_ms: At which lengths were read.
+        marks_ms: Times at which lengths were read.
         inside_us: By environment, mean times to a first path in compiled code, [µs]: ours, and
             RRTConnect's at OMPL's default range and without a limit of steps.
     """
@@ -46,13 +46,13 @@ def claims(
 
 def _compiled(inside_us: Sequence[float]) -> list[str]:
     """Our mean time to the first path against RRTConnect's, both in compiled code."""
-    said = []
+    lines = []
     for name, theirs in zip(("at OMPL's range", "unlimited"), inside_us[1:], strict=True):
         ratio = theirs / inside_us[0]
         claim = f"first path before {_FIRST} {name}, both compiled"
         found = f"{ratio:.1f} times: {inside_us[0]:.1f} against {theirs:.1f} µs"
-        said.append(f"{claim} | {found} | {_said(ratio >= FIRST_COMPILED)}")
-    return said
+        lines.append(f"{claim} | {found} | {_yes_or_no(ratio >= FIRST_COMPILED)}")
+    return lines
 
 
 def _first(spent_ms: float, rows: Sequence[Row], checker: str, wanted: float, where: str) -> str:
@@ -64,7 +64,7 @@ def _first(spent_ms: float, rows: Sequence[Row], checker: str, wanted: float, wh
             found = (
                 f"{theirs / spent_ms:.1f} times: {spent_ms * 1e3:.0f} against {theirs * 1e3:.0f} µs"
             )
-            return f"{claim} | {found} | {_said(theirs / spent_ms >= wanted)}"
+            return f"{claim} | {found} | {_yes_or_no(theirs / spent_ms >= wanted)}"
     return ""
 
 
@@ -81,8 +81,8 @@ def _shorter(mine: Row, rows: Sequence[Row]) -> str:
         return ""
     best, name = min(known)
     claim = f"shorter after {OURS_AT_MS:g} ms than all of OMPL's after {THEIRS_AT_MS:g} ms"
-    return f"{claim} | {own:+.2f} % against {best:+.2f} % ({name}) | {_said(own < best)}"
+    return f"{claim} | {own:+.2f} % against {best:+.2f} % ({name}) | {_yes_or_no(own < best)}"
 
 
-def _said(holds: bool) -> str:
+def _yes_or_no(holds: bool) -> str:
     return "yes" if holds else "no"

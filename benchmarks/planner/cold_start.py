@@ -1,10 +1,10 @@
-"""How long `cdpr plan` takes from the shell's prompt to the prompt, machine code compiled before.
+"""Time of `cdpr plan` from shell prompt to shell prompt, with machine code compiled before.
 
     python benchmarks/planner/cold_start.py --runs 10
 
-Beside it, in turns: a Python that ends at once, and one that imports what a compiled planner cannot
-do without. Wall time tells on a quiet machine; processor time nearly so on a busy one. Python keeps
-its byte code as it does by default, whatever PYTHONDONTWRITEBYTECODE says here.
+Measured alternately with it: a Python that ends at once, and one that imports the libraries that a
+compiled planner needs. Wall time is meaningful on a quiet machine, processor time also on a busy
+one. Python caches byte code as by default, whatever PYTHONDONTWRITEBYTECODE is set to here.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class Start:
 
 def main() -> None:
     """Measures and prints."""
-    wishes = _wishes()
+    options = _options()
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     with tempfile.TemporaryDirectory() as folder:
         commands = _commands(Path(folder) / "plan.json")
         for command in commands.values():
-            started(command, environment)  # byte code and machine code are made here
+            started(command, environment)  # compiles byte code and machine code
         starts: dict[str, list[Start]] = {name: [] for name in commands}
-        for _ in range(wishes.runs):
+        for _ in range(options.runs):
             for name, command in commands.items():
                 starts[name].append(started(command, environment))
     print(f"{'':28s}{'wall: median, best':>22s}{'processor: median, best':>28s}  [s]")
@@ -68,7 +68,7 @@ def started(command: Sequence[str], environment: dict[str, str]) -> Start:
 
 
 def _processor_time() -> float:
-    """Of all programs that were started here and have ended, [s]."""
+    """Processor time of all finished child processes, [s]."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
@@ -94,7 +94,7 @@ def _commands(output: Path) -> dict[str, list[str]]:
     }
 
 
-def _wishes() -> argparse.Namespace:
+def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--runs", type=int, default=10, help="starts of each program")
     return parser.parse_args()

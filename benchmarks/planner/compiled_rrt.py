@@ -1,7 +1,7 @@
-"""RRTConnect as OMPL has it, compiled and with our edge test: no call from Python is counted.
+"""RRTConnect as in OMPL, compiled and with our edge test: no call from Python is counted.
 
 Source: Kuffner & LaValle, "RRT-Connect: an efficient approach to single-query path planning", 2000;
-OMPL's form of it: steps of at most a range, and the other tree is drawn on until it is stopped.
+in OMPL's form: steps of at most a range, and the other tree is extended until it is stopped.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def new_trees(start: Array, goal: Array, seed: int) -> Trees:
 def trees_handle(problem: PathProblem, trees: Trees) -> Handle:
     """Both as one reference.
 
-    Not by `planner.anytime.path.handle_of`: its kept code would then name a type of this module.
+    Not by `planner.anytime.path.handle_of`: its cached code would then name a type of this module.
     """
     return Handle(problem, trees)
 
@@ -65,7 +65,7 @@ def trees_met(handle: Handle, longest: float, samples: int) -> bool:
 
 @leaf
 def connected(problem: PathProblem, trees: Trees, longest: float, samples: int) -> bool:
-    """Draws so many samples at most; whether the trees have met. ``longest``: of a step, [m]."""
+    """Draws at most ``samples``; whether the trees have met. ``longest`` step in [m]."""
     limits, counts = problem.world.limits, trees.counts
     for _ in range(samples):
         wanted = (
@@ -118,9 +118,9 @@ def _extended(problem: PathProblem, trees: Trees, tree: int, wanted: Vector, lon
         if squared < least:
             best, least = i, squared
     at = row_of(nodes[best])
-    way = minus(wanted, at)
-    distance = norm(way)
-    to = wanted if distance <= longest else along(at, way, longest / distance)
+    delta = minus(wanted, at)
+    distance = norm(delta)
+    to = wanted if distance <= longest else along(at, delta, longest / distance)
     if not edge_allowed(problem, at, to):
         return _STOPPED
     new = counts[tree]

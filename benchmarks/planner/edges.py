@@ -1,7 +1,7 @@
 """Time of one accepted 40 mm edge: compiled exact checks, python-fcl and coal, in one run.
 
-All three answer the same question about the same edges: do eight swept cable triangles and the
-swept platform stay 10 mm from every box. Usage: python benchmarks/planner/edges.py [edges]
+All three check the same condition on the same edges: eight swept cable triangles and the swept
+platform stay 10 mm from every box. Usage: python benchmarks/planner/edges.py [edges]
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def main() -> None:
     """Prints a row for each environment."""
     library_edges = int(sys.argv[1]) if len(sys.argv) > 1 else 200
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
-    print("accepted edges of 40 mm, processor time a edge [µs]")
+    print("accepted edges of 40 mm, processor time per edge [µs]")
     print("env  exact   all(*)  python-fcl    coal   fcl/exact  coal/exact  disagreements fcl coal")
     for number in (1, 2, 3):
         scene = load_scene(CONFIGS / f"environment_{number}.yaml")
@@ -84,8 +84,8 @@ def _row(number: int, rig: Rig, scene: Scene, library_edges: int) -> None:
 def _edges(rig: Rig, count: int) -> tuple[Array, Array]:
     rng = np.random.default_rng(0)
     starts = rng.uniform(rig.workspace_lower, rig.workspace_upper, (count, 3))
-    ways = rng.normal(size=(count, 3))
-    ends = starts + LENGTH * ways / np.linalg.norm(ways, axis=1)[:, None]
+    directions = rng.normal(size=(count, 3))
+    ends = starts + LENGTH * directions / np.linalg.norm(directions, axis=1)[:, None]
     inside = np.all((ends >= rig.workspace_lower) & (ends <= rig.workspace_upper), axis=1)
     return starts[inside], ends[inside]
 
@@ -109,7 +109,7 @@ def _swept(rig: Rig, start: Array, end: Array) -> tuple[Array, Array]:
 
 
 def _fcl_check(rig: Rig, scene: Scene) -> Check:
-    """As a user of python-fcl would write it: stops at the first that is too near."""
+    """As a user of python-fcl would write it: stops at the first pair that is too near."""
     boxes = [
         fcl.CollisionObject(
             fcl.Box(*(2.0 * o.shape.half_size)),
@@ -146,9 +146,9 @@ def _coal_check(rig: Rig, scene: Scene) -> Check:
     two_sides = _coal_sides([(0, 1, 2), (0, 2, 1)])
     fan = _coal_sides([(0, i, i + 1) for i in range(1, 15)])
 
-    def distance(body: coal.Convex, box: coal.Box, place: coal.Transform3s) -> float:
+    def distance(body: coal.Convex, box: coal.Box, pose: coal.Transform3s) -> float:
         result = coal.DistanceResult()
-        return float(coal.distance(body, nowhere, box, place, request, result))
+        return float(coal.distance(body, nowhere, box, pose, request, result))
 
     def free(start: Array, end: Array) -> bool:
         triangles, corners = _swept(rig, start, end)

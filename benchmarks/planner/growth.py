@@ -1,12 +1,12 @@
-"""How exact edge checks and planning grow with the number of obstacles and of cables.
+"""Growth of the time of exact edge checks and planning with the number of obstacles and cables.
 
     python benchmarks/planner/growth.py -o results
 
-Random edges of 40 mm: on the paper's rig around the pillar of environment 1 and more and more small
-boxes; and around the pillar alone on robots whose 6 to 16 cables leave two rings of outlets. A plan
-is 30 rounds of the search between the free positions nearest to the scene's start and goal, the
-median of five seeds. Written as a table and a plot; the slope is that of the curve's last half
-between logarithms (1 is linear growth). Processor time of this process.
+Random edges of 40 mm: on the paper's rig around the pillar of environment 1 and an increasing
+number of small boxes; and around the pillar alone on robots whose 6 to 16 cables leave two rings of
+outlets. A plan is 30 rounds of the search between the free positions nearest to the scene's start
+and goal, the median of five seeds. Written as a table and a plot; the slope is that of the last
+half of the log-log curve (1 is linear growth). Processor time of this process.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ EDGE = 0.040
 ROUNDS = 30
 SEEDS = 5
 TWIST = 0.3
-"""Between an outlet and its anchor about the platform, [rad]: without it nothing resists a turn."""
+"""Angle between an outlet and its anchor, [rad]: without it nothing resists rotation about z."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Cost:
     """Processor time in one world, [µs].
 
     `open_comparisons` are those of cables with each other and the platform that are not proved for
-    the whole workspace at once, so that every edge of a plan asks for them.
+    the whole workspace at once, so that every edge of a plan checks them.
     """
 
     size: int
@@ -61,17 +61,17 @@ class Cost:
 
 def main() -> None:
     """Measures, prints and writes."""
-    wishes = _wishes()
+    options = _options()
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     base = load_scene(CONFIGS / "environment_1.yaml")
-    random = np.random.default_rng(wishes.seed)
+    random = np.random.default_rng(options.seed)
     show = sys.stderr.isatty()
     by_obstacles = [
-        cost(rig, crowded(base, n, random), random, n, wishes.repeats)
+        cost(rig, crowded(base, n, random), random, n, options.repeats)
         for n in track(OBSTACLES, "obstacles", disable=not show)
     ]
     by_cables = [
-        cost(with_cables(rig, m), base, random, m, wishes.repeats)
+        cost(with_cables(rig, m), base, random, m, options.repeats)
         for m in track(CABLES, "cables", disable=not show)
     ]
     tables = {"obstacles": by_obstacles, "cables": by_cables}
@@ -83,8 +83,8 @@ def main() -> None:
                   f"  {c.open_comparisons:4d}")  # fmt: skip
         for what in ("free_edge_us", "any_edge_us", "world_us", "plan_us"):
             print(f"  slope of {what}: {slope(costs, what):.2f}")
-    if wishes.output:
-        write(wishes.output, tables)
+    if options.output:
+        write(options.output, tables)
 
 
 def cost(rig: Rig, scene: Scene, random: np.random.Generator, size: int, repeats: int) -> Cost:
@@ -95,8 +95,8 @@ def cost(rig: Rig, scene: Scene, random: np.random.Generator, size: int, repeats
         world = build_world(rig, scene, rig.home.rotation, scene.obstacle_clearance)
         built.append(time.process_time() - begin)
     starts = random.uniform(rig.workspace_lower, rig.workspace_upper, (EDGES, 3))
-    ways = random.normal(size=(EDGES, 3))
-    ends = starts + EDGE * ways / np.linalg.norm(ways, axis=1)[:, None]
+    directions = random.normal(size=(EDGES, 3))
+    ends = starts + EDGE * directions / np.linalg.norm(directions, axis=1)[:, None]
     ends = np.clip(ends, rig.workspace_lower, rig.workspace_upper)
     free = edges_free(world, starts, ends)
     some = np.flatnonzero(free)
@@ -139,11 +139,11 @@ def crowded(base: Scene, count: int, random: np.random.Generator) -> Scene:
 
 
 def with_cables(rig: Rig, count: int) -> Rig:
-    """A rig with other cables: from a ring above to low anchors, from one below to high ones."""
+    """The rig with ``count`` cables: upper ring to low anchors, lower ring to high ones."""
     upper = np.arange(count) % 2 == 0
     angle = 2.0 * np.pi * (np.arange(count) + 0.25) / count
-    turned = angle + np.where(np.arange(count) // 2 % 2 == 0, TWIST, -TWIST)
-    around, near = (np.column_stack([np.cos(a), np.sin(a)]) for a in (angle, turned))
+    rotated = angle + np.where(np.arange(count) // 2 % 2 == 0, TWIST, -TWIST)
+    around, near = (np.column_stack([np.cos(a), np.sin(a)]) for a in (angle, rotated))
     side = np.max(np.abs(near), axis=1)[:, None]
     height = float(rig.half_size[2])
     anchors = np.column_stack([near / side * rig.half_size[:2], np.where(upper, -height, height)])
@@ -193,7 +193,7 @@ def write(folder: Path, tables: dict[str, list[Cost]]) -> None:
         figure.savefig(folder / f"growth.{ending}", dpi=150)
 
 
-def _wishes() -> argparse.Namespace:
+def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--repeats", type=int, default=5, help="of each measurement; best counts")
     parser.add_argument("--seed", type=int, default=1)

@@ -4,10 +4,10 @@
     python benchmarks/planner/narrow.py -o results                 # half an hour
     python benchmarks/planner/narrow.py --runs 3 --limit-s 0.5 --gaps-mm 0.2 5
 
-All ask the same compiled test of whole edges, with the planner's reserves; OMPL's planners call it
-from Python. Processor time of this process to the first path; a run ends at the limit. Machine
-code is made before the first run. A row is led by us where no other planner finds a path more
-often, and none that finds it as often is faster at the median.
+All use the same compiled test of whole edges, with the planner's reserves; OMPL's planners call it
+from Python. Processor time of this process to the first path; a run ends at the limit. Machine code
+is compiled before the first run. Ours leads a row where no other planner finds a path more often,
+and none that finds it as often is faster at the median.
 """
 
 from __future__ import annotations
@@ -54,29 +54,31 @@ class Row:
     found: int
     runs: int
     median_ms: float
-    """Of all runs, infinite where not half of them found a path."""
+    """Of all runs, infinite where fewer than half of them found a path."""
     worst_ms: float
 
 
 def main() -> None:
-    """Runs everything, prints the table, and writes it where it is asked for."""
-    wishes = _wishes()
+    """Runs everything, prints the table, and writes it if requested."""
+    options = _options()
     ompl_runs.seed(1)
     rows: list[Row] = []
     for passage in passages():
-        is_asked = passage.name in wishes.passages and round(passage.gap * 1e3, 6) in wishes.gaps_mm
+        is_asked = (
+            passage.name in options.passages and round(passage.gap * 1e3, 6) in options.gaps_mm
+        )
         if not is_asked:
             continue
-        here = _rows(passage, _contestants(passage, wishes.limit_s), wishes.runs)
+        here = _rows(passage, _contestants(passage, options.limit_s), options.runs)
         rows += here
         print(table(here).splitlines()[-1], flush=True)
     led = [_is_led(group) for group in _groups(rows)]
     print(f"ours leads in {sum(led)} of {len(led)} passages")
     print(table(rows))
-    if wishes.output:
-        wishes.output.mkdir(parents=True, exist_ok=True)
-        (wishes.output / "narrow.md").write_text(table(rows) + "\n", encoding="utf-8")
-        with (wishes.output / "narrow.csv").open("w", newline="", encoding="utf-8") as file:
+    if options.output:
+        options.output.mkdir(parents=True, exist_ok=True)
+        (options.output / "narrow.md").write_text(table(rows) + "\n", encoding="utf-8")
+        with (options.output / "narrow.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(asdict(rows[0])))
             writer.writeheader()
             writer.writerows(asdict(row) for row in rows)
@@ -95,7 +97,7 @@ def _contestants(passage: Passage, limit: float) -> dict[str, Run]:
         "RRTConnect, compiled": lambda seed: _rrt(problem, passage, _RANGE * extent, seed, limit),
         "RRTConnect*, compiled": lambda seed: _rrt(problem, passage, extent, seed, limit),
     }
-    for run in made.values():  # machine code is made
+    for run in made.values():  # compiles machine code
         run(0)
     for name in OMPL:
         made[f"{name}, OMPL"] = _of_ompl(asked, check, name, extent, limit)
@@ -143,9 +145,9 @@ def _of_ompl(passage: Passage, check: EdgeCheck, name: str, extent: float, limit
 
 
 def _rows(passage: Passage, contestants: dict[str, Run], runs: int) -> list[Row]:
-    """All planners take turns in random order: other work on the machine slows all of them alike.
+    """All planners alternate in random order: other work on the machine slows all of them alike.
 
-    One that finds nothing in `_ENOUGH` runs is not asked again.
+    One that finds nothing in `_ENOUGH` runs is not run again.
     """
     spent: dict[str, list[float]] = {name: [] for name in contestants}
     rng = np.random.default_rng(0)
@@ -180,7 +182,7 @@ def _is_led(group: Sequence[Row]) -> bool:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The rows as Markdown: a line a passage, found and median in each cell."""
+    """The rows as Markdown: one line per passage, found and median in each cell."""
     names = list(dict.fromkeys(row.planner for row in rows))
     lines = [
         "| passage | gap | " + " | ".join(names) + " |",
@@ -200,7 +202,7 @@ def _time(spent_ms: float) -> str:
     return f"{spent_ms:.3g} ms" if np.isfinite(spent_ms) else "–"
 
 
-def _wishes() -> argparse.Namespace:
+def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--runs", type=int, default=10, help="runs of every planner")
     parser.add_argument("--limit-s", type=float, default=1.0, help="processor time of a run")

@@ -25,10 +25,10 @@ PLANNERS = ("RRTConnect", "RRTConnect*", "RRTstar", "InformedRRTstar", "BITstar"
 
 
 class Question:
-    """A start, a goal and a checker, as OMPL wants them."""
+    """A start, a goal and a checker, in OMPL's form."""
 
     def __init__(self, rig: Rig, scene: Scene, check: EdgeCheck | FclStates) -> None:
-        """Makes the space once; every run gets its own planner and problem."""
+        """Builds the space once; every run gets its own planner and problem."""
         self._space = base.RealVectorStateSpace(3)
         bounds = base.RealVectorBounds(3)
         for axis in range(3):
@@ -45,7 +45,7 @@ class Question:
         self.ends = self._state(scene.start.position), self._state(scene.goal.position)
 
     def run(self, planner: str, marks_s: Sequence[float]) -> Result:
-        """Runs a planner until the last mark; one that never improves, until its first path."""
+        """Runs a planner until the last mark, or its first path if it does not improve paths."""
         self.checks = 0
         problem = base.ProblemDefinition(self.information)
         problem.setStartAndGoalStates(*self.ends)
@@ -136,7 +136,7 @@ class _Curve:
 
 
 def seed(number: int) -> None:
-    """Seeds OMPL's random numbers, once for the whole process: it allows no more."""
+    """Seeds OMPL's random numbers; it allows this once per process."""
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(number)
 

@@ -1,4 +1,4 @@
-"""How near the default planner comes to the best paths known, and how soon.
+"""Excess of the default planner's paths over the best known ones, by time.
 
     python benchmarks/planner/optimal.py                       # 100 seeds: about three minutes
     python benchmarks/planner/optimal.py --seeds 10 -o results
@@ -6,8 +6,8 @@
 For every environment of the paper and each objective the excess of the best path after 5 to 200 ms
 over a fine reference computed in the same run (`reference.py`): length, and the line integral of
 the kinematic cost from the model itself. Processor time of this process after the preparation of
-the scene, whose time is told apart. The path of every run at its last mark goes through
-`planner.check`.
+the scene, whose time is shown separately. `planner.check` checks the path of every run at its last
+mark.
 """
 
 from __future__ import annotations
@@ -59,28 +59,28 @@ class Row:
 
 def main() -> None:
     """Runs, prints and writes."""
-    wishes = _wishes()
+    options = _options()
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     rows: list[Row] = []
     with Progress(disable=not sys.stderr.isatty()) as bar:
-        total = len(wishes.environments) * len(wishes.objectives) * wishes.seeds
+        total = len(options.environments) * len(options.objectives) * options.seeds
         task = bar.add_task("searching", total=total)
-        for environment in wishes.environments:
+        for environment in options.environments:
             asked = question(rig, load_scene(CONFIGS / f"environment_{environment}.yaml"))
-            for name in wishes.objectives:
+            for name in options.objectives:
                 runs = []
-                for seed in range(wishes.seeds):
-                    runs.append(_paths(asked, OBJECTIVES[name], seed, wishes.marks_ms))
+                for seed in range(options.seeds):
+                    runs.append(_paths(asked, OBJECTIVES[name], seed, options.marks_ms))
                     bar.advance(task)
-                rows += _rows(asked, environment, name, wishes.marks_ms, runs)
+                rows += _rows(asked, environment, name, options.marks_ms, runs)
             spent = ", ".join(f"{s * 1e3:.0f}" for s in _preparations(asked))
             print(f"environment {environment}: preparation {spent} ms of processor time")
     text = _table(rows)
     print(text)
     for sentence in _verdicts(rows):
         print(sentence)
-    if wishes.output:
-        _write(wishes.output, rows, text)
+    if options.output:
+        _write(options.output, rows, text)
 
 
 def _problem(asked: Question, weights: Weights) -> PathProblem:
@@ -101,7 +101,7 @@ def _preparations(asked: Question) -> list[float]:
 def _paths(
     asked: Question, weights: Weights, seed: int, marks_ms: Sequence[float]
 ) -> list[Array | None]:
-    """The best path that was there at each mark."""
+    """The best path at each mark."""
     problem = _problem(asked, weights)
     # Machine code is loaded when first called.
     advance(handle_of(problem, new_search(*asked.ends, 0)), 1)
@@ -164,28 +164,28 @@ def _table(rows: Sequence[Row]) -> str:
 
 
 def _verdicts(rows: Sequence[Row]) -> list[str]:
-    """What was asked for, beside what was found."""
-    said = []
+    """Targets beside results."""
+    lines = []
     for r in rows:
         if r.objective == "length" and r.time_ms in (20.0, 50.0):
             limit = 1.0 if r.time_ms == 20.0 else 0.3
             known = KNOWN_MM[r.environment] / r.reference_mm
             over_known = (1.0 + r.median / 100.0) / known * 100.0 - 100.0
             held = max(r.median, over_known) <= limit and r.worst <= 3.0 and r.found == r.seeds
-            said.append(
+            lines.append(
                 f"environment {r.environment}, length after {r.time_ms:g} ms: median"
                 f" {r.median:+.2f} % ({over_known:+.2f} % over {KNOWN_MM[r.environment]} mm),"
                 f" wanted ≤ {limit:g} %; worst {r.worst:+.2f} %, wanted ≤ 3 %;"
                 f" {'held' if held else 'NOT held'}"
             )
         elif r.objective == "kinematic" and r.time_ms == 50.0:
-            said.append(
+            lines.append(
                 f"environment {r.environment}, kinematic integral after 50 ms: median"
                 f" {r.median:+.2f} %, wanted ≤ 1 %; worst {r.worst:+.2f} %;"
                 f" {'held' if r.median <= 1.0 and r.found == r.seeds else 'NOT held'}"
             )
     refused, checked = sum(r.refused for r in rows), sum(r.checked for r in rows)
-    return [*said, f"{checked - refused} of {checked} paths passed planner.check"]
+    return [*lines, f"{checked - refused} of {checked} paths passed planner.check"]
 
 
 def _write(folder: Path, rows: Sequence[Row], text: str) -> None:
@@ -199,7 +199,7 @@ def _write(folder: Path, rows: Sequence[Row], text: str) -> None:
         writer.writerows(records)
 
 
-def _wishes() -> argparse.Namespace:
+def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seeds", type=int, default=100, help="searches of each kind")
     parser.add_argument("--environments", type=int, nargs="+", default=[1, 2, 3])

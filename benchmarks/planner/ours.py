@@ -1,4 +1,4 @@
-"""Our planner under the same question and the same clock as OMPL's."""
+"""Our planner on the same problem and with the same clock as OMPL's."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from planner.settings import Weights
 
 NAME = "optimal"
 _TRIES = 10
-"""Turns of trees and roadmap in a call."""
+"""Alternations of trees and roadmap in a call."""
 _MANY = 2000
 
 
 class Contestant:
-    """The planner that `cdpr plan` uses, for the shortest path.
+    """The planner of `cdpr plan`, for the shortest path.
 
-    It keeps more than the others are asked to: self clearance and wrench feasibility (on the
-    paper's rig both are proved for the whole workspace before the search), and a small reserve.
+    It keeps more limits than the others: self clearance and wrench feasibility (on the paper's rig
+    both are proved for the whole workspace before the search), and a small reserve.
     """
 
     def __init__(self, rig: Rig, scene: Scene) -> None:
-        """Makes the problem once and has the machine code made."""
+        """Builds the problem once and compiles the machine code."""
         cost = KinematicCost(rig, scene.start.rotation)
         self._problem = problem_of(rig, scene, Weights(length=1.0), cost)
         self._start, self._goal = (np.array(p.position) for p in (scene.start, scene.goal))
@@ -55,12 +55,12 @@ class Contestant:
 
     @property
     def open_comparisons(self) -> int:
-        """Of cables with each other and the platform: those not proved over the whole workspace."""
+        """Number of self-clearance comparisons not proved over the whole workspace."""
         robot = self._problem.robot
         return len(robot.open_pairs) + len(robot.open_cables)
 
     def rounds_us(self, rounds: int, seed: int) -> float:
-        """Processor time of so many rounds of the search, [µs]; not a number without a path."""
+        """Processor time of ``rounds`` rounds of the search, [µs]; NaN without a path."""
         search = new_search(self._start, self._goal, seed)
         handle = handle_of(self._problem, search)
         begin = time.process_time()
@@ -71,7 +71,7 @@ class Contestant:
     def mean_first_us(self) -> float:
         """Mean processor time to the first path inside compiled code, [µs].
 
-        Without what one call from Python costs, which OMPL pays at every check instead.
+        Without the cost of a call from Python, which OMPL pays at every check.
         """
         handle = handle_of(self._problem, new_search(self._start, self._goal, 0))
         _many(handle, 1)
@@ -81,7 +81,7 @@ class Contestant:
         return spent / _MANY * 1e6 if found == _MANY else np.inf
 
     def mean_rival_us(self, share: float) -> float:
-        """The same of RRTConnect, compiled, its steps at most a share of the space's extent."""
+        """The same for compiled RRTConnect, with steps up to a share of the space's extent."""
         low, high = self._problem.world.limits
         extent = float(np.linalg.norm(high - low))
         return compiled_rrt.mean_first_us(self._problem, self._start, self._goal, share * extent)
@@ -97,9 +97,9 @@ class Contestant:
 
 @kernel
 def first_path(handle: Handle) -> int:
-    """What a round begins with: the two trees and the roadmap, without the polishing after it.
+    """The beginning of a round: the two trees and the roadmap, without polishing.
 
-    Called again it goes on. Returns the number of vertices; 0 where there is no path yet.
+    Called again it continues. Returns the number of vertices; 0 where there is no path yet.
     """
     search = handle.search
     for _ in range(_TRIES):
@@ -111,7 +111,7 @@ def first_path(handle: Handle) -> int:
 
 @kernel
 def _many(handle: Handle, times: int) -> int:
-    """Searches for a first path so many times; returns how often there was one."""
+    """Searches for a first path ``times`` times; returns how often one was found."""
     found = 0
     for _ in range(times):
         handle.search.grown[:] = 0

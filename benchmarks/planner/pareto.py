@@ -1,9 +1,9 @@
-"""Length against average kinematic cost: what a better average costs in way, per environment.
+"""Length against average kinematic cost: the length that a better average costs, per environment.
 
     python benchmarks/planner/pareto.py -o results             # both boxes: some minutes
 
 The best paths known (`reference.py`) for ∫ (c + λ) ds with prices λ from those of the shortest path
-to negative ones, which prefer longer ways to a lower average, in the rig's own box and in the wide
+to negative ones, which prefer longer paths to a lower average, in the rig's own box and in the wide
 one (±350, 100–750 mm). Beside them what `cdpr plan --cost kinematic` finds in its default budget.
 Averages and integrals come from the model along the path, scaled over the box that they are in.
 """
@@ -34,7 +34,7 @@ from planner.settings import OBJECTIVES, OptimalSettings
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 CLAIM = 18.2
-"""By how many per cent the paper says that the average gets better."""
+"""Improvement of the average that the paper claims, [%]."""
 PRICES = (np.inf, 1.0, 0.4, 0.2, 0.1, 0.0, -0.4, -0.7, -0.9)
 """λ in units of the average along the shortest path; the negative ones of the least cost."""
 
@@ -57,20 +57,20 @@ class Point:
 
 def main() -> None:
     """Searches, prints, writes."""
-    wishes = _wishes()
+    options = _options()
     paper = load_rig(CONFIGS / "gachon_8_6.yaml")
-    cases = [(box, environment) for box in wishes.boxes for environment in wishes.environments]
+    cases = [(box, environment) for box in options.boxes for environment in options.environments]
     points: list[Point] = []
     for box, environment in track(cases, "fronts", disable=not sys.stderr.isatty()):
         points += _front(with_box(paper, box), box, environment)
     for line in _table(points):
         print(line)
-    for box in wishes.boxes:
+    for box in options.boxes:
         print(f"\nIn the box {box_text(with_box(paper, box))}:")
-        for environment in wishes.environments:
+        for environment in options.environments:
             print(_finding([p for p in points if (p.box, p.environment) == (box, environment)]))
-    if wishes.output:
-        _write(wishes.output, points)
+    if options.output:
+        _write(options.output, points)
 
 
 def _front(rig: Rig, box: str, environment: int) -> list[Point]:
@@ -129,7 +129,7 @@ def _table(points: Sequence[Point]) -> list[str]:
 
 
 def _finding(points: Sequence[Point]) -> str:
-    """What holds in one environment, in words."""
+    """The findings in one environment, in words."""
     front = sorted((p for p in points if p.made_by == "reference"), key=lambda p: p.length_mm)
     integral = min(front, key=lambda p: p.integral_mm)
     best = min(front, key=lambda p: p.average)
@@ -144,7 +144,7 @@ def _finding(points: Sequence[Point]) -> str:
 
 
 def _longer_for(front: Sequence[Point], percent: float) -> float | None:
-    """How much longer a path must be for an average, between the points of the front."""
+    """Excess length for an average, interpolated between the points of the front."""
     for before, after in itertools.pairwise(front):
         if after.average_percent <= percent:
             drop = before.average_percent - after.average_percent
@@ -168,7 +168,7 @@ def _write(folder: Path, points: Sequence[Point]) -> None:
         figure.savefig(folder / f"pareto.{ending}", dpi=150)
 
 
-def _wishes() -> argparse.Namespace:
+def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--environments", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--boxes", nargs="+", default=[OWN, WIDE], choices=list(SHARES))

@@ -24,9 +24,9 @@ class Passage:
     """One row of the suite.
 
     Attributes:
-        name: Of its kind.
-        gap: How far the platform can move to the side in it, [m].
-        rig: With a workspace box that leaves no other way.
+        name: Kind of passage.
+        gap: Lateral play of the platform in it, [m].
+        rig: With a workspace box that leaves no other path.
         scene: Obstacles, start and goal.
         path: A path through it, shape (k, 3), [m].
     """

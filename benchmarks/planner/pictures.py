@@ -72,7 +72,7 @@ def _firsts(axes: Any, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def growth_figure(panels: Sequence[tuple[str, str, dict[str, list[tuple[int, float]]]]]) -> Figure:
-    """Time over size; a dotted line through the first point of each curve grows linearly.
+    """Time over size; the dotted line through the first point of each curve is linear growth.
 
     Args:
         panels: Title, name of the size, and curves of (size, microseconds) by name.
@@ -99,7 +99,7 @@ def growth_figure(panels: Sequence[tuple[str, str, dict[str, list[tuple[int, flo
 
 
 def pareto_figure(points: Sequence[dict[str, Any]], claim: float) -> Figure:
-    """Change of the average kinematic cost over that of the length, a panel each environment."""
+    """Change of average kinematic cost over change of length, one panel per environment."""
     from matplotlib.figure import Figure
 
     environments = sorted({point["environment"] for point in points})

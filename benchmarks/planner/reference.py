@@ -1,8 +1,8 @@
-"""Fine references: the best path that much more time, a dense graph and polishing find.
+"""Fine references: the best paths from much more time, a dense graph and more polishing.
 
-They are upper bounds of the optimum, made by the same exact edges as the planner under test but
-from a graph 30 times as dense and some thousand times the polishing. The kinematic cost is taken
-from the dense grid, and integrals are computed from the model itself, not from any grid.
+They are upper bounds of the optimum, from the same exact edges as the planner under test but a
+graph 30 times as dense and some thousand times the polishing. The kinematic cost is taken from the
+dense grid, and integrals are computed from the model itself, not from a grid.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from planner.settings import Weights
 from planner.space import Lattice
 
 DENSE = 0.008
-"""Between points of the dense graph, [m]."""
+"""Spacing of points of the dense graph, [m]."""
 SAMPLING = 0.001
-"""Between samples of exact integrals, [m]."""
+"""Spacing of samples of exact integrals, [m]."""
 _TRIALS = 400
 _FIRST_POLISHING = 30
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is done for one reference.
+    """Effort for one reference.
 
     Attributes:
         spreads: Of the costs of edges, for each path through the dense graph.
-        searches: Long ones of the planner itself.
+        searches: Number of long searches by the planner itself.
         rounds: Of each of them.
-        finalists: The best paths of both, which are polished.
+        finalists: Number of best paths of both kinds that are polished.
         polishing: Rounds for each of those.
     """
 
@@ -88,9 +88,9 @@ class Question:
         """The line integral of the kinematic cost along a path from the model, [m]."""
         steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
         counts = np.maximum(1, np.ceil(steps / SAMPLING)).astype(int)
-        starts, ways = np.repeat(path[:-1], counts, axis=0), np.diff(path, axis=0)
+        starts, moves = np.repeat(path[:-1], counts, axis=0), np.diff(path, axis=0)
         shares = np.concatenate([(np.arange(n) + 0.5) / n for n in counts])
-        at = self.cost.at(starts + shares[:, None] * np.repeat(ways, counts, axis=0))
+        at = self.cost.at(starts + shares[:, None] * np.repeat(moves, counts, axis=0))
         return float((at * np.repeat(steps / counts, counts)).sum())
 
     def value(self, length: float, kinematic: float, path: Array) -> float:
@@ -134,10 +134,10 @@ def reference_of(
 
     Args:
         asked: The scene.
-        length: Its weight; may be negative, but less so than the least kinematic cost makes good.
+        length: Its weight; may be negative if the least kinematic cost outweighs it.
         kinematic: Its weight.
-        also: Paths to polish beside those of the dense graph and of long searches.
-        effort: How much is done.
+        also: Paths to polish besides those of the dense graph and of long searches.
+        effort: Effort of the search.
     """
     fine = asked.fine._replace(terms=asked.fine.terms.copy())
     fine.terms[[LENGTH, KINEMATIC]] = length, kinematic

@@ -1,4 +1,4 @@
-"""What a run of any planner gives."""
+"""Result of a run of any planner."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Result:
     Attributes:
         first_s: Processor time to the first path, [s]; infinite without one.
         lengths_m: Length of the best path at each mark, [m]; infinite without one.
-        checks: Edges or, with python-fcl, poses that were asked about.
+        checks: Number of edges or, with python-fcl, poses checked.
         path: The last path, shape (k, 3), [m]; empty without one.
     """
 

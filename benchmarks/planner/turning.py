@@ -1,8 +1,8 @@
-"""How long proofs of turning moves take, and how good paths are after a time.
+"""Time of proofs of rotating moves, and quality of paths after a time.
 
     python -m benchmarks.planner.turning [--seeds 10]
 
-Times are of the processor, so that other programs count less.
+Times are processor time, so that other programs count less.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from model.files.scene_file import SceneDocument
 from model.pose import Array
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene, scene_from_document
-from planner.anytime_6d.moves import matrix_of, put_turned, turn_between
+from planner.anytime_6d.moves import matrix_of, put_rotated, turn_between
 from planner.anytime_6d.path import RotatingSearch, turning_problem
 from planner.anytime_6d.problem import RotatingProblem, move_allowed
 from planner.collision.rotating_edges import turning_edge_free
@@ -29,13 +29,13 @@ from planner.space import PoseSpace
 from planner.wrench.rotation import turning_edge_held
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-WAY, ANGLE = 0.040, np.radians(2.0)
+DISTANCE, ANGLE = 0.040, np.radians(2.0)
 MARKS = (0.050, 0.500)
 REPEATS = 20
 
 
 def hall() -> tuple[Rig, Scene]:
-    """The hall with a goal that is tilted and turned."""
+    """The hall with a goal that is tilted and rotated."""
     document = load_scene(CONFIGS / "hall_pillar.yaml").document.model_dump()
     tilt = [float(np.cos(0.05)), 0.0, float(np.sin(0.05)), 0.0]
     document["goal"]["rotation_wxyz"] = tilt
@@ -45,18 +45,18 @@ def hall() -> tuple[Rig, Scene]:
 
 
 def allowed_moves(problem: RotatingProblem, count: int) -> list[tuple[Array, Array]]:
-    """Random moves of `WAY` and `ANGLE` that keep everything."""
+    """Random moves of `DISTANCE` and `ANGLE` that keep all limits."""
     random, found = np.random.default_rng(0), []
     limits, tallies = problem.world.limits, np.zeros(6, dtype=np.int64)
     while len(found) < count:
         start, end = np.zeros(7), np.zeros(7)
         start[:3], start[3] = random.uniform(*limits), 1.0
-        tip, way, turn = random.normal(size=(3, 3))
+        tip, heading, turn = random.normal(size=(3, 3))
         tip *= 0.5 * problem.tilt / np.linalg.norm(tip)
-        put_turned(start.copy(), (tip[0], tip[1], 0.0), start)
-        end[:3] = start[:3] + WAY * way / np.linalg.norm(way)
+        put_rotated(start.copy(), (tip[0], tip[1], 0.0), start)
+        end[:3] = start[:3] + DISTANCE * heading / np.linalg.norm(heading)
         turn *= ANGLE / np.linalg.norm(turn)
-        put_turned(start, (turn[0], turn[1], turn[2]), end)
+        put_rotated(start, (turn[0], turn[1], turn[2]), end)
         if move_allowed(problem, start, end, tallies):
             found.append((start, end))
     return found
@@ -73,7 +73,7 @@ def microseconds(check: Callable[[int], object], count: int) -> float:
 
 
 def edges(problem: RotatingProblem) -> None:
-    """Prints what the parts of the proof of one allowed move take."""
+    """Prints the times of the parts of the proof of one allowed move."""
     moves = allowed_moves(problem, 60)
     given = [
         (a[:3], b[:3], matrix_of(a), np.array(turn_between(a, b))) for a, b in moves
@@ -86,8 +86,9 @@ def edges(problem: RotatingProblem) -> None:
         "wrenches": lambda k: turning_edge_held(world, load, reserve, *given[k]),
         "all": lambda k: move_allowed(problem, *moves[k], tallies),
     }
-    told = ", ".join(f"{name} {microseconds(f, len(moves)):.1f}" for name, f in parts.items())
-    print(f"  µs for an allowed move of {WAY * 1e3:g} mm and {np.degrees(ANGLE):g} deg: {told}")
+    times = ", ".join(f"{name} {microseconds(f, len(moves)):.1f}" for name, f in parts.items())
+    move = f"{DISTANCE * 1e3:g} mm and {np.degrees(ANGLE):g} deg"
+    print(f"  µs for an allowed move of {move}: {times}")
 
 
 def searches(rig: Rig, scene: Scene, problem: RotatingProblem, seeds: int) -> None:
@@ -108,9 +109,7 @@ def searches(rig: Rig, scene: Scene, problem: RotatingProblem, seeds: int) -> No
         firsts.append(first * 1e3)
         lengths.append(reached)
     low, middle, high = np.quantile(firsts, (0.0, 0.5, 1.0))
-    print(
-        f"  first path, one round of polishing in it: median {middle:.1f} ms, {low:.1f}–{high:.1f}"
-    )
+    print(f"  first path, with one polishing round: median {middle:.1f} ms, {low:.1f}–{high:.1f}")
     for mark, column in zip(MARKS, np.array(lengths).T, strict=True):
         print(
             f"  after {mark * 1e3:g} ms: median {np.median(column):.1f} mm,"

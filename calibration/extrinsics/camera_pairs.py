@@ -34,9 +34,9 @@ from calibration.tag_map.observations import TagObservations, observe_tags, plat
 from calibration.targets.boards import Board, Charuco, DetectedBoard
 from calibration.targets.grids import TagGrid
 from executor.kernels import ready_to_measure
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.errors import BadInput
-from model.pose import Array, Pose, carried, matrix_from_rotation_vector, read_only
+from model.pose import Array, Pose, lever_arm_matrix, matrix_from_rotation_vector, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from tracking.camera_model import Image, project_undistorted, undistort_pixels
@@ -169,7 +169,7 @@ def locate_by_pairs(
         by="another camera",
         covariance=read_only(relative + shared),
         by_lens=None,
-        half_widths=read_only(np.hypot(own_widths, SURE * np.sqrt(np.diag(shared)))),
+        half_widths=read_only(np.hypot(own_widths, Z_95 * np.sqrt(np.diag(shared)))),
         points=workspace_corners(rig),
         tag_errors={} if not rig.platform_tags else {rig.platform_tags[0].id: error},
         pictures=len(pairs),

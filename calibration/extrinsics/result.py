@@ -16,7 +16,7 @@ from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, page_of, table_of
 from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import CONFIDENCE, Interval, rms_bound
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.files.camera_file import PoseCovariance, PoseSlopes
 from model.files.documents import AnyNonNegative, PoseDocument, Vector
 from model.files.rig_file import RigDocument
@@ -64,7 +64,7 @@ class ExtrinsicCalibration:
     def stated_covariance(self) -> Array:
         """The covariance scaled to the half widths (1.96 deviations), (6, 6), [m, rad]."""
         deviations = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance * np.outer(*2 * [self.half_widths / SURE / deviations]))
+        return np.asarray(self.covariance * np.outer(*2 * [self.half_widths / Z_95 / deviations]))
 
     @property
     def error(self) -> float:
@@ -112,7 +112,7 @@ def widths_of(covariance: Array, without: Sequence[Array]) -> Array:
     Returns:
         The larger of both, shape (k,).
     """
-    by_scatter = SURE * np.sqrt(np.diag(covariance))
+    by_scatter = Z_95 * np.sqrt(np.diag(covariance))
     count = len(without)
     if count < 3:
         return np.asarray(by_scatter)

@@ -145,7 +145,7 @@ def locate_by_frame_tags(
         camera=replace(camera, world_from_camera=pose),
         by="frame tags",
         covariance=read_only(covariance),
-        half_widths=read_only(SURE * np.sqrt(np.diag(covariance))),
+        half_widths=read_only(Z_95 * np.sqrt(np.diag(covariance))),
         by_lens=by_lens,
         points=workspace_corners(rig),
         tag_errors={t.number: float(np.sqrt(np.mean(t.errors(camera, best) ** 2))) for t in tags},

@@ -62,7 +62,7 @@ class Uncertainty:
 
         That of the scatter, scaled up by `widened`.
         """
-        quantile = _quantile(len(self.without)) / SURE
+        quantile = _quantile(len(self.without)) / Z_95
         return widened(self.covariance, self.without) * quantile**2
 
     def error_of(self, slopes: Array) -> float:

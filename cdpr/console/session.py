@@ -56,7 +56,7 @@ from model.errors import CdprError, Refused
 from model.files.documents import millimetres, write_atomic
 from model.pose import Pose
 from model.rig import Rig
-from model.scene import Scene, load_scene, nothing_in_the_way
+from model.scene import Scene, empty_scene, load_scene
 
 #: Latch and reference are read this often at most, [s].
 KEPT_EVERY = 0.5
@@ -356,7 +356,7 @@ class Console:
         self.verbs.start("plan", [rig, str(scene), *options])
 
     def _taught_scene(self) -> Path:
-        around = nothing_in_the_way(self.rig) if self.scene is None else self.scene
+        around = empty_scene(self.rig) if self.scene is None else self.scene
         document = self.poses.scene(around, "taught")
         path = MADE / "taught.yaml"
         MADE.mkdir(exist_ok=True)

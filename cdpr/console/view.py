@@ -20,7 +20,7 @@ from model.kinematics import cables_at, forward_kinematics
 from model.pages.scene import SceneFigure, Stroke, grid_floor, scene_data
 from model.pose import Pose
 from model.rig import Rig
-from model.scene import Scene, nothing_in_the_way
+from model.scene import Scene, empty_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
@@ -199,7 +199,7 @@ class RobotView:
 
     def _set(self, rig: Rig, scene: Scene | None) -> None:
         self.rig = rig
-        self.scene = nothing_in_the_way(rig) if scene is None else scene
+        self.scene = empty_scene(rig) if scene is None else scene
         self._winches = WinchMap(rig)
         self._model = ClearanceModel(rig, self.scene)
         self._pose = rig.home

@@ -28,7 +28,7 @@ from model.files.scene_file import SceneDocument
 from model.pose import Pose
 from model.progress import Listener
 from model.rig import Camera, Rig, rig_from_document
-from model.scene import Scene, nothing_in_the_way, scene_from_document
+from model.scene import Scene, empty_scene, scene_from_document
 from tracking.measurement import Observation
 
 if TYPE_CHECKING:  # a real camera loads no simulator
@@ -200,7 +200,7 @@ def look_at_rest(
         listener: Receives that the camera opens.
     """
     camera, source = eye
-    scene = nothing_in_the_way(rig).document
+    scene = empty_scene(rig).document
     make = partial(
         make_observer, rig.document, scene, camera.name, source, None, pictures, named=False
     )

@@ -42,7 +42,7 @@ from model.kinematics import cable_lengths
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig
-from model.scene import Load, Scene, nothing_in_the_way
+from model.scene import Load, Scene, empty_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
@@ -92,7 +92,7 @@ def jog_session(
     interlock = MotionInterlock(slow)
     interlock.require_free()
     ready = interlock.referenced_rig()
-    around = (nothing_in_the_way(slow) if scene is None else scene).changed(stops=())
+    around = (empty_scene(slow) if scene is None else scene).changed(stops=())
     start = ready.home if is_simulated(ready) else measured_pose(ready, around)
     require_confirmed(confirm, JogProposal(ready, around, start))
     session = _Session(

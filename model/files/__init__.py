@@ -1,1 +1,1 @@
-"""Files at the border: pydantic documents, limits on reading, and messages about their faults."""
+"""File formats: pydantic documents, limits on reading, and messages about problems."""

@@ -1,4 +1,4 @@
-"""The part of a rig file that says what cameras and tags it has."""
+"""The cameras and tags of a rig file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from model.files.documents import (
     Positive,
 )
 
-# Families of fiducial tags: what can be printed and found, by their names in rig files.
+# Families of fiducial tags that can be printed and detected, by their names in rig files.
 
 
 AprilTagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
@@ -30,12 +30,12 @@ ArucoDictionary = Literal[
     "ARUCO_ORIGINAL", "ARUCO_MIP_36H12",
 ]  # fmt: skip
 TagFamily = Literal[AprilTagFamily, ArucoDictionary]
-#: What finds tags in images: OpenCV, or pyapriltags of the extra `apriltag`.
+#: Tag detectors: OpenCV, or pyapriltags from the extra `apriltag`.
 TagDetectorName = Literal["opencv", "apriltag"]
 
 APRILTAG_FAMILIES: tuple[str, ...] = get_args(AprilTagFamily)
 DETECTORS: tuple[str, ...] = get_args(TagDetectorName)
-#: All that can be printed and found.
+#: All families.
 FAMILIES: tuple[str, ...] = APRILTAG_FAMILIES + get_args(ArucoDictionary)
 
 
@@ -47,9 +47,9 @@ def opencv_dictionary(family: str) -> str:
 
 
 def drawn_upside_down(family: str) -> bool:
-    """Whether OpenCV draws the family turned by 180° against the prints of its own project.
+    """Whether OpenCV draws the family rotated by 180° against the prints of its own project.
 
-    It does so with the families of the AprilTag project, whose images labs print.
+    It does so for the families of the AprilTag project, whose images labs print.
     """
     return family in APRILTAG_FAMILIES
 
@@ -59,12 +59,12 @@ _NAMED = {"ARUCO_ORIGINAL": 1024, "ARUCO_MIP_36H12": 250}
 
 
 def tags_in(family: str) -> int:
-    """How many tags a family has, numbered from 0."""
+    """Number of tags in a family; ids count from 0."""
     named = _APRILTAGS | _NAMED
     return named[family] if family in named else int(family.split("_")[1])
 
 
-# Models of lenses, as rig files name them.
+# Lens models, as rig files name them.
 
 
 FISHEYE = "fisheye"
@@ -74,10 +74,10 @@ LensName = Literal["pinhole", "fisheye"]
 
 
 def require_coefficients(lens: str, count: int) -> None:
-    """Refuses numbers of distortion coefficients that OpenCV's model does not have.
+    """Refuses a number of distortion coefficients that OpenCV's model does not have.
 
     Raises:
-        ValueError: It has no such number.
+        ValueError: The number does not fit the lens model.
     """
     known = (4,) if lens == FISHEYE else (0, 4, 5, 8, 12, 14)
     if count not in known:
@@ -86,7 +86,7 @@ def require_coefficients(lens: str, count: int) -> None:
         raise ValueError(f"a {lens} lens needs {listed} coefficients, it has {count}")
 
 
-# How sure a calibration is of a camera.
+# Covariances of a calibrated camera.
 
 
 def _is_covariance(rows: list[list[float]], count: int) -> list[list[float]]:
@@ -98,7 +98,7 @@ def _is_covariance(rows: list[list[float]], count: int) -> list[list[float]]:
     if not np.allclose(alike, alike.T, rtol=1e-6, atol=1e-6):
         raise ValueError(f"needs {count} rows of {count} numbers, symmetric")
     if np.diag(matrix).min() < 0.0 or np.linalg.eigvalsh(alike)[0] < -1e-6:
-        raise ValueError("is no covariance: it has a negative eigenvalue")
+        raise ValueError("is not a covariance: it has a negative eigenvalue")
     return rows
 
 
@@ -108,18 +108,18 @@ def _is_covariance_of_numbers(rows: list[list[float]]) -> list[list[float]]:
 
 def _has_six_rows(rows: list[list[float]]) -> list[list[float]]:
     if len(rows) != 6 or len({len(row) for row in rows}) != 1:
-        raise ValueError("needs 6 rows, of as many numbers each as the camera has")
+        raise ValueError("needs 6 rows, each with one number per lens number of the camera")
     return rows
 
 
 PoseCovariance = Annotated[
     list[list[AnyNumber]], AfterValidator(lambda rows: _is_covariance(rows, 6))
 ]
-"""Of a pose: position [mm] and turns about the outer frame's axes [deg], 6 x 6."""
+"""Of a pose: position [mm] and rotation about the outer frame's axes [deg], 6 x 6."""
 LensCovariance = Annotated[list[list[AnyNumber]], AfterValidator(_is_covariance_of_numbers)]
-"""Of a camera's n numbers, as the rig file has them: fx, fy, cx, cy [px] and distortion, n x n."""
+"""Of a camera's n numbers in rig file order: fx, fy, cx, cy [px] and distortion, n x n."""
 PoseSlopes = Annotated[list[list[AnyNumber]], AfterValidator(_has_six_rows)]
-"""Of a pose by a camera's n numbers: position [mm] and turns [deg], 6 x n."""
+"""Derivatives of a pose by a camera's n numbers: position [mm] and rotation [deg], 6 x n."""
 
 
 Pixels = Annotated[int, Field(ge=64, le=16384)]
@@ -144,7 +144,7 @@ class TagsDocument(Document):
     frame: list[TagDocument] = []
     error_mm: NonNegative | None = Field(
         default=None,
-        description="how far off corners of the platform's tags are, 95 %; calibrations write it",
+        description="position error of the platform's tag corners, 95 %; calibrations write it",
     )
 
 
@@ -174,13 +174,13 @@ class CameraDocument(Document):
     )
     pose_by_lens: PoseSlopes | None = Field(
         default=None,
-        description="how errors of the numbers of lens_covariance move world_from_camera, mm and"
+        description="derivatives of world_from_camera by the numbers of lens_covariance, mm and"
         " deg; calibrations write it",
     )
     error_mm: NonNegative | None = Field(
         default=None,
-        description="how far off platform and cables are measured, 95 %, by all errors that"
-        " pictures share; used where calibrations do not state all of them",
+        description="error of measured platform and cables, 95 %, from everything that images"
+        " share; used where calibrations do not state all of it",
     )
     rate_hz: Positive = 10.0
     readout_ms: Readout = Field(
@@ -202,5 +202,5 @@ class CameraDocument(Document):
     ) -> list[list[float]] | None:
         count = 4 + len(info.data.get("distortion", []))
         if rows is not None and len(rows[0]) != count:
-            raise ValueError(f"needs {count} numbers a row: fx, fy, cx, cy and distortion")
+            raise ValueError(f"needs {count} numbers per row: fx, fy, cx, cy and distortion")
         return rows

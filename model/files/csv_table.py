@@ -1,4 +1,4 @@
-"""CSV files with named columns of numbers, as people and other programs write them."""
+"""CSV files with named columns of numbers, written by hand or by other programs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from model.pose import Array
 
 
 class CsvTable:
-    """Named columns of texts and numbers.
+    """Named columns of text and numbers.
 
     Attributes:
-        names: Of the columns, in their order.
+        names: Of the columns, in order.
     """
 
     def __init__(self, path: Path) -> None:
@@ -44,34 +44,34 @@ class CsvTable:
         """Columns of finite numbers side by side, shape (n, len(names)).
 
         Raises:
-            BadInput: One is missing, or a value is none; with its line.
+            BadInput: A column is missing, or a value is not a finite number; with its line.
         """
-        columns = [(self._place(name), name) for name in names]
+        columns = [(self._index(name), name) for name in names]
         return np.array(
             [
-                [self._number(row[place], name, line) for place, name in columns]
+                [self._number(row[index], name, line) for index, name in columns]
                 for row, line in zip(self._rows, self._lines, strict=True)
             ]
         )
 
     def texts(self, name: str) -> list[str]:
-        """A column as it stands there, without blanks at the ends.
+        """A column as text, without surrounding blanks.
 
         Raises:
             BadInput: It is missing.
         """
-        place = self._place(name)
-        return [row[place].strip() for row in self._rows]
+        index = self._index(name)
+        return [row[index].strip() for row in self._rows]
 
     def line(self, row: int) -> int:
-        """The line of a row, both counted as editors and programs do: from 1, and from 0."""
+        """The line, counted from 1, of a row, counted from 0."""
         return self._lines[row]
 
     def bad(self, what: str, next_step: str) -> BadInput:
         """The error about this file."""
         return BadInput(what, where=str(self._path), next_step=next_step)
 
-    def _place(self, name: str) -> int:
+    def _index(self, name: str) -> int:
         if name not in self.names:
             raise self.bad(f"the column {name!r} is missing", "see docs/data-formats.md")
         return self.names.index(name)

@@ -19,37 +19,37 @@ from model.errors import BadInput, InvalidFile, Problem
 from model.files.reading import YAML_LIMIT, read_text
 from model.files.validation import (
     KeyPath,
-    Places,
+    Positions,
     YamlSyntaxError,
     YamlTree,
     key_path,
     model_in,
     parse_yaml,
-    place_of,
+    position_of,
     problems_of,
 )
 from model.pose import Pose
 
-# The parts that rig, scene and plan files share: strict models, vectors, poses.
+# Parts shared by rig, scene and plan files: strict models, vectors, poses.
 
 
 LARGEST, SMALLEST = 1e12, 1e-12
-"""No size, force or count of a robot is beyond these, whatever its unit; sums and squares of what
-is within them stay finite."""
+"""No size, force or count of a robot is beyond these in any unit; sums and squares of values within
+them stay finite."""
 WHOLE_LARGEST = 2**31 - 1
-"""Of a drive position, and of other whole numbers."""
+"""Limit of drive positions and other whole numbers."""
 SEED_LARGEST = 2**63 - 1
 NAME_BYTES = 100
-"""Of a name, in UTF-8: it becomes part of file names."""
+"""Longest name in UTF-8: it becomes part of file names."""
 
 
-def _within_reason(value: float) -> float:
+def _not_too_large(value: float) -> float:
     if abs(value) > LARGEST:
         raise ValueError(f"must be within ±{LARGEST:g}; it is {value:g}")
     return value
 
 
-def _not_next_to_nothing(value: float) -> float:
+def _not_too_small(value: float) -> float:
     if value < SMALLEST:
         raise ValueError(f"must be {SMALLEST:g} or more; it is {value:g}")
     return value
@@ -65,21 +65,21 @@ def _is_name(text: str) -> str:
     return text
 
 
-_reason = AfterValidator(_within_reason)
-Number = Annotated[float, Field(allow_inf_nan=False), _reason]
+_bounded = AfterValidator(_not_too_large)
+Number = Annotated[float, Field(allow_inf_nan=False), _bounded]
 Positive = Annotated[
-    float, Field(gt=0, allow_inf_nan=False), _reason, AfterValidator(_not_next_to_nothing)
+    float, Field(gt=0, allow_inf_nan=False), _bounded, AfterValidator(_not_too_small)
 ]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), _reason]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), _bounded]
 AnyNumber = Annotated[float, Field(allow_inf_nan=False)]
-"""What a calibration found: of what cannot be identified, intervals are as wide as they are."""
+"""Of a calibration result: intervals of what cannot be identified may be arbitrarily wide."""
 AnyNonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1), AfterValidator(_is_name)]
 Seed = Annotated[int, Field(ge=0, le=SEED_LARGEST)]
 
 
 def _exactly(count: int) -> BeforeValidator:
-    """Says how many entries a list needs; pydantic alone would say "at least"."""
+    """States the exact length of a list; pydantic alone would say "at least"."""
 
     def check(value: object) -> object:
         if isinstance(value, list) and len(value) != count:
@@ -118,7 +118,7 @@ def _has_length_one(vector: list[float]) -> list[float]:
 UnitVector = Annotated[Vector, AfterValidator(_has_length_one)]
 
 Finding = tuple[tuple[str | int, ...], str]
-"""Path of a key, and a sentence about what is wrong with it."""
+"""Path of a key, and a sentence that states its problem."""
 
 
 class Document(BaseModel):
@@ -127,20 +127,20 @@ class Document(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
-        """Checks between the document's parts; each reads as few of them as it can.
+        """Checks across the document's parts; each reads as few of them as possible.
 
-        Of a file with other problems only the rules are asked whose parts are sound, so that one
+        In a file with other problems, only rules whose parts are valid are applied, so that one
         reading reports everything.
         """
         return ()
 
     def findings(self) -> list[Finding]:
-        """What is wrong between the parts of the document."""
+        """Problems across the parts of the document."""
         return [finding for rule in self.rules() for finding in rule()]
 
 
 class PoseDocument(Document):
-    """Where something is: position in mm and a unit quaternion (level when left out)."""
+    """A pose: position in mm and a unit quaternion (level when left out)."""
 
     position_mm: Vector
     rotation_wxyz: Quaternion = [1.0, 0.0, 0.0, 0.0]
@@ -157,7 +157,7 @@ class PoseDocument(Document):
 
     @staticmethod
     def of(pose: Pose) -> PoseDocument:
-        """The document of a pose; positions to a nanometre, and no negative zero among them."""
+        """The document of a pose; positions rounded to a nanometre, without negative zeros."""
         return PoseDocument(
             position_mm=[round(float(x) * 1000.0, 6) + 0.0 for x in pose.position],
             rotation_wxyz=[float(q) for q in pose.quaternion],
@@ -189,7 +189,7 @@ Model = TypeVar("Model", bound=Document)
 
 
 def read_yaml(path: Path) -> YamlTree:
-    """The plain data of a YAML file, with the place of every key.
+    """The plain data of a YAML file, with the position of every key.
 
     Raises:
         BadInput: The file cannot be read.
@@ -213,8 +213,8 @@ def load_yaml(path: Path, model: type[Model]) -> Model:
     problems = [Problem(key_path(f.key), f.what, f.line, f.column) for f in tree.faults]
     if isinstance(tree.data, dict):
         _require_kind(tree.data, model, path)
-        check_version(tree.data, model, path, tree.places)
-        document, found = _validated(tree.data, model, tree.places)
+        check_version(tree.data, model, path, tree.positions)
+        document, found = _validated(tree.data, model, tree.positions)
         problems += found
         if document is not None and not problems:
             return document
@@ -231,11 +231,11 @@ _MARKS = {
     "scene file": ("start", "goal"),
     "calibration result": ("kind", "data_sha256"),
 }
-"""Keys that only one kind of file has together."""
+"""Keys that occur together in only one kind of file."""
 
 
 def _require_kind(data: Mapping[str, Any], model: type[Document], path: Path) -> None:
-    """Refuses a whole file of another kind: the arguments of a command are in another order."""
+    """Refuses a file of another kind, as when the arguments of a command are swapped."""
     known = model.model_fields
     wanted = [kind for kind, marks in _MARKS.items() if all(key in known for key in marks)]
     given = [kind for kind, marks in _MARKS.items() if all(key in data for key in marks)]
@@ -243,15 +243,19 @@ def _require_kind(data: Mapping[str, Any], model: type[Document], path: Path) ->
         raise BadInput(
             f"this is a {given[0]}, not a {wanted[0]}",
             where=str(path),
-            why="another file was named, or the files in another order",
+            why="the wrong file was named, or the files in the wrong order",
             next_step=f"pass a {wanted[0]} here; the command's --help shows the order",
         )
 
 
 def check_version(
-    data: Mapping[str, Any], model: type[Document], path: Path, places: Places, next_step: str = ""
+    data: Mapping[str, Any],
+    model: type[Document],
+    path: Path,
+    positions: Positions,
+    next_step: str = "",
 ) -> None:
-    """Refuses a file of another schema version before anything else in it is judged.
+    """Refuses a file of another schema version before checking anything else in it.
 
     Raises:
         InvalidFile: With that one problem.
@@ -262,13 +266,13 @@ def check_version(
         return
     (known,) = field.annotation.__args__  # type: ignore[union-attr]
     if version != known:
-        what = f"the file is of schema version {version}; this program reads version {known}"
+        what = f"the file has schema version {version}; this program reads version {known}"
         hint = next_step or f"bring the file to version {known}, or use the program it was made for"
-        raise InvalidFile(str(path), [Problem(key, what, *place_of((key,), places))], hint)
+        raise InvalidFile(str(path), [Problem(key, what, *position_of((key,), positions))], hint)
 
 
 def _validated(
-    data: dict[str, Any], model: type[Model], places: Places
+    data: dict[str, Any], model: type[Model], positions: Positions
 ) -> tuple[Model | None, list[Problem]]:
     document: Model | None = None
     problems: list[Problem] = []
@@ -276,16 +280,18 @@ def _validated(
         document = model.model_validate(data)
         found = document.findings()
     except ValidationError as error:
-        problems = problems_of(error, model, places)
+        problems = problems_of(error, model, positions)
         found = _findings_of_sound_parts(data, model, error)
-    problems += [Problem(key_path(parts), what, *place_of(parts, places)) for parts, what in found]
+    problems += [
+        Problem(key_path(parts), what, *position_of(parts, positions)) for parts, what in found
+    ]
     return (document if not problems else None), problems
 
 
 def _findings_of_sound_parts(
     data: dict[str, Any], model: type[Document], error: ValidationError
 ) -> list[Finding]:
-    """What the rules between parts find, where the parts they read are sound."""
+    """Findings of the rules whose parts are valid."""
     unsound = {
         item["loc"]
         for item in error.errors(include_url=False)
@@ -294,14 +300,14 @@ def _findings_of_sound_parts(
     partial: Any = _unchecked(model, data, (), unsound)
     found: list[Finding] = []
     for rule in partial.rules():
-        # The rule reads a part that is not sound, such as a point of two numbers.
+        # The rule may read an invalid part, such as a point of two numbers.
         with suppress(AttributeError, TypeError, ValueError, ArithmeticError, LookupError):
             found += rule()
     return found
 
 
 def _unchecked(annotation: Any, value: Any, path: KeyPath, unsound: set[KeyPath]) -> Any:
-    """Documents of plain data; in place of an unsound value an object that nothing can use."""
+    """Documents from plain data, unchecked; an invalid value becomes a bare `object`."""
     if path in unsound:
         return object()
     model = model_in(annotation)
@@ -319,23 +325,23 @@ def _unchecked(annotation: Any, value: Any, path: KeyPath, unsound: set[KeyPath]
 
 
 def content_hash(document: Any) -> str:
-    """SHA-256 of a JSON-like document, whatever the order of its keys or its layout."""
+    """SHA-256 of a JSON-like document, independent of key order and layout."""
     text = json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return "sha256:" + hashlib.sha256(text.encode()).hexdigest()
 
 
 def document_hash(document: BaseModel, without: Collection[str] = ()) -> str:
-    """SHA-256 of what a document says.
+    """SHA-256 of a document's content.
 
-    A key that stands at its default counts as left out. So a key that a later version of the
-    program adds changes no hash, and a default that it changes does.
+    A key with its default value counts as left out. So a key added by a later version of the
+    program changes no hash; a changed default does.
 
     Args:
-        document: Read or made.
-        without: Keys at its top that do not count.
+        document: The document.
+        without: Top-level keys that do not count.
     """
-    said = document.model_dump(mode="json", exclude_defaults=True)
-    return content_hash({key: value for key, value in said.items() if key not in without})
+    content = document.model_dump(mode="json", exclude_defaults=True)
+    return content_hash({key: value for key, value in content.items() if key not in without})
 
 
 def write_atomic(path: Path, text: str) -> None:
@@ -367,18 +373,18 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
         with os.fdopen(handle, "wb") as stream:
             stream.write(data)
             stream.flush()
-            os.fsync(handle)  # or a power cut could leave the new name on an empty file
+            os.fsync(handle)  # or a power failure could leave the new name on an empty file
         Path(temporary).chmod(0o644)
         Path(temporary).replace(path)
         keep_names(path.parent)
     except OSError as error:
         raise _not_written(path, error, "free some space or choose another folder") from None
     finally:
-        Path(temporary).unlink(missing_ok=True)  # gone already when all went well
+        Path(temporary).unlink(missing_ok=True)  # already renamed on success
 
 
 def keep_names(folder: Path) -> None:
-    """Forces a folder to disk: a new name outlives a power cut only from then on.
+    """Syncs a folder to disk, so that new file names survive a power failure.
 
     Raises:
         OSError: The folder is gone, or the disk fails.

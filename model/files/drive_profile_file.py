@@ -1,7 +1,7 @@
-"""The drive profile file: what drives of one make have, and what differs from the standard's.
+"""The drive profile file: objects and deviations from the standard of one make of drives.
 
-It says what is so; `drivers.cia402.object_dictionary` makes of it what is written. Every fact in it
-comes from the maker's manual or EDS file, which ``sources`` names.
+It states facts; `drivers.cia402.object_dictionary` derives the values to write. Every fact in it
+comes from the maker's manual or EDS file, named in ``sources``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ OBJECTS: Mapping[str, str] = {
     "60C2h:01": "interpolation time period value",
     "60C2h:02": "interpolation time index",
 }
-"""What a profile may say something about: the objects that are set up, less the PDOs' mapping."""
+"""Objects that a profile may describe: those that are set up, except for PDO mapping."""
 
 NEEDED = (
     "1017h:00",
@@ -48,7 +48,7 @@ NEEDED = (
     "607Dh:02",
     "6085h:00",
 )
-"""Without these no run is safe, whatever a profile says."""
+"""Without these no run is safe, whatever a profile states."""
 
 _OBJECT = re.compile(r"[0-9A-F]{4}h:[0-9A-F]{2}")
 _CODE = re.compile(r"[0-9A-Fx]{4}h")
@@ -80,7 +80,7 @@ Text = Annotated[str, Field(min_length=1)]
 
 
 class Range(Document):
-    """Smallest and largest value that an object takes."""
+    """Smallest and largest value that an object accepts."""
 
     low: int
     high: int
@@ -96,7 +96,7 @@ class Expected(Document):
     object: ObjectName
     value: Annotated[int, Field(ge=0)]
     name: Text
-    why: Text = Field(description="what it is needed for, and how it is set")
+    why: Text = Field(description="what it is needed for, and how to set it")
 
 
 class TorqueLimit(Document):
@@ -107,9 +107,9 @@ class TorqueLimit(Document):
 
 
 class ProfileDocument(Document):
-    """What drives of one make have, and what of it differs from the standard's."""
+    """Objects of one make of drives, and their deviations from the standard."""
 
-    name: Text = Field(description="maker and type, as people name them")
+    name: Text = Field(description="maker and type, as displayed")
     sources: Annotated[list[Text], Field(min_length=1)] = Field(
         description="source of every fact in this file"
     )
@@ -121,61 +121,61 @@ class ProfileDocument(Document):
         default=[], description="objects that are read and must hold a value, such as units"
     )
     heartbeat_entries: Annotated[int, Field(ge=1, le=127)] | None = Field(
-        default=None, description="entries of 1016h; left out, as many as the drive says"
+        default=None, description="entries of 1016h; left out, the number that the drive states"
     )
     rpdo: Annotated[int, Field(ge=1, le=4)] = Field(
         default=1,
-        description="number of the RPDO that takes set-points: one whose mapping can be written;"
-        " all others are switched off",
+        description="number of the RPDO for set-points: one whose mapping can be written; all"
+        " others are disabled",
     )
     tpdo: Annotated[int, Field(ge=1, le=4)] = Field(
-        default=1, description="number of the TPDO that sends the replies, as rpdo"
+        default=1, description="number of the TPDO for replies, as rpdo"
     )
     monitoring: Literal["sync", "heartbeat"] = Field(
         default="sync",
         description="what stops a drive whose master is gone; heartbeat: it has no 1006h, or must"
-        " not use it, since it takes its torque off without SYNC",
+        " not use it, since it removes torque without SYNC",
     )
     sync_timeout_periods: Annotated[float, Field(ge=1.1, le=10.0)] = Field(
         default=3.0,
         description="periods of 1006h without SYNC after which a drive stops by itself; with"
-        " monitoring heartbeat, the age of SYNC from which on nothing is enabled",
+        " monitoring heartbeat, the age of SYNC from which no drive is enabled",
     )
     heartbeat_loss: Literal["quick stop", "fault"] = Field(
         default="quick stop",
-        description="what a drive does whose heartbeat producer is lost; fault: it takes its torque"
-        " off whatever 6007h says, so it is given no heartbeat to monitor",
+        description="reaction of a drive to the loss of its heartbeat producer; fault: it removes"
+        " torque whatever 6007h states, so it gets no heartbeat to monitor",
     )
     acceleration_unit: Literal["counts/s^2", "rpm/s", "rev/s^2"] = Field(
         default="counts/s^2", description="of 6085h; revolutions are of the motor shaft"
     )
     acceleration_step: Annotated[float, Field(gt=0.0, le=1e6)] = Field(
-        default=1.0, description="acceleration, in this unit, that 6085h = 1 stands for"
+        default=1.0, description="acceleration, in this unit, of 6085h = 1"
     )
     torque_limit: TorqueLimit | None = Field(
         default=None, description="left out, 6072h limits the torque"
     )
     warnings: list[CodePattern] = Field(
         default=[],
-        description="EMCY codes of mere warnings while the drive stays enabled; x is any digit",
+        description="EMCY codes of warnings with which the drive stays enabled; x is any digit",
     )
     mode_display_when_enabled: bool = Field(
         default=False, description="6061h shows the mode only once the drive is enabled"
     )
     enable_timeout_ms: Annotated[int, Field(ge=100, le=30_000)] = Field(
-        default=1000, description="the longest that enabling or releasing takes, brake included"
+        default=1000, description="longest time to enable or release, brake included"
     )
     sdo_timeout_ms: Annotated[int, Field(ge=50, le=30_000)] = Field(
-        default=2000, description="the longest that one SDO answer takes"
+        default=2000, description="longest time to one SDO reply"
     )
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
-        """Checks between the keys."""
+        """Checks across keys."""
         return (self._monitoring, self._torque, self._needed)
 
     def _monitoring(self) -> list[Finding]:
         if self.monitoring == "heartbeat" and self.heartbeat_loss == "fault":
-            what = "drives that take their torque off when the master is lost cannot be run safely"
+            what = "drives that remove torque when the master is lost cannot be run safely"
             return [(("heartbeat_loss",), what)]
         by_heartbeat = self.monitoring == "heartbeat"
         if "1006h:00" in self.absent and not by_heartbeat:
@@ -193,26 +193,26 @@ class ProfileDocument(Document):
 
     def _needed(self) -> list[Finding]:
         return [
-            (("absent", place), f"required for a safe run: {name} {OBJECTS[name]}")
-            for place, name in enumerate(self.absent)
+            (("absent", index), f"required for a safe run: {name} {OBJECTS[name]}")
+            for index, name in enumerate(self.absent)
             if name in NEEDED
         ]
 
     @property
     def watches_heartbeats(self) -> bool:
-        """Drives are given heartbeats to monitor."""
+        """Whether drives get heartbeats to monitor."""
         return self.heartbeat_loss == "quick stop" and "1016h:01" not in self.absent
 
     def has(self, index: int, sub: int) -> bool:
-        """Whether the drive has an object, as far as the profile says."""
+        """Whether the drive has an object, according to the profile."""
         return object_name(index, sub) not in self.absent
 
     def range_of(self, index: int, sub: int) -> Range | None:
-        """What values an object takes; None where the profile says nothing of it."""
+        """Values that an object accepts; None where the profile does not state them."""
         return self.ranges.get(object_name(index, sub))
 
     def is_warning(self, code: int) -> bool:
-        """Whether an EMCY code is a mere warning of a drive that stays enabled."""
+        """Whether an EMCY code is a warning of a drive that stays enabled."""
         text = f"{code:04X}h"
         return any(
             all(want in ("x", digit) for want, digit in zip(pattern, text, strict=True))
@@ -221,7 +221,7 @@ class ProfileDocument(Document):
 
 
 def object_name(index: int, sub: int) -> str:
-    """As profiles name an object: ``6072h:00``."""
+    """Name of an object in profiles: ``6072h:00``."""
     return f"{index:04X}h:{sub:02X}"
 
 

@@ -1,4 +1,4 @@
-"""The rigs, scenes and recorded sessions that come with the program: what there is, and copies."""
+"""The rigs, scenes and recorded sessions that come with the program: list and copies."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _KIND = re.compile(r"\$schema=.*/(rig|scene)\.schema\.json")
 _DESCRIPTION = re.compile(r"^description: *(.+)$", re.MULTILINE)
 _ABOUT = "README.md"
 PAPER_RIG = "gachon_8_6.yaml"
-"""The rig file of the paper's robot, in the folder of the ready files."""
+"""The rig file of the paper's robot, in the folder of the examples."""
 
 
 @dataclass(frozen=True)
 class Example:
-    """One ready file, or the folder of a recorded session.
+    """One rig or scene file, or the folder of a recorded session.
 
     Attributes:
-        name: What it is called on the command line.
+        name: Name on the command line.
         kind: ``rig``, ``scene`` or ``session``.
-        about: One line for people.
+        about: One line of description.
         source: The file or folder.
-        group: The folder in which a clone of the repository has it.
+        group: Its folder in a clone of the repository.
     """
 
     name: str
@@ -39,12 +39,12 @@ class Example:
 
     @property
     def file_name(self) -> str:
-        """Of a copy."""
+        """Name of a copy."""
         return self.source.name
 
 
 def ready_folder(name: str = "configs") -> Path:
-    """The folder of the ready rigs and scenes: in the package `cdpr`, or in the repository.
+    """The folder of the example rigs and scenes: in the package `cdpr`, or in the repository.
 
     Args:
         name: ``examples`` for the recorded sessions instead.
@@ -58,7 +58,7 @@ def find_examples(configs: Path, sessions: Path) -> list[Example]:
     """All examples: rigs, then scenes, then sessions, each by name.
 
     Args:
-        configs: The folder of the ready rigs and scenes.
+        configs: The folder of the example rigs and scenes.
         sessions: The folder of the recorded sessions.
     """
     files = [_ready_file(path) for path in configs.glob("*.yaml")]
@@ -84,17 +84,17 @@ def _session(path: Path) -> Example:
 
 
 def select_examples(examples: Iterable[Example], names: Iterable[str]) -> list[Example]:
-    """The examples of these names.
+    """The examples with these names.
 
     Raises:
-        BadInput: There is none of a name; the message lists those there are.
+        BadInput: A name is unknown; the message lists the known ones.
     """
     by_name = {example.name: example for example in examples}
     wanted = [name.removesuffix(".yaml") for name in names]
     unknown = [name for name in wanted if name not in by_name]
     if unknown:
         raise BadInput(
-            f"there is no example {unknown[0]!r}",
+            f"no example {unknown[0]!r}",
             where="cdpr examples",
             next_step=f"name one of these: {', '.join(by_name)}",
         )
@@ -104,11 +104,11 @@ def select_examples(examples: Iterable[Example], names: Iterable[str]) -> list[E
 def copy_examples(
     examples: Iterable[Example], folder: Path, *, grouped: bool, replace: bool
 ) -> list[Path]:
-    """Copies examples; all or, when one exists already, none.
+    """Copies all examples, or none when a copy exists already.
 
     Args:
-        examples: Which.
-        folder: Where to; it is made with the folders above it.
+        examples: The examples.
+        folder: Target; created with its parents.
         grouped: In ``configs`` and ``examples`` below the folder, as in a clone.
         replace: Replace files that exist.
 

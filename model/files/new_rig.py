@@ -1,7 +1,7 @@
-"""A new rig file: the questions that it answers, with units and defaults, and its commented text.
+"""A new rig file: the questions for its values, with units and defaults.
 
-`collect_answers` goes through the questions in order and asks by a callback;
-`model.files.rig_template` makes the file of the answers.
+`collect_answers` asks the questions in order through a callback; `model.files.rig_template` makes
+the file from the answers.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ def _no_objection(_value: Any, _answers: Answers) -> str:
 
 @dataclass(frozen=True)
 class RigQuestion:
-    """One thing that a rig file needs to know.
+    """A question about one value of a rig file.
 
     Attributes:
         key: Name of the answer, as in ``--key`` of the command line.
-        text: What is asked.
+        text: The question.
         unit: Of the answer; empty where it has none.
-        parse: From the words of an answer to its value.
-        default: The value for no answer, from the answers before.
-        objection: Why a value cannot be, from the answers before; empty where it can.
+        parse: Converts the typed answer to a value.
+        default: The value for no answer, from the previous answers.
+        objection: Why a value is invalid, given the previous answers; empty where it is valid.
     """
 
     key: str
@@ -48,10 +48,10 @@ class RigQuestion:
     objection: Callable[[Any, Answers], str] = _no_objection
 
     def read(self, text: str, default: Any, answers: Answers) -> Any:
-        """The value of a typed answer; nothing typed is the default.
+        """The value of a typed answer; an empty answer is the default.
 
         Raises:
-            ValueError: With the reason, for people.
+            ValueError: With the reason, as displayed.
         """
         value = self.parse(text) if text else default
         if reason := self.objection(value, answers):
@@ -60,7 +60,7 @@ class RigQuestion:
 
 
 def shown_value(value: Any) -> str:
-    """A value as it is typed."""
+    """A value as typed."""
     if isinstance(value, (list, tuple)):
         return " ".join(shown_value(part) for part in value)
     return f"{value:.10g}" if isinstance(value, float) else str(value)
@@ -127,7 +127,7 @@ def _channel(answers: Answers) -> str:
 
 
 def _suggested_outlet(index: int, count: int) -> list[float]:
-    """High and low in pairs on a circle of 700 mm, 10 degrees apart so that cables do not cross."""
+    """High and low pairs on a circle of 700 mm, 10 degrees apart so that cables do not cross."""
     pair, low = divmod(index, 2)
     aside = math.radians(5.0) * (-1.0) ** (pair + low)
     angle = 2.0 * math.pi * (pair + 0.5) / math.ceil(count / 2) + aside
@@ -155,7 +155,7 @@ def _middle(answers: Answers) -> list[float]:
 
 
 def _box(answers: Answers, side: int) -> list[float]:
-    """Half-way from home to the outlets on that side, and at least 10 mm."""
+    """Halfway from home to the outlets on that side, and at least 10 mm."""
     columns = list(zip(*answers["outlets_mm"], strict=True))
     ends = [(min(column), max(column))[side] for column in columns]
     least = (-10.0, 10.0)[side]
@@ -168,7 +168,7 @@ def _box(answers: Answers, side: int) -> list[float]:
 def _box_around_home(value: list[float], answers: Answers, side: int) -> str:
     for axis, bound, home in zip("xyz", value, answers["home_mm"], strict=True):
         if (home - bound, bound - home)[side] < 0.0:
-            return f"{axis} = {home:g} mm of the home position would be outside"
+            return f"the home position {axis} = {home:g} mm would be outside"
     if side and any(a >= b for a, b in zip(answers["lower_mm"], value, strict=True)):
         return f"it must be above the lower corner {shown_value(answers['lower_mm'])} on all axes"
     return ""
@@ -293,12 +293,12 @@ def collect_answers(
     Args:
         name: Of the rig, where no other is given.
         given: Answers that need no question, by their keys.
-        ask: Asks a question with its default and returns what was typed; without it, every question
-            that is left has its default.
-        refuse: Gets the reason why an answer cannot be, before the question is asked again.
+        ask: Asks a question with its default and returns what was typed; without it, the remaining
+            questions take their defaults.
+        refuse: Receives the reason why an answer is invalid, before the question is repeated.
 
     Raises:
-        BadInput: A given answer cannot be.
+        BadInput: A given answer is invalid.
     """
     answers: dict[str, Any] = {"name": name}
 
@@ -327,7 +327,7 @@ def _given(question: RigQuestion, value: Any, answers: Answers) -> Any:
     try:
         return question.read(shown_value(value), value, answers)
     except ValueError as error:
-        raise _impossible(question, error, "give another value") from None
+        raise _invalid(question, error, "give another value") from None
 
 
 def _default(question: RigQuestion, answers: Answers) -> Any:
@@ -336,25 +336,25 @@ def _default(question: RigQuestion, answers: Answers) -> Any:
         return question.read("", value, answers)
     except ValueError as error:
         hint = "give it with its option: its default does not fit the other values"
-        raise _impossible(question, error, hint) from None
+        raise _invalid(question, error, hint) from None
 
 
-def _impossible(question: RigQuestion, error: ValueError, hint: str) -> BadInput:
+def _invalid(question: RigQuestion, error: ValueError, hint: str) -> BadInput:
     what = f"--{question.key.replace('_', '-')}: {error}"
     return BadInput(what, where="cdpr new", next_step=hint)
 
 
 def read_coordinates(path: Path) -> dict[str, Any]:
-    """Outlets and anchors from a CSV file with a line a cable.
+    """Outlets and anchors from a CSV file with one line per cable.
 
     Args:
-        path: Its columns are `CSV_COLUMNS`; others are passed over.
+        path: Its columns are `CSV_COLUMNS`; others are ignored.
 
     Raises:
         BadInput: The file cannot be read, a column is missing, or a value is not a number.
     """
     table = CsvFile(path)
-    hint = f"begin with the line {','.join(CSV_COLUMNS)}, then a line a cable"
+    hint = f"begin with the line {','.join(CSV_COLUMNS)}, then one line per cable"
     header = [word.strip() for word in table.rows[0]] if table.rows else []
     missing = [name for name in CSV_COLUMNS if name not in header]
     if missing:
@@ -363,11 +363,11 @@ def read_coordinates(path: Path) -> dict[str, Any]:
     if not 6 <= count <= CABLES_MOST:
         what = f"{count} cables; a rig has from 6 to {CABLES_MOST}"
         raise BadInput(what, where=str(path), next_step=hint)
-    places = [header.index(name) for name in CSV_COLUMNS]
+    columns = [header.index(name) for name in CSV_COLUMNS]
     points = []
     for line, row in zip(table.lines[1:], table.rows[1:], strict=True):
         try:
-            points.append([_number(Number)(row[place].strip()) for place in places])
+            points.append([_number(Number)(row[column].strip()) for column in columns])
         except (IndexError, ValueError) as error:
             what = "a value is missing" if isinstance(error, IndexError) else str(error)
             raise BadInput(what, where=f"{path}:{line}", next_step=hint) from None

@@ -1,4 +1,4 @@
-"""Where results go: looked at before the work, as a result that cannot be written would be lost."""
+"""Output paths, checked before the work: a result that cannot be written would be lost."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def require_new_file(path: Path, replace: bool = False) -> None:
 
     Args:
         path: The file.
-        replace: It may exist.
+        replace: Whether it may exist.
 
     Raises:
         BadInput: The file exists, or its folder does not or is read-only.
@@ -30,7 +30,7 @@ def require_new_file(path: Path, replace: bool = False) -> None:
     if not folder.is_dir():
         why = f"{folder} is not a folder" if folder.exists() else f"there is no folder {folder}"
         raise BadInput(
-            what, where=str(path), why=why, next_step="make the folder, or name another file"
+            what, where=str(path), why=why, next_step="create the folder, or name another file"
         )
     if not os.access(folder, os.W_OK):
         raise BadInput(
@@ -42,21 +42,21 @@ def require_new_file(path: Path, replace: bool = False) -> None:
 
 
 def make_folder(folder: Path, force: bool = False) -> None:
-    """Makes a folder for results; one that holds something only with ``force``.
+    """Creates a folder for results; one that is not empty is refused without ``force``.
 
     Raises:
-        BadInput: The folder holds something and ``force`` is not set, or cannot be made.
+        BadInput: The folder is not empty and ``force`` is not set, or cannot be created.
     """
-    make_place(folder)
+    make_missing_folder(folder)
     if any(folder.iterdir()) and not force:
         raise AlreadyExists("the folder is not empty", str(folder))
 
 
-def make_place(folder: Path) -> None:
-    """Makes a folder where there is none; one that holds something will do.
+def make_missing_folder(folder: Path) -> None:
+    """Creates a folder if it is missing; it need not be empty.
 
     Raises:
-        BadInput: It cannot be made or written to.
+        BadInput: It cannot be created or written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -77,17 +77,17 @@ def make_place(folder: Path) -> None:
 
 
 Identity = tuple[int, int] | str
-"""Of a file: device and inode; of what does not exist yet, where it will be."""
+"""Device and inode of a file; the real path of one that does not exist yet."""
 
 
 def refuse_overwriting(outputs: Mapping[str, Path], inputs: Iterable[Path]) -> None:
     """Refuses outputs that are an input, a file in an input folder, or one another.
 
-    Links of both kinds are seen through; what does not exist yet is compared by where it will be.
+    Links of both kinds are resolved; paths that do not exist yet are compared by their real path.
 
     Args:
-        outputs: What is written, by what names it, such as ``--output``.
-        inputs: What is read.
+        outputs: Paths to write, by their option, such as ``--output``.
+        inputs: Paths to read.
 
     Raises:
         BadInput: Writing would destroy something.
@@ -128,10 +128,10 @@ def _require_writable_kind(path: Path, name: str) -> None:
 
 
 def file_identity(path: Path) -> Identity:
-    """What two paths of one file have in common; of no file yet, where it will be.
+    """Identity shared by all paths of one file; its real path where it does not exist yet.
 
     Raises:
-        BadInput: No file can have such a path.
+        BadInput: The path is invalid.
     """
     try:
         found = path.stat()
@@ -143,10 +143,10 @@ def file_identity(path: Path) -> Identity:
 
 
 def _identities(path: Path) -> Iterator[Identity]:
-    """Of an input, and of the files in it where it is a folder."""
+    """Identities of an input, and of the files in it where it is a folder."""
     yield file_identity(path)
-    with suppress(OSError), os.scandir(path) as entries:  # of what is no folder, the verb says so
+    with suppress(OSError), os.scandir(path) as entries:  # if not a folder, the verb reports it
         for entry in entries:
             if not entry.is_dir():
-                with suppress(BadInput):  # a link that leads nowhere
+                with suppress(BadInput):  # a dangling link
                     yield file_identity(Path(entry.path))

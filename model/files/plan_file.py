@@ -21,7 +21,7 @@ from model.files.scene_file import SceneDocument, StopDocument
 
 
 class ReadingsDocument(Document):
-    """How the paper's text was read where it is open (docs/paper.md)."""
+    """Reading of the paper's text where it is ambiguous (docs/paper.md)."""
 
     failure_rate: Literal["k/(k+1)", "k/(k+2)", "tree", "node"]
     focus: Literal["last-failed", "most-failed", "highest-rate"]
@@ -32,7 +32,7 @@ class ReadingsDocument(Document):
 
 
 class WeightsDocument(Document):
-    """What the path makes small (docs/plan-file.md); clearance and capacity are made large."""
+    """Objective (docs/plan-file.md); clearance and capacity are maximised, the others minimised."""
 
     length: NonNegative
     kinematic: NonNegative
@@ -41,7 +41,7 @@ class WeightsDocument(Document):
 
 
 class OptimalPlannerDocument(Document):
-    """How the path was searched for by the default planner; ``turning`` with `--free-rotation`."""
+    """Settings of the default planner; ``turning`` with `--free-rotation`."""
 
     name: Literal["optimal", "turning"]
     weights: WeightsDocument
@@ -52,7 +52,7 @@ class OptimalPlannerDocument(Document):
 
 
 class PlannerDocument(Document):
-    """How the path was searched for by the paper's planner or its baseline."""
+    """Settings of the paper's planner or its baseline."""
 
     name: Literal["adaptive", "goal-bias"]
     cost: Literal["kinematic", "length"]
@@ -66,14 +66,14 @@ class PlannerDocument(Document):
 
 
 class WaypointsDocument(Document):
-    """A path that a planner of the user's own found; see `planner.planning.plan_from_waypoints`."""
+    """A path from the user's own planner; see `planner.planning.plan_from_waypoints`."""
 
     name: Literal["waypoints"]
-    author: str = Field(default="", description="the planner, in its user's words")
+    author: str = Field(default="", description="free text that names the planner")
 
 
 class StatisticsDocument(Document):
-    """What the search cost."""
+    """Effort of the search."""
 
     nodes: Annotated[int, Field(ge=1, le=WHOLE_LARGEST)]
     iterations: Annotated[int, Field(ge=0, le=WHOLE_LARGEST)]
@@ -83,7 +83,7 @@ class StatisticsDocument(Document):
 
 
 class NearestDocument(Document):
-    """The smallest distance along the path: which pair, and with the platform where."""
+    """The smallest distance along the path, with its pair and platform position."""
 
     first: str
     second: str
@@ -111,14 +111,14 @@ class TreeDocument(Document):
 
 
 class StopMarkDocument(Document):
-    """Which waypoint is at a stop of the scene."""
+    """The waypoint at a stop of the scene."""
 
     name: str
     waypoint: Annotated[int, Field(ge=0, le=WHOLE_LARGEST)]
 
 
 class PlanDocument(Document):
-    """A path from start to goal; `hash` is over everything else in the file."""
+    """A path from start to goal; `hash` covers everything else in the file."""
 
     kind: Literal["cdpr-plan"] = "cdpr-plan"
     schema_version: Literal[1]

@@ -1,7 +1,7 @@
-"""One reader of input files, with limits: what is no plain file, too large or too deep is refused.
+"""The reader of input files, with limits: refuses anything irregular, too large or too deep.
 
-Every file that a user names passes here, so that a device, a pipe, or a file that was made to hurt
-ends in one message before it costs memory or time.
+Every file that a user names is read here, so that a device, a pipe or a malicious file ends in one
+message before it costs memory or time.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from model.errors import BadInput
 
 MEGABYTE = 1_000_000
 TEXT_LIMIT = 256 * MEGABYTE
-"""Of a text file, [bytes]: some hours of a run's tables."""
+"""Largest text file, [bytes]: some hours of a run's tables."""
 YAML_LIMIT = 1 * MEGABYTE
-"""Of a YAML file, [bytes]; its parser needs several seconds for that."""
+"""Largest YAML file, [bytes]; its parser needs several seconds for that."""
 PICTURE_LIMIT = 256 * MEGABYTE
-"""Of an image file, [bytes]."""
+"""Largest image file, [bytes]."""
 
 
 def read_bytes(path: Path, limit: int = TEXT_LIMIT) -> bytes:
-    """The content of a plain file.
+    """The content of a regular file.
 
     Args:
         path: The file.
@@ -39,19 +39,19 @@ def read_bytes(path: Path, limit: int = TEXT_LIMIT) -> bytes:
         BadInput: The file is missing, a folder, a device or a pipe, unreadable or too large.
     """
     try:
-        # A pipe is opened without waiting for its writer, and refused.
+        # A pipe is opened without waiting for its writer, and then refused.
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     except (OSError, ValueError) as error:
         raise unreadable(path, error) from None
     try:
         with os.fdopen(handle, "rb") as stream:
-            _require_plain(path, os.fstat(handle), limit)
+            _require_regular(path, os.fstat(handle), limit)
             return stream.read(limit + 1)
     except OSError as error:
         raise unreadable(path, error) from None
 
 
-def _require_plain(path: Path, found: os.stat_result, limit: int) -> None:
+def _require_regular(path: Path, found: os.stat_result, limit: int) -> None:
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError
     if not stat.S_ISREG(found.st_mode):
@@ -71,14 +71,14 @@ def _require_plain(path: Path, found: os.stat_result, limit: int) -> None:
 
 
 def unreadable(path: Path, error: Exception) -> BadInput:
-    """The message about a file that the operating system does not give."""
+    """The error for a file that the operating system cannot read."""
     what, why, hint = "the file cannot be read", "", "check the path and its read permissions"
     match error:
         case FileNotFoundError():
             what, hint = "no such file", "check the path and its spelling"
         case IsADirectoryError():
             what, hint = "this is a folder", "name a file"
-        case OSError(errno=errno.ENAMETOOLONG):  # of an output too
+        case OSError(errno=errno.ENAMETOOLONG):  # for outputs too
             what, why, hint = "the path cannot be used", str(error.strerror), "shorten its name"
         case OSError():
             why = error.strerror or str(error)
@@ -88,13 +88,13 @@ def unreadable(path: Path, error: Exception) -> BadInput:
 
 
 def shown(path: Path | str) -> str:
-    """A path for a message, without the middle of a very long one."""
+    """A path for a message, shortened in the middle if very long."""
     text = str(path)
     return text if len(text) <= 160 else f"{text[:80]} … {text[-60:]}"
 
 
 def read_text(path: Path, limit: int = TEXT_LIMIT) -> str:
-    """The text of a plain file.
+    """The text of a regular file.
 
     Raises:
         BadInput: As `read_bytes`, or it is not UTF-8.
@@ -113,11 +113,11 @@ def read_text(path: Path, limit: int = TEXT_LIMIT) -> str:
 
 
 def read_json(path: Path, next_step: str) -> Any:
-    """What a JSON file holds; finite numbers only, and no key twice.
+    """The content of a JSON file with finite numbers and unique keys.
 
     Args:
         path: The file.
-        next_step: What to do about a file that is damaged.
+        next_step: What to do about a damaged file.
 
     Raises:
         BadInput: It cannot be read or is not such JSON.
@@ -128,7 +128,7 @@ def read_json(path: Path, next_step: str) -> Any:
     except json.JSONDecodeError as error:
         what = f"not valid JSON: {error.msg}"
         where = f"{path}:{error.lineno}:{error.colno}"
-        why = "the file was cut off or edited" if text.strip() else "the file is empty"
+        why = "the file was truncated or edited" if text.strip() else "the file is empty"
         if text.strip() and text.lstrip()[0] not in "{[":
             why, next_step = "it is a file of another kind", f"pass another file, or {next_step}"
         raise BadInput(what, where=where, why=why, next_step=next_step) from None
@@ -137,11 +137,11 @@ def read_json(path: Path, next_step: str) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """What a JSON text holds.
+    """The content of a JSON text.
 
     Raises:
-        ValueError: It is not JSON, is nested too deeply, has a key twice, or a number that is
-            infinite, none, or of too many digits.
+        ValueError: It is not JSON, is nested too deeply, has a duplicate key, or a number that is
+            infinite, NaN or has too many digits.
     """
     try:
         return json.loads(
@@ -181,18 +181,18 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class CsvFile:
-    """The rows of a CSV file, whatever its line ends.
+    """The rows of a CSV file with any line ends.
 
     Args:
         path: The file.
-        text: Its content, where the caller has read it already.
+        text: Its content, if the caller has read it already.
 
     Attributes:
         rows: Lists of texts, empty lines left out.
         lines: The line in which each row ends, counted from 1.
 
     Raises:
-        BadInput: It cannot be read, or is no CSV.
+        BadInput: It cannot be read, or is not CSV.
     """
 
     def __init__(self, path: Path, text: str | None = None) -> None:

@@ -1,4 +1,4 @@
-"""The rig file: what a lab writes down once about its robot (YAML, strict, version 1)."""
+"""The rig file: description of a robot, written once by its lab (YAML, strict, version 1)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from model.files.documents import (
 )
 from model.files.simulation_file import SimulationDocument
 
-# The part of the rig file that says which drives turn the winches.
+# The drives of the winches.
 
 
 Period = Annotated[int, Field(ge=1, le=1000)]
@@ -34,13 +34,13 @@ ODRIVE_LAST_NODE = 62
 
 
 class Cia402Document(Document):
-    """CANopen drives in cyclic synchronous position mode; all they need is set over the bus."""
+    """CANopen drives in cyclic synchronous position mode, configured over the bus."""
 
     type: Literal["cia402"]
     profile: FileName = Field(
         default="cia402",
-        description="what the drives have: cia402, epos4, nanotec-c5e, akd, elmo-gold, or the path"
-        " of a YAML file",
+        description="drive profile: cia402, epos4, nanotec-c5e, akd, elmo-gold, or the path of a"
+        " YAML file",
     )
     vendor_id: Identity | None = Field(
         default=None, description="required 1018h:01 of every drive; left out: not checked"
@@ -55,7 +55,7 @@ class OdriveDocument(Document):
 
     type: Literal["odrive"]
     motor_torque_constant_nm_a: Positive = Field(
-        description="torque by current of the motors; ODrive's torque_constant, 8.27 / KV"
+        description="torque per current of the motors; ODrive's torque_constant, 8.27 / KV"
     )
     watchdog_ms: Annotated[float, Field(ge=10, le=1000)] | None = Field(
         default=None,
@@ -87,7 +87,7 @@ class PlatformDocument(Document):
 
 
 class WorkspaceDocument(Document):
-    """Box that the platform's origin may not leave, in the world frame."""
+    """Box within which the platform's origin stays, in the world frame."""
 
     lower_mm: Vector
     upper_mm: Vector
@@ -102,7 +102,7 @@ class WorkspaceDocument(Document):
 
 
 class CableDocument(Document):
-    """What all cables have in common."""
+    """Properties that all cables share."""
 
     radius_mm: NonNegative
     stiffness_n: Positive = Field(description="axial stiffness E·A")
@@ -159,7 +159,7 @@ class WinchDocument(Document):
 
 
 class MotionDocument(Document):
-    """How the platform is moved along a plan."""
+    """Limits of motion along a plan."""
 
     speed_mm_s: Positive = 20.0
     acceleration_mm_s2: Positive = 100.0
@@ -204,10 +204,10 @@ class RigDocument(Document):
     outlets_mm: Annotated[list[Vector], Field(min_length=1)]
     anchors_mm: Annotated[list[Vector], Field(min_length=1)]
     outlets_error_mm: NonNegative | None = Field(
-        default=None, description="how far off any of them is, 95 %; calibrations write it"
+        default=None, description="position error of any of them, 95 %; calibrations write it"
     )
     anchors_error_mm: NonNegative | None = Field(
-        default=None, description="how far off any of them is, 95 %; calibrations write it"
+        default=None, description="position error of any of them, 95 %; calibrations write it"
     )
     cables: CableDocument
     pulleys: PulleysDocument | None = None
@@ -220,7 +220,7 @@ class RigDocument(Document):
     simulation: SimulationDocument | None = None
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
-        """Counts that do not agree, numbers given twice, a home pose outside the workspace."""
+        """Mismatched counts, duplicate numbers, a home pose outside the workspace."""
         return (
             self._enough_cables,
             self._an_anchor_each,
@@ -252,9 +252,9 @@ class RigDocument(Document):
             return []
         return self._one_each(("pulleys", "feed_directions"), len(self.pulleys.feed_directions))
 
-    def _one_each(self, place: tuple[str, ...], count: int) -> list[Finding]:
-        m, things = len(self.outlets_mm), place[-1].removesuffix("_mm").replace("_", " ")
-        return [(place, f"{count} {things} for {m} outlets")] if count != m else []
+    def _one_each(self, key: tuple[str, ...], count: int) -> list[Finding]:
+        m, things = len(self.outlets_mm), key[-1].removesuffix("_mm").replace("_", " ")
+        return [(key, f"{count} {things} for {m} outlets")] if count != m else []
 
     def _nodes_once(self) -> list[Finding]:
         nodes = [(("winches", i, "node_id"), w.node_id) for i, w in enumerate(self.winches)]
@@ -278,7 +278,7 @@ class RigDocument(Document):
             return []
         count = tags_in(self.tags.family)
         what = f"{self.tags.family} has the tags 0 to {count - 1}"
-        return [(place, what) for place, number in self._tag_ids() if number >= count]
+        return [(key, what) for key, number in self._tag_ids() if number >= count]
 
     def _tag_ids(self) -> list[tuple[tuple[str | int, ...], int]]:
         if self.tags is None:
@@ -335,8 +335,8 @@ def _repeated(
 ) -> list[Finding]:
     seen: set[int | str] = set()
     found: list[Finding] = []
-    for place, value in values:
+    for key, value in values:
         if value in seen:
-            found.append((place, f"{kind} {value!r} appears twice"))
+            found.append((key, f"{kind} {value!r} appears twice"))
         seen.add(value)
     return found

@@ -18,7 +18,7 @@ def rig_text(answers: Answers) -> str:
     """The text of the rig file.
 
     Raises:
-        BadInput: The rig cannot be, with every reason.
+        BadInput: The rig is invalid, with every reason.
     """
     text = _TEMPLATE.format(
         **{key: _yaml(value) for key, value in answers.items()},
@@ -42,7 +42,7 @@ def _problems(text: str) -> list[str]:
     try:
         findings = RigDocument.model_validate(tree.data).findings()
     except ValidationError as error:
-        return [f"{p.key}: {p.what}" for p in problems_of(error, RigDocument, tree.places)]
+        return [f"{p.key}: {p.what}" for p in problems_of(error, RigDocument, tree.positions)]
     return [f"{key_path(path)}: {what}" for path, what in findings]
 
 

@@ -26,15 +26,15 @@ from model.files.documents import (
 )
 from model.pose import RotationLimits
 
-# What the platform carries, and what picking up and putting down make of it.
+# The payload of the platform, and its changes at picks and places.
 #
-# In the units of the scene file, where it comes from and goes back to.
+# In the units of the scene file.
 
 
 NOTHING_KG = 1e-9
-"""Less than this is nothing."""
-SAME_PLACE_MM = 1e-3
-"""Centres nearer to each other than this are one."""
+"""Masses below this count as none."""
+SAME_POINT_MM = 1e-3
+"""Centres nearer to each other than this count as equal."""
 
 Point = tuple[float, float, float]
 
@@ -52,15 +52,15 @@ class Payload:
     centre_mm: Point
 
     def with_mass(self, mass_kg: float, centre_mm: Point) -> Payload:
-        """After a mass was taken up whose centre is there."""
+        """The payload after picking up a mass with the given centre."""
         whole = self.mass_kg + mass_kg
         return Payload(whole, self._centre(mass_kg, centre_mm, whole))
 
     def without_mass(self, mass_kg: float, centre_mm: Point | None) -> Payload:
-        """After a mass was put down whose centre was there, or where the whole payload's is.
+        """The payload after putting down a mass; its centre defaults to the payload's.
 
         Raises:
-            ValueError: It is more than is carried, or all of it with its centre elsewhere.
+            ValueError: It is more than is carried, or all of it with another centre.
         """
         rest = self.mass_kg - mass_kg
         if rest < -NOTHING_KG:
@@ -70,7 +70,7 @@ class Payload:
         away = [
             abs(a - b) for a, b in zip(centre_mm or self.centre_mm, self.centre_mm, strict=True)
         ]
-        if max(away) > SAME_PLACE_MM:
+        if max(away) > SAME_POINT_MM:
             x, y, z = self.centre_mm
             raise ValueError(
                 f"puts down the whole payload, whose centre is at [{x:g}, {y:g}, {z:g}] mm"
@@ -78,7 +78,7 @@ class Payload:
         return Payload(0.0, (0.0, 0.0, 0.0))
 
     def _centre(self, mass_kg: float, centre_mm: Point, whole_kg: float) -> Point:
-        """Where the centre is with a mass more (or less); to a nanometre, as poses are written."""
+        """The centre after adding or removing a mass, to a nanometre as in pose documents."""
         x, y, z = (
             round((self.mass_kg * own + mass_kg * other) / whole_kg, 6) + 0.0
             for own, other in zip(self.centre_mm, centre_mm, strict=True)
@@ -86,16 +86,16 @@ class Payload:
         return x, y, z
 
 
-# The stops of a scene file: poses that are passed exactly, and where a load is taken or left.
+# The stops of a scene file: poses that are met exactly, where a load may be picked or placed.
 
 
 class StopDocument(PoseDocument):
-    """A pose between start and goal, and what happens there."""
+    """A pose between start and goal, with dwell and change of load."""
 
     name: Name
     kind: Literal["pass", "pick", "place"] = "pass"
     dwell_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = Field(
-        default=0.0, description="how long the platform rests there"
+        default=0.0, description="time that the platform rests there"
     )
     mass_kg: Positive | None = Field(
         default=None, description="picked up at a pick, put down at a place"
@@ -107,7 +107,7 @@ class StopDocument(PoseDocument):
     )
 
     def changed(self, payload: Payload) -> Payload:
-        """What is carried on from here.
+        """The payload from this stop on.
 
         Raises:
             ValueError: More is put down than is carried.
@@ -122,16 +122,16 @@ class StopDocument(PoseDocument):
 
 
 def payloads(first: Payload, stops: Sequence[StopDocument]) -> list[Payload]:
-    """What is carried to the first stop, from each stop to the next, and to the goal.
+    """The payload to the first stop, from each stop to the next, and to the goal.
 
     Raises:
-        ValueError: More is put down somewhere than is carried.
+        ValueError: More is put down at a stop than is carried.
     """
     return list(accumulate(stops, lambda carried, stop: stop.changed(carried), initial=first))
 
 
 def misfits(stops: Sequence[StopDocument]) -> list[Finding]:
-    """Names given twice, and keys that do not fit a stop's kind."""
+    """Duplicate names, and keys that do not fit a stop's kind."""
     found: list[Finding] = []
     names = [stop.name for stop in stops]
     for i, stop in enumerate(stops):
@@ -151,7 +151,7 @@ def misfits(stops: Sequence[StopDocument]) -> list[Finding]:
 
 
 def overdrawn(first: Payload, stops: Sequence[StopDocument]) -> list[Finding]:
-    """The first stop that puts down what is not carried."""
+    """The first stop that puts down more than is carried."""
     carried = first
     for i, stop in enumerate(stops):
         try:
@@ -162,8 +162,8 @@ def overdrawn(first: Payload, stops: Sequence[StopDocument]) -> list[Finding]:
 
 
 FARTHEST_MM = 1e6
-"""No number of an obstacle is larger: distances are proved to 0.1 µm, for which the digits of
-numbers end at some ten kilometres."""
+"""Largest number of an obstacle: distances are proved to 0.1 µm, for which floating-point numbers
+suffice up to about ten kilometres."""
 
 SHAPES = ("box", "sphere", "cylinder", "capsule", "convex", "mesh")
 
@@ -201,7 +201,7 @@ class MeshDocument(Document):
 
 
 class ObstacleDocument(Document):
-    """One obstacle: a name, exactly one shape, and where its centre is."""
+    """One obstacle: a name, exactly one shape, and its pose."""
 
     name: Name
     position_mm: Vector = [0.0, 0.0, 0.0]
@@ -229,7 +229,7 @@ class ClearanceDocument(Document):
 
 
 class LoadDocument(Document):
-    """What the cables must carry beside the platform's own weight."""
+    """What the cables must carry besides the platform's own weight."""
 
     payload_kg: NonNegative = 0.0
     payload_centre_mm: Vector = [0.0, 0.0, 0.0]
@@ -241,7 +241,7 @@ class LoadDocument(Document):
     )
 
     def payload(self) -> Payload:
-        """What is carried at the start."""
+        """The payload at the start."""
         x, y, z = self.payload_centre_mm
         return Payload(self.payload_kg, (x, y, z))
 
@@ -252,7 +252,7 @@ class LoadDocument(Document):
 
 
 class RotationLimitsDocument(Document):
-    """How far the platform may be tilted and turned, measured from level and not turned."""
+    """Limits of the platform's tilt and turn, measured from the level, unrotated platform."""
 
     tilt_deg: Annotated[float, Field(ge=0, le=90, allow_inf_nan=False)] = Field(
         description="largest angle of the platform's z axis from the vertical"
@@ -263,7 +263,7 @@ class RotationLimitsDocument(Document):
 
 
 class SceneDocument(Document):
-    """What a plan is made for."""
+    """The scene of a plan."""
 
     schema_version: Literal[1]
     name: Name
@@ -277,10 +277,9 @@ class SceneDocument(Document):
     obstacles: list[ObstacleDocument] = []
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
-        """Obstacles without exactly one shape or past any room, names given twice, flat hulls.
+        """Obstacles without exactly one shape or out of range, duplicate names, flat hulls.
 
-        And wrong triangles; stops whose load changes by too little or too much; and poses turned
-        too far.
+        Also wrong triangles, stops that do not fit the load, and poses beyond the rotation limits.
         """
         return (
             self._one_shape_each,
@@ -316,8 +315,8 @@ class SceneDocument(Document):
             largest = max(abs(number) for number in _numbers(obstacle))
             if largest > FARTHEST_MM:
                 what = (
-                    f"obstacle {obstacle.name!r} reaches {largest:g} mm, and distances are proved"
-                    f" up to {FARTHEST_MM:g} mm (1 km): make it as large as the room"
+                    f"obstacle {obstacle.name!r} reaches {largest:g} mm; distances are proved up"
+                    f" to {FARTHEST_MM:g} mm (1 km): make it as large as the room"
                 )
                 found.append((("obstacles", i), what))
         return found
@@ -329,8 +328,8 @@ class SceneDocument(Document):
                 what = "the points lie in a plane; a convex body needs a volume"
                 found.append((("obstacles", i, "convex", "points_mm"), what))
             if obstacle.mesh is not None:
-                place = ("obstacles", i, "mesh", "triangles")
-                found += [((*place, t), what) for t, what in _wrong_triangles(obstacle.mesh)]
+                key = ("obstacles", i, "mesh", "triangles")
+                found += [((*key, t), what) for t, what in _wrong_triangles(obstacle.mesh)]
         return found
 
     def _ends_in_limits(self) -> list[Finding]:
@@ -344,11 +343,11 @@ class SceneDocument(Document):
             *((f"stop {stop.name!r}", ("stops", i), stop) for i, stop in enumerate(self.stops)),
         ]
         found: list[Finding] = []
-        for name, place, end in ends:
+        for name, key, end in ends:
             pose = end.pose()
             excess = allowed.excess(pose, pose)
             if excess is not None:
-                found.append(((*place, "rotation_wxyz"), f"the {name} is {excess.sentence()}"))
+                found.append(((*key, "rotation_wxyz"), f"the {name} is {excess.sentence()}"))
         return found
 
 
@@ -376,7 +375,7 @@ def _is_flat(points_mm: list[list[float]]) -> bool:
 
 
 def _wrong_triangles(mesh: MeshDocument) -> list[tuple[int, str]]:
-    """Triangles that name points which do not exist, or one point twice: number and sentence."""
+    """Triangles with unknown or duplicate points: index and sentence."""
     count = len(mesh.points_mm)
     found: list[tuple[int, str]] = []
     for number, triangle in enumerate(mesh.triangles):

@@ -1,7 +1,7 @@
-"""The rig file's ``simulation`` section: how a simulated rig differs from what its file says.
+"""The rig file's ``simulation`` section: deviations of a simulated rig from its rig file.
 
-Simulated drives, plant and camera read it; nothing else does, so that program and calibration know
-of a simulated rig what they know of a real one.
+Only simulated drives, plant and cameras read it, so program and calibration know no more of a
+simulated rig than of a real one.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class AsBuiltDocument(Document):
-    """The geometry that the simulated rig truly has; absolute, so that no calibration moves it."""
+    """True geometry of the simulated rig; absolute, so that no calibration changes it."""
 
     outlets_mm: list[Vector]
     anchors_mm: list[Vector]
@@ -42,7 +42,7 @@ class AsBuiltDocument(Document):
 
 
 class SimulatedWinchesDocument(Document):
-    """What lies between a simulated motor and its cable, and how well torque is measured."""
+    """Transmission from a simulated motor to its cable, and noise of measured torque."""
 
     backlash_mm: NonNegative = Field(
         default=0.0, description="cable length lost when a motor reverses (backlash)"
@@ -54,7 +54,7 @@ class SimulatedWinchesDocument(Document):
 
 
 class LensDocument(Document):
-    """The lens that a simulated camera truly has."""
+    """True lens of a simulated camera."""
 
     fx_px: Positive
     fy_px: Positive
@@ -65,7 +65,7 @@ class LensDocument(Document):
 
 
 class SimulatedCameraDocument(Document):
-    """What the simulated images of one of the rig's cameras show."""
+    """Simulated images of one of the rig's cameras."""
 
     name: Annotated[str, Field(min_length=1)] = Field(description="of the camera in `cameras`")
     lens: LensDocument | None = Field(default=None, description="left out, as in `cameras`")
@@ -83,11 +83,11 @@ class SimulatedCameraDocument(Document):
     vignetting: Share = Field(default=0.25, description="share of light lost in the corners")
     light: Positive = Field(default=1.0, description="share of full light")
     cables: bool = Field(default=True, description="cables hide what is behind them")
-    halo: Share = Field(default=0.0, description="of a lamp in view: added there, share of white")
+    halo: Share = Field(default=0.0, description="light added by a lamp in view, share of white")
     shadow: Share = Field(default=0.0, description="share of light lost beyond a line in the image")
-    sharpening: NonNegative = Field(default=0.0, description="as cameras do, share of the contrast")
+    sharpening: NonNegative = Field(default=0.0, description="by the camera, share of contrast")
     enlarged: Annotated[int, Field(ge=1, le=4)] = Field(
-        default=1, description="how many times more rows and columns the image has than the sensor"
+        default=1, description="ratio of rows and columns of the image to those of the sensor"
     )
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = Field(
         default=100, description="of compression; 100 for none"
@@ -95,7 +95,7 @@ class SimulatedCameraDocument(Document):
 
 
 class SimulationDocument(Document):
-    """Imperfections of a simulated rig; what is left out is perfect."""
+    """Imperfections of a simulated rig; those left out are zero."""
 
     seed: Seed = Field(default=0, description="of all noise")
     as_built: AsBuiltDocument | None = None
@@ -103,31 +103,31 @@ class SimulationDocument(Document):
     cameras: list[SimulatedCameraDocument] = []
 
     def misfits(self, cables: int, pulleys: bool, cameras: Mapping[str, float]) -> list[Finding]:
-        """What does not agree with the rest of the rig file.
+        """Mismatches with the rest of the rig file.
 
         Args:
             cables: Number of outlets.
-            pulleys: The rig has pulleys.
-            cameras: Names of its cameras and how many images they take, [1/s].
+            pulleys: Whether the rig has pulleys.
+            cameras: Names of its cameras and their frame rates, [1/s].
         """
         found: list[Finding] = []
         if self.as_built is not None:
-            place = ("simulation", "as_built")
+            section = ("simulation", "as_built")
             for key, values in self.as_built:
                 if isinstance(values, list) and len(values) != cables:
-                    what = f"needs {cables} entries, one a cable; it has {len(values)}"
-                    found.append(((*place, key), what))
+                    what = f"needs {cables} entries, one per cable; it has {len(values)}"
+                    found.append(((*section, key), what))
             if pulleys != (self.as_built.pulley_radius_mm is not None):
                 what = "needs pulley_radius_mm" if pulleys else "the rig has no pulleys"
-                found.append(((*place, "pulley_radius_mm"), what))
+                found.append(((*section, "pulley_radius_mm"), what))
         names = [camera.name for camera in self.cameras]
         for i, name in enumerate(names):
-            place_of_name = ("simulation", "cameras", i, "name")
+            name_key = ("simulation", "cameras", i, "name")
             if name not in cameras:
-                found.append((place_of_name, f"there is no camera {name!r}"))
+                found.append((name_key, f"there is no camera {name!r}"))
             elif name in names[:i]:
-                found.append((place_of_name, f"camera {name!r} appears twice"))
+                found.append((name_key, f"camera {name!r} appears twice"))
             elif self.cameras[i].exposure_ms > 1000.0 / cameras[name]:
-                what = f"the exposure exceeds the frame period at {cameras[name]:g} pictures/s"
+                what = f"the exposure exceeds the frame period at {cameras[name]:g} images/s"
                 found.append((("simulation", "cameras", i, "exposure_ms"), what))
         return found

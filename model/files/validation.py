@@ -1,4 +1,4 @@
-"""What pydantic finds in a file, said in sentences for people."""
+"""YAML with positions, and pydantic's findings as readable sentences."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from model.errors import Problem
 
 # YAML text as plain data, with the line and column of every key.
 #
-# Numbers follow YAML 1.2, as people expect them: ``1e5`` is a number, ``010`` is ten, ``1:30`` and
-# dates are text. (PyYAML's own rules, YAML 1.1, would read text, eight and ninety.)
+# Numbers follow YAML 1.2, as users expect: ``1e5`` is a number, ``010`` is ten, ``1:30`` and dates
+# are text. (PyYAML's own rules, YAML 1.1, would read text, eight and ninety.)
 
 
 KeyPath = tuple[str | int, ...]
-Places = dict[KeyPath, tuple[int, int]]
+Positions = dict[KeyPath, tuple[int, int]]
 
 DEPTH_LIMIT, NODE_LIMIT = 40, 40_000
-"""How deep a file may be nested, and how many keys and values it may hold."""
+"""Largest nesting depth of a file, and largest number of its keys and values."""
 
 _TAG = "tag:yaml.org,2002:"
 
 
 @dataclass(frozen=True, slots=True)
 class YamlFault:
-    """Something that YAML allows and our files do not."""
+    """YAML that our files do not allow."""
 
     key: KeyPath
     what: str
@@ -41,17 +41,17 @@ class YamlFault:
 
 @dataclass(slots=True)
 class YamlTree:
-    """What a YAML text holds.
+    """The content of a YAML text.
 
     Attributes:
         data: Dictionaries, lists, text, numbers, booleans and None; None for an empty text.
-        places: Line and column, counted from 1, of every key and list entry.
-        faults: What YAML allows and our files do not.
-        typed: Some value has its type forced by a tag; ``data`` is not read then.
+        positions: Line and column, counted from 1, of every key and list entry.
+        faults: YAML that our files do not allow.
+        typed: Whether a tag forces the type of some value; ``data`` is then not read.
     """
 
     data: Any = None
-    places: Places = field(default_factory=dict)
+    positions: Positions = field(default_factory=dict)
     faults: list[YamlFault] = field(default_factory=list)
     typed: bool = False
 
@@ -84,7 +84,7 @@ class _Loader(yaml.SafeLoader):
         self._sizes: dict[int, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """A node with all below it, counted as often as aliases repeat it."""
+        """A node with all its descendants, counted as often as aliases repeat it."""
         event = self.peek_event()  # type: ignore[no-untyped-call]
         self._count, self._depth = self._count + 1, self._depth + 1
         if self._depth > DEPTH_LIMIT:
@@ -93,14 +93,14 @@ class _Loader(yaml.SafeLoader):
         self._depth -= 1
         if not isinstance(event, yaml.AliasEvent):
             self._sizes[id(node)] = self._written_out(node)
-        # A node within itself has no size yet; the model says that it refers to itself.
+        # A node within itself has no size yet; the model reports that it refers to itself.
         if max(self._count, self._sizes.get(id(node), 0)) > NODE_LIMIT:
             what = f"more than {NODE_LIMIT} keys and values, aliases counted"
             raise _too_much(what, event.start_mark)
         return node
 
     def _written_out(self, node: yaml.Node | None) -> int:
-        """How many nodes it is without aliases and merges."""
+        """Number of nodes with aliases and merges expanded."""
         parts: list[yaml.Node] = []
         if isinstance(node, yaml.MappingNode):
             parts = [part for pair in node.value for part in pair]
@@ -134,7 +134,7 @@ def parse_yaml(text: str) -> YamlTree:
     """Reads one YAML document.
 
     Raises:
-        YamlSyntaxError: The text is not YAML; with the first place where it is not.
+        YamlSyntaxError: The text is not YAML; with the first invalid position.
     """
     try:
         return _parsed(text)
@@ -181,22 +181,22 @@ def _what(error: yaml.MarkedYAMLError) -> str:
 
 
 def _walk(loader: _Loader, node: yaml.Node, path: KeyPath, tree: YamlTree, seen: set[int]) -> None:
-    """Notes places and faults; what an alias repeats has the place of the alias."""
-    place = _place_of(node)
-    tree.places.setdefault(path, place)
+    """Records positions and faults; nodes repeated by an alias have the alias's position."""
+    position = _position_of(node)
+    tree.positions.setdefault(path, position)
     if id(node) in seen:
         return
     seen.add(id(node))
     if not _is_plain(loader, node):
         tag = node.tag.replace(_TAG, "!!")
-        tree.faults.append(YamlFault(path, f"YAML tag {tag} is not allowed", *place))
+        tree.faults.append(YamlFault(path, f"YAML tag {tag} is not allowed", *position))
         tree.typed = True
     elif isinstance(node, yaml.MappingNode):
         for key, value in node.value:
             inner = (*path, _name_of(loader, key, path, tree))
-            if inner in tree.places:
-                tree.faults.append(YamlFault(inner, "this key appears twice", *_place_of(key)))
-            tree.places[inner] = _place_of(key)
+            if inner in tree.positions:
+                tree.faults.append(YamlFault(inner, "this key appears twice", *_position_of(key)))
+            tree.positions[inner] = _position_of(key)
             _walk(loader, value, inner, tree, seen)
     elif isinstance(node, yaml.SequenceNode):
         for index, value in enumerate(node.value):
@@ -207,7 +207,7 @@ def _name_of(loader: _Loader, key: yaml.Node, path: KeyPath, tree: YamlTree) -> 
     name = str(key.value) if isinstance(key, yaml.ScalarNode) else "?"
     if key.tag not in (_TAG + "str", _TAG + "merge"):
         what = f"the key {name} is not text"
-        tree.faults.append(YamlFault((*path, name), what, *_place_of(key)))
+        tree.faults.append(YamlFault((*path, name), what, *_position_of(key)))
         if not (isinstance(key, yaml.ScalarNode) and _is_plain(loader, key)):
             tree.typed = True
     return name
@@ -222,11 +222,11 @@ def _is_plain(loader: _Loader, node: yaml.Node) -> bool:
     return node.tag in (_TAG + "map", _TAG + "seq")
 
 
-def _place_of(node: yaml.Node) -> tuple[int, int]:
+def _position_of(node: yaml.Node) -> tuple[int, int]:
     return node.start_mark.line + 1, node.start_mark.column + 1
 
 
-#: Sentences by pydantic's kind of finding; ``{…}`` are the limits it gives.
+#: Sentences by pydantic's error type; ``{…}`` are the limits it gives.
 SENTENCES = {
     "missing": "this key is missing",
     "greater_than": "must be more than {gt:g}",
@@ -260,31 +260,33 @@ def key_path(parts: KeyPath) -> str:
     return text
 
 
-def place_of(parts: KeyPath, places: Places) -> tuple[int, int]:
-    """Line and column of a key, or of the nearest part around it that the file has.
+def position_of(parts: KeyPath, positions: Positions) -> tuple[int, int]:
+    """Line and column of a key, or of its nearest enclosing part in the file.
 
     Returns:
-        Counted from 1; (0, 0) where no places are known.
+        Counted from 1; (0, 0) where no position is known.
     """
-    while parts and parts not in places:
+    while parts and parts not in positions:
         parts = parts[:-1]
-    return places.get(parts, (0, 0))
+    return positions.get(parts, (0, 0))
 
 
-def problems_of(error: ValidationError, model: type[BaseModel], places: Places) -> list[Problem]:
-    """Pydantic's findings as our problems, each with its place in the file."""
+def problems_of(
+    error: ValidationError, model: type[BaseModel], positions: Positions
+) -> list[Problem]:
+    """Pydantic's findings as our problems, each with its position in the file."""
     found = []
     for item in error.errors(include_url=False):
         if item["type"] != "invalid_key":  # reported with its position by the YAML reader
             parts, _ = _followed(item["loc"], model)
             found.append(
-                Problem(key_path(parts), sentence_of(item, model), *place_of(parts, places))
+                Problem(key_path(parts), sentence_of(item, model), *position_of(parts, positions))
             )
     return found
 
 
 def sentence_of(item: Mapping[str, Any], model: type[BaseModel]) -> str:
-    """What is wrong, from one entry of `ValidationError.errors`."""
+    """The problem in words, from one entry of `ValidationError.errors`."""
     kind, limits, value = str(item["type"]), item.get("ctx", {}), item.get("input")
     match kind:
         case "extra_forbidden":
@@ -336,16 +338,16 @@ def _unknown_key(parts: KeyPath, model: type[BaseModel]) -> str:
 
 
 def _known_keys(model: type[BaseModel], parts: KeyPath) -> list[str]:
-    """The keys a model knows at a place; follows nested models and lists of models."""
+    """The keys that a model has at a path; follows nested models and lists of models."""
     _, current = _followed(parts, model)
     return list(current.model_fields) if current is not None else []
 
 
 def _followed(parts: KeyPath, model: type[BaseModel]) -> tuple[KeyPath, type[BaseModel] | None]:
-    """A place as the file has it, and the model that stands there.
+    """A key path as in the file, and the model at that path.
 
-    Where a key holds one of several models, pydantic puts the name of the one chosen behind the
-    key; the file has no such part.
+    Where a key holds one of several models, pydantic adds the name of the chosen one after the key;
+    the file has no such part.
     """
     current: type[BaseModel] | None = model
     kept: list[str | int] = []

@@ -1,9 +1,9 @@
 """Line charts as SVG that keeps its text size at any width, and the data for `charts.js`.
 
-The lines live in an inner SVG that stretches with the page; ticks and names are placed by shares of
-its size. Colours are the page's variables, distinguishable with any colour vision
-(Okabe and Ito's palette). The script adds zoom and values under the pointer; the page is complete
-without it.
+The lines are in an inner SVG that stretches with the page; ticks and names are positioned in
+percent of its size. Colours are the page's variables, distinguishable with any colour vision (Okabe
+and Ito's palette). The script adds zoom and values under the pointer; the page is complete without
+it.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ class ChartLine:
     """A line of a chart; NaN breaks it.
 
     Attributes:
-        name: In the legend and beside values; a line without one is not in them.
-        x: Shape (n,), rising.
+        name: In the legend and beside values; empty to leave it out there.
+        x: Shape (n,), increasing.
         y: Shape (n,).
         role: CSS variable of its colour, such as ``encoder``.
         width: [px].
         dash: SVG dash pattern; empty for a full line.
         opacity: 1 for opaque.
         band: Lower and upper edge of a band around it, each of shape (n,).
-        fits: Whether the chart is made high enough for it.
+        fits: Whether the range of y includes it.
     """
 
     name: str
@@ -54,7 +54,7 @@ class ChartLine:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A stretch of x that is shaded, and its name; empty for none."""
+    """A shaded interval of x, and its name; empty for none."""
 
     begin: float
     end: float
@@ -67,20 +67,20 @@ class Chart:
 
     Attributes:
         title: Plain text above it.
-        alternative: What a reader who does not see it should know; plain text.
-        quantity: What y is, and its unit.
+        alternative: Plain-text alternative for readers who do not see the chart.
+        quantity: Quantity of y.
         unit: Of y; may be empty.
-        lines: In the order in which they are painted.
+        lines: In drawing order.
         x_range: Both ends of x.
-        x_quantity: What x is.
+        x_quantity: Quantity of x.
         x_unit: Of x.
-        spans: Shaded stretches of x.
+        spans: Shaded intervals of x.
         from_zero: Whether y begins at 0 where no value is negative.
-        y_includes: Values that y reaches at least, so that charts can be compared.
-        logarithmic: Whether y holds decimal logarithms of what is meant.
+        y_includes: Values that the range of y includes, so that charts can be compared.
+        logarithmic: Whether y holds decimal logarithms of the quantity.
         names_at_ends: Whether lines are named at their right ends instead of in a legend.
         height: [px].
-        group: Charts of one group are zoomed together.
+        group: Charts of one group zoom together.
     """
 
     title: str
@@ -219,7 +219,7 @@ def _drawn(line: ChartLine, x_range: tuple[float, float], y_range: tuple[float, 
 
 
 def _unbroken(values: Array) -> list[slice]:
-    """Where values are finite, stretch by stretch."""
+    """Slices of consecutive finite values."""
     known = np.concatenate([[False], np.isfinite(values), [False]])
     ends = np.flatnonzero(known[1:] != known[:-1])
     return [slice(int(a), int(b)) for a, b in ends.reshape(-1, 2)]
@@ -231,22 +231,22 @@ def _polyline(points: Iterable[tuple[float, float]]) -> str:
 
 
 def _names(chart: Chart, low: float, high: float) -> str:
-    """Names at the right ends of lines, spread so that they do not cover each other."""
+    """Names at the right ends of lines, spread so that they do not overlap."""
     if not chart.names_at_ends:
         return ""
     lines = [line for line in chart.lines if line.name and np.isfinite(line.y).any()]
     last = [float(line.y[np.isfinite(line.y)][-1]) for line in lines]
     ends = [(high - value) / (high - low) for value in last]
-    places = spread(ends, 14.0 / chart.height)
+    label_ys = spread(ends, 14.0 / chart.height)
     return "".join(
-        f'<text x="100%" dx="6" y="{place:.2%}" dy="4" style="fill:var(--{line.role})">'
+        f'<text x="100%" dx="6" y="{label_y:.2%}" dy="4" style="fill:var(--{line.role})">'
         f"{escape(line.name)}</text>"
-        for line, place in zip(lines, places, strict=True)
+        for line, label_y in zip(lines, label_ys, strict=True)
     )
 
 
 def _data(chart: Chart, low: float, high: float) -> str:
-    """What the script reads: JSON that cannot end its element."""
+    """Data for the script: JSON that cannot close its element."""
     data: dict[str, Any] = {
         "group": chart.group,
         "x": [_rounded(v) for v in chart.x_range],
@@ -280,13 +280,13 @@ def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-# Fewer points, gaps, and names that keep apart.
+# Thinning, gaps, and spread of labels.
 
 
 def thinned(time: Array, values: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
     """A line with at most about ``most`` points that still shows every peak.
 
-    Keeps the first smallest and the first largest value of each of ``most / 2`` equal stretches.
+    Keeps the first smallest and the first largest value of each of ``most / 2`` equal intervals.
 
     Args:
         time: Shape (n,).
@@ -297,9 +297,9 @@ def thinned(time: Array, values: Array, most: int = MOST_POINTS) -> tuple[Array,
     if len(known) <= most:
         return time[known], values[known]
     keep: set[int] = {int(known[0]), int(known[-1])}
-    for stretch in np.array_split(known, most // 2):
-        keep.add(int(stretch[np.argmin(values[stretch])]))
-        keep.add(int(stretch[np.argmax(values[stretch])]))
+    for part in np.array_split(known, most // 2):
+        keep.add(int(part[np.argmin(values[part])]))
+        keep.add(int(part[np.argmax(values[part])]))
     chosen = np.array(sorted(keep))
     return time[chosen], values[chosen]
 
@@ -318,16 +318,16 @@ def spread(values: Sequence[float], gap: float) -> Array:
     """Positions of labels: near their values, at least ``gap`` apart, in the same order."""
     wanted = np.asarray(list(values), dtype=np.float64)
     order = np.argsort(wanted)
-    places = wanted[order].copy()
+    positions = wanted[order].copy()
     for _ in range(200):
-        short = gap - np.diff(places)
+        short = gap - np.diff(positions)
         close = np.flatnonzero(short > 1e-9 * gap)
         if not close.size:
             break
         for i in close:
-            push = max(gap - (places[i + 1] - places[i]), 0.0) / 2.0
-            places[i] -= push
-            places[i + 1] += push
-    result = np.empty_like(places)
-    result[order] = places
+            push = max(gap - (positions[i + 1] - positions[i]), 0.0) / 2.0
+            positions[i] -= push
+            positions[i + 1] += push
+    result = np.empty_like(positions)
+    result[order] = positions
     return result

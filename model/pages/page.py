@@ -1,6 +1,6 @@
-"""One HTML page and its small parts; every text that comes from outside is escaped here.
+"""The HTML page and its parts; all text from outside is escaped here.
 
-A page is one file in one style (`base.css`), light or dark as the reader's system is, which needs
+A page is one file in one style (`base.css`), light or dark like the reader's system, and needs
 neither a server nor a network. It is complete without scripts.
 """
 
@@ -34,8 +34,8 @@ def page(
         title: Plain text.
         body: HTML, such as of `section`.
         lead: HTML below the title.
-        scripts: File names of this package, such as ``charts.js``.
-        data: What the scripts read, JSON-like, by the id of its element.
+        scripts: File names in this package, such as ``charts.js``.
+        data: Data for the scripts, JSON-like, by the id of its element.
         files_beside: Whether the page shows images that are files in its folder.
     """
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -75,7 +75,7 @@ def contents(sections: Iterable[tuple[str, str]]) -> str:
 
 
 def paragraph(text: str, kind: str = "") -> str:
-    """A quiet line of explanation; ``kind`` is one more CSS class."""
+    """A muted line of explanation; ``kind`` is an additional CSS class."""
     return (
         f'<p class="quiet {kind}">{escape(text)}</p>'
         if kind
@@ -84,7 +84,7 @@ def paragraph(text: str, kind: str = "") -> str:
 
 
 def bullets(texts: Iterable[str]) -> str:
-    """A list of plain texts; commands in backticks and options of the command line are code."""
+    """A list of plain texts; commands in backticks and command-line options become code."""
     return "<ul>" + "".join(f"<li>{_with_code(text)}</li>" for text in texts) + "</ul>"
 
 
@@ -94,7 +94,7 @@ def _with_code(text: str) -> str:
 
 
 def tile(name: str, value: str, note: str, kind: str = "") -> str:
-    """A key figure: name, number with unit, and a note below; ``headline`` is a large one."""
+    """A key figure: name, number with unit, and a note below; kind ``headline`` is large."""
     number, _, unit = value.rpartition(" ") if " " in value else (value, "", "")
     opening = f'<div class="{kind}">' if kind else "<div>"
     return (
@@ -117,11 +117,11 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def list_table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """A table with a head line; it scrolls within itself where the window is narrow.
+    """A table with a header row; it scrolls where the window is narrow.
 
     Args:
         head: Title of each column.
-        rows: Cells; a line break in one stays.
+        rows: Cells; line breaks are kept.
         kind: CSS class, such as ``numbers`` for columns of numbers.
     """
     top = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
@@ -138,9 +138,9 @@ def _cell(text: str) -> str:
 
 
 def picture(name: str, alternative: str) -> str:
-    """An image that is a file beside the page, on white as its colours need, and a link to it.
+    """An image file beside the page, on a white background, with a link to it.
 
-    Where the window is narrow it scrolls within itself, so that its numbers stay readable.
+    It scrolls where the window is narrow, so that its numbers stay legible.
     """
     file = escape(name)
     shown = f'<a href="{file}"><img class="paper" src="{file}" alt="{escape(alternative)}"></a>'
@@ -148,16 +148,16 @@ def picture(name: str, alternative: str) -> str:
 
 
 def known(value: float | None, digits: int, unit: str) -> str:
-    """A number with its unit, or a dash for one that is not known."""
+    """A number with its unit, or a dash where unknown."""
     return "–" if value is None else f"{value:.{digits}f} {unit}".rstrip()
 
 
 def prose(text: str) -> str:
-    """An escaped sentence whose numbers keep their units on the same line."""
+    """An escaped sentence with each number and its unit kept on the same line."""
     return _UNIT.sub("\u00a0", escape(text))
 
 
-# How objects show themselves in a notebook.
+# Notebook display.
 
 
 def html_table(title: str, rows: Iterable[tuple[str, str]]) -> str:

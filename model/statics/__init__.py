@@ -1,8 +1,8 @@
-"""Statics: which wrenches the cables can give, how well, and with which tensions.
+"""Statics: available wrenches, dexterity, and tension distribution.
 
-Pure functions over arrays. One sign rule holds everywhere: ``structure_matrix @ tensions +
+Pure functions of arrays. One sign convention holds everywhere: ``structure_matrix @ tensions +
 external_wrench = 0``, where gravity is part of the external wrench. A wrench is three forces
-[N] then three moments [N·m] about the platform origin, in the world frame.
+[N], then three moments [N·m] about the platform origin, in the world frame.
 """
 
 from __future__ import annotations

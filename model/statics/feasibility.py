@@ -1,4 +1,4 @@
-"""Wrench feasibility: do the tension limits suffice for every wrench that may act, by how much."""
+"""Wrench feasibility: whether the tension limits suffice for every required wrench, with margin."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from model.statics.wrench_sets import (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrenchBox:
-    """The external wrenches that must be held: a centre and how far each component may differ.
+    """The required external wrenches: a centre and the half width of each component.
 
     Attributes:
         centre: shape (6,) or (..., 6), [N, N·m], world frame; usually gravity.
@@ -57,15 +57,15 @@ class WrenchBox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrenchFeasibility:
-    """Whether every wrench of a box can be held at one pose, with the plane that decides.
+    """Whether every wrench of a box can be held at one pose, with the binding facet.
 
     Attributes:
         margin: Signed distance [N] from the required wrenches to the nearest (or most exceeded)
             facet, moments divided by the length; minus infinity where the cables do not act in
             every direction.
-        binding_normal: shape (6,), unit vector out of the set through that facet, for wrenches
-            with moments divided by the length; where the margin is minus infinity, a direction in
-            which no cable acts.
+        binding_normal: shape (6,), outward unit normal of that facet, for wrenches with moments
+            divided by the length; where the margin is minus infinity, a direction in which no
+            cable acts.
         structure_matrix: shape (6, m).
         t_min: shape (m,), [N].
         t_max: shape (m,), [N].
@@ -90,8 +90,8 @@ class WrenchFeasibility:
         """Return the gap along the binding normal [N], from the cables' own wrenches.
 
         A negative value proves that the box is not held: no tensions within the limits reach its
-        farthest wrench along this direction. It is zero or less, too, along a direction in which
-        no cable acts.
+        farthest wrench along this direction. It is also zero or less along a direction in which no
+        cable acts.
         """
         normal = self.binding_normal.copy()
         normal[FORCE_ROWS:] /= self.characteristic_length
@@ -108,19 +108,19 @@ def capacity_margin(
     external: WrenchBox,
     characteristic_length: float,
 ) -> NDArray[np.float64]:
-    """Return how far the required wrenches are inside the set of available ones.
+    """Return the distance of the required wrenches from the boundary of the available set.
 
     Args:
         structure_matrix: shape (..., 6, m); force rows [-], moment rows [m].
         t_min: Smallest tensions, shape (m,) or (..., m), or one number, [N].
-        t_max: Largest tensions, likewise.
-        external: The external wrenches to hold, gravity among them.
+        t_max: Largest tensions, shape (m,) or (..., m), or one number, [N].
+        external: The external wrenches to hold, gravity included.
         characteristic_length: [m], divides the moments.
 
     Returns:
         Signed distance, shape (...), [N]: positive inside, where it is the Euclidean distance to
         the boundary; negative outside, where it is the distance to the most exceeded facet
-        plane; minus infinity where the structure matrix has no full rank.
+        plane; minus infinity where the structure matrix is rank-deficient.
 
     Raises:
         BadInput: A shape is wrong, a value is not finite, or limits are crossed.
@@ -151,12 +151,12 @@ def wrench_feasible(
     external: WrenchBox,
     characteristic_length: float,
 ) -> WrenchFeasibility:
-    """Return whether the cables hold every wrench of the box at one pose, and what decides.
+    """Return whether the cables hold every wrench of the box at one pose, with the proof.
 
     Args:
         structure_matrix: shape (6, m); force rows [-], moment rows [m].
         t_min: Smallest tensions, shape (m,), or one number, [N].
-        t_max: Largest tensions, likewise.
+        t_max: Largest tensions, shape (m,), or one number, [N].
         external: The external wrenches to hold, one box.
         characteristic_length: [m], divides the moments.
 
@@ -197,7 +197,7 @@ def _gaps(
     facets: WrenchFacets, external: WrenchBox, characteristic_length: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the room of the box at the lower and at the upper plane of each pair."""
-    # The cables give the opposite of what acts from outside.
+    # The cables give the opposite of the external wrench.
     centre = -external.centre / _units(characteristic_length)
     half_widths = external.half_widths / _units(characteristic_length)
     along = (facets.normals @ centre[..., np.newaxis])[..., 0]
@@ -218,7 +218,7 @@ def _binding(
 def _idle_direction(
     structure_matrix: NDArray[np.float64], external: WrenchBox, characteristic_length: float
 ) -> NDArray[np.float64]:
-    """Return the unit direction in which no cable acts, turned to where help is needed."""
+    """Return the unit direction in which no cable acts, with the sign of the required wrench."""
     scaled = structure_matrix / _units(characteristic_length)[:, np.newaxis]
     direction = np.linalg.svd(scaled)[0][:, -1]
     needed = direction @ (-external.centre / _units(characteristic_length))
@@ -229,12 +229,12 @@ def _units(characteristic_length: float) -> NDArray[np.float64]:
     return np.repeat([1.0, checked_length(characteristic_length)], FORCE_ROWS)
 
 
-# Wrench closure: can the cables, tensions unlimited, balance any wrench at all.
+# Wrench closure: whether the cables, with unlimited tensions, can balance any wrench.
 #
-# They can exactly when the structure matrix has full rank and tensions that are all positive
-# balance each other. When they cannot, there is a wrench against which no cable can pull; one
-# quadratic program gives either proof. For maps of many poses, `closure_margin` gives the same
-# answer as a number, without a proof.
+# They can exactly when the structure matrix has full rank and all-positive tensions balance each
+# other. When they cannot, there is a wrench against which no cable can pull; one quadratic program
+# gives either proof. For maps of many poses, `closure_margin` gives the same answer as a number,
+# without a proof.
 
 
 SMALLEST_TENSION = 1e-9
@@ -248,8 +248,8 @@ class WrenchClosure:
     Attributes:
         closed: Whether the cables can balance any wrench.
         structure_matrix: shape (6, m); force rows [-], moment rows [m].
-        proof: Where closed: tensions that balance each other, shape (m,), all positive, the
-            largest 1. Otherwise: a unit wrench along which no cable can pull, shape (6,).
+        proof: Where closed: self-balancing tensions, shape (m,), all positive, the largest 1.
+            Otherwise: a unit wrench along which no cable can pull, shape (6,).
     """
 
     closed: bool
@@ -265,8 +265,8 @@ class WrenchClosure:
     def residual(self) -> float:
         """Residual of the proof, recomputed; round-off when it holds.
 
-        Where closed, the size of the wrench that the self-balancing tensions leave. Otherwise, the
-        largest pull of any unit tension along the wrench that none should pull along.
+        Where closed, the norm of the wrench that the self-balancing tensions leave. Otherwise, the
+        largest pull of any unit tension along the wrench along which none should pull.
         """
         if self.closed:
             return float(np.linalg.norm(self.structure_matrix @ self.proof))
@@ -280,7 +280,7 @@ def wrench_closure(structure_matrix: ArrayLike) -> WrenchClosure:
         structure_matrix: shape (6, m); force rows [-], moment rows [m].
 
     Raises:
-        BadInput: The shape is another one, or a value is not finite.
+        BadInput: The shape is wrong, or a value is not finite.
     """
     matrix = checked_structure_matrix(structure_matrix).copy()
     if matrix.ndim != 2:
@@ -300,10 +300,10 @@ def wrench_closure(structure_matrix: ArrayLike) -> WrenchClosure:
 def closure_margin(
     structure_matrix: ArrayLike, characteristic_length: float
 ) -> NDArray[np.float64]:
-    """Return how far poses are from gaining or losing wrench closure.
+    """Return the distance of poses from gaining or losing wrench closure.
 
-    Every direction that five independent cables cannot act along is a test: the others must pull
-    along it both ways.
+    Every direction in which five independent cables cannot act is a test: the others must pull
+    along it in both directions.
 
     Args:
         structure_matrix: shape (..., 6, m); force rows [-], moment rows [m].
@@ -312,11 +312,11 @@ def closure_margin(
     Returns:
         shape (...), [-]. Positive exactly where closed: every wrench of this size can be balanced
         with tensions from 0 to 1. Otherwise zero or negative: the self-balancing tensions, of unit
-        length, miss the same sign by this much. It crosses zero without a jump, and is minus
-        infinity where the structure matrix has no full rank.
+        norm, miss having one sign by this much. It is continuous at zero, and minus infinity where
+        the structure matrix is rank-deficient.
 
     Raises:
-        BadInput: The shape is another one, a value is not finite, or the length is not positive.
+        BadInput: The shape is wrong, a value is not finite, or the length is not positive.
 
     Source: Gouttefarde & Gosselin, "Analysis of the wrench-closure workspace of planar parallel
         cable-driven mechanisms", 2006 (the same condition for planar robots).
@@ -337,19 +337,19 @@ def _closure_margins(matrices: NDArray[np.float64], facets: WrenchFacets) -> NDA
     if freedom < 0:
         return margins
     usable = np.isfinite(facets.upper)
-    one_way = usable & (_weaker_way(facets.cable_gains, freedom) <= 0.0)
-    closed = facets.full_rank & ~one_way.any(axis=-1)
+    one_sided = usable & (_weaker_pull(facets.cable_gains, freedom) <= 0.0)
+    closed = facets.full_rank & ~one_sided.any(axis=-1)
     room = np.minimum(facets.upper, -facets.lower).min(axis=-1)
     margins[closed] = room[closed]
     opened = facets.full_rank & ~closed
     null_space = np.linalg.svd(matrices[opened])[2][..., WRENCH_SIZE:, :]
-    missed = np.where(one_way[opened], _weaker_way(facet_gains(null_space), freedom), 0.0)
+    missed = np.where(one_sided[opened], _weaker_pull(facet_gains(null_space), freedom), 0.0)
     margins[opened] = np.minimum(missed.min(axis=-1), 0.0)
     return margins
 
 
-def _weaker_way(gains: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
-    """Return the largest pull the weaker way along each facet's normal, negative if there is none.
+def _weaker_pull(gains: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
+    """Return the largest pull in the weaker direction along each facet normal, < 0 if none.
 
     Only cables that do not span the facet count: the gains of the others are round-off.
     """
@@ -361,8 +361,8 @@ def _weaker_way(gains: NDArray[np.float64], freedom: int) -> NDArray[np.float64]
 def _most_even(null_basis: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return z with the largest smallest tension, and the multipliers of its optimum.
 
-    Solves min ‖z‖² + s² with ``null_basis @ z + s >= 1``, which has a solution always. Where a
-    positive z exists, its optimum is a multiple of the best one; where none does, z = 0 and the
+    Solves min ‖z‖² + s² with ``null_basis @ z + s >= 1``, which always has a solution. Where a
+    positive z exists, the optimum is a multiple of the best one; where none does, z = 0 and the
     multipliers are gains ``Jᵀc >= 0`` of some wrench c (Stiemke's lemma).
 
     Source: Lawson & Hanson, "Solving least squares problems", 1974, ch. 23 (least distance).

@@ -1,4 +1,4 @@
-"""The wrench of gravity on the platform and what it carries."""
+"""The wrench of gravity on platform and payload, and the commanded tensions."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ def _weight(mass: float, offset: ArrayLike, gravity: float, name: str) -> NDArra
     return wrench
 
 
-# The tensions that the rig is run with: one rule for planner, check, executor and plant.
+# The commanded tensions: one rule for planner, check, executor and plant.
 
 
 PRETENSION_SHARE = 0.2
-"""Where the wanted tension lies between the smallest and the largest allowed one: taut enough not
-to sag, far from the limit. The solution is the one nearest to it, hence continuous in the pose."""
+"""Position of the reference tension between the tension limits: taut enough not to sag, far from
+the upper limit. The solution is the nearest to it, hence continuous in the pose."""
 
 
 def weight_wrench(rig: Rig, pose: Pose, load: Load | None = None) -> Array:
@@ -78,7 +78,7 @@ def weight_wrench(rig: Rig, pose: Pose, load: Load | None = None) -> Array:
     Args:
         rig: The robot.
         pose: ``world_from_platform``.
-        load: The scene's load; its payload is carried, its wrench box is not in this wrench.
+        load: The scene's load; the wrench includes its payload, not its wrench box.
 
     Returns:
         Shape (6,), [N, N·m].
@@ -96,7 +96,7 @@ def working_tensions(rig: Rig, pose: Pose, load: Load | None = None) -> TensionS
     Args:
         rig: The robot.
         pose: ``world_from_platform``.
-        load: What it carries; nothing when left out.
+        load: Payload; none when left out.
 
     Raises:
         TensionInfeasible: The cables cannot hold the weight at this pose within their limits.

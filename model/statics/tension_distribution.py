@@ -1,8 +1,9 @@
-"""Tension distribution: the one set of tensions to command, out of all that balance a wrench.
+"""Tension distribution: the tensions to command, out of all that balance a wrench.
 
 All tensions that balance a wrench are ``particular + null_basis @ z``. With as many cables as
-freedoms there is one; with one cable more, z is in an interval; with two more, in a convex polygon
-that is found exactly. Beyond that a quadratic program finds the tensions nearest to a reference.
+degrees of freedom there is one; with one cable more, z is in an interval; with two more, in a
+convex polygon that is computed exactly. Beyond that, a quadratic program finds the tensions nearest
+to a reference.
 
 `least_norm` and `centroid` are continuous in the pose and the wrench as long as the feasible set
 has an interior; `barycentre` (mean of the corners) jumps where a corner splits in two.
@@ -31,7 +32,7 @@ from model.statics.wrench_sets import (
     wrench_facets,
 )
 
-# The answer to a tension problem, and the answer that there is none.
+# The solution of a tension problem, and the error where there is none.
 
 
 TensionMethod = Literal["least_norm", "centroid", "barycentre"]
@@ -43,9 +44,9 @@ class TensionSolution:
 
     Attributes:
         tensions: shape (m,), [N].
-        method: How they were chosen among all that balance the wrench.
+        method: Criterion of choice among all that balance the wrench.
         structure_matrix: shape (6, m); force rows [-], moment rows [m].
-        external_wrench: shape (6,), [N, N·m], gravity among it.
+        external_wrench: shape (6,), [N, N·m], gravity included.
         t_min: shape (m,), [N].
         t_max: shape (m,), [N].
     """
@@ -70,12 +71,12 @@ class TensionSolution:
 
     @property
     def wrench_residual(self) -> NDArray[np.float64]:
-        """What is left unbalanced, shape (6,), [N, N·m]; recomputed from the tensions."""
+        """The unbalanced wrench, shape (6,), [N, N·m]; recomputed from the tensions."""
         return np.asarray(self.structure_matrix @ self.tensions + self.external_wrench)
 
     @property
     def bound_violation(self) -> float:
-        """How far the worst tension is outside its limits [N]; zero when all are inside."""
+        """Distance of the worst tension outside its limits [N]; zero when all are inside."""
         below = (self.t_min - self.tensions).max()
         above = (self.tensions - self.t_max).max()
         return max(0.0, float(below), float(above))
@@ -85,10 +86,10 @@ class TensionInfeasible(Refused):
     """No tensions within the limits balance the wrench.
 
     Args:
-        shortfall: By how much every limit would have to give way [N]; infinity where the cables
-            do not act in every direction.
-        at_largest: Cables (counted from 0) that would have to pull harder than they may.
-        at_smallest: Cables (counted from 0) that would have to pull less than they must.
+        shortfall: Amount by which every limit would have to be relaxed [N]; infinity where the
+            cables do not act in every direction.
+        at_largest: Cables (counted from 0) at their largest tension.
+        at_smallest: Cables (counted from 0) at their smallest tension.
     """
 
     code: ClassVar[str] = "tension_infeasible"
@@ -102,7 +103,7 @@ class TensionInfeasible(Refused):
         if np.isinf(shortfall):
             super().__init__(
                 "the cables do not act in every direction at this pose",
-                why="the structure matrix has no full rank: the pose is singular",
+                why="the structure matrix is rank-deficient: the pose is singular",
                 next_step="choose another pose or orientation",
                 values={"shortfall_n": shortfall},
             )
@@ -129,10 +130,10 @@ def _blame(at_largest: tuple[int, ...], at_smallest: tuple[int, ...]) -> str:
     return " while ".join(parts)
 
 
-# The feasible tensions of a robot with two cables more than freedoms: a convex polygon.
+# The feasible tensions of a robot with two redundant cables: a convex polygon.
 #
-# Plain floats, not arrays: with at most two lines a cable the polygon has few corners, and an
-# array operation costs more than the whole clip of one line.
+# Plain floats, not arrays: with at most two lines per cable the polygon has few corners, and an
+# array operation costs more than clipping with one line.
 
 
 Point = tuple[float, float]
@@ -140,7 +141,7 @@ HalfPlane = tuple[float, float, float]
 """(a, b, c) for the side ``a x + b y + c >= 0``."""
 
 SMALLEST_AREA = 1e-12
-"""Area by squared extent, under which a polygon is taken as a segment or a point."""
+"""Ratio of area to squared extent below which a polygon is treated as a segment or a point."""
 
 
 def square(reach: float) -> list[Point]:
@@ -149,7 +150,7 @@ def square(reach: float) -> list[Point]:
 
 
 def clipped(polygon: list[Point], half_planes: Iterable[HalfPlane]) -> list[Point]:
-    """Return what of the convex polygon lies in every half-plane; empty if nothing does."""
+    """Return the part of a convex polygon inside every half-plane; empty if there is none."""
     for a, b, c in half_planes:
         sides = [a * x + b * y + c for x, y in polygon]
         if min(sides) >= 0.0:
@@ -175,7 +176,7 @@ def _cut(polygon: list[Point], sides: list[float]) -> list[Point]:
 
 
 def area_centroid(polygon: list[Point]) -> Point:
-    """Return the centroid of the area; of a polygon without area, the middle of its length."""
+    """Return the centroid of the area, or the midpoint of a polygon without area."""
     x0, y0 = polygon[0]
     doubled_area = sum_x = sum_y = extent = 0.0
     for (x1, y1), (x2, y2) in pairwise(polygon[1:]):
@@ -191,14 +192,14 @@ def area_centroid(polygon: list[Point]) -> Point:
 
 
 def _middle_of_length(polygon: list[Point]) -> Point:
-    """Return the middle between the two corners farthest apart."""
+    """Return the midpoint of the two corners farthest apart."""
     pairs = ((p, q) for i, p in enumerate(polygon) for q in polygon[i:])
     (x1, y1), (x2, y2) = max(pairs, key=lambda pair: _distance(*pair))
     return (x1 + x2) / 2.0, (y1 + y2) / 2.0
 
 
 def corner_mean(polygon: list[Point]) -> Point:
-    """Return the mean of the corners, corners that coincide counted once."""
+    """Return the mean of the corners; coincident corners count once."""
     extent = max(_distance(polygon[0], point) for point in polygon)
     corners: list[Point] = []
     for point in polygon:
@@ -230,7 +231,7 @@ def _distance(p: Point, q: Point) -> float:
 
 
 ROUND_OFF = 1e-10
-"""Part of the largest limit by which a limit may be missed before a wrench counts as infeasible."""
+"""Tolerance of the limits, as part of the largest, before a wrench counts as infeasible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,16 +267,15 @@ def solve_tensions(
 
     Args:
         structure_matrix: shape (6, m); force rows [-], moment rows [m].
-        external_wrench: shape (6,), [N, N·m], world frame, gravity among it.
+        external_wrench: shape (6,), [N, N·m], world frame, gravity included.
         t_min: Smallest tensions, shape (m,), or one number, [N].
-        t_max: Largest tensions, likewise.
+        t_max: Largest tensions, shape (m,), or one number, [N].
         method: ``least_norm``: nearest to the reference; ``centroid`` and ``barycentre``: centre
-            of area and mean of the corners of the feasible set, for at most two cables more than
-            freedoms.
-        reference: Wanted tensions for ``least_norm``, shape (m,), or one number, [N].
+            of area and mean of the corners of the feasible set, for at most two redundant cables.
+        reference: Reference tensions for ``least_norm``, shape (m,), or one number, [N].
 
     Raises:
-        TensionInfeasible: No such tensions exist; it says by how much.
+        TensionInfeasible: No such tensions exist; with the shortfall.
         BadInput: A shape is wrong, a value is not finite, limits are crossed, or the method is
             unknown or not defined for this number of cables.
 
@@ -297,7 +297,7 @@ def solve_tensions(
         z = _choice(balance.relaxed(2.0 * round_off), method, wanted)
         if z is None:
             raise Fault("two methods disagree on whether tensions exist that balance the wrench")
-    # Only round-off is clipped here; wrench_residual shows what it costs.
+    # This clips only round-off; wrench_residual shows its effect.
     tensions = np.minimum(np.maximum(balance.tensions(z), low), high)
     return TensionSolution(tensions, method, matrix.copy(), wrench.copy(), low.copy(), high.copy())
 
@@ -371,7 +371,7 @@ def _in_polygon(
 
 
 def _reach(balance: _Balance) -> float:
-    """Return a bound of ‖z‖, which is at most ‖tensions‖ as the null basis is orthonormal."""
+    """Return a bound of ‖z‖, which is at most ‖tensions‖ for an orthonormal null basis."""
     largest = np.maximum(np.abs(balance.low), np.abs(balance.high))
     return 2.0 * float(np.sqrt(largest @ largest)) + 1.0
 
@@ -414,8 +414,8 @@ def _raise_unless_round_off(
 ) -> None:
     """Raise `TensionInfeasible` with the exact shortfall, unless that is round-off.
 
-    Limits that all give way by s move a facet plane with gains y outward by s times the sum of
-    |y|, and leave its direction; so the largest ratio over all facets is the shortfall.
+    Relaxing all limits by s moves a facet plane with gains y outward by s times the sum of |y| and
+    keeps its direction; so the largest ratio over all facets is the shortfall.
     """
     facets = wrench_facets(matrix, low, high, 1.0)
     along = facets.normals @ -wrench

@@ -1,9 +1,9 @@
 """Size and shape of the set of wrenches that the cables can give.
 
-The set {J t : t_min <= t <= t_max} is a zonotope: the sum of one segment a cable. Its volume
-is exactly the sum of |det| over every choice of as many segments as there are dimensions, and
-does not depend on t_min but only on t_max - t_min. The condition number of J (dexterity) states
-how evenly the cables turn tensions into wrenches.
+The set {J t : t_min <= t <= t_max} is a zonotope: the Minkowski sum of one segment per cable. Its
+volume is exactly the sum of |det| over every choice of as many segments as there are dimensions; it
+depends on t_max - t_min only. The condition number of J (dexterity) measures how evenly the cables
+convert tensions into wrenches.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.errors import BadInput
 
-# What the functions of this package accept, checked at their border.
+# Checks of arguments of this package.
 
 
 FORCE_ROWS = 3
 WRENCH_SIZE = 6
 POSES_IN_A_BLOCK = 128
-"""Batches are worked through in blocks, so that a block stays in the processor's cache."""
+"""Batches are processed in blocks that stay in the processor's cache."""
 
 
 def checked_structure_matrix(structure_matrix: ArrayLike) -> NDArray[np.float64]:
     """Return the structure matrix as floats, shape (..., 6, m).
 
     Raises:
-        BadInput: The shape is another one, or a value is not finite.
+        BadInput: The shape is wrong, or a value is not finite.
     """
     matrix = np.asarray(structure_matrix, dtype=np.float64)
     if matrix.ndim < 2 or matrix.shape[-2] != WRENCH_SIZE or matrix.shape[-1] == 0:
@@ -45,7 +45,7 @@ def checked_wrench(wrench: ArrayLike, name: str) -> NDArray[np.float64]:
     """Return a wrench as floats, shape (..., 6).
 
     Raises:
-        BadInput: The shape is another one, or a value is not finite.
+        BadInput: The shape is wrong, or a value is not finite.
     """
     checked = np.asarray(wrench, dtype=np.float64)
     if checked.ndim < 1 or checked.shape[-1] != WRENCH_SIZE:
@@ -56,10 +56,10 @@ def checked_wrench(wrench: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def checked_per_cable(values: ArrayLike, cable_count: int, name: str) -> NDArray[np.float64]:
-    """Return one finite value a cable, shape (..., m); a single number serves every cable.
+    """Return one finite value per cable, shape (..., m); a single number is used for all.
 
     Raises:
-        BadInput: There are values for another number of cables, or one is not finite.
+        BadInput: The number of values is not that of the cables, or one is not finite.
     """
     checked = np.asarray(values, dtype=np.float64)
     if checked.ndim == 0:
@@ -116,7 +116,7 @@ def blocks(count: int) -> Iterator[slice]:
 
 
 def force_volume(structure_matrix: ArrayLike, tension_ranges: ArrayLike) -> NDArray[np.float64]:
-    """Return the volume of the set of forces, whatever moment comes with them.
+    """Return the volume of the set of forces, with any moment.
 
     Args:
         structure_matrix: shape (..., 6, m); force rows [-], moment rows [m].
@@ -145,7 +145,7 @@ def wrench_volume(
         characteristic_length: [m].
 
     Returns:
-        Volume, shape (...), [N⁶]; zero (to round-off) where the matrix has no full rank.
+        Volume, shape (...), [N⁶]; zero (to round-off) where the matrix is rank-deficient.
 
     Raises:
         BadInput: A shape is wrong, a value is not finite, a range is negative, or the length is
@@ -160,7 +160,7 @@ def zonotope_volume(generators: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the volume of the sum of segments in n dimensions.
 
     Args:
-        generators: shape (..., n, m), one segment a column.
+        generators: shape (..., n, m), one segment per column.
 
     Returns:
         Σ |det| over all n-subsets of the columns, shape (...).
@@ -181,7 +181,7 @@ def zonotope_volume(generators: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @cache
 def subsets(count: int, size: int) -> NDArray[np.intp]:
-    """Return every ``size``-subset of ``range(count)``, one a row, in a read-only array."""
+    """Return every ``size``-subset of ``range(count)``, one per row, in a read-only array."""
     chosen = np.array(list(combinations(range(count), size)), dtype=np.intp).reshape(-1, size)
     chosen.flags.writeable = False
     return chosen
@@ -190,7 +190,7 @@ def subsets(count: int, size: int) -> NDArray[np.intp]:
 def _determinants(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     if matrices.shape[-1] != 3:
         return np.asarray(np.linalg.det(matrices), dtype=np.float64)
-    # The planner asks for thousands of these, and LAPACK is eight times slower at this size.
+    # The planner needs thousands of these, and LAPACK is eight times slower at this size.
     (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(matrices, (-2, -1), (0, 1))
     return np.asarray(a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g))
 
@@ -204,7 +204,7 @@ def _generators(
     return structure_matrix * ranges[..., np.newaxis, :]
 
 
-# The set of available wrenches as the space between pairs of parallel hyperplanes.
+# The available wrench set as the intersection of slabs between parallel hyperplanes.
 #
 # Every facet of the zonotope ``{J t : t_min <= t <= t_max}`` is spanned by n - 1 columns of J, so
 # its normal c is orthogonal to them: ``y = Jᵀc`` is zero on these columns. Such a y lies in the row
@@ -216,7 +216,7 @@ def _generators(
 RANK_TOLERANCE = 1e-10
 """σ_min / σ_max at and below which the cables do not act in every direction."""
 DEPENDENT_COLUMNS = 1e-12
-"""Length of a cross product of null-space rows (each at most 1) that is round-off, no normal."""
+"""Norm of a cross product of null-space rows (each at most 1) below which it is round-off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,10 +227,10 @@ class WrenchFacets:
 
     Attributes:
         normals: shape (..., k, 6), unit vectors; zero where dependent columns span no facet.
-        cable_gains: ``normals @ J``, shape (..., k, m): wrench along the normal by unit tension.
+        cable_gains: ``normals @ J``, shape (..., k, m): wrench along the normal per unit tension.
         lower: shape (..., k), [N].
         upper: shape (..., k), [N].
-        full_rank: shape (...); where it is false the set is flat and the planes say nothing.
+        full_rank: shape (...); where false, the set is flat and the planes are meaningless.
     """
 
     normals: NDArray[np.float64]
@@ -251,7 +251,7 @@ def wrench_facets(
     Args:
         structure_matrix: shape (..., 6, m); force rows [-], moment rows [m].
         t_min: Smallest tensions, shape (m,) or (..., m), or one number, [N].
-        t_max: Largest tensions, likewise.
+        t_max: Largest tensions, shape (m,) or (..., m), or one number, [N].
         characteristic_length: [m], divides the moments.
 
     Raises:
@@ -274,7 +274,7 @@ def wrench_facets(
 def _normals(
     scaled: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the unit normals, which of them are facets' normals, and where the rank is full."""
+    """Return unit normals, whether each is a facet's normal, and whether the rank is full."""
     cable_count = scaled.shape[-1]
     freedom = cable_count - WRENCH_SIZE
     if freedom < 0:
@@ -297,7 +297,7 @@ def _normals(
 
 
 def facet_gains(null_space: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``Jᵀc`` of every facet normal c; its length fades where columns become dependent.
+    """Return ``Jᵀc`` of every facet normal c; its norm vanishes as columns become dependent.
 
     Args:
         null_space: Orthonormal rows that span the null space of J, shape (..., d, m).
@@ -317,10 +317,10 @@ def generalised_cross(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the vector orthogonal to d vectors of d + 1 components.
 
     Args:
-        rows: shape (..., d, d + 1), one vector a row.
+        rows: shape (..., d, d + 1), one vector per row.
 
     Returns:
-        shape (..., d + 1); its length is the volume that the vectors span.
+        shape (..., d + 1); its norm is the volume that the vectors span.
     """
     count = rows.shape[-2]
     if count == 0:
@@ -334,7 +334,7 @@ def generalised_cross(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.stack(minors, axis=-1) * signs)
 
 
-# Dexterity: how evenly the cables turn tensions into wrenches.
+# Dexterity: how evenly the cables convert tensions into wrenches.
 
 
 def condition_number(
@@ -342,20 +342,20 @@ def condition_number(
 ) -> NDArray[np.float64]:
     """Return the condition number of the structure matrix, 1 at best.
 
-    Forces and moments have different units, so the number means something only together with
-    the length that the moments are divided by; hence no default.
+    Forces and moments have different units, so the number is meaningful only together with the
+    length by which the moments are divided; hence no default.
 
     Args:
         structure_matrix: shape (..., 6, m); force rows [-], moment rows [m].
         characteristic_length: [m]; `rms_anchor_radius` gives the usual one.
 
     Returns:
-        σ_max / σ_min, shape (...); infinite where the matrix has no full rank.
+        σ_max / σ_min, shape (...); infinite where the matrix is rank-deficient.
 
     Raises:
         BadInput: A shape is wrong, a value is not finite, or the length is not positive.
 
-    Source: Xu & Park, Eq. 4, with the ratio as the singular values of a 6×m matrix need it.
+    Source: Xu & Park, Eq. 4, with the ratio adapted to the singular values of a 6×m matrix.
     """
     matrix = checked_structure_matrix(structure_matrix)
     scaled = with_scaled_moments(matrix, characteristic_length)
@@ -379,7 +379,7 @@ def rms_anchor_radius(anchors_in_platform: ArrayLike) -> float:
         The radius [m], the usual characteristic length.
 
     Raises:
-        BadInput: The shape is another one, or a value is not finite.
+        BadInput: The shape is wrong, or a value is not finite.
     """
     anchors = np.asarray(anchors_in_platform, dtype=np.float64)
     if anchors.ndim != 2 or anchors.shape[1] != 3 or len(anchors) == 0:

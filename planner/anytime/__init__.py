@@ -1,1 +1,1 @@
-"""The planner we recommend: a first path at once, then better ones until the budget is spent."""
+"""The recommended planner: a first path at once, then better ones until the budget is spent."""

@@ -1,10 +1,10 @@
 """The first path: two trees, one from each end, joined by edges of any length.
 
-An exact test of a whole edge costs about as much as one of a point, so edges have no step: a sample
-is joined to the nearest node of one tree by one edge, and where that is allowed to the nearest of
-the other. A sample that both reach is the path.
+An exact test of a whole edge costs about as much as one of a point, so edges have no step length: a
+sample is joined to the nearest node of one tree by one edge, and if that is allowed to the nearest
+of the other. A sample that both trees reach completes the path.
 
-What is called for every sample is inlined: handing over a problem takes as long as an edge test.
+Functions called for every sample are inlined: passing a problem takes as long as an edge test.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 NODES = 2048
-"""Room for nodes in each tree; a full tree takes no more and is still joined to."""
+"""Room for nodes in each tree; a full tree grows no further but can still be joined."""
 _FROM_INSIDE = 0.25
 """Part of the samples that are uniform in the workspace box."""
 
@@ -38,16 +38,16 @@ def connect(
     samples: int,
     path: Array,
 ) -> int:
-    """Grows both trees until they meet; called again with the same trees it goes on.
+    """Grows both trees until they meet; called again with the same trees it continues.
 
     Args:
-        problem: Where.
+        problem: Limits and costs.
         ends: Start and goal, shape (2, 3), [m].
         state: Of the random numbers; stepped.
         trees: Nodes, shape (2, NODES, 3), written.
         parents: Shape (2, NODES), written.
         counts: Nodes in both trees, edge tests and samples so far, shape (4,); zeros at first.
-        samples: How many to draw at most.
+        samples: Most samples to draw.
         path: From start to goal, shape (MOST_ON_PATH, 3), written.
 
     Returns:
@@ -81,8 +81,8 @@ def connect(
 def _sample(problem: PathProblem, state: State) -> Vector:
     """A point of the workspace, most often on its walls, edges or in its corners.
 
-    Obstacles leave more room there: drawn from a box twice as wide and put back on the walls,
-    samples see the ends 2 to 5 times as often in the paper's scenes.
+    Obstacles leave more room there: samples drawn from a box twice as wide and clamped to the walls
+    see the ends 2 to 5 times as often in the paper's scenes.
     """
     wide = 1.0 if uniform(state) < _FROM_INSIDE else 2.0
     limits = problem.world.limits
@@ -108,7 +108,7 @@ def _extended(
     tree: int,
     wanted: Vector,
 ) -> int:
-    """Grows one tree toward a point: the node from which all the way was allowed, or -1."""
+    """Grows one tree to a point: the node whose edge to the point is allowed, or -1."""
     nearest = _nearest(trees, tree, counts[tree], wanted)
     at = row_of(trees[tree, nearest])
     counts[2] += 1
@@ -141,7 +141,7 @@ def _nearest(trees: Array, tree: int, count: int, wanted: Vector) -> int:
 def _joined(
     trees: Array, parents: Integers, first: int, between: Vector, second: int, path: Array
 ) -> int:
-    """Writes the way from the first root over a point to the second; 0 where it has no room."""
+    """Writes the path from the first root through a point to the second; 0 if it does not fit."""
     length, node = 0, first
     while node >= 0:
         length, node = length + 1, parents[0, node]
@@ -163,5 +163,5 @@ def _joined(
 
 
 @inlined
-def _put(points: Array, place: int, point: Vector) -> None:
-    points[place, 0], points[place, 1], points[place, 2] = point
+def _put(points: Array, index: int, point: Vector) -> None:
+    points[index, 0], points[index, 1], points[index, 2] = point

@@ -1,8 +1,8 @@
 """A proof that no path exists: cells of the workspace that are forbidden as a whole.
 
-Under translation the positions at which one cable, or the platform, is too near to one convex piece
-form a convex set: a shadow, or a sum of convex bodies. A cell with all corners in one such set is
-in it. What a flood from the start does not reach through the other cells, not even over their edges
+Under translation, the positions at which a cable, or the platform, is too near to one convex piece
+form a convex set: a shadow, or a Minkowski sum. A cell with all corners in one such set lies in it.
+What a flood fill from the start does not reach through the other cells, not even across their edges
 and corners, cannot be reached at all.
 """
 
@@ -32,14 +32,14 @@ Array = NDArray[np.float64]
 Masks = NDArray[np.uint64]
 
 FINENESSES: Final = (8, 16, 32)
-"""Cells along each axis, coarse to fine; finer ones would take longer than a search."""
+"""Cells along each axis, coarse to fine; finer grids would take longer than a search."""
 _WORD = 64
 
 
 def is_separated(world: World, start: Array, goal: Array) -> bool:
     """Whether it is proved that no path joins two free positions, shape (3,), [m].
 
-    The proof rests on obstacle clearance and workspace alone; False means nothing.
+    The proof uses obstacle clearance and workspace only; False proves nothing.
     """
     pairs = len(world.spans) * len(world.bodies)
     words = (pairs + _WORD - 1) // _WORD
@@ -50,13 +50,13 @@ def is_separated(world: World, start: Array, goal: Array) -> bool:
 
 @kernel
 def flood_reaches(world: World, ends: Array, cells: int, words: int) -> bool:
-    """Whether a flood from the first of two positions, shape (2, 3), [m], reaches the second.
+    """Whether a flood fill from the first of two positions, (2, 3), [m], reaches the second.
 
     Args:
-        world: Where.
+        world: Obstacles and workspace.
         ends: The positions.
         cells: Along each axis.
-        words: Of 64 pairs of body and piece each.
+        words: Number of 64-bit words, one bit for each pair of body and piece.
     """
     corners = cells + 1
     masks = np.zeros((corners * corners * corners, words), dtype=np.uint64)
@@ -133,7 +133,7 @@ def _mark(world: World, mask: Masks, shares: Vector) -> None:
             needed = world.bodies[body, 0]
             if body == bodies - 1:
                 near = not platform_apart(world, piece, at, at, needed)
-            elif world.pulley > 0.0:  # an exit that moves leaves no convex shadow
+            elif world.pulley > 0.0:  # with a moving exit point the shadow is not convex
                 near = False
             else:
                 anchor = plus(at, arm(world, body))
@@ -143,7 +143,7 @@ def _mark(world: World, mask: Masks, shares: Vector) -> None:
                 mask[pair // _WORD] |= np.uint64(1) << np.uint64(pair % _WORD)
 
 
-# Why no path was found, in words: proved to be none, or not found in the time given.
+# The error text where no path was found: none exists, or none was found in the time given.
 
 
 _TRIED = 300
@@ -157,8 +157,8 @@ def no_path(
     Args:
         rig: The robot.
         scene: Obstacles, start and goal.
-        problem: What was asked.
-        search: What was done.
+        problem: Limits and costs.
+        search: The finished search.
         settings: Objective, seed and budget.
     """
     values: dict[str, float | str] = {
@@ -177,16 +177,16 @@ def no_path(
         return NoSolution(
             "there is no path: the obstacles separate start and goal",
             where=where,
-            why=f"proved by cells of the workspace that a cable or the platform excludes as a"
-            f" whole, at {scene.obstacle_clearance * 1e3:g} mm clearance and 0.05 mm reserve;"
-            f" {_in_the_way(rig, scene, problem, search)}",
+            why=f"proved by workspace cells that a cable or the platform excludes as a whole, at"
+            f" {scene.obstacle_clearance * 1e3:g} mm clearance and 0.05 mm reserve;"
+            f" {_blocking_pairs(rig, scene, problem, search)}",
             next_step="reduce the clearance, or move the goal or an obstacle",
             values={**values, "proved": "yes"},
         )
     return NoSolution(
         settings.not_found(int(search.totals[0]), gap),
         where=where,
-        why=f"it is not proved that no path exists; {_in_the_way(rig, scene, problem, search)}",
+        why=f"it is not proved that no path exists; {_blocking_pairs(rig, scene, problem, search)}",
         next_step=f"{settings.longer}, reduce the clearance, try another seed, or move the"
         " goal or an obstacle",
         values=values,
@@ -202,8 +202,8 @@ def _gap(search: AnytimeSearch) -> float:
     return float(gaps.min())
 
 
-def _in_the_way(rig: Rig, scene: Scene, problem: PathProblem, search: AnytimeSearch) -> str:
-    """What most often forbids edges from start and goal, by trying some."""
+def _blocking_pairs(rig: Rig, scene: Scene, problem: PathProblem, search: AnytimeSearch) -> str:
+    """The limits and pairs that most often forbid edges from start and goal, from trials."""
     random = np.random.default_rng(0)
     low, high = problem.world.limits
     reasons: Counter[str] = Counter()
@@ -224,5 +224,5 @@ def _in_the_way(rig: Rig, scene: Scene, problem: PathProblem, search: AnytimeSea
     text = f"of {_TRIED} edges tried from start and goal were refused for: {listed}"
     if pairs:
         named = ", ".join(f"{pair} ({count})" for pair, count in pairs.most_common(3))
-        text += f"; most often in the way: {named}"
+        text += f"; most often blocking: {named}"
     return text

@@ -1,7 +1,7 @@
-"""The cheapest path through a lattice: where random first paths all lie on the wrong side.
+"""The cheapest path through a lattice, for when random first paths all pass on the wrong side.
 
 Best-first search (A*) over the points at which the cost is known and their 26 neighbours. An edge
-is tested when its far end is about to be settled, not when it is first seen, so most never are.
+is tested only when its far end is about to be settled, so most edges are never tested.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from planner.collision.edges import row_of
 from planner.kernels.jit import kernel
 from planner.kernels.primitives import Vector, minus, norm
 
-# A heap in two arrays: the entry of the smallest key first.
+# A binary heap in two arrays, smallest key first.
 
 
 @kernel
@@ -33,13 +33,13 @@ def push(
     """Adds an entry; returns the arrays, which grow when they are full, and the new count.
 
     Args:
-        keys: What is ordered by, and a value that goes with it, shape (k, 2).
+        keys: Sort key of each entry and a value stored with it, shape (k, 2).
         entries: Two numbers of each entry, shape (k, 2).
         count: Entries so far.
-        key: Of the new entry.
-        value: Likewise.
-        first: Likewise.
-        second: Likewise.
+        key: Sort key of the new entry.
+        value: Value of the new entry.
+        first: First number of the new entry.
+        second: Second number of the new entry.
     """
     if count == len(keys):
         more_keys, more_entries = np.empty((2 * count, 2)), np.empty((2 * count, 2), dtype=np.int64)
@@ -59,7 +59,7 @@ def push(
 
 @kernel
 def pop(keys: Array, entries: Integers, count: int) -> int:
-    """Takes the first entry out; returns the new count."""
+    """Removes the first entry; returns the new count."""
     last = count - 1
     key, at = keys[last, 0], 0
     while True:
@@ -87,7 +87,7 @@ Integers = NDArray[np.int64]
 Shape = tuple[int, int, int]
 
 _REACH = 2
-"""Steps about start and goal to whose lattice points they are joined."""
+"""Start and goal are joined to lattice points within this many steps."""
 _ROOM = 4096
 _OPEN = -2
 
@@ -102,22 +102,22 @@ def lattice_path(
     points: Array,
     counts: Integers,
 ) -> int:
-    """Searches for the cheapest path by the sums in the cost; nodes are the grid's points.
+    """Finds the cheapest path by length and kinematic cost; nodes are grid points.
 
     Args:
-        problem: Where, and what edges cost; smallest clearance and margin are left out.
+        problem: Limits and costs; smallest clearance and margin are not counted.
         ends: Start and goal, shape (2, 3), [m].
         state: Of the random numbers; stepped.
-        stride: Every how manyth point of the grid is used, along each axis.
-        spread: Up to what part of it the cost of an edge is raised at random, for other paths.
+        stride: Grid points per lattice step, along each axis.
+        spread: Largest random increase of an edge's cost, as a part of it; for other paths.
         points: Vertices of the path, shape (k, 3), written.
-        counts: The second number is stepped by the edge tests, shape (2,).
+        counts: The second number is incremented by each edge test, shape (2,).
 
     Returns:
         The number of vertices; 0 without a path, or without room for it.
     """
     shape = _shape(problem.kinematic, stride)
-    size = shape[0] * shape[1] * shape[2]  # this is the start's number, the goal's is one more
+    size = shape[0] * shape[1] * shape[2]  # node index of the start; the goal's is one more
     parent = np.full(size + 2, _OPEN, dtype=np.int64)
     least = problem.terms[LENGTH] + problem.terms[KINEMATIC] * problem.kinematic.min()
     goal = row_of(ends[1])
@@ -135,7 +135,7 @@ def lattice_path(
                 continue
         parent[node] = before
         if node == size + 1:
-            return _way(problem, parent, stride, shape, ends, points)
+            return _write_path(problem, parent, stride, shape, ends, points)
         weight = _weight(problem, at)
         low, high = _around(problem, at, stride, shape, _REACH if node == size else 1)
         for i in range(low[0], high[0] + 1):
@@ -145,7 +145,7 @@ def lattice_path(
                     if parent[other] != _OPEN:
                         continue
                     number = _numbers(problem, i, j, k, stride)
-                    to, there = _place(problem, number), _weight_at(problem, number)
+                    to, there = _position(problem, number), _weight_at(problem, number)
                     factor = (1.0 + spread * uniform(state)) * (weight + there) / 2.0
                     total = so_far + factor * norm(minus(to, at))
                     ahead = total + least * norm(minus(goal, to))
@@ -158,7 +158,7 @@ def lattice_path(
 
 @kernel
 def _weight(problem: PathProblem, at: Vector) -> float:
-    """What a metre costs at a point."""
+    """Cost of a metre at a point."""
     cost = problem.terms[KINEMATIC]
     if cost > 0.0:
         cost *= interpolated(problem.grid, problem.kinematic, at)
@@ -167,14 +167,14 @@ def _weight(problem: PathProblem, at: Vector) -> float:
 
 @kernel
 def _weight_at(problem: PathProblem, number: Shape) -> float:
-    """What a metre costs at a point of the grid."""
+    """Cost of a metre at a grid point."""
     kinematic = problem.terms[KINEMATIC] * problem.kinematic[number]
     return problem.terms[LENGTH] + kinematic  # type: ignore[no-any-return]
 
 
 @kernel
 def _shape(values: Array, stride: int) -> Shape:
-    """How many points there are along each axis, those on all walls among them."""
+    """Number of lattice points along each axis, the walls included."""
     return (
         (values.shape[0] + stride - 2) // stride + 1,
         (values.shape[1] + stride - 2) // stride + 1,
@@ -184,7 +184,7 @@ def _shape(values: Array, stride: int) -> Shape:
 
 @kernel
 def _numbers(problem: PathProblem, i: int, j: int, k: int, stride: int) -> Shape:
-    """The grid numbers of a lattice point."""
+    """The grid indices of a lattice point."""
     last = problem.kinematic.shape
     return (
         min(i * stride, last[0] - 1),
@@ -194,7 +194,7 @@ def _numbers(problem: PathProblem, i: int, j: int, k: int, stride: int) -> Shape
 
 
 @kernel
-def _place(problem: PathProblem, number: Shape) -> Vector:
+def _position(problem: PathProblem, number: Shape) -> Vector:
     grid = problem.grid
     return (
         grid[0, 0] + number[0] * grid[1, 0],
@@ -209,14 +209,14 @@ def _point(problem: PathProblem, node: int, stride: int, shape: Shape, ends: Arr
     if node >= size:
         return row_of(ends[node - size])
     k, rest = node % shape[2], node // shape[2]
-    return _place(problem, _numbers(problem, rest // shape[1], rest % shape[1], k, stride))
+    return _position(problem, _numbers(problem, rest // shape[1], rest % shape[1], k, stride))
 
 
 @kernel
 def _around(
     problem: PathProblem, at: Vector, stride: int, shape: Shape, reach: int
 ) -> tuple[Shape, Shape]:
-    """The first and the last lattice numbers within some steps of a point, along each axis."""
+    """First and last lattice index within ``reach`` steps of a point, along each axis."""
     x = _nearest(problem, at[0], 0, stride)
     y = _nearest(problem, at[1], 1, stride)
     z = _nearest(problem, at[2], 2, stride)
@@ -241,10 +241,10 @@ def _near(problem: PathProblem, at: Vector, goal: Vector, stride: int) -> bool:
 
 
 @kernel
-def _way(
+def _write_path(
     problem: PathProblem, parent: Integers, stride: int, shape: Shape, ends: Array, points: Array
 ) -> int:
-    """Writes the way to the goal."""
+    """Writes the path to the goal; 0 if it does not fit."""
     length, node = 0, len(parent) - 1
     while node >= 0:
         length, node = length + 1, parent[node]

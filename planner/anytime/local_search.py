@@ -1,8 +1,8 @@
-"""Making a path cheaper by small random changes, each of which is exact.
+"""Making a path cheaper by small random changes, each checked exactly.
 
-An allowed change costs about a microsecond to find out, so use many simple ones:
-cutting a corner between two places of the path, moving one or two vertices by any size, and moving
-a vertex away and drawing it tight again, which lets it slide along what it touches.
+A change takes about a microsecond to check, so many simple ones are tried: cutting a corner
+between two positions on the path, moving one or two vertices by any distance, and moving a vertex
+away and pulling it tight again, which lets it slide along what it touches.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from planner.collision.edges import row_of
 from planner.kernels.jit import leaf
 from planner.kernels.primitives import Vector, along, dot, minus
 
-# A path under improvement, and the one way in which it is ever changed.
+# A path under improvement, and the only operation that changes it.
 #
-# Everything that makes a path better asks for some of its vertices to be replaced by none, one or
-# two others. The change is made when it makes the path cheaper and every new edge is allowed.
+# Every improvement replaces some vertices by none, one or two others. It is made if the path gets
+# cheaper and every new edge is allowed.
 
 
 Array = NDArray[np.float64]
@@ -43,15 +43,15 @@ _ROUND_OFF = 1e-13
 
 
 class PathChange(NamedTuple):
-    """Vertices to be replaced, and by what.
+    """Vertices to replace, and their replacements.
 
     Attributes:
-        first: Number of the vertex before those that go.
-        last: Number of the vertex after them.
-        number: How many come in their place, 0, 1 or 2.
+        first: Index of the vertex before those replaced.
+        last: Index of the vertex after them.
+        number: Number of replacements, 0, 1 or 2.
         one: The first of them, [m].
         two: The second of them, [m].
-        ends_known: Whether the edges to ``one`` and from ``two`` are parts of present edges.
+        ends_known: Whether the edges to ``one`` and from ``two`` are parts of existing edges.
     """
 
     first: int
@@ -67,9 +67,8 @@ class Polyline(NamedTuple):
 
     Attributes:
         points: Vertices, start and goal included, shape (MOST_VERTICES, 3), [m].
-        edges: Of each edge, by its first vertex, what it adds to the sums in the cost, its
-            smallest clearance [m] and margin [N] (infinite where they have no weight), shape
-            (MOST_VERTICES, 3).
+        edges: Cost of each edge, its smallest clearance [m] and margin [N] (infinite where they
+            have no weight), indexed by its first vertex, shape (MOST_VERTICES, 3).
         counts: Vertices, and edge tests so far, shape (2,).
     """
 
@@ -79,13 +78,13 @@ class Polyline(NamedTuple):
 
 
 def polyline_of(points: Array) -> Polyline:
-    """A polyline of vertices, shape (k, 3), [m], not measured and with no room for more."""
+    """A polyline of vertices, shape (k, 3), [m], not yet measured, without spare capacity."""
     return Polyline(points.copy(), np.zeros((len(points), 3)), np.array([len(points), 0]))
 
 
 @leaf
 def measure(problem: PathProblem, line: Polyline) -> float:
-    """Fills in what the edges are worth, and gives the cost of the whole path."""
+    """Computes the values of all edges; returns the cost of the whole path."""
     for i in range(line.counts[0] - 1):
         start, end = row_of(line.points[i]), row_of(line.points[i + 1])
         clearance, margin = edge_lows(problem, start, end)
@@ -96,7 +95,7 @@ def measure(problem: PathProblem, line: Polyline) -> float:
 
 @leaf
 def cost_of(problem: PathProblem, line: Polyline) -> float:
-    """The cost of the whole path, its edges being measured."""
+    """The cost of a path whose edges are measured."""
     total, clearance, margin = 0.0, math.inf, math.inf
     for i in range(line.counts[0] - 1):
         total += line.edges[i, 0]
@@ -107,7 +106,7 @@ def cost_of(problem: PathProblem, line: Polyline) -> float:
 
 @leaf
 def replace(problem: PathProblem, line: Polyline, change: PathChange) -> bool:
-    """Makes a change, if it makes the path cheaper and every new edge is allowed."""
+    """Makes a change if the path gets cheaper and every new edge is allowed."""
     added = change.number - (change.last - change.first - 1)
     if line.counts[0] + added > len(line.points):
         return False
@@ -157,7 +156,7 @@ def _gain(
     change: PathChange,
     lows: tuple[float, float, float, float, float, float],
 ) -> float:
-    """What the change does for the smallest clearance and margin of the whole path."""
+    """The gain of a change in the smallest clearance and margin of the whole path."""
     clearance, margin = math.inf, math.inf
     old_clearance, old_margin = math.inf, math.inf
     for i in range(line.counts[0] - 1):
@@ -178,7 +177,7 @@ def _put(
     costs: Vector,
     lows: tuple[float, float, float, float, float, float],
 ) -> None:
-    """Makes room for the new vertices, and writes them and what their edges are worth.
+    """Makes room for the new vertices, and writes them and the values of their edges.
 
     The last numbers of ``costs`` and ``lows`` are those of the last new edge.
     """
@@ -202,14 +201,14 @@ def _put(
 
 
 @leaf
-def _move(line: Polyline, place: int, to: int) -> None:
+def _move(line: Polyline, source: int, target: int) -> None:
     for column in range(3):
-        line.points[to, column] = line.points[place, column]
-        line.edges[to, column] = line.edges[place, column]
+        line.points[target, column] = line.points[source, column]
+        line.edges[target, column] = line.edges[source, column]
 
 
 _LARGEST, _SMALLEST = 0.040, 5e-5
-"""Moves of vertices, [m]: from a tenth of a usual way to what no longer matters."""
+"""Moves of vertices, [m]: from a tenth of a typical path length to a negligible distance."""
 _TIGHTENINGS = 7
 _MOST_REPEATS, _ON = 12, 1.4
 _CUT, _MOVE, _MOVE_TWO, _SLIDE, _DROP, _SPLIT = 0, 1, 2, 3, 4, 5
@@ -218,13 +217,13 @@ _NOWHERE = (0.0, 0.0, 0.0)
 
 @leaf
 def polish(problem: PathProblem, line: Polyline, state: State, trials: int) -> None:
-    """Tries a number of kinds of changes at random positions.
+    """Tries random kinds of changes at random positions.
 
-    Where moving vertices was better, they are moved on by ever more the same way.
+    A successful move of vertices is repeated in the same direction by growing distances.
     """
     for _ in range(trials):
-        kind, way, size = _kind(line, state), direction(state), _size(state)
-        change = _drawn(line, state, kind, way, size)
+        kind, heading, size = _kind(line, state), direction(state), _size(state)
+        change = _drawn(line, state, kind, heading, size)
         if kind == _SLIDE:
             change = _tightened(problem, line, change)
         repeats = _MOST_REPEATS if kind in (_MOVE, _MOVE_TWO) else 1
@@ -232,13 +231,13 @@ def polish(problem: PathProblem, line: Polyline, state: State, trials: int) -> N
             if not replace(problem, line, change):
                 break
             size *= _ON
-            one, two = along(change.one, way, size), along(change.two, way, size)
+            one, two = along(change.one, heading, size), along(change.two, heading, size)
             change = PathChange(change.first, change.last, change.number, one, two, False)
 
 
 @leaf
 def _kind(line: Polyline, state: State) -> int:
-    """What to try next. Source of the shares: measured on the paper's scenes."""
+    """The kind of change to try. Source of the shares: measured on the paper's scenes."""
     choice = uniform(state)
     if line.counts[0] < 3 or choice < 0.05:
         return _SPLIT
@@ -255,7 +254,7 @@ def _kind(line: Polyline, state: State) -> int:
 
 @leaf
 def _size(state: State) -> float:
-    """The size of a move, every scale equally often."""
+    """The size of a move, log-uniform."""
     return _SMALLEST * math.exp(uniform(state) * math.log(_LARGEST / _SMALLEST))
 
 
@@ -265,8 +264,8 @@ def _vertex(line: Polyline, k: int) -> Vector:
 
 
 @leaf
-def _drawn(line: Polyline, state: State, kind: int, way: Vector, size: float) -> PathChange:
-    """One change of a kind at a random place."""
+def _drawn(line: Polyline, state: State, kind: int, heading: Vector, size: float) -> PathChange:
+    """A change of the given kind at a random position."""
     vertices = line.counts[0]
     if kind == _CUT:
         return _cut(line, state)
@@ -278,13 +277,16 @@ def _drawn(line: Polyline, state: State, kind: int, way: Vector, size: float) ->
         k = below(state, vertices - 1)
         start, end = _vertex(line, k), _vertex(line, k + 1)
         at = along(start, minus(end, start), uniform(state))
-        return PathChange(k, k + 1, 1, along(at, way, size), _NOWHERE, False)
-    if kind == _MOVE_TWO:  # alike, as where an edge between them touches something
+        return PathChange(k, k + 1, 1, along(at, heading, size), _NOWHERE, False)
+    if kind == _MOVE_TWO:  # both by the same vector: the edge between them may touch something
         k = 1 + below(state, vertices - 3)
-        one, two = along(_vertex(line, k), way, size), along(_vertex(line, k + 1), way, size)
+        one, two = (
+            along(_vertex(line, k), heading, size),
+            along(_vertex(line, k + 1), heading, size),
+        )
         return PathChange(k - 1, k + 2, 2, one, two, False)
     k = 1 + below(state, vertices - 2)
-    return PathChange(k - 1, k + 1, 1, along(_vertex(line, k), way, size), _NOWHERE, False)
+    return PathChange(k - 1, k + 1, 1, along(_vertex(line, k), heading, size), _NOWHERE, False)
 
 
 @leaf
@@ -295,7 +297,7 @@ def _cut(line: Polyline, state: State) -> PathChange:
     second = first + 1 + int(uniform(state) ** 3 * (edges - 1 - first))
     second = min(second, edges - 1)
     back, on = uniform(state), uniform(state)
-    if uniform(state) < 0.5:  # close to the corners, where most of what is left to gain is
+    if uniform(state) < 0.5:  # close to the corners, where most of the remaining gain is
         near = math.exp(-6.0 * uniform(state))
         back, on = back * near, on * near
     a, b = _vertex(line, first), _vertex(line, first + 1)
@@ -306,7 +308,7 @@ def _cut(line: Polyline, state: State) -> PathChange:
 
 @leaf
 def _tightened(problem: PathProblem, line: Polyline, change: PathChange) -> PathChange:
-    """Draws a moved vertex toward the straight line of its neighbours, as far as allowed."""
+    """Pulls a moved vertex toward the line between its neighbours, as far as allowed."""
     before, after = _vertex(line, change.first), _vertex(line, change.last)
     chord = minus(after, before)
     squared = dot(chord, chord)
@@ -314,7 +316,7 @@ def _tightened(problem: PathProblem, line: Polyline, change: PathChange) -> Path
         return change
     share = min(max(dot(minus(change.one, before), chord) / squared, 0.0), 1.0)
     inward = minus(along(before, chord, share), change.one)
-    low, high, middle = 0.0, 1.0, 0.0  # where it was moved to must be allowed, too
+    low, high, middle = 0.0, 1.0, 0.0  # the moved vertex itself must be allowed too
     for _ in range(_TIGHTENINGS):
         line.counts[1] += 2
         at, allowed = along(change.one, inward, middle), True

@@ -1,14 +1,14 @@
-"""A first path where the room is narrow: parts of a roadmap that begin in the gaps themselves.
+"""A first path through narrow passages: a roadmap whose components begin in the gaps themselves.
 
-Samples of the whole workspace miss a gap that is a thousandth of it. Under translation, though,
-every obstacle keeps a body behind planes (`planner.collision.separating_planes`), so a point that
-is too near to something is drawn before one of its planes, then before one of what is too near
-there, until it is free: it then lies at the side of a gap, if there is one nearby. From there
-straight ways along the planes it touches lead out at both mouths. Each such way is a part of its
-own, joined to those next to it by straight edges, until start and goal are of one part. What the
-two trees of `planner.anytime.connect` reached by then belongs to the parts of start and goal.
+Samples of the whole workspace miss a gap of a thousandth of its volume. Under translation, though,
+every obstacle keeps a body behind planes (`planner.collision.separating_planes`). A point too near
+to something is therefore projected onto one of its planes, then onto one of whatever is too near
+there, until it is free: it then lies at the side of a gap, if there is one nearby. From there,
+straight segments along the planes it touches lead out at both mouths. Each sample starts a
+component of the roadmap; straight edges join neighbouring components until start and goal are in
+one. The two trees of `planner.anytime.connect` belong to the components of start and goal.
 
-Nearly all functions are inlined: handing over a problem takes as long as several edge tests.
+Nearly all functions are inlined: passing a problem takes as long as several edge tests.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from planner.kernels.scene_arrays import World
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-PLACES = 1024
+ROADMAP_NODES = 1024
 """Room for nodes; a full roadmap is restarted."""
 _IN_GAPS, _NEAR_NODES = 0.8, 0.15
-"""Shares of the samples: drawn into gaps, and near a node; the rest is from all the workspace."""
+"""Shares of the samples: in gaps, and near a node; the rest are uniform in the workspace."""
 _DRAWN, _OTHER_PLANE = 24, 0.3
-"""How often a point is drawn before a plane, and how often not before that which is nearest."""
+"""Most projections of a point, and the share of them onto another plane than the nearest."""
 _ROOM = 1e-7
-"""By which it is drawn farther, [m]: more than round-off, less than any gap worth finding."""
+"""Added to a projection, [m]: more than round-off, less than any gap worth finding."""
 _FROM_TREES = 200
-"""Nodes of each tree that the roadmap begins with at most."""
+"""Most nodes of each tree with which the roadmap begins."""
 _BISECTIONS = 4
 _NEAREST, _FARTHEST = 5e-5, 0.2
-"""Of samples near a node, [m]."""
+"""Distances of samples near a node, [m]."""
 _START, _GOAL = 0, 1
 _ANY_OTHER = -1
-"""As a part: any but the node's own."""
+"""In place of a component: any but the node's own."""
 
 
 @leaf
@@ -51,7 +51,7 @@ def through_passages(
     problem: PathProblem,
     ends: Array,
     state: State,
-    places: Array,
+    nodes: Array,
     above: Integers,
     parts: Integers,
     made: Integers,
@@ -61,50 +61,50 @@ def through_passages(
     samples: int,
     path: Array,
 ) -> int:
-    """Adds samples to a roadmap until it joins start and goal; called again it goes on.
+    """Adds samples to a roadmap until it joins start and goal; called again it continues.
 
     Args:
-        problem: Where.
+        problem: Limits and costs.
         ends: Start and goal, shape (2, 3), [m].
         state: Of the random numbers; stepped.
-        places: Nodes, the first two start and goal, shape (PLACES, 3), written.
-        above: Of each node the next toward the root of its part, -1 for that, shape (PLACES,).
-        parts: Of each node the part that it belongs to, shape (PLACES,), written.
+        nodes: Nodes, the first two start and goal, shape (ROADMAP_NODES, 3), written.
+        above: Parent of each node, -1 for the root of a component, shape (ROADMAP_NODES,).
+        parts: Component of each node, shape (ROADMAP_NODES,), written.
         made: Nodes and edge tests so far, shape (2,); zeros at first.
         trees: Of start and goal, see `planner.anytime.connect.connect`, shape (2, k, 3), [m].
-        parents: Likewise, shape (2, k).
-        counts: Likewise; of nodes in both.
-        samples: How many to draw at most.
+        parents: See there, shape (2, k).
+        counts: Nodes in both trees.
+        samples: Most samples to draw.
         path: From start to goal, shape (k, 3), written.
 
     Returns:
         The number of vertices of the path; 0 where none was found yet.
     """
     for _ in range(samples):
-        if made[0] == 0 or made[0] + 3 > len(places):
-            _begin(ends, places, above, parts, made)
-            _add_trees(places, above, parts, made, trees, parents, counts)
+        if made[0] == 0 or made[0] + 3 > len(nodes):
+            _begin(ends, nodes, above, parts, made)
+            _add_trees(nodes, above, parts, made, trees, parents, counts)
         node, touched, other = made[0], -1, -1
         choice = uniform(state)
         if _IN_GAPS <= choice < _IN_GAPS + _NEAR_NODES:
             near = below(state, made[0])
             size = _NEAREST * math.exp(uniform(state) * math.log(_FARTHEST / _NEAREST))
-            _add_way(problem, places, above, parts, made, near, direction(state), size)
+            _add_segment(problem, nodes, above, parts, made, near, direction(state), size)
         else:
             at = _anywhere(problem.world, state)
             if choice < _IN_GAPS:
                 at, touched, other = _out_of_obstacles(problem.world, state, at)
             if not _allowed(problem, made, at, at):
                 continue
-            _add(places, above, parts, made, at, -1)
+            _add(nodes, above, parts, made, at, -1)
         while node < made[0] and parts[_START] != parts[_GOAL]:
-            _join(problem, places, above, parts, made, node)
+            _join(problem, nodes, above, parts, made, node)
             if touched >= 0 and parts[_START] != parts[_GOAL]:
-                _add_ways(problem, state, places, above, parts, made, node, touched, other)
+                _add_segments(problem, state, nodes, above, parts, made, node, touched, other)
                 touched = -1
             node += 1
         if parts[_START] == parts[_GOAL]:
-            count = _path(places, above, path)
+            count = _path(nodes, above, path)
             made[0] = 0
             if count > 0:
                 return count
@@ -112,15 +112,15 @@ def through_passages(
 
 
 @leaf
-def _begin(ends: Array, places: Array, above: Integers, parts: Integers, made: Integers) -> None:
+def _begin(ends: Array, nodes: Array, above: Integers, parts: Integers, made: Integers) -> None:
     made[0] = 0
-    _add(places, above, parts, made, row_of(ends[0]), -1)
-    _add(places, above, parts, made, row_of(ends[1]), -1)
+    _add(nodes, above, parts, made, row_of(ends[0]), -1)
+    _add(nodes, above, parts, made, row_of(ends[1]), -1)
 
 
 @leaf
 def _add_trees(
-    places: Array,
+    nodes: Array,
     above: Integers,
     parts: Integers,
     made: Integers,
@@ -128,13 +128,13 @@ def _add_trees(
     parents: Integers,
     counts: Integers,
 ) -> None:
-    """Adds the nodes of both trees, which hang together with start or goal."""
+    """Adds the nodes of both trees to the components of start and goal."""
     for tree in range(2):
         first = made[0]
         for i in range(1, min(counts[tree], _FROM_TREES)):
-            parent = parents[tree, i]  # before its child, hence added
+            parent = parents[tree, i]  # precedes its child, so it is already added
             below_it = tree if parent == 0 else first + parent - 1
-            _add(places, above, parts, made, row_of(trees[tree, i]), below_it)
+            _add(nodes, above, parts, made, row_of(trees[tree, i]), below_it)
 
 
 @inlined
@@ -145,11 +145,11 @@ def _allowed(problem: PathProblem, made: Integers, start: Vector, end: Vector) -
 
 @leaf
 def _add(
-    places: Array, above: Integers, parts: Integers, made: Integers, at: Vector, parent: int
+    nodes: Array, above: Integers, parts: Integers, made: Integers, at: Vector, parent: int
 ) -> None:
-    """Adds a node below another, or as a part of its own."""
+    """Adds a node below another, or as a component of its own."""
     new = made[0]
-    places[new, 0], places[new, 1], places[new, 2] = at
+    nodes[new, 0], nodes[new, 1], nodes[new, 2] = at
     above[new] = parent
     parts[new] = parts[parent] if parent >= 0 else new
     made[0] = new + 1
@@ -167,9 +167,9 @@ def _anywhere(world: World, state: State) -> Vector:
 
 @inlined
 def _out_of_obstacles(world: World, state: State, at: Vector) -> tuple[Vector, int, int]:
-    """A point drawn out of what it is too near to, and the last two planes it was drawn before.
+    """A point projected out of obstacles, and the last two planes it was projected onto.
 
-    Planes are those of `World.planes`, -1 for none. The point may still be too near to something.
+    Planes are indices of `World.planes`, -1 for none. The point may still be too near to something.
     """
     touched, other = -1, -1
     for _ in range(_DRAWN):
@@ -191,9 +191,9 @@ def _out_of_obstacles(world: World, state: State, at: Vector) -> tuple[Vector, i
 
 @inlined
 def _worst(world: World, state: State, at: Vector) -> tuple[int, float]:
-    """A plane of the pair that is proved least at a position, and the room before it, [m].
+    """A plane of the pair with the least room at a position, and that room, [m].
 
-    -1 where all pairs are proved.
+    -1 where all pairs are separated.
     """
     worst, least, found = -1, 0.0, -1
     for pair in range(len(world.pairs)):
@@ -221,10 +221,10 @@ def _room(world: World, k: int, at: Vector) -> float:
 
 
 @inlined
-def _add_ways(
+def _add_segments(
     problem: PathProblem,
     state: State,
-    places: Array,
+    nodes: Array,
     above: Integers,
     parts: Integers,
     made: Integers,
@@ -232,42 +232,42 @@ def _add_ways(
     touched: int,
     other: int,
 ) -> None:
-    """Adds the ends of the straight way through a node along the planes that it touches."""
+    """Adds the ends of the straight segment through a node along the planes it touches."""
     planes = problem.world.planes
     normal = row_of(planes[touched, :3])
     second = direction(state)
     if other >= 0 and uniform(state) < 0.7:
         second = row_of(planes[other, :3])
-    way = cross(normal, second)
-    size = norm(way)
+    tangent = cross(normal, second)
+    size = norm(tangent)
     if size < 1e-6:
-        way = cross(normal, direction(state))
-        size = norm(way)
+        tangent = cross(normal, direction(state))
+        size = norm(tangent)
     if size < 1e-6:
         return
     reach = norm(minus(row_of(problem.world.limits[1]), row_of(problem.world.limits[0])))
     for sign in (-1.0, 1.0):
-        one = (sign * way[0] / size, sign * way[1] / size, sign * way[2] / size)
-        _add_way(problem, places, above, parts, made, node, one, reach)
+        one = (sign * tangent[0] / size, sign * tangent[1] / size, sign * tangent[2] / size)
+        _add_segment(problem, nodes, above, parts, made, node, one, reach)
 
 
 @inlined
-def _add_way(
+def _add_segment(
     problem: PathProblem,
-    places: Array,
+    nodes: Array,
     above: Integers,
     parts: Integers,
     made: Integers,
     node: int,
-    way: Vector,
+    heading: Vector,
     reach: float,
 ) -> None:
     """Adds the farthest point allowed from a node along a unit vector, at most ``reach`` away."""
-    start = row_of(places[node])
-    reach = min(reach, _to_the_wall(problem.world, start, way))
+    start = row_of(nodes[node])
+    reach = min(reach, _to_the_wall(problem.world, start, heading))
     low, high, share = 0.0, 1.0, 1.0
     for _ in range(_BISECTIONS):
-        if _allowed(problem, made, start, along(start, way, share * reach)):
+        if _allowed(problem, made, start, along(start, heading, share * reach)):
             low = share
         else:
             high = share
@@ -275,58 +275,58 @@ def _add_way(
             break
         share = (low + high) / 2.0
     if low * reach > _NEAREST:
-        _add(places, above, parts, made, along(start, way, low * reach), node)
+        _add(nodes, above, parts, made, along(start, heading, low * reach), node)
 
 
 @inlined
-def _to_the_wall(world: World, start: Vector, way: Vector) -> float:
-    """How far it is from a point along a unit vector to the wall of the workspace, [m]."""
+def _to_the_wall(world: World, start: Vector, heading: Vector) -> float:
+    """Distance from a point along a unit vector to the wall of the workspace, [m]."""
     least = math.inf
     for axis in range(3):
-        if way[axis] > 0.0:
-            least = min(least, (world.limits[1, axis] - start[axis]) / way[axis])
-        elif way[axis] < 0.0:
-            least = min(least, (world.limits[0, axis] - start[axis]) / way[axis])
+        if heading[axis] > 0.0:
+            least = min(least, (world.limits[1, axis] - start[axis]) / heading[axis])
+        elif heading[axis] < 0.0:
+            least = min(least, (world.limits[0, axis] - start[axis]) / heading[axis])
     return max(least, 0.0)
 
 
 @inlined
 def _join(
-    problem: PathProblem, places: Array, above: Integers, parts: Integers, made: Integers, node: int
+    problem: PathProblem, nodes: Array, above: Integers, parts: Integers, made: Integers, node: int
 ) -> None:
-    """Joins a node to the parts of start and goal, and to the nearest node of any other."""
+    """Joins a node to the components of start and goal, and to the nearest node of any other."""
     for k in range(3):
         part = parts[_START] if k == 0 else (parts[_GOAL] if k == 1 else _ANY_OTHER)
         if part != parts[node]:
-            _try_to_join(problem, places, above, parts, made, node, part)
+            _try_to_join(problem, nodes, above, parts, made, node, part)
 
 
 @inlined
 def _try_to_join(
     problem: PathProblem,
-    places: Array,
+    nodes: Array,
     above: Integers,
     parts: Integers,
     made: Integers,
     node: int,
     part: int,
 ) -> None:
-    """Tries an edge to the nearest node of a part, or of any but the node's own."""
+    """Tries an edge to the nearest node of a component, or of any but the node's own."""
     own, best, least = parts[node], -1, math.inf
-    x, y, z = places[node, 0], places[node, 1], places[node, 2]
+    x, y, z = nodes[node, 0], nodes[node, 1], nodes[node, 2]
     for i in range(made[0]):
         if parts[i] == own or part not in (_ANY_OTHER, parts[i]):
             continue
-        squared = (places[i, 0] - x) ** 2 + (places[i, 1] - y) ** 2 + (places[i, 2] - z) ** 2
+        squared = (nodes[i, 0] - x) ** 2 + (nodes[i, 1] - y) ** 2 + (nodes[i, 2] - z) ** 2
         if squared < least:
             best, least = i, squared
-    if best >= 0 and _allowed(problem, made, row_of(places[best]), row_of(places[node])):
+    if best >= 0 and _allowed(problem, made, row_of(nodes[best]), row_of(nodes[node])):
         _merge(above, parts, made, best, node)
 
 
 @leaf
 def _merge(above: Integers, parts: Integers, made: Integers, one: int, two: int) -> None:
-    """Hangs all of the part of the second node below the first."""
+    """Attaches the whole component of the second node below the first."""
     _make_root(above, two)
     above[two] = one
     old, kept = parts[two], parts[one]
@@ -337,7 +337,7 @@ def _merge(above: Integers, parts: Integers, made: Integers, one: int, two: int)
 
 @leaf
 def _make_root(above: Integers, node: int) -> None:
-    """Turns the way from a node to its root about."""
+    """Reverses the path from a node to its root, making the node the root."""
     before, at = -1, node
     while at >= 0:
         after = above[at]
@@ -346,13 +346,13 @@ def _make_root(above: Integers, node: int) -> None:
 
 
 @leaf
-def _path(places: Array, above: Integers, path: Array) -> int:
-    """Writes the way from start to goal, which are of one part; 0 where it has no room."""
+def _path(nodes: Array, above: Integers, path: Array) -> int:
+    """Writes the path from start to goal, both in one component; 0 if it does not fit."""
     _make_root(above, _GOAL)
     count, node = 0, _START
     while node >= 0:
         if count == len(path):
             return 0
-        path[count, 0], path[count, 1], path[count, 2] = row_of(places[node])
+        path[count, 0], path[count, 1], path[count, 2] = row_of(nodes[node])
         count, node = count + 1, above[node]
     return count

@@ -1,9 +1,9 @@
-"""From start to goal with the planner we recommend: rounds until the budget is spent.
+"""From start to goal with the recommended planner: rounds until the budget is spent.
 
-Some first paths, and more and more polishing of the best of them. A round costs a fraction of a
-millisecond, and depends on the seed and on the rounds before alone. So a search can end after any
-of them, and be repeated from the number of rounds. The best path is kept apart from those under
-work, so that more rounds never give a worse one.
+Rounds find some first paths and then polish the best of them. A round takes a fraction of a
+millisecond and depends only on the seed and the rounds before it, so a search can end after any
+round and be repeated from the number of rounds. The best path is stored apart from those being
+polished, so more rounds never give a worse one.
 """
 
 from __future__ import annotations
@@ -44,31 +44,31 @@ from planner.settings import LEAST_ROUNDS, OptimalSettings
 from planner.wrench.translation import edge_held
 
 _TRIALS, _SLOW_TRIALS = 400, 100
-"""Changes tried in a round; the second where clearances are asked for or edges have pulleys."""
+"""Changes tried in a round; the second where clearance has a weight or the rig has pulleys."""
 _TURNS = ((20, 8), (40, 15), (100, 30), (300, 90), (600, 180))
-"""Samples of the two trees and of the roadmap in a round without a path, taking turns."""
+"""Samples of the two trees and of the roadmap, alternating, in a round without a path."""
 _SAMPLES_OF_TREES = 4000
 """After this many without a path the two trees are restarted."""
 _LATTICE_EVERY = 4
-"""One in this many rounds without a path goes to the lattice, which narrow gaps slip through."""
+"""One in this many rounds without a path searches the lattice, which misses narrow gaps."""
 _COARSE, _MIDDLE = 4, 2
 _SPREAD = 1.0
 _FINE, _FINE_FOR_LENGTH = 1, 9
-"""Which of the first paths comes from all points of the grid; it takes longest where the cost is
-not the length, and finds the narrow ways that matter then."""
+"""Which of the first paths uses all grid points. It takes longest where the cost is not the
+length, and then finds the narrow passages that matter."""
 _ANOTHER_EVERY = 8
 """After the first `KEPT` rounds, one in this many begins with a new path."""
 _TO_THE_BEST = 0.7
 _VERTEX_PRICES = ((2, 1.5e-3), (5, 5e-4), (12, 2e-4))
-"""What a vertex must save, as share of the straight path, up to a number of rounds of polishing."""
+"""Least saving of a vertex, as part of the straight distance, up to some polishing rounds."""
 _LAST_VERTEX_PRICE = 1e-4
 _PATIENCE = 8
-"""Rounds without a path after which the grid's margins are no longer relied upon."""
+"""Rounds without a path after which interpolated margins are ignored."""
 
 
 @kernel
 def handle_of(problem: PathProblem, search: AnytimeSearch) -> Handle:
-    """Both as one reference; what is changed in them later is changed for it, too."""
+    """Problem and search as one reference; later changes of either show through it."""
     return Handle(problem, search)
 
 
@@ -76,16 +76,16 @@ def handle_of(problem: PathProblem, search: AnytimeSearch) -> Handle:
 def advance(handle: Handle, rounds: int) -> float:
     """Does some rounds; returns the cost of the best path so far, infinite without one.
 
-    Where the grid's margins mislead, `PathProblem.terms` is changed: where they leave no path they
-    are no longer asked, which shows whether obstacles do; and where a path is found that is not
-    proved to hold the wrenches, proofs are asked for from then on.
+    Where interpolated margins mislead, `PathProblem.terms` changes. If they leave no path, they are
+    ignored, which shows whether obstacles alone do. If a path turns out not to be proved
+    wrench-feasible, proofs are required from then on.
     """
     problem, search = handle.problem, handle.search
     for _ in range(rounds):
         begun = search.totals[0]
         search.totals[0] += 1
         if begun == _PATIENCE and search.costs[BEST] == math.inf and _may_mislead(problem):
-            _begin_anew(problem, search, NO_MARGIN)
+            _restart(problem, search, NO_MARGIN)
         kept = _chosen(search, begun)
         if search.counts[kept, 0] == 0:
             kept = _begin(problem, search, kept)
@@ -103,7 +103,7 @@ def advance(handle: Handle, rounds: int) -> float:
 
 @kernel
 def measure_again(problem: PathProblem, search: AnytimeSearch) -> None:
-    """Recomputes the costs of all paths, after a change of the objective."""
+    """Recomputes the costs of all paths after a change of the objective."""
     for k in range(KEPT + 1):
         if search.counts[k, 0] > 0:
             search.costs[k] = measure(problem, _line(search, k))
@@ -111,7 +111,7 @@ def measure_again(problem: PathProblem, search: AnytimeSearch) -> None:
 
 @kernel
 def _cheapest(search: AnytimeSearch) -> int:
-    """The number of the cheapest of the paths under work."""
+    """The index of the cheapest of the paths being polished."""
     best = 0
     for k in range(1, KEPT):
         if search.costs[k] < search.costs[best]:
@@ -121,20 +121,20 @@ def _cheapest(search: AnytimeSearch) -> int:
 
 @kernel
 def _worth(problem: PathProblem, search: AnytimeSearch, k: int) -> float:
-    """The cost of a path with the last price of its vertices: what the best has least of."""
+    """The cost by which the best path is chosen: with the final price of vertices."""
     price = _vertex_price(problem, search, math.inf)
     return search.costs[k] + price * search.counts[k, 0]  # type: ignore[no-any-return]
 
 
 @kernel
 def _remember(problem: PathProblem, search: AnytimeSearch, kept: int) -> None:
-    """Keeps a path as the best, if wrenches are proved to be held along it; else restarts."""
+    """Stores a path as the best if it is proved wrench-feasible; else restarts with proofs."""
     line = _line(search, kept)
     if _may_mislead(problem):
         for i in range(line.counts[0] - 1):
             start, end = line.points[i], line.points[i + 1]
             if not edge_held(problem.world, problem.load, problem.holding, start, end):
-                _begin_anew(problem, search, ASK_PROOF)
+                _restart(problem, search, ASK_PROOF)
                 return
     search.points[BEST], search.edges[BEST] = line.points, line.edges
     search.counts[BEST, 0], search.costs[BEST] = line.counts[0], search.costs[kept]
@@ -142,13 +142,13 @@ def _remember(problem: PathProblem, search: AnytimeSearch, kept: int) -> None:
 
 @kernel
 def _may_mislead(problem: PathProblem) -> bool:
-    """Whether edges are allowed by interpolated margins, which prove nothing."""
+    """Whether interpolated margins, which prove nothing, decide on edges."""
     return not problem.holding.everywhere and problem.terms[LEAST_MARGIN] != ASK_PROOF
 
 
 @kernel
-def _begin_anew(problem: PathProblem, search: AnytimeSearch, least: float) -> None:
-    """Forgets all but the best path, and asks for another least margin from now on."""
+def _restart(problem: PathProblem, search: AnytimeSearch, least: float) -> None:
+    """Discards all but the best path and changes the least margin."""
     problem.terms[LEAST_MARGIN] = least
     search.totals[2] += search.grown[2]
     search.totals[3], search.totals[5] = 0, search.totals[0]
@@ -170,7 +170,7 @@ def _line(search: AnytimeSearch, kept: int) -> Polyline:
 
 @kernel
 def _chosen(search: AnytimeSearch, begun: int) -> int:
-    """Which path to work on; one without vertices is to be found first."""
+    """Which path to polish; one without vertices has to be found first."""
     best, worst = _cheapest(search), 0
     for k in range(1, KEPT):
         if search.costs[k] > search.costs[worst]:
@@ -188,7 +188,7 @@ def _chosen(search: AnytimeSearch, begun: int) -> int:
 
 @kernel
 def _begin(problem: PathProblem, search: AnytimeSearch, kept: int) -> int:
-    """Finds another path for a place; else the best path, or -1 where there is none."""
+    """Finds a new path for a slot; returns the slot, else the best path's, or -1 without one."""
     line, grown = _line(search, kept), search.grown
     search.costs[kept], line.counts[0] = math.inf, 0
     begun = search.totals[3]
@@ -224,7 +224,7 @@ def _begin(problem: PathProblem, search: AnytimeSearch, kept: int) -> int:
 
 @leaf
 def sampled_path(problem: PathProblem, search: AnytimeSearch, points: Array) -> int:
-    """A path by two trees, or by a roadmap where they miss a gap: its vertices, 0 for none."""
+    """Finds a path by two trees, or a roadmap where they miss a gap; number of vertices or 0."""
     if search.grown[3] >= _SAMPLES_OF_TREES:
         search.totals[2] += search.grown[2]
         for i in range(len(search.grown)):
@@ -245,7 +245,7 @@ def sampled_path(problem: PathProblem, search: AnytimeSearch, points: Array) -> 
                 problem,
                 search.ends,
                 search.state,
-                search.places,
+                search.nodes,
                 search.above,
                 search.parts,
                 search.made,
@@ -262,7 +262,7 @@ def sampled_path(problem: PathProblem, search: AnytimeSearch, points: Array) -> 
 
 @kernel
 def _vertex_price(problem: PathProblem, search: AnytimeSearch, polished: float) -> float:
-    """What a vertex must save, after a number of rounds of polishing."""
+    """Least saving that a vertex must bring, after a number of polishing rounds."""
     straight = 0.0
     for axis in range(3):
         straight += (search.ends[1, axis] - search.ends[0, axis]) ** 2
@@ -274,24 +274,24 @@ def _vertex_price(problem: PathProblem, search: AnytimeSearch, polished: float) 
     return share * math.sqrt(straight) * problem.terms[UNIT]  # type: ignore[no-any-return]
 
 
-# From start to goal with the planner we recommend: rounds until the budget is spent.
+# The search as called from Python.
 
 
 Clock = Callable[[], float]
 
 LEAST_WITH_PROOFS = 2
-"""Likewise from where wrenches have to be proved on every edge, which takes long."""
-_TELL_EVERY = 0.1
-"""Between calls of a progress, [s]."""
+"""As `LEAST_ROUNDS`, where every edge needs a proof of wrench feasibility, which takes long."""
+_REPORT_EVERY = 0.1
+"""Between calls of the progress function, [s]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OptimalRoute:
-    """A route, and what it takes to find it again.
+    """A route, and the rounds that reproduce it.
 
     Attributes:
         route: The path; its nodes are those of the first path found.
-        rounds: How many were done; `OptimalSettings.rounds` repeats them.
+        rounds: Number of rounds done; `OptimalSettings.rounds` repeats them.
         preparation_time: [s].
         search_time: [s].
     """
@@ -310,7 +310,7 @@ def optimal_route(
     progress: Progress | None = None,
     clock: Clock = time.perf_counter,
 ) -> OptimalRoute:
-    """Searches and improves.
+    """Finds a path and improves it until the budget is spent.
 
     Args:
         rig: The robot.
@@ -346,7 +346,7 @@ def optimal_route(
 
 
 def _load(problem: PathProblem, search: AnytimeSearch) -> None:
-    """Calls what the rounds call: machine code is made, or loaded, when it is called first."""
+    """Calls every kernel of a round once, so that compiling or loading is not timed."""
     advance(handle_of(problem, search), 0)
     measure_again(problem, search)
     measure(problem, polyline_of(search.ends))
@@ -360,29 +360,29 @@ def _improved(
     progress: Progress | None,
     clock: Clock,
 ) -> Array | None:
-    """Does rounds until the budget is spent, or nothing can be better."""
+    """Does rounds until the budget is spent or the path is known to be optimal."""
     limit = None
     if settings.longest < math.inf:
         limit = LengthLimit(settings.longest, problem.terms[UNIT])
     handle = handle_of(problem, search)
-    spent, told = 0.0, 0.0
+    spent, reported = 0.0, 0.0
     while not _is_over(problem, settings, search, spent):
         cost = advance(handle, 1)
         if limit is not None:
-            _limited(problem, search, settings, limit)
+            _apply_limit(problem, search, settings, limit)
         elif cost <= _least(search, settings):
             break
         spent = clock() - began
-        if progress is not None and spent - told >= _TELL_EVERY:
-            told = spent
-            settings.tell(progress, int(search.totals[0]), spent, float(search.costs[BEST]))
+        if progress is not None and spent - reported >= _REPORT_EVERY:
+            reported = spent
+            settings.report(progress, int(search.totals[0]), spent, float(search.costs[BEST]))
     return limit.path if limit is not None else best_path(search)
 
 
-def _limited(
+def _apply_limit(
     problem: PathProblem, search: AnytimeSearch, settings: OptimalSettings, limit: LengthLimit
 ) -> None:
-    """Passes the best path to the limit, and applies the price that it sets."""
+    """Passes the best path to the limit and applies the price it sets."""
     path, weights = best_path(search), settings.weights
     if path is None:
         return
@@ -409,7 +409,7 @@ def _is_over(
 
 
 def _least(search: AnytimeSearch, settings: OptimalSettings) -> float:
-    """The cost that nothing is below; only known where the length alone counts."""
+    """A lower bound of the cost; known only where the length alone counts."""
     weights = settings.weights
     if not weights.is_length:
         return -math.inf

@@ -1,6 +1,6 @@
-"""What a compiled search is given: where edges are allowed, and what they cost.
+"""Input of a compiled search: where edges are allowed, and what they cost.
 
-The arrays that it reads are made from rig, scene and weights.
+Its arrays are built from rig, scene and weights.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def interpolated(grid: Array, values: Array, point: Vector) -> float:
 
 @leaf
 def _cell(value: float, lower: float, spacing: float, count: int) -> tuple[float, int]:
-    """Place within a cell, 0 … 1, and the number of the cell, along one axis."""
+    """Position within a cell, 0 … 1, and the index of the cell, along one axis."""
     scaled = (value - lower) / spacing
     scaled = min(max(scaled, 0.0), count - 1.0)
     cell = min(int(scaled), count - 2)
@@ -60,17 +60,17 @@ def _cell(value: float, lower: float, spacing: float, count: int) -> tuple[float
 
 
 LENGTH, KINEMATIC, CLEARANCE, CAPACITY, VERTEX, UNIT, LEAST_MARGIN = 0, 1, 2, 3, 4, 5, 6
-"""Places in `PathProblem.terms`."""
+"""Indices into `PathProblem.terms`."""
 
 NO_MARGIN = -math.inf
-"""As the least margin: interpolated ones are not looked at."""
+"""As the least margin: interpolated margins are ignored."""
 ASK_PROOF = math.inf
-"""As the least margin: wrenches are proved to be held on every edge, which takes long."""
+"""As the least margin: every edge is proved wrench-feasible, which takes long."""
 
 _SAMPLING = 0.010
-"""Between samples of what is known on the grid, [m]: less than half of its spacing."""
+"""Spacing of samples of values on the grid, [m]: less than half of the grid's."""
 _CLEARANCE_SAMPLING = 0.020
-"""Between positions at which the clearance of cables over pulleys is looked at, [m]."""
+"""Spacing of positions at which the clearance of cables on pulleys is computed, [m]."""
 
 
 class PathProblem(NamedTuple):
@@ -80,14 +80,14 @@ class PathProblem(NamedTuple):
         world: Obstacles and workspace, with the clearance that edges must keep.
         robot: The self clearance that edges must keep.
         load: The wrenches that must be held on edges.
-        holding: Where in the workspace they are proved to be.
+        holding: Where in the workspace that is proved.
         grid: Lower corner of the lattice and its spacing, shape (2, 3), [m].
         kinematic: The cost c = γ_d + γ_f at the lattice's points, shape (i, j, k).
         margins: Capacity margins there, shape (i, j, k), [N].
-        terms: Weights of length, ∫c ds, smallest clearance and smallest margin in the cost that
-            is made small (the last two count against it); what a vertex more must save at least;
-            what a metre of a usual path costs; and the least margin of interpolated samples of
-            an edge, or `NO_MARGIN`, or `ASK_PROOF`, shape (7,).
+        terms: Weights of length, ∫c ds, smallest clearance and smallest margin in the cost (the
+            last two reduce it); least saving of an extra vertex; typical cost of a metre; and the
+            least margin of interpolated samples of an edge, or `NO_MARGIN`, or `ASK_PROOF`,
+            shape (7,).
     """
 
     world: World
@@ -102,7 +102,7 @@ class PathProblem(NamedTuple):
 
 @inlined
 def edge_allowed(problem: PathProblem, start: Vector, end: Vector) -> bool:
-    """Whether an edge keeps everything asked for: workspace, clearances, wrench feasibility."""
+    """Whether an edge keeps every limit: workspace, clearances, wrench feasibility."""
     world, robot = problem.world, problem.robot
     if not (in_workspace(world, start) and in_workspace(world, end)):
         return False
@@ -114,7 +114,7 @@ def edge_allowed(problem: PathProblem, start: Vector, end: Vector) -> bool:
     if least == NO_MARGIN:
         return True
     margin = lowest_margin(problem.grid, problem.margins, start, end)
-    if least < ASK_PROOF or margin < 0.0:  # far from held: not worth the time of a proof
+    if least < ASK_PROOF or margin < 0.0:  # clearly infeasible: not worth a proof
         return bool(margin >= least)
     return _is_held(problem, start, end)
 
@@ -133,28 +133,28 @@ def _is_held(problem: PathProblem, start: Vector, end: Vector) -> bool:
 @leaf
 def lowest_margin(grid: Array, margins: Array, start: Vector, end: Vector) -> float:
     """The smallest interpolated capacity margin at samples of an edge, [N]."""
-    way = minus(end, start)
-    steps = math.ceil(norm(way) / _SAMPLING) + 1
+    delta = minus(end, start)
+    steps = math.ceil(norm(delta) / _SAMPLING) + 1
     least = math.inf
     for i in range(steps + 1):
-        at = along(start, way, i / steps)
+        at = along(start, delta, i / steps)
         least = min(least, interpolated(grid, margins, at))
     return least
 
 
 @leaf
 def edge_cost(problem: PathProblem, start: Vector, end: Vector) -> float:
-    """What an edge adds to the sums in the cost: weighted length and integral of c, [m]."""
-    way = minus(end, start)
-    length = norm(way)
+    """The cost of an edge: weighted length and integral of c, [m]."""
+    delta = minus(end, start)
+    length = norm(delta)
     cost = problem.terms[LENGTH] * length
     weight = problem.terms[KINEMATIC]
     if weight == 0.0:
         return float(cost)
     steps = math.ceil(length / _SAMPLING) + 1
     total = 0.0
-    for i in range(steps):  # middles of equal parts
-        at = along(start, way, (i + 0.5) / steps)
+    for i in range(steps):  # midpoints of equal parts
+        at = along(start, delta, (i + 0.5) / steps)
         total += interpolated(problem.grid, problem.kinematic, at)
     return float(cost + weight * total * length / steps)
 
@@ -172,20 +172,20 @@ def edge_lows(problem: PathProblem, start: Vector, end: Vector) -> tuple[float, 
 
 @kernel
 def _clearance(world: World, start: Vector, end: Vector) -> float:
-    """Smallest clearance of an edge, [m]: exact, with pulleys at samples, for the cost alone."""
+    """Smallest clearance of an edge, [m], for the cost: exact, or at samples with pulleys."""
     if world.pulley == 0.0:
         return float(edge_clearance(world, np.array(start), np.array(end))[0])
-    way, least = minus(end, start), math.inf
-    steps = math.ceil(norm(way) / _CLEARANCE_SAMPLING) + 1
+    delta, least = minus(end, start), math.inf
+    steps = math.ceil(norm(delta) / _CLEARANCE_SAMPLING) + 1
     for i in range(steps + 1):
-        at = np.array(along(start, way, i / steps))
+        at = np.array(along(start, delta, i / steps))
         least = min(least, edge_clearance(world, at, at)[0])
     return least
 
 
 @leaf
 def gained(problem: PathProblem, clearance: float, margin: float) -> float:
-    """What smallest clearance and margin of a whole path take off its cost."""
+    """The amount by which a path's smallest clearance and margin reduce its cost."""
     gain = 0.0
     if problem.terms[CLEARANCE] > 0.0 and clearance < math.inf:
         gain += problem.terms[CLEARANCE] * clearance
@@ -194,15 +194,15 @@ def gained(problem: PathProblem, clearance: float, margin: float) -> float:
     return gain
 
 
-# From rig, scene and weights to the arrays that the compiled search reads.
+# The arrays of the compiled search, built from rig, scene and weights.
 
 
 _CELLS = (16, 16, 16)
 _FEW = 64
-"""Cells of the workspace left unproved that are worth proving in smaller parts."""
+"""Most unproved cells of the workspace for which smaller parts are tried."""
 _PARTS = 4
 _FAR_FROM_LIMIT = 5.0
-"""Times the reserve: where margins are as large as this, their interpolation misleads seldom."""
+"""Times the reserve: for margins as large as this, interpolation seldom misleads."""
 _OF_AN_END = 0.9
 
 
@@ -212,7 +212,7 @@ def problem_of(rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCos
     Args:
         rig: The robot.
         scene: Obstacles, clearances, load; its start gives the orientation.
-        weights: Of what is made small.
+        weights: The objective.
         kinematic: The cost of poses at that orientation.
     """
     rotation = np.array(scene.start.rotation)
@@ -249,9 +249,9 @@ def problem_of(rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCos
 
 
 def _least_margin(holding: Holding, lattice: Lattice, capacity: Array, ends: Array) -> float:
-    """What interpolated margins must keep while searching; finished paths are always proved.
+    """The least interpolated margin during a search; finished paths are always proved.
 
-    Less where an end, shape (2, 3), [m], has no more: a path has to leave it.
+    Lower where an end, shape (2, 3), [m], has less, since a path has to leave it.
     """
     least = _FAR_FROM_LIMIT * holding.reserve
     if holding.everywhere or float(capacity.min()) >= least:
@@ -262,14 +262,14 @@ def _least_margin(holding: Holding, lattice: Lattice, capacity: Array, ends: Arr
 
 
 def set_weights(problem: PathProblem, weights: Weights) -> None:
-    """Changes what a problem makes small, in place."""
+    """Changes the objective of a problem in place."""
     problem.terms[:4] = weights.length, weights.kinematic, weights.clearance, weights.capacity
     typical = float(problem.kinematic.mean())
     problem.terms[UNIT] = weights.length + weights.kinematic * typical
 
 
 def _proved_cells(world: World, load: LoadArrays, reserve: float) -> NDArray[np.bool_]:
-    """Cells of the workspace box; where only few are left, those in smaller parts too."""
+    """Proved cells of the workspace box; a few remaining ones are tried in smaller parts."""
     cells = build_holding(world, load, reserve).cells
     left = np.argwhere(~cells)
     if len(left) <= _FEW:

@@ -22,7 +22,7 @@ _UNIT = 2.0**-53
 
 
 def seeded(seed: int) -> State:
-    """The state for a seed, shape (1,); kernels step it in place."""
+    """The state for a seed, shape (1,); kernels advance it in place."""
     return np.array([seed % 2**64], dtype=np.uint64)
 
 

@@ -1,4 +1,4 @@
-"""The state of a search, and how one begins."""
+"""The state of a search."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from planner.anytime.connect import NODES
 from planner.anytime.local_search import MOST_VERTICES
-from planner.anytime.passages import PLACES
+from planner.anytime.passages import ROADMAP_NODES
 from planner.anytime.random import State, seeded
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 KEPT = 6
-"""Paths that are kept and polished."""
+"""Paths that are stored and polished."""
 BEST = KEPT
-"""The place of the best path so far, which is not worked on."""
+"""Index of the best path so far, which is not polished."""
 
 
 class AnytimeSearch(NamedTuple):
@@ -34,12 +34,12 @@ class AnytimeSearch(NamedTuple):
         costs: Of each path; infinite for none, shape (KEPT + 1,).
         polished: Rounds spent on each path, shape (KEPT,).
         trees: See `planner.anytime.connect.connect`, shape (2, NODES, 3), [m].
-        parents: Likewise, shape (2, NODES).
-        grown: Likewise (`counts`), shape (4,).
-        places: See `planner.anytime.passages.through_passages`, shape (PLACES, 3), [m].
-        above: Likewise, shape (PLACES,).
-        parts: Likewise, shape (PLACES,).
-        made: Likewise, shape (2,).
+        parents: See there, shape (2, NODES).
+        grown: See there (`counts`), shape (4,).
+        nodes: See `planner.anytime.passages.through_passages`, shape (ROADMAP_NODES, 3), [m].
+        above: See there, shape (ROADMAP_NODES,).
+        parts: See there, shape (ROADMAP_NODES,).
+        made: See there, shape (2,).
         totals: Rounds; nodes of finished trees and edge tests in them; first paths sought;
             vertices of the very first path; the round of the last restart, shape (6,).
         first: That path, shape (MOST_VERTICES, 3), [m].
@@ -55,7 +55,7 @@ class AnytimeSearch(NamedTuple):
     trees: Array
     parents: Integers
     grown: Integers
-    places: Array
+    nodes: Array
     above: Integers
     parts: Integers
     made: Integers
@@ -66,11 +66,11 @@ class AnytimeSearch(NamedTuple):
 
 @structref.register
 class _HandleType(types.StructRef):
-    """What compiled code takes a handle for."""
+    """The type of a handle in compiled code."""
 
 
 class _CompiledHandle(structref.StructRefProxy):
-    """What Python takes a handle for."""
+    """The type of a handle in Python."""
 
     problem: Any
     search: Any
@@ -89,8 +89,8 @@ structref.define_proxy(  # type: ignore[no-untyped-call]
 Handle: Any = _PlainHandle if config.DISABLE_JIT else _CompiledHandle  # type: ignore[attr-defined]
 """A problem and the state of a search in it (``problem``, ``search``), as one reference.
 
-At every call from Python Numba looks at each array that it is given; the fifty of a problem and a
-search take longer than many a search. `planner.anytime.path.handle_of` makes a handle.
+Numba inspects every array argument at each call from Python; for the fifty of a problem and a
+search that takes longer than a short search. `planner.anytime.path.handle_of` makes a handle.
 """
 
 
@@ -106,9 +106,9 @@ def new_search(start: Array, goal: Array, seed: int) -> AnytimeSearch:
         trees=np.zeros((2, NODES, 3)),
         parents=np.zeros((2, NODES), dtype=np.int64),
         grown=np.zeros(4, dtype=np.int64),
-        places=np.zeros((PLACES, 3)),
-        above=np.zeros(PLACES, dtype=np.int64),
-        parts=np.zeros(PLACES, dtype=np.int64),
+        nodes=np.zeros((ROADMAP_NODES, 3)),
+        above=np.zeros(ROADMAP_NODES, dtype=np.int64),
+        parts=np.zeros(ROADMAP_NODES, dtype=np.int64),
         made=np.zeros(2, dtype=np.int64),
         totals=np.zeros(6, dtype=np.int64),
         first=np.zeros((MOST_VERTICES, 3)),

@@ -1,1 +1,1 @@
-"""Planning of position and orientation together, for scenes that allow the platform to turn."""
+"""Planning of position and orientation together, for scenes with rotation limits."""

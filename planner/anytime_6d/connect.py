@@ -1,7 +1,7 @@
 """A first path of poses: two trees, one from each end, that grow toward samples and each other.
 
-A move to a sample is tried whole, then half of it, then a quarter: long moves are tested as fast as
-short ones where there is room, and shorter ones get into gaps.
+A move to a sample is tried whole, then half of it, then a quarter: in free space long moves are
+tested as fast as short ones, and shorter ones get into gaps.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.anytime_6d.moves import put_between, put_turned
+from planner.anytime_6d.moves import put_between, put_rotated
 from planner.anytime_6d.problem import RotatingProblem, move_allowed
 from planner.kernels.jit import kernel
 
@@ -19,17 +19,17 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 NODES = 4096
-"""Room for nodes in each tree; a full tree takes no more and is still joined to."""
+"""Room for nodes in each tree; a full tree grows no further but can still be joined."""
 DRAWS = 9
 """Random numbers for each sample."""
 _SHARES = (1.0, 0.5, 0.25)
 _INSIDE = 0.5
-"""Part of the samples whose position is uniform in the workspace box; the others lie on its walls,
-edges and corners more often than not, where obstacles leave more room."""
+"""Part of the samples whose position is uniform in the workspace box; most of the others lie on its
+walls, edges and corners, where obstacles leave more room."""
 _BETWEEN_ENDS = 0.4
-"""Part of the samples turned as on the shortest way from start to goal."""
+"""Part of the samples whose orientation lies on the shortest rotation from start to goal."""
 _OVER = 1.3
-"""Tilts and turns are drawn from a range this much larger and put back on the limit."""
+"""Tilts and turns are drawn from a range larger by this factor and clamped to the limit."""
 
 
 @kernel
@@ -43,10 +43,10 @@ def connect(
     tallies: Integers,
     path: Array,
 ) -> int:
-    """Grows both trees until they meet; called again with the same trees it goes on.
+    """Grows both trees until they meet; called again with the same trees it continues.
 
     Args:
-        problem: Where.
+        problem: Limits and costs.
         ends: Start and goal, shape (2, 7).
         draws: Random numbers in 0 … 1, a row for a sample, shape (k, DRAWS).
         trees: Nodes, shape (2, NODES, 7), written.
@@ -98,7 +98,7 @@ def _sample(problem: RotatingProblem, ends: Array, draw: Array, wanted: Array) -
             math.sin(tilt / 2.0) * math.sin(about),
             0.0,
         )
-        put_turned(wanted.copy(), (0.0, 0.0, turn), wanted)
+        put_rotated(wanted.copy(), (0.0, 0.0, turn), wanted)
     for axis in range(3):
         share = min(max(0.5 + wide * (draw[1 + axis] - 0.5), 0.0), 1.0)
         wanted[axis] = limits[0, axis] + share * (limits[1, axis] - limits[0, axis])
@@ -151,7 +151,7 @@ def _nearest(problem: RotatingProblem, trees: Array, tree: int, count: int, want
 
 @kernel
 def _joined(trees: Array, parents: Integers, first: int, second: int, path: Array) -> int:
-    """Writes the way from the first root over two nodes at one pose to the second root."""
+    """Writes the path from the first root through two nodes at one pose to the second root."""
     length, node = 0, first
     while node >= 0:
         length, node = length + 1, parents[0, node]

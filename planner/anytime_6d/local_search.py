@@ -1,7 +1,7 @@
-"""Making a path of poses better by random changes, each of which is exact.
+"""Making a path of poses better by random changes, each checked exactly.
 
-Corners are cut between two places of the path, poses are moved and turned by any size or drawn
-toward the move between their neighbours, left out, or put in.
+Corners are cut between two positions on the path; poses are moved and rotated by any amount, pulled
+toward the move between their neighbours, left out or inserted.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.anytime_6d.moves import move_length, put_between, put_turned
+from planner.anytime_6d.moves import move_length, put_between, put_rotated
 from planner.anytime_6d.problem import (
     CAPACITY,
     CLEARANCE,
@@ -25,17 +25,17 @@ from planner.anytime_6d.problem import (
 )
 from planner.kernels.jit import kernel
 
-# A path of poses under improvement, and the one way in which it is ever changed.
+# A path of poses under improvement, and the only operation that changes it.
 #
-# Everything that makes a path better asks for some of its poses to be replaced by none, one or two
-# others. The change is made when it makes the path cheaper and every new move is allowed.
+# Every improvement replaces some poses by none, one or two others. It is made if the path gets
+# cheaper and every new move is allowed.
 
 
 MOST_POSES = 64
 """Room for the poses of a path."""
 _ROUND_OFF = 1e-12
 _POSE_PRICE = 2e-4
-"""What a pose more must save, as part of the sums: each is a corner that is run more slowly."""
+"""Least saving of an extra pose, as part of the cost: each is a corner that is run more slowly."""
 
 
 class Line(NamedTuple):
@@ -43,9 +43,8 @@ class Line(NamedTuple):
 
     Attributes:
         poses: Start and goal included, shape (MOST_POSES, 7).
-        moves: Of each move, by its first pose, what it adds to the sums in the cost, its smallest
-            clearance [m] and margin [N] (infinite where they have no weight), shape
-            (MOST_POSES, 3).
+        moves: Cost of each move, its smallest clearance [m] and margin [N] (infinite where they
+            have no weight), indexed by its first pose, shape (MOST_POSES, 3).
         counts: Poses, shape (1,).
     """
 
@@ -55,18 +54,18 @@ class Line(NamedTuple):
 
 
 def new_line() -> Line:
-    """Room for a path."""
+    """An empty path with room for `MOST_POSES` poses."""
     return Line(np.zeros((MOST_POSES, 7)), np.zeros((MOST_POSES, 3)), np.zeros(1, dtype=np.int64))
 
 
 def copied(line: Line) -> Line:
-    """A path that changes on its own."""
+    """An independent copy."""
     return Line(line.poses.copy(), line.moves.copy(), line.counts.copy())
 
 
 @kernel
 def line_length(problem: RotatingProblem, line: Line) -> float:
-    """Length, turning counted, [m]."""
+    """Length, rotation counted, [m]."""
     total = 0.0
     for i in range(line.counts[0] - 1):
         total += move_length(line.poses[i], line.poses[i + 1], problem.objective.radian)
@@ -75,7 +74,7 @@ def line_length(problem: RotatingProblem, line: Line) -> float:
 
 @kernel
 def measure(problem: RotatingProblem, line: Line) -> float:
-    """Fills in what the moves are worth, and gives the cost of the whole path."""
+    """Computes the values of all moves; returns the cost of the whole path."""
     world, load, objective = problem.world, problem.load, problem.objective
     for i in range(line.counts[0] - 1):
         start, end, move = line.poses[i], line.poses[i + 1], line.moves[i]
@@ -86,7 +85,7 @@ def measure(problem: RotatingProblem, line: Line) -> float:
 
 @kernel
 def line_cost(problem: RotatingProblem, line: Line) -> float:
-    """The cost of the whole path, its moves being measured."""
+    """The cost of a path whose moves are measured."""
     clearance, margin = _lows(line, 0, 0)
     return _sums(line) - gained(problem.objective, clearance, margin)
 
@@ -102,20 +101,20 @@ def replace(
     ends_known: bool,
     tallies: Integers,
 ) -> bool:
-    """Puts none, one or two poses in place of those between two, if that is better and allowed.
+    """Replaces the poses between two by none, one or two, if that is better and allowed.
 
     Args:
-        problem: Where.
-        line: Changed in place, its moves being measured.
-        first: Number of the pose before those that go.
-        last: Number of the pose after them.
-        new: What comes in their place, shape (2, 7).
-        number: How many of these.
-        ends_known: Whether the first and the last new move are parts of present moves.
+        problem: Limits and costs.
+        line: Path with measured moves; changed in place.
+        first: Index of the pose before those replaced.
+        last: Index of the pose after them.
+        new: Replacements, shape (2, 7).
+        number: Number of replacements.
+        ends_known: Whether the first and the last new move are parts of existing moves.
         tallies: See `move_allowed`.
 
     Returns:
-        Whether it was done.
+        Whether the path was changed.
     """
     added = number - (last - first - 1)
     if line.counts[0] + added > len(line.poses):
@@ -158,7 +157,7 @@ def _sums(line: Line) -> float:
 
 @kernel
 def _lows(line: Line, first: int, last: int) -> tuple[float, float]:
-    """Smallest clearance and margin of the moves, those from ``first`` to ``last`` left out."""
+    """Smallest clearance and margin of the moves, except those from ``first`` to ``last``."""
     clearance, margin = math.inf, math.inf
     for i in range(line.counts[0] - 1):
         if i < first or i >= last:
@@ -168,7 +167,7 @@ def _lows(line: Line, first: int, last: int) -> tuple[float, float]:
 
 @kernel
 def _gain(problem: RotatingProblem, line: Line, first: int, last: int, worth: Array) -> float:
-    """What the change does for the smallest clearance and margin of the whole path."""
+    """The gain of a change in the smallest clearance and margin of the whole path."""
     before = gained(problem.objective, *_lows(line, 0, 0))
     clearance, margin = _lows(line, first, last)
     for i in range(len(worth)):
@@ -178,7 +177,7 @@ def _gain(problem: RotatingProblem, line: Line, first: int, last: int, worth: Ar
 
 @kernel
 def _put(line: Line, first: int, last: int, new: Array, worth: Array) -> None:
-    """Makes room for the new poses, and writes them and what their moves are worth."""
+    """Makes room for the new poses, and writes them and the values of their moves."""
     old, added = line.counts[0], len(new) - (last - first - 1)
     if added > 0:
         for i in range(old - 1, last - 1, -1):
@@ -203,11 +202,11 @@ _MOST_REPEATS, _ON = 6, 1.5
 
 @kernel
 def polish(problem: RotatingProblem, line: Line, draws: Array, tallies: Integers) -> float:
-    """Tries changes at random places; returns what the path costs then.
+    """Tries changes at random positions; returns the cost of the path afterwards.
 
     Args:
-        problem: Where.
-        line: Changed in place, its moves being measured.
+        problem: Limits and costs.
+        line: Path with measured moves; changed in place.
         draws: Random numbers in 0 … 1, a row for a change, shape (k, DRAWS).
         tallies: See `move_allowed`.
     """
@@ -236,14 +235,14 @@ def polish(problem: RotatingProblem, line: Line, draws: Array, tallies: Integers
 
 @kernel
 def _may_bend(problem: RotatingProblem) -> bool:
-    """Whether more than a single move may be better than it: not where the length alone counts."""
+    """Whether a bent path may beat a single move: not where the length alone counts."""
     weights = problem.objective.weights
     return bool(weights[KINEMATIC] + weights[CLEARANCE] + weights[CAPACITY] > 0.0)
 
 
 @kernel
 def _size(draw: Array) -> float:
-    """The size of a change, every scale equally often, [m]."""
+    """The size of a change, log-uniform, [m]."""
     return _SMALLEST * math.exp(draw[3] * math.log(_LARGEST / _SMALLEST))
 
 
@@ -251,7 +250,7 @@ def _size(draw: Array) -> float:
 def _split(
     problem: RotatingProblem, line: Line, draw: Array, new: Array, tallies: Integers
 ) -> None:
-    """A pose beside a place of a move."""
+    """Inserts a pose beside a random position on a move."""
     first = int(draw[1] * (line.counts[0] - 1))
     put_between(line.poses[first], line.poses[first + 1], draw[2], new[0])
     _shift(problem, draw, _size(draw), new[0])
@@ -260,12 +259,12 @@ def _split(
 
 @kernel
 def _cut(problem: RotatingProblem, line: Line, draw: Array, new: Array, tallies: Integers) -> None:
-    """A move from somewhere on one move to somewhere on a later one."""
+    """Joins a position on one move to a position on a later one."""
     count, poses = line.counts[0], line.poses
     first = int(draw[1] * (count - 2))
     second = min(first + 1 + int(draw[2] ** 3 * (count - 2 - first)), count - 2)
     back, on = draw[3], draw[4]
-    if draw[5] < 0.5:  # close to the corners, where most of what is left to gain is
+    if draw[5] < 0.5:  # close to the corners, where most of the remaining gain is
         near = math.exp(-6.0 * draw[6])
         back, on = back * near, on * near
     put_between(poses[first + 1], poses[first], back, new[0])
@@ -277,9 +276,9 @@ def _cut(problem: RotatingProblem, line: Line, draw: Array, new: Array, tallies:
 def _moved(
     problem: RotatingProblem, line: Line, number: int, draw: Array, new: Array, tallies: Integers
 ) -> None:
-    """One pose, or two in turn alike, are moved; where that was better, on ever more the same way.
+    """Moves one pose, or two by the same change; repeats a success by growing amounts.
 
-    Two are moved where the move between them touches something.
+    Two are moved because the move between them may touch something.
     """
     k, size = int(draw[1] * (line.counts[0] - 1 - number)), _size(draw)
     for _ in range(_MOST_REPEATS):
@@ -295,7 +294,7 @@ def _moved(
 def _drawn(
     problem: RotatingProblem, line: Line, draw: Array, new: Array, tallies: Integers
 ) -> None:
-    """A pose is drawn toward the move between its neighbours, or only turned that way."""
+    """Pulls a pose, or only its orientation, toward the move between its neighbours."""
     k, poses = 1 + int(draw[1] * (line.counts[0] - 2)), line.poses
     radian = problem.objective.radian
     before = move_length(poses[k - 1], poses[k], radian)
@@ -311,7 +310,7 @@ def _drawn(
 
 @kernel
 def _shift(problem: RotatingProblem, draw: Array, size: float, pose: Array) -> None:
-    """Moves a pose by a size in a random direction: position, orientation or both."""
+    """Changes a pose by ``size`` in a random direction: position, orientation or both."""
     height, around = 2.0 * draw[4] - 1.0, 2.0 * math.pi * draw[5]
     radius = math.sqrt(max(0.0, 1.0 - height * height))
     if draw[8] < 0.65:
@@ -326,4 +325,4 @@ def _shift(problem: RotatingProblem, draw: Array, size: float, pose: Array) -> N
             angle * radius * math.sin(around),
             angle * height,
         )
-        put_turned(pose.copy(), turn, pose)
+        put_rotated(pose.copy(), turn, pose)

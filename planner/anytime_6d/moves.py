@@ -1,7 +1,7 @@
 """Poses in compiled code, and the straight moves between them.
 
 A pose is a row of seven numbers: the position [m] and a unit quaternion (w, x, y, z). A move goes
-straight while the platform turns at a steady rate about one axis, the shorter way; that is
+straight while the platform rotates at a steady rate about one axis by the smaller angle, as in
 `model.pose.interpolate`, which `planner.check` and the executor use.
 """
 
@@ -12,10 +12,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.collision.swept_pair import place_corners, points_distance
+from planner.collision.swept_pair import points_distance, put_corners
 from planner.kernels.exit_points import exit_point
 from planner.kernels.jit import kernel
-from planner.kernels.primitives import Vector, dot, plus, row, turned
+from planner.kernels.primitives import Vector, dot, plus, rotated, row
 from planner.kernels.scene_arrays import World, anchor
 
 Array = NDArray[np.float64]
@@ -24,7 +24,7 @@ Quaternion = tuple[float, float, float, float]
 
 @kernel
 def relative(start: Array, end: Array) -> Quaternion:
-    """The rotation from a pose to another in the frame of the first, the shorter way (w ≥ 0)."""
+    """The rotation between poses, in the first one's frame, by at most half a turn (w ≥ 0)."""
     a, b, c, d = start[3], -start[4], -start[5], -start[6]
     w, x, y, z = end[3], end[4], end[5], end[6]
     real = a * w - b * x - c * y - d * z
@@ -64,12 +64,12 @@ def put_between(start: Array, end: Array, share: float, found: Array) -> None:
     turn = turn_between(start, end)
     for axis in range(3):
         found[axis] = start[axis] + share * (end[axis] - start[axis])
-    put_turned(start, (share * turn[0], share * turn[1], share * turn[2]), found)
+    put_rotated(start, (share * turn[0], share * turn[1], share * turn[2]), found)
 
 
 @kernel
-def put_turned(start: Array, turn: Vector, found: Array) -> None:
-    """Writes the quaternion of a pose turned by a rotation vector in its own frame, [rad]."""
+def put_rotated(start: Array, turn: Vector, found: Array) -> None:
+    """Writes the quaternion of a pose rotated by a rotation vector in its own frame, [rad]."""
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     scale = math.sin(angle / 2.0) / angle if angle > 1e-9 else 0.5
     w, x, y, z = math.cos(angle / 2.0), scale * turn[0], scale * turn[1], scale * turn[2]
@@ -101,7 +101,7 @@ def matrix_of(pose: Array) -> Array:
 
 @kernel
 def rotations_kept(tilt: float, turn: float, start: Array, end: Array) -> bool:
-    """Whether tilt and turn stay within limits, [rad], all along a move between poses."""
+    """Whether tilt and turn stay within limits, [rad], all along a move between two poses."""
     first = 1.0 if start[3] >= 0.0 else -1.0
     cosine = first * (start[3] * end[3] + start[4] * end[4] + start[5] * end[5] + start[6] * end[6])
     last = 1.0 if cosine >= 0.0 else -1.0
@@ -137,20 +137,20 @@ def rotations_kept(tilt: float, turn: float, start: Array, end: Array) -> bool:
 def pose_clearance(world: World, position: Vector, rotation: Array, enough: float) -> float:
     """Smallest distance of any body to any obstacle, [m]; 0 or less where they touch.
 
-    From ``enough`` on any value at least that is returned. The definition is
+    Where the distance is ``enough`` or more, ``enough`` is returned. The definition is
     `model.clearance.ClearanceModel`.
 
     Args:
-        world: Where; its own rotation is not used.
+        world: Rig and obstacles; its own rotation is not used.
         position: World frame, [m].
         rotation: ``world_from_platform``, shape (3, 3).
         enough: [m].
     """
     least, platform = enough, len(world.bodies) - 1
     corners, lines = np.empty((8, 3)), np.empty((platform, 2, 3))
-    place_corners(world, rotation, position, corners)
+    put_corners(world, rotation, position, corners)
     for cable in range(platform):
-        at = plus(position, turned(rotation, anchor(world, cable)))
+        at = plus(position, rotated(rotation, anchor(world, cable)))
         lines[cable, 0], lines[cable, 1] = exit_point(world, cable, at), at
     for pair in range(len(world.pairs)):
         piece, body = world.pairs[pair, 0], world.pairs[pair, 1]

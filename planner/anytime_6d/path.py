@@ -1,8 +1,7 @@
-"""From start to goal with the platform free to turn: rounds until the budget is spent.
+"""From start to goal with the platform free to rotate: rounds until the budget is spent.
 
-Some first paths, and more and more polishing of the best of them. A round depends on the seed and
-on the rounds before alone. So a search can end after any of them, and be repeated from the number
-of rounds.
+Rounds find some first paths and then polish the best of them. A round depends only on the seed and
+the rounds before it, so a search can end after any round and be repeated from the number of rounds.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ _TO_THE_BEST = 0.5
 
 @dataclass(slots=True, eq=False)
 class _Kept:
-    """A path under improvement, and what it costs."""
+    """A path under improvement, and its cost."""
 
     line: Line
     cost: float
@@ -59,7 +58,7 @@ class RotatingSearch:
 
     Attributes:
         rounds: Done so far.
-        tallies: Moves asked about, by what forbids them; see `planner.anytime_6d.problem`.
+        tallies: Moves checked, by what forbids them; see `planner.anytime_6d.problem`.
         first: The very first path, shape (k, 7); empty without one.
     """
 
@@ -79,7 +78,7 @@ class RotatingSearch:
 
     @property
     def cost(self) -> float:
-        """What the best path costs; infinite without one."""
+        """Cost of the best path; infinite without one."""
         return math.inf if self._best is None else self._best.cost
 
     @property
@@ -92,18 +91,18 @@ class RotatingSearch:
 
     @property
     def length(self) -> float:
-        """Length of the best path, turning counted, [m]; infinite without one."""
+        """Length of the best path, rotation counted, [m]; infinite without one."""
         if self._best is None:
             return math.inf
         return float(line_length(self.problem, self._best.line))
 
     @property
     def shortest(self) -> float:
-        """Length that no path is below, [m]."""
+        """Lower bound of the length of any path, [m]."""
         return float(move_length(self._ends[0], self._ends[1], self.problem.objective.radian))
 
     def weigh(self, weights: Weights) -> None:
-        """Changes what is made small."""
+        """Changes the weights of the objective."""
         set_weights(self.problem.objective, weights)
         for kept in (*self._kept, *filter(None, [self._best])):
             kept.cost = float(measure(self.problem, kept.line))
@@ -111,7 +110,7 @@ class RotatingSearch:
             self._note(kept)
 
     def cost_by(self, weights: Weights) -> float:
-        """What the best path costs by other weights; infinite without one."""
+        """Cost of the best path by other weights; infinite without one."""
         if self._best is None:
             return math.inf
         objective = self.problem.objective
@@ -120,7 +119,7 @@ class RotatingSearch:
         return float(measure(problem, copied(self._best.line)))
 
     def gap(self) -> float:
-        """Smallest distance of positions in the two trees, [m]."""
+        """Smallest distance between positions in the two trees, [m]."""
         first, second = (self._trees[k, : max(self._grown[k], 1), :3] for k in (0, 1))
         if self._grown[0] == 0:
             first, second = self._ends[:1, :3], self._ends[1:, :3]
@@ -138,12 +137,12 @@ class RotatingSearch:
         self._note(kept)
 
     def _note(self, kept: _Kept) -> None:
-        """Keeps a copy of the best: leaving poses out may make those under work a little worse."""
+        """Keeps a copy of the best path: leaving poses out may make a path slightly worse."""
         if kept.cost < self.cost:
             self._best = _Kept(copied(kept.line), kept.cost)
 
     def _chosen(self, begun: int) -> _Kept | None:
-        """Which path to work on; a new one now and then."""
+        """Which path to polish; a new one now and then."""
         if len(self._kept) < _KEPT or begun % _ANOTHER_EVERY == 0:
             new = self._begun()
             if new is not None:
@@ -179,23 +178,23 @@ class RotatingSearch:
         return _Kept(line, float(measure(self.problem, line)))
 
 
-# From start to goal with the platform free to turn: rounds until the budget is spent.
+# The search as called from the planner.
 
 
 Clock = Callable[[], float]
 
-_TELL_EVERY = 20
+_REPORT_EVERY = 20
 _ROTATION_ROUND_OFF = 5e-8
-"""Added to the rotation limits, [rad]: half of what the check leaves for round-off in files."""
+"""Added to the rotation limits, [rad]: half of the check's tolerance for round-off in files."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurningRoute:
-    """A route, and what it takes to find it again.
+    """A route, and the rounds that reproduce it.
 
     Attributes:
         route: The path in `planner.space.PoseSpace`.
-        rounds: How many were done; `TurningSettings.rounds` repeats them.
+        rounds: Number of rounds done; `TurningSettings.rounds` repeats them.
         search_time: [s].
     """
 
@@ -241,7 +240,7 @@ def turning_route(
     progress: Progress | None = None,
     clock: Clock = time.perf_counter,
 ) -> TurningRoute:
-    """Searches and improves.
+    """Finds a path and improves it until the budget is spent.
 
     Args:
         rig: The robot.
@@ -267,10 +266,10 @@ def turning_route(
     while not _is_over(settings, search, spent):
         search.advance()
         if limit is not None:
-            _tell_limit(limit, search, settings.weights)
+            _apply_limit(limit, search, settings.weights)
         spent = clock() - began
-        if progress is not None and search.rounds % _TELL_EVERY == 0:
-            settings.tell(progress, search.rounds, spent, search.cost)
+        if progress is not None and search.rounds % _REPORT_EVERY == 0:
+            settings.report(progress, search.rounds, spent, search.cost)
     path = search.path if limit is None else limit.path
     if path is None:
         raise _no_path(scene, search, settings)
@@ -286,18 +285,18 @@ def turning_route(
 
 
 def _load(search: RotatingSearch, weights: Weights) -> None:
-    """Calls what the rounds call: machine code is made, or loaded, when it is called first."""
+    """Calls every kernel of a round once, so that compiling or loading is not timed."""
     search.advance()
     search.cost_by(weights)
 
 
 def _unit(weights: Weights, kinematic: KinematicCost) -> float:
-    """What a metre of a usual path costs."""
+    """Typical cost of a metre."""
     return weights.length + weights.kinematic * float(kinematic.values.mean())
 
 
-def _tell_limit(limit: LengthLimit, search: RotatingSearch, weights: Weights) -> None:
-    """Passes the best path to the limit, and applies the price that it sets."""
+def _apply_limit(limit: LengthLimit, search: RotatingSearch, weights: Weights) -> None:
+    """Passes the best path to the limit and applies the price it sets."""
     path = search.path
     if path is None:
         return

@@ -1,4 +1,4 @@
-"""What a compiled search of poses is given, and what a move must keep."""
+"""Input of a compiled search of poses, and the limits of a move."""
 
 from __future__ import annotations
 
@@ -27,31 +27,31 @@ from planner.kernels.scene_arrays import World
 from planner.settings import Weights
 from planner.wrench.capacity import LoadArrays, load_at, margin_at, structure_columns
 
-# What moves cost where the platform may turn: sums along them, and their smallest values.
+# The cost of moves that may rotate the platform: integrals along them, and their smallest values.
 #
-# All of it is computed at poses of the move. It guides the search alone; what a path must keep is
-# proved by `planner.anytime_6d.problem`.
+# All of it is computed at sampled poses of the move and only guides the search; `move_allowed`
+# proves the limits.
 
 
 LENGTH, KINEMATIC, CLEARANCE, CAPACITY = 0, 1, 2, 3
-"""Places in `Objective.weights`."""
+"""Indices into `Objective.weights`."""
 
 _SAMPLING = 0.015
-"""Between poses at which c is looked at, turning counted, [m]."""
+"""Spacing of poses at which c is computed, rotation counted, [m]."""
 _LOW_SAMPLING = 0.020
-"""Likewise clearance and margin."""
+"""Spacing of poses at which clearance and margin are computed, rotation counted, [m]."""
 
 
 class Objective(NamedTuple):
-    """What is made small.
+    """The cost to minimise.
 
     Attributes:
-        weights: Of length, ∫c ds, smallest clearance and smallest margin (the last two count
-            against the cost), shape (4,).
-        extremes: Smallest and largest condition number, and inverse volume of the force set, that
-            c is scaled by, shape (2, 2).
+        weights: Of length, ∫c ds, smallest clearance and smallest margin (the last two reduce the
+            cost), shape (4,).
+        extremes: Smallest and largest condition number, and inverse volume of the force set, by
+            which c is scaled, shape (2, 2).
         triples: Three cables for each part of the volume, shape (k, 3).
-        radian: Metres that a radian of turning counts as.
+        radian: Metres that a radian of rotation counts as.
     """
 
     weights: Array
@@ -74,7 +74,7 @@ def build_objective(weights: Weights, kinematic: KinematicCost) -> Objective:
 
 
 def set_weights(objective: Objective, weights: Weights) -> None:
-    """Changes what is made small, in place."""
+    """Changes the weights in place."""
     objective.weights[:] = weights.length, weights.kinematic, weights.clearance, weights.capacity
 
 
@@ -84,7 +84,7 @@ def pose_cost(
 ) -> float:
     """The cost c = γ_d + γ_f of a pose; its definition is `planner.costs.KinematicCost`.
 
-    Where turning makes an index better than it is anywhere without, that part is 0.
+    Where rotation makes an index better than its best value without rotation, that part is 0.
     """
     count = len(world.cables)
     columns = np.empty((count, 6))
@@ -127,14 +127,14 @@ def _force_volume(columns: Array, triples: Integers) -> float:
 def move_sum(
     world: World, load: LoadArrays, objective: Objective, start: Array, end: Array
 ) -> float:
-    """What a move adds to the sums in the cost: weighted length and integral of c, [m]."""
+    """The cost of a move: weighted length and integral of c, [m]."""
     length = move_length(start, end, objective.radian)
     weight = objective.weights[KINEMATIC]
     if weight == 0.0 or length == 0.0:
         return float(objective.weights[LENGTH] * length)
     pose, total = np.empty(7), 0.0
     parts = math.ceil(length / _SAMPLING)
-    for i in range(parts):  # middles of equal parts
+    for i in range(parts):  # midpoints of equal parts
         put_between(start, end, (i + 0.5) / parts, pose)
         at = (pose[0], pose[1], pose[2])
         total += pose_cost(world, load, objective, matrix_of(pose), at)
@@ -165,7 +165,7 @@ def move_lows(
 
 @kernel
 def gained(objective: Objective, clearance: float, margin: float) -> float:
-    """What smallest clearance and margin of a whole path take off its cost."""
+    """The amount by which a path's smallest clearance and margin reduce its cost."""
     gain = 0.0
     if objective.weights[CLEARANCE] > 0.0 and clearance < math.inf:
         gain += objective.weights[CLEARANCE] * clearance
@@ -181,7 +181,7 @@ ROTATION: Final = 5
 """A move beyond the rotation limits; the other reasons are those of `planner.edge_checks`."""
 
 LARGEST_TURN = 2.9
-"""Of one move, [rad]: nearer to a half turn, round-off could decide which way is the shorter."""
+"""Of one move, [rad]: nearer to a half turn, round-off could decide the direction of rotation."""
 
 
 class RotatingProblem(NamedTuple):
@@ -194,7 +194,7 @@ class RotatingProblem(NamedTuple):
         reserve: Smallest capacity margin, [N].
         tilt: Largest tilt, [rad].
         turn: Largest turn about the vertical, [rad].
-        objective: What is made small.
+        objective: The cost to minimise.
     """
 
     world: World
@@ -208,13 +208,13 @@ class RotatingProblem(NamedTuple):
 
 @kernel
 def move_allowed(problem: RotatingProblem, start: Array, end: Array, tallies: Integers) -> bool:
-    """Whether a move keeps everything asked for; counts why not.
+    """Whether a move keeps every limit; counts the reason if not.
 
     Args:
-        problem: What is asked for.
+        problem: The limits.
         start: A pose, shape (7,).
-        end: Likewise.
-        tallies: Moves asked about, by what forbids them, shape (6,); one is stepped.
+        end: A pose, shape (7,).
+        tallies: Moves checked, by what forbids them, shape (6,); one is incremented.
     """
     if not rotations_kept(problem.tilt, problem.turn, start, end):
         tallies[ROTATION] += 1

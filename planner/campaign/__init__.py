@@ -1,1 +1,1 @@
-"""The paper's evaluation (section 5.3, Fig. 9) as a campaign of many searches, and its verdicts."""
+"""The paper's evaluation (section 5.3, Fig. 9) as a campaign of many searches, with verdicts."""

@@ -1,4 +1,4 @@
-"""The paper's whole evaluation: its searches, their settings, and its files."""
+"""The paper's whole evaluation: its searches, their settings, and its output files."""
 
 from __future__ import annotations
 
@@ -53,17 +53,17 @@ def run_campaign(
         rig: The robot.
         scenes: The paper's environments.
         seeds: Searches of each planner in each case.
-        checked: Whether every path of Fig. 9 is put to `planner.check.check_path` as well.
-        workers: Processes; one a core when left out.
-        dask: Address of a Dask cluster that does the work instead.
-        listener: Receives how far it is.
+        checked: Whether `planner.check.check_path` checks every path of Fig. 9 as well.
+        workers: Processes; one per core when left out.
+        dask: Address of a Dask cluster to use instead.
+        listener: Receives progress.
 
     Raises:
         BadInput: Dask is not installed, or no scheduler answers.
     """
     work = batches(rig, scenes, seeds, checked=checked)
     with planner_compilation("paper", listener):
-        run_batch(work[0])  # before several processes would compile the same
+        run_batch(work[0])  # or every process would compile
     total = sum(len(batch.seeds) for batch in work)
     with (
         worker_pool(workers or os.cpu_count() or 1, dask) as pool,
@@ -73,7 +73,7 @@ def run_campaign(
 
 
 def about(rig: Rig, scenes: Sequence[Scene], seeds: int, results: Results) -> dict[str, Any]:
-    """What the campaign was, for its page and its findings."""
+    """Facts about the campaign, for its page and its findings."""
     lost = {study: results.lost(study) for study in STUDIES}
     checked = [t.path.passed for t in results.trials if t.path.passed == t.path.passed]
     return {
@@ -115,7 +115,7 @@ _ARM = (
 
 
 def trials_csv(results: Results) -> str:
-    """One row a search."""
+    """One row per search."""
     head = (*_CASE, *_ARM, "seed", "found", *COUNTED, *MEASURED, "passed_check")
     rows = (
         (
@@ -131,7 +131,7 @@ def trials_csv(results: Results) -> str:
 
 
 def summary_csv(results: Results) -> str:
-    """One row a quantity of an arm in a case: mean, standard deviation, bootstrap interval."""
+    """One row per quantity, arm and case: mean, standard deviation, bootstrap interval."""
     head = (*_CASE, *_ARM, "quantity", "searches_with_path", "searches", *_FIGURES)
     rows = []
     for (study, case, arm), trials in results.groups():
@@ -150,7 +150,7 @@ _FIGURES = ("mean", "standard_deviation", "interval_low", "interval_high")
 
 
 def findings_json(results: Results, about: dict[str, Any]) -> str:
-    """The claims and what was found, with what the campaign was."""
+    """The claims, the findings, and facts about the campaign."""
     listed = [{**asdict(finding), "verdict": finding.verdict} for finding in findings(results)]
     return json.dumps({"about": about, "findings": listed}, indent=1, allow_nan=False) + "\n"
 

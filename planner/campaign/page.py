@@ -1,4 +1,4 @@
-"""The page of a campaign: each claim of the paper beside what was found."""
+"""The page of a campaign: each claim of the paper beside its finding."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from model.pose import Array
 from planner.campaign.studies import (
     BOXES,
     COMPARISONS,
+    CONDITIONS,
     COSTS,
     COUNTED,
     FIGURE_9,
     MEASURED,
     NEAREST_TO_THE_CLAIM,
     NODES,
-    PLACES,
     READINGS,
     SAMPLERS,
     VARIANTS,
@@ -89,11 +89,13 @@ def _claims(results: Results) -> str:
     rows = []
     for claim in dict.fromkeys(finding.claim for finding in found):
         row = [claim]
-        for place in PLACES:
-            here = next(f for f in found if f.claim == claim and (f.box, f.ends) == place)
+        for condition in CONDITIONS:
+            here = next(f for f in found if f.claim == claim and (f.box, f.ends) == condition)
             row.append(f"{change_text(here.change)}\n{here.verdict}")
         rows.append(row)
-    return list_table(["claim", *(f"{box} box, {ends} ends" for box, ends in PLACES)], rows, "wide")
+    return list_table(
+        ["claim", *(f"{box} box, {ends} ends" for box, ends in CONDITIONS)], rows, "wide"
+    )
 
 
 def _figure_9_table(results: Results, ends: Any) -> str:
@@ -118,12 +120,14 @@ def _comparisons(results: Results) -> str:
     rows = []
     for comparison in COMPARISONS:
         row = [comparison.name]
-        for box, ends in PLACES:
+        for box, ends in CONDITIONS:
             arms = arms_of(comparison)
             mean, deviation = results.change(VARIANTS, box, ends, arms, "nodes")
             row.append(f"{change_text(mean)}\ndeviation {percent(deviation.mean)}")
         rows.append(row)
-    return list_table(["nodes", *(f"{box} box, {ends} ends" for box, ends in PLACES)], rows, "wide")
+    return list_table(
+        ["nodes", *(f"{box} box, {ends} ends" for box, ends in CONDITIONS)], rows, "wide"
+    )
 
 
 def _readings(results: Results) -> str:
@@ -176,13 +180,13 @@ def _paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
-# Images of a campaign: Fig. 9, and what the claim owes to the reading and to the box.
+# Images of a campaign: Fig. 9, and how the claim depends on the reading and on the box.
 
 
 FIRST, SECOND, THIRD, CLAIM, MUTED = "#2f7fb5", "#c98500", "#3f9b6b", "#c0392b", "#5c6675"
 _COLOURS = {"adaptive": FIRST, "goal-bias": SECOND, "kinematic": THIRD, "length": MUTED}
 _SHOWN = ((-45.0, 75.0), (-80.0, 100.0))
-"""Changes that the image of the readings shows in place, [%]; beyond, at its edge."""
+"""Range of the image of the readings, [%]; changes beyond it are drawn at its edge."""
 _SETTINGS: dict[Any, Any] = {  # matplotlib types the keys as a union of every setting's name
     "svg.fonttype": "none",
     "svg.hashsalt": "cdpr",
@@ -201,7 +205,7 @@ _COST_LABEL = "mean kinematic cost along the path"
 
 
 def save_figures(results: Results, folder: Path) -> tuple[str, ...]:
-    """Writes every image as SVG and PNG; the names without their ends."""
+    """Writes every image as SVG and PNG; returns the names without suffix."""
     import matplotlib as mpl
 
     drawn = {
@@ -260,15 +264,15 @@ def readings_figure(results: Results) -> Figure:
 
 
 def boxes_figure(results: Results) -> Figure:
-    """How the change of the nodes goes with the size of the workspace box."""
+    """Change of the number of nodes against the size of the workspace box."""
     figure, (axes,) = _new(5.2, 3.0, 1)
-    places = np.array(list(SHARES.values())) * 100.0
+    growth = np.array(list(SHARES.values())) * 100.0
     for comparison, colour in zip(COMPARISONS[1:4], (FIRST, SECOND, THIRD), strict=True):
         arms = arms_of(comparison)
         changes = [results.change(BOXES, box, "scene", arms, "nodes")[0] for box in SHARES]
         middle, low, high = np.array([[c.mean, c.low, c.high] for c in changes]).T * 100.0
-        axes.plot(places, middle, "o-", color=colour, ms=4, label=comparison.name)
-        axes.fill_between(places, low, high, color=colour, alpha=0.15, lw=0)
+        axes.plot(growth, middle, "o-", color=colour, ms=4, label=comparison.name)
+        axes.fill_between(growth, low, high, color=colour, alpha=0.15, lw=0)
     axes.axhline(NODES * 100, color=CLAIM, lw=1)
     axes.text(0.0, NODES * 100, "claimed", color=CLAIM, ha="left", va="top")
     axes.axhline(0.0, color=MUTED, lw=0.6)
@@ -302,7 +306,7 @@ def _bars(axes: Axes, results: Results, ends: Any, arms: dict[Any, Arm], quantit
 
 
 def _dots(axes: Axes, points: Array, colour: str, name: str) -> None:
-    """Points in the image as dots, those beyond it as triangles at its edge."""
+    """Points within the image as dots, those beyond it as triangles at its edge."""
     low, high = np.array(_SHOWN).T
     beyond = np.any((points < low) | (points > high), axis=1)
     shown = np.clip(points, low, high)

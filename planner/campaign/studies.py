@@ -1,4 +1,4 @@
-"""What the campaign compares: planners, boxes, starts and goals; and what its searches show."""
+"""What the campaign compares (planners, boxes, starts and goals), and its findings."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def batches(
         rig: With its own workspace box.
         scenes: The environments.
         seeds: Searches in each arm of each case.
-        checked: Whether the paths of Fig. 9 are put to the independent check.
+        checked: Whether the independent check checks the paths of Fig. 9.
     """
     rig_json = rig.document.model_dump_json()
     scene_json = {scene.name: scene.document.model_dump_json() for scene in scenes}
@@ -100,7 +100,7 @@ def figure_9_arm(sampler: SamplerName, cost: CostName) -> Arm:
 
 
 def arms_of(comparison: StudyComparison) -> tuple[Arm, Arm]:
-    """The adaptive planner and the baseline of a comparison, under the length."""
+    """The adaptive planner and the baseline of a comparison, with the length as cost."""
     return Arm("adaptive", "length", comparison.adaptive), _baseline(comparison.baseline)
 
 
@@ -139,20 +139,20 @@ def _distinct(comparisons: Sequence[StudyComparison]) -> tuple[Arm, ...]:
     return tuple(dict.fromkeys(arm for c in comparisons for arm in arms_of(c)))
 
 
-# Doing all searches of a campaign, in this process or wherever a pool does them.
+# Running all searches of a campaign, in this process or in a pool.
 
 
 Progress = Callable[[int], None]
-"""Called with the number of searches newly done."""
+"""Called with the number of searches just finished."""
 
 
 def run_all(batches: Sequence[Batch], pool: Executor | None, progress: Progress) -> list[Trial]:
-    """Does all batches; the trials are in the order of the batches, whatever process did them.
+    """Runs all batches; the trials are in the order of the batches, whichever process ran them.
 
     Args:
-        batches: What to do.
-        pool: Does it, in other processes or on other machines; this process without one.
-        progress: Called with the number of searches newly done.
+        batches: The searches.
+        pool: Other processes or machines; None for this process.
+        progress: Called with the number of searches just finished.
     """
     if pool is None:
         trials = []
@@ -182,7 +182,7 @@ _LEVELS = (2.5, 97.5)
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A sample in figures.
+    """Statistics of a sample.
 
     Attributes:
         count: Its size.
@@ -201,10 +201,10 @@ class Summary:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """How a figure of one planner differs from another's, as a part of the other's.
+    """Relative difference of a figure between two planners.
 
     Attributes:
-        each: In every environment.
+        each: In each environment.
         mean: Over the environments.
         low: Lower end of the 95 % bootstrap interval of `mean`.
         high: Its upper end.
@@ -228,8 +228,8 @@ def change_of_means(pairs: Sequence[tuple[Array, Array]]) -> Change:
     """Change of the mean from the second sample of each pair to the first.
 
     Args:
-        pairs: One of each environment; the samples of a pair have the same seeds in the same order,
-            shape (k,) each, and are resampled together, as random ends tie them to each other.
+        pairs: One per environment; the samples of a pair have the same seeds in the same order,
+            shape (k,) each, and are resampled together, as random ends correlate them.
     """
     return _change(pairs, _mean)
 
@@ -272,11 +272,11 @@ MEASURED = ("raw_length_mm", "length_mm", "raw_cost", "cost", "clearance_mm")
 
 
 class Results:
-    """What was found.
+    """All trials of a campaign.
 
     Attributes:
-        trials: All of them.
-        environments: Their names, in the order of the campaign.
+        trials: In order.
+        environments: Names, in the order of the campaign.
     """
 
     def __init__(self, trials: Iterable[Trial]) -> None:
@@ -297,7 +297,7 @@ class Results:
         return np.array([t.value(quantity) for t in found], dtype=np.float64)
 
     def lost(self, study: str) -> int:
-        """How many searches of a study found no path."""
+        """Number of searches of a study that found no path."""
         return sum(t.study == study and not t.found for t in self.trials)
 
     def change(
@@ -318,13 +318,13 @@ class Results:
         return change_of_means(pairs), change_of_deviations(pairs)
 
 
-# What the paper claims of Fig. 9, beside what was found.
+# The paper's claims about Fig. 9, beside the findings.
 
 
 NODES, NODES_DEVIATION = -0.205, 0.0
 COST, COST_DEVIATION = -0.182, 0.0
 
-PLACES: tuple[tuple[str, Ends], ...] = tuple((box, ends) for box in (OWN, WIDE) for ends in ENDS)
+CONDITIONS: tuple[tuple[str, Ends], ...] = tuple(product((OWN, WIDE), ENDS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,10 +333,10 @@ class Finding:
 
     Attributes:
         claim: In the paper's words, shortened.
-        claimed: Change that it claims, as a part; 0 where only "smaller" is claimed.
-        box: Where it was looked at.
-        ends: From where to where.
-        change: What was found.
+        claimed: Relative change claimed; 0 where only "smaller" is claimed.
+        box: Name of the workspace box.
+        ends: Kind of start and goal.
+        change: The change found.
     """
 
     claim: str
@@ -360,7 +360,7 @@ class Finding:
         return "no difference seen" if change.low <= 0.0 else "the opposite"
 
 
-#: Who rejects new nodes within 30 mm of another: the claim depends on it.
+#: Which planner rejects new nodes within 30 mm of another: the claim depends on it.
 _REJECTING = (
     ("adaptive alone rejects near nodes", NEAREST_TO_THE_CLAIM),
     ("both reject them", BOTH_REJECT),
@@ -371,7 +371,7 @@ def findings(results: Results) -> tuple[Finding, ...]:
     """Every claim in every box with every kind of ends."""
     found = []
     costs = figure_9_arm("adaptive", "kinematic"), figure_9_arm("adaptive", "length")
-    for box, ends in PLACES:
+    for box, ends in CONDITIONS:
         for name, comparison in _REJECTING:
             mean, deviation = results.change(VARIANTS, box, ends, arms_of(comparison), "nodes")
             found.append(Finding(f"20.5 % fewer nodes, {name}", NODES, box, ends, mean))

@@ -1,4 +1,4 @@
-"""One search of the campaign, and what is measured of it."""
+"""One search of the campaign, and its measurements."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ _TRIES = 100_000
 
 
 def random_ends(planner: PaperPlanner, distance: float, random: Generator) -> tuple[Array, Array]:
-    """A start and a goal that can be used, with an obstacle across the straight line.
+    """A usable start and goal with an obstacle across the straight line.
 
-    The text says "different start and goal points with the same path length"; of a path that is
-    still to be found only the straight line is known, so that is what has the same length. Pairs
-    that see each other are left out: neither planner has anything to search there.
+    The text says "different start and goal points with the same path length"; before a search only
+    the straight distance is known, so that is kept equal. Pairs joined by a free straight line are
+    left out: neither planner has anything to search there.
 
     Args:
         planner: Of the scene; decides what is free.
-        distance: Of start and goal, [m].
-        random: Drawn from.
+        distance: Between start and goal, [m].
+        random: Random generator.
 
     Returns:
         Start and goal, shape (3,) each, [m].
 
     Raises:
-        NoSolution: There seem to be no such pairs.
+        NoSolution: No such pair was found.
     """
     lower, upper = planner.space.lower, planner.space.upper
     for _ in range(_TRIES):
@@ -68,7 +68,7 @@ def random_ends(planner: PaperPlanner, distance: float, random: Generator) -> tu
     )
 
 
-# Workspace boxes: the rig's own, and larger ones to see what a claim owes to the box.
+# Workspace boxes: the rig's own, and larger ones to see how a claim depends on the box.
 
 
 GROWTH_MM = ((-100.0, -100.0, -50.0), (100.0, 100.0, 100.0))
@@ -77,11 +77,11 @@ GROWTH_MM = ((-100.0, -100.0, -50.0), (100.0, 100.0, 100.0))
 
 OWN, WIDE = "own", "wide"
 SHARES = {OWN: 0.0, "25 %": 0.25, "50 %": 0.5, "75 %": 0.75, WIDE: 1.0}
-"""Boxes by name: the share of `GROWTH_MM` they are grown by."""
+"""Boxes by name, with the share of `GROWTH_MM` by which they are grown."""
 
 
 def with_box(rig: Rig, name: str) -> Rig:
-    """The same rig with its workspace grown to the box of a name in `SHARES`."""
+    """The same rig with its workspace grown to the box named in `SHARES`."""
     share, box = SHARES[name], rig.document.workspace
     lower, upper = (
         [edge + share * growth for edge, growth in zip(edges, grown, strict=True)]
@@ -120,7 +120,7 @@ class Arm:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Where searches take place.
+    """Conditions of a search.
 
     Attributes:
         box: Name of the workspace box (`planner.campaign.trial`).
@@ -138,15 +138,15 @@ class Batch:
     """Searches of one arm in one case, for any process on any machine.
 
     Attributes:
-        study: What they are for.
-        case: Where they take place.
+        study: Name of the study.
+        case: Box, environment and ends.
         arm: The planner.
         rig: Rig document, JSON, with its own box.
         scene: Scene document, JSON.
         seeds: One search each.
         measured: Whether path and cost are measured, beyond counts.
-        clearance: Whether the true smallest clearance is found too.
-        checked: Whether the path is put to `planner.check.check_path`.
+        clearance: Whether the true smallest clearance is computed too.
+        checked: Whether `planner.check.check_path` checks the path.
     """
 
     study: str
@@ -162,13 +162,13 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class PathFigures:
-    """What is measured of a path; NaN where it was not asked for.
+    """Measurements of a path; NaN where not requested.
 
     Attributes:
         raw_length_mm: Before post-processing.
         length_mm: After Algorithm 3.
         raw_cost: Mean kinematic cost along the path before post-processing.
-        cost: And after it.
+        cost: Mean kinematic cost after Algorithm 3.
         clearance_mm: Smallest distance to an obstacle along the finished path, by
             `model.clearance`.
         passed: 1 where the finished path passed its check, 0 where it did not.
@@ -184,7 +184,7 @@ class PathFigures:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What one search gave.
+    """Result of one search.
 
     Attributes:
         study: As in its batch.
@@ -194,9 +194,9 @@ class Trial:
         found: Whether there is a path.
         nodes: Nodes of the tree.
         searches: Samples drawn.
-        edge_checks: Edges asked about by the search.
+        edge_checks: Edges checked by the search.
         time_ms: Processor time of the search.
-        path: Of the path, where it is measured.
+        path: Measurements of the path.
     """
 
     study: str
@@ -216,7 +216,7 @@ class Trial:
 
 
 def run_batch(batch: Batch) -> list[Trial]:
-    """Does the searches; the same batch gives the same trials anywhere, times aside."""
+    """Runs the searches; the same batch gives the same trials anywhere, except for times."""
     planner = _planner(batch.rig, batch.scene, batch.case.box, batch.arm)
     return [_trial(batch, planner, seed) for seed in batch.seeds]
 
@@ -271,16 +271,16 @@ def _length(path: Array) -> float:
     return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
-def _clearance(rig: Rig, scene: Scene, track: PosePath) -> float:
-    """The smallest distance to an obstacle anywhere along a track, to 0.1 mm, [m]."""
+def _clearance(rig: Rig, scene: Scene, path: PosePath) -> float:
+    """The smallest distance to an obstacle anywhere along a path, to 0.1 mm, [m]."""
     model = ClearanceModel(rig, scene)
 
-    def evaluate(places: Array) -> Array:
-        nearest = [model.smallest(track.pose(place)) for place in places.tolist()]
+    def evaluate(positions: Array) -> Array:
+        nearest = [model.smallest(path.pose(position)) for position in positions.tolist()]
         return np.array([near.distance for near in nearest if near is not None])
 
-    places = track.places(_SPACING)
-    return smallest_along(places, evaluate, 1.0, -np.inf, _CLEARANCE_TOLERANCE).value
+    samples = path.samples(_SPACING)
+    return smallest_along(samples, evaluate, 1.0, -np.inf, _CLEARANCE_TOLERANCE).value
 
 
 @lru_cache(maxsize=64)
@@ -292,7 +292,7 @@ def _planner(rig: str, scene: str, box: str, arm: Arm) -> PaperPlanner:
     cost = _cost(rig, box) if arm.cost == "kinematic" else None
     exact = _exact(rig, scene, box)
     planner = PaperPlanner(the_rig, _scene(scene), settings, CLEARANCE_RESERVE, cost, exact)
-    # Machine code is loaded, or made, by the first search: its time belongs to no trial.
+    # The first search loads or compiles machine code; its time belongs to no trial.
     ends = _scene(scene).start.position, _scene(scene).goal.position
     planner.search(*ends, np.random.default_rng(0))
     return planner

@@ -1,1 +1,1 @@
-"""Compiled edge checks against obstacles and the robot's own parts, exact over the whole edge."""
+"""Compiled edge checks against obstacles and the robot itself, exact over the whole edge."""

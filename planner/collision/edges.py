@@ -1,9 +1,9 @@
 """Edges of pure translation: obstacles and workspace, exact from end to end.
 
-For every pair of a body and a piece the planes made beforehand are tried: one with the whole edge
-before it proves the pair, all of some others with a part of the edge behind them refute it; only
-between these is the closed form asked. Cables over pulleys, whose exits move, go to
-`planner.collision.rotating_edges`, which also knows edges with rotation.
+For every pair of a body and a piece, precomputed planes are tried. A plane with the whole edge
+before it proves the pair; a part of the edge behind all planes of a core refutes it; only otherwise
+is the closed form evaluated. Cables on pulleys, whose exit points move, go to
+`planner.collision.rotating_edges`, which also handles edges with rotation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from planner.kernels.scene_arrays import BOX, Integers, World, arm, outlet
 Array = NDArray[np.float64]
 
 _AT_THE_WALL = 1e-9
-"""How far past the workspace box a position may be, [m]: round-off of files and frames."""
+"""Tolerance of the workspace box, [m]: round-off of files and frames."""
 _ALL_FREE, _REFUTED = -1, -2
 
 
@@ -35,7 +35,7 @@ def edge_free(world: World, start: Array, end: Array) -> bool:
     """Whether the platform may be translated from ``start`` to ``end``, shape (3,) each, [m].
 
     It stays in the workspace box, and platform and cables keep the clearance to every obstacle.
-    Never yes where that is untrue; no, too, where the distance is within round-off of the needed.
+    Never True where that is violated; False also where a distance is within round-off of its limit.
     """
     before = (start[0], start[1], start[2])
     after = (end[0], end[1], end[2])
@@ -67,13 +67,13 @@ def edge_clearance(world: World, start: Array, end: Array) -> tuple[float, int, 
     """The smallest distance of any body to any obstacle along an edge, exact.
 
     Args:
-        world: Where.
+        world: Rig and obstacles.
         start: World frame, shape (3,), [m].
-        end: Likewise.
+        end: World frame, shape (3,), [m].
 
     Returns:
         The distance between surfaces, [m], 0 or less where they touch and infinite without
-        obstacles; the number of the body (m for the platform); the number of the obstacle.
+        obstacles; the index of the body (m for the platform); the index of the obstacle.
     """
     before, after = row_of(start), row_of(end)
     bodies = len(world.bodies)
@@ -104,7 +104,7 @@ def row_of(point: Array) -> Vector:
 
 @leaf
 def in_workspace(world: World, position: Vector) -> bool:
-    """Whether a position, and nothing that is not a number, is in the workspace box."""
+    """Whether a position is in the workspace box; False for NaN."""
     for axis in range(3):
         low, high = world.limits[0, axis] - _AT_THE_WALL, world.limits[1, axis] + _AT_THE_WALL
         if not low <= position[axis] <= high:
@@ -114,7 +114,7 @@ def in_workspace(world: World, position: Vector) -> bool:
 
 @inlined
 def obstacles_free(world: World, before: Vector, after: Vector) -> bool:
-    """Whether all bodies keep what they need to all obstacles between two positions."""
+    """Whether all bodies keep their distance to all obstacles between two positions."""
     if world.pulley > 0.0:
         return _free_over_pulleys(world, before, after)
     pair = 0
@@ -124,7 +124,7 @@ def obstacles_free(world: World, before: Vector, after: Vector) -> bool:
             return pair == _ALL_FREE
         piece, body = world.pairs[pair, 0], world.pairs[pair, 1]
         if world.spans[piece, 0] == BOX and body < len(world.cables):
-            # The world is a hundred words to hand over, which takes longer than the comparison.
+            # Passing the whole world, a hundred words, would take longer than the comparison.
             if not box_apart(world.pieces, world.cables, world.bodies, piece, body, before, after):
                 return False
         elif not _pair_free(world, piece, body, before, after):
@@ -134,7 +134,7 @@ def obstacles_free(world: World, before: Vector, after: Vector) -> bool:
 
 @leaf
 def _undecided(planes: Array, pairs: Integers, first: int, before: Vector, after: Vector) -> int:
-    """The next pair that planes do not decide; else `_ALL_FREE` or `_REFUTED`."""
+    """The next pair that the planes do not decide; else `_ALL_FREE` or `_REFUTED`."""
     for pair in range(first, len(pairs)):
         if _before_a_plane(planes, pairs[pair, 2], pairs[pair, 3], before, after):
             continue
@@ -146,7 +146,7 @@ def _undecided(planes: Array, pairs: Integers, first: int, before: Vector, after
 
 @leaf
 def _before_a_plane(planes: Array, first: int, last: int, before: Vector, after: Vector) -> bool:
-    """Whether one of some planes proves a pair."""
+    """Whether any of the planes has the whole edge before it."""
     for k in range(first, last):
         x, y, z, limit = planes[k, 0], planes[k, 1], planes[k, 2], planes[k, 3]
         if (
@@ -159,7 +159,7 @@ def _before_a_plane(planes: Array, first: int, last: int, before: Vector, after:
 
 @leaf
 def _enters_core(planes: Array, first: int, last: int, before: Vector, after: Vector) -> bool:
-    """Whether some part of an edge is behind all of some planes."""
+    """Whether some part of the edge is behind all of the planes."""
     low, high = 0.0, 1.0
     for k in range(first, last):
         x, y, z, limit = planes[k, 0], planes[k, 1], planes[k, 2], planes[k, 3]
@@ -191,7 +191,7 @@ def _free_over_pulleys(world: World, before: Vector, after: Vector) -> bool:
 
 @leaf
 def _pair_free(world: World, piece: int, body: int, before: Vector, after: Vector) -> bool:
-    """Whether a pair keeps what it needs, where the exit stays."""
+    """Whether a pair keeps its distance, with a fixed exit point."""
     needed = world.bodies[body, 0]
     if body == len(world.bodies) - 1:
         return platform_apart(world, piece, before, after, needed)
@@ -201,10 +201,10 @@ def _pair_free(world: World, piece: int, body: int, before: Vector, after: Vecto
 
 @leaf
 def _room_at_planes(world: World, pair: int, before: Vector, after: Vector) -> float:
-    """A lower bound of the pair's distance, [m], the radius of the cable not taken off."""
+    """A lower bound of the pair's distance, [m], without subtracting the cable's radius."""
     room, body = -np.inf, world.pairs[pair, 1]
     if world.pulley > 0.0 and body < len(world.bodies) - 1:
-        return room  # the planes hold for exits that stay
+        return room  # the planes hold for fixed exit points
     for k in range(world.pairs[pair, 2], world.pairs[pair, 3]):
         normal = (world.planes[k, 0], world.planes[k, 1], world.planes[k, 2])
         reach = max(

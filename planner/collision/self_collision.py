@@ -1,4 +1,4 @@
-"""Self clearance of a rig: proved beforehand where that goes, then only what is left, by edge."""
+"""Self clearance of a rig: precomputed proofs where possible, the rest checked by edge."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from model.clearance import SelfModel
 from model.errors import BadInput
 from model.pose import Array
 from model.rig import Rig
-from planner.collision.rotating_edges import turned_by
+from planner.collision.rotating_edges import rotated_by
 from planner.collision.self_collision_regions import (
     CELLS,
     PROVED,
@@ -34,11 +34,11 @@ _FINEST = 1e-9
 
 
 def build_robot(rig: Rig, world: World, clearance: float) -> Robot:
-    """What is to be compared on a rig, proved over its workspace as far as that goes.
+    """The comparisons on a rig, proved over its workspace as far as possible.
 
     Args:
         rig: The robot.
-        world: Made from it for one orientation; its obstacles are not used.
+        world: Built from it for one orientation; its obstacles are not used.
         clearance: Smallest allowed distance between cables and of cables to the platform, [m].
 
     Raises:
@@ -58,11 +58,11 @@ def build_robot(rig: Rig, world: World, clearance: float) -> Robot:
 
 
 def unproved_robot(rig: Rig, world: World, clearance: float) -> Robot:
-    """As `build_robot`, with nothing proved: edges without a turn are not to be asked of it.
+    """As `build_robot`, with nothing proved; only for edges with rotation.
 
     Args:
         rig: The robot.
-        world: Made from it for one orientation; its obstacles are not used.
+        world: Built from it for one orientation; its obstacles are not used.
         clearance: Smallest allowed distance between cables and of cables to the platform, [m].
 
     Raises:
@@ -88,7 +88,7 @@ def unproved_robot(rig: Rig, world: World, clearance: float) -> Robot:
 
 
 def _open_cells(world: World, robot: Robot, left: list[int]) -> Masks:
-    """In which cells of the workspace which of some comparisons are open."""
+    """Bit masks of the comparisons that are open in each cell of the workspace."""
     masks = np.zeros((CELLS, CELLS, CELLS, words_for(len(left))), dtype=np.uint64)
     for number, which in enumerate(left):
         word, bit = number // WORD, np.uint64(1 << (number % WORD))
@@ -107,14 +107,14 @@ def _stubs(ends: Array, model: SelfModel) -> Array:
 def self_edge_free(world: World, robot: Robot, start: Array, end: Array) -> bool:
     """Whether the cables keep the self clearance under a translation.
 
-    What is proved over the cells that the edge passes is not looked at, so both ends must lie in
-    the workspace.
+    Comparisons proved over the cells that the edge passes are skipped, so both ends must lie in the
+    workspace.
 
     Args:
-        world: Where; gives the orientation.
-        robot: What is needed.
+        world: Rig and orientation.
+        robot: Required distances.
         start: World frame, shape (3,), [m].
-        end: Likewise.
+        end: World frame, shape (3,), [m].
     """
     pairs, rotation, still = len(robot.pairs), world.platform[:3], np.zeros(3)
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
@@ -140,7 +140,7 @@ def self_edge_free(world: World, robot: Robot, start: Array, end: Array) -> bool
 
 @inlined
 def is_open(world: World, robot: Robot, start: Vector, end: Vector) -> bool:
-    """Whether anything is left to compare along a translation within the workspace."""
+    """Whether any comparison is open along a translation within the workspace."""
     for word in range(robot.open_cells.shape[3]):
         if open_along(robot.open_cells, world.limits, start, end, word) != np.uint64(0):
             return True
@@ -151,20 +151,20 @@ def is_open(world: World, robot: Robot, start: Vector, end: Vector) -> bool:
 def self_turning_edge_free(
     world: World, robot: Robot, start: Array, end: Array, rotation: Array, turn: Array
 ) -> bool:
-    """Whether the cables keep the self clearance while the platform is moved and turned.
+    """Whether the cables keep the self clearance while the platform is moved and rotated.
 
     Args:
-        world: Where; its own orientation is not used.
-        robot: What is needed.
+        world: Rig and obstacles; its own orientation is not used.
+        robot: Required distances.
         start: World frame, shape (3,), [m].
-        end: Likewise.
+        end: World frame, shape (3,), [m].
         rotation: ``world_from_platform`` at the start, shape (3, 3).
         turn: Rotation vector from start to end, platform frame, shape (3,), [rad].
     """
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
     angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
-    # Most comparisons are decided over the whole edge, the middle of which is then found but once.
-    ends, there = np.empty((2, 3)), turned_by(rotation, turn, 0.5)
+    # Most comparisons are decided over the whole edge, whose middle is then computed only once.
+    ends, there = np.empty((2, 3)), rotated_by(rotation, turn, 0.5)
     ends[0], ends[1] = before, after
     middle = along(before, minus(after, before), 0.5)
     for which in range(len(robot.pairs) + len(world.cables)):
@@ -186,10 +186,10 @@ def _clear(
     rotation: Array,
     turn: Array,
 ) -> bool:
-    """One comparison along an edge that is halved until decided; ``which`` as in `compared`."""
-    way = minus(after, before)
+    """One comparison along an edge, bisected until decided; ``which`` as in `compared`."""
+    delta = minus(after, before)
     angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
-    size = np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2) + angle
+    size = np.sqrt(delta[0] ** 2 + delta[1] ** 2 + delta[2] ** 2) + angle
     lows, highs, ends = np.empty(_DEEPEST), np.empty(_DEEPEST), np.empty((2, 3))
     lows[0], highs[0] = 0.0, 1.0
     waiting, tried = 1, 0
@@ -197,8 +197,8 @@ def _clear(
         waiting -= 1
         low, high, tried = lows[waiting], highs[waiting], tried + 1
         middle = (low + high) / 2.0
-        ends[0], ends[1] = along(before, way, low), along(before, way, high)
-        at, there = along(before, way, middle), turned_by(rotation, turn, middle)
+        ends[0], ends[1] = along(before, delta, low), along(before, delta, high)
+        at, there = along(before, delta, middle), rotated_by(rotation, turn, middle)
         off = angle * (high - low) / 2.0
         found = compared(world, robot, which, there, ends, at, off)
         if found == PROVED:

@@ -1,18 +1,18 @@
 """Cables against each other and against the platform, proved over whole regions of poses.
 
 A region is the hull of corner positions (two for an edge, eight for a box) at one orientation. Two
-cables lie on lines, the distance of which is |N| / ‖D‖ with N and D affine in the position p; so
-N - c ‖D‖ is concave, and not below zero anywhere if it is not at the corners. The room at a plane
-with a fixed normal is the least of functions affine in p.
+cables lie on lines at the distance |N| / ‖D‖, with N and D affine in the position p; so N - c ‖D‖
+is concave, and non-negative everywhere if it is at the corners. The room at a plane with a fixed
+normal is the minimum of functions affine in p.
 
-A cable keeps c to the platform where all of it beyond its stub is before a plane with normal n that
-is c before the platform's box. Its exit is, at all positions, if it is at the corners. Where the
-anchor is before that plane, too (it then lies off the box), all of the cable is, half-spaces being
-convex. Where it is behind it by h, the stub's end is before it if s n·w - h ‖w‖ is not below
-zero, w from anchor to exit being affine in p and s the stub: concave again.
+A cable keeps c to the platform if all of it beyond its stub is before a plane with normal n that is
+c before the platform's box. Its exit is before it at all positions if it is at the corners. If the
+anchor is before the plane too (it then lies off the box), so is all of the cable, half-spaces being
+convex. If the anchor is behind it by h, the stub's end is before it if s n·w - h ‖w‖ ≥ 0, with w
+from anchor to exit, affine in p, and s the stub: concave again.
 
-Exits that move on pulleys and a platform that turns are taken off as a bound of what they move. A
-small region is proved by such a bound alone, so halving ends wherever there is room.
+Motion of exits on pulleys and rotation of the platform are subtracted as bounds. In a small region
+such a bound alone is a proof, so bisection ends wherever there is room.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from planner.kernels.primitives import (
     minus,
     norm,
     plus,
+    rotated,
     row,
     segment_box_between,
     segment_pair_between,
-    turned,
 )
 from planner.kernels.scene_arrays import World, anchor, half_size
 
 # Cells of the workspace box, each with a bit for each comparison that is still open in it.
 #
-# What cannot be proved over the whole workspace at once most often can over nearly all of it. An
-# edge then asks only for what is open in the cells that it passes.
+# A comparison that cannot be proved over the whole workspace usually can over nearly all of it. An
+# edge then checks only what is open in the cells that it passes.
 
 
 Masks = NDArray[np.uint64]
@@ -55,22 +55,22 @@ WORD: Final = 64
 
 
 def words_for(comparisons: int) -> int:
-    """How many words hold a bit for each comparison."""
+    """Number of words that hold one bit per comparison."""
     return (comparisons + WORD - 1) // WORD
 
 
 @leaf
 def open_along(masks: Masks, limits: Array, start: Vector, end: Vector, word: int) -> np.uint64:
-    """What is open in at least one of the cells that a straight way passes.
+    """The comparisons open in at least one of the cells that a straight move passes.
 
-    A way along the border of cells passes one of them: a cell holds its border.
+    A move along the border of cells passes one of them: a cell holds its border.
 
     Args:
         masks: Shape (CELLS, CELLS, CELLS, words).
         limits: Lower and upper corner of the workspace box, shape (2, 3), [m].
         start: In that box, [m].
-        end: Likewise.
-        word: Which word of the masks.
+        end: In that box, [m].
+        word: Index of the word in the masks.
     """
     i, j, k = _cell(limits, start, 0), _cell(limits, start, 1), _cell(limits, start, 2)
     found = masks[i, j, k, word]
@@ -101,13 +101,13 @@ def _cell(limits: Array, point: Vector, axis: int) -> int:
 
 @leaf
 def _next_border(limits: Array, start: Vector, end: Vector, cell: int, axis: int) -> float:
-    """The share of the way at which it leaves a cell along an axis; infinite if it does not."""
-    way = end[axis] - start[axis]
-    border = cell + 1 if way > 0.0 else cell
-    if way == 0.0 or border <= 0 or border >= CELLS:
+    """The share of a move at which it leaves a cell along an axis; infinite if it does not."""
+    delta = end[axis] - start[axis]
+    border = cell + 1 if delta > 0.0 else cell
+    if delta == 0.0 or border <= 0 or border >= CELLS:
         return np.inf
     low, high = limits[0, axis], limits[1, axis]
-    return (low + border * (high - low) / CELLS - start[axis]) / way  # type: ignore[no-any-return]
+    return (low + border * (high - low) / CELLS - start[axis]) / delta  # type: ignore[no-any-return]
 
 
 Array = NDArray[np.float64]
@@ -119,7 +119,7 @@ _LINE_ROUND_OFF = 1e-14
 
 
 class Robot(NamedTuple):
-    """What of a robot is compared with what, and what is still open.
+    """Comparisons of a robot's parts, and those still open.
 
     Attributes:
         pairs: Cables of each compared pair, shape (q, 2).
@@ -129,8 +129,8 @@ class Robot(NamedTuple):
         platform_needed: Between the line of a cable and the platform, radius included, [m].
         open_pairs: Pairs not proved over the whole workspace, shape (k,).
         open_cables: Cables not proved against the platform over the whole workspace, shape (l,).
-        open_cells: In which cells of it which of these are open, the pairs first, shape (c, c, c,
-            words); see `planner.collision.self_collision_regions`.
+        open_cells: Bit masks of these comparisons, pairs first, that are open in each cell, shape
+            (c, c, c, words).
     """
 
     pairs: Integers
@@ -156,18 +156,18 @@ def pair_over_region(
     """Whether two cables keep their distance over a region: `PROVED`, `REFUTED` or `OPEN`.
 
     Args:
-        world: Where.
-        robot: What is needed.
-        pair: Number of the pair.
+        world: Rig and obstacles.
+        robot: Required distances.
+        pair: Index of the pair.
         rotation: ``world_from_platform`` in the middle, shape (3, 3).
-        corners: Positions the hull of which is the region, shape (k, 3), [m].
+        corners: Positions whose hull is the region, shape (k, 3), [m].
         middle: A position in it, [m].
-        angle: By which the platform is turned from ``rotation`` at most, [rad].
+        angle: Largest rotation of the platform from ``rotation``, [rad].
     """
     i, j = robot.pairs[pair, 0], robot.pairs[pair, 1]
     at_anchor, at_exit = robot.stubs[pair, 0], robot.stubs[pair, 1]
     needed, reach = robot.pair_needed, _reach(corners, middle)
-    arm_i, arm_j = turned(rotation, anchor(world, i)), turned(rotation, anchor(world, j))
+    arm_i, arm_j = rotated(rotation, anchor(world, i)), rotated(rotation, anchor(world, j))
     b_i, b_j = plus(middle, arm_i), plus(middle, arm_j)
     a_i, a_j = exit_point(world, i, b_i), exit_point(world, j, b_j)
     w_i, w_j = minus(a_i, b_i), minus(a_j, b_j)
@@ -210,14 +210,14 @@ def platform_over_region(
     """Whether a cable keeps its distance to the platform over a region; see `pair_over_region`."""
     needed, stub, half = robot.platform_needed, robot.stub, half_size(world)
     fixed = anchor(world, cable)
-    at = plus(middle, turned(rotation, fixed))
+    at = plus(middle, rotated(rotation, fixed))
     leaving = exit_point(world, cable, at)
     far = _into(rotation, minus(leaving, middle))
-    way = minus(far, fixed)
-    length = norm(way)
+    delta = minus(far, fixed)
+    length = norm(delta)
     if not (math.isfinite(length) and length > 0.0):
         return REFUTED
-    between = segment_box_between(along(fixed, way, stub / length), far, half)
+    between = segment_box_between(along(fixed, delta, stub / length), far, half)
     distance = norm(between)
     if not distance >= needed:
         return REFUTED
@@ -237,7 +237,7 @@ def platform_over_region(
         shift = _into(rotation, minus(row(corners, k), middle))
         if not dot(normal, minus(far, shift)) - face - moved >= needed:
             return OPEN
-        to_exit = minus(way, shift)
+        to_exit = minus(delta, shift)
         room = stub * dot(normal, to_exit) - height * norm(to_exit)
         if height > 0.0 and not room >= (stub + height) * moved:
             return OPEN
@@ -246,7 +246,10 @@ def platform_over_region(
 
 @kernel
 def _by_motion(room: float, moved: float, stubs: float, l_i: float, l_j: float) -> bool:
-    """Two points of cables whose ends move by at most d move apart by at most d, stubs aside."""
+    """Proof by motion: points of cables whose ends move by ≤ d change distance by ≤ d.
+
+    Stubs add a term, as their ends move along the cables.
+    """
     shortest = min(l_i, l_j) - moved
     if shortest <= 0.0:
         return False
@@ -267,7 +270,7 @@ def _by_lines(
         if sign == 0.0:
             sign = 1.0 if value > 0.0 else -1.0
         round_off = _LINE_ROUND_OFF * norm(gap) * norm(u_i) * norm(u_j)
-        # Parallel lines, for which all of this is zero, do not pass.
+        # Parallel lines, for which both sides are zero, do not pass.
         if not sign * value > needed * norm(across) + round_off:
             return False
     return True
@@ -294,14 +297,14 @@ def _by_plane(
 
 @kernel
 def _drift(world: World, cable: int, at: Vector, reach: float, angle: float) -> float:
-    """How far a cable leaves the one with its exit at rest and its anchor not turned, [m]."""
+    """Deviation of a cable from the one with fixed exit and unrotated anchor, [m]."""
     turning = angle * norm(anchor(world, cable))
     return turning + _exit_drift(world, cable, at, reach + turning)
 
 
 @kernel
 def _exit_drift(world: World, cable: int, at: Vector, reach: float) -> float:
-    """How far an exit travels while its anchor stays within a distance of a point, [m]."""
+    """Travel of an exit while its anchor stays within ``reach`` of a point, [m]."""
     return exit_travel(world, cable, at, at, 2.0 * reach) / 2.0
 
 
@@ -323,7 +326,7 @@ def _into(rotation: Array, a: Vector) -> Vector:
     )
 
 
-# What of a robot's self clearance is proved over the workspace box, as a whole or by its cells.
+# Comparisons proved over the workspace box, as a whole or by its cells.
 
 
 _MOST_BOXES = 2048
@@ -340,7 +343,7 @@ def compared(
     middle: Vector,
     angle: float,
 ) -> int:
-    """Comparison ``which`` over a region: the pairs in turn, then each cable with the platform."""
+    """Comparison ``which`` over a region: first the pairs, then each cable with the platform."""
     pairs = len(robot.pairs)
     if which < pairs:
         return pair_over_region(world, robot, which, rotation, corners, middle, angle)
@@ -381,15 +384,15 @@ def box_proved(world: World, robot: Robot, which: int) -> bool:
 def mark_open_cells(
     world: World, robot: Robot, which: int, masks: Masks, word: int, bit: np.uint64
 ) -> None:
-    """Sets a bit of the cells over which one comparison is not proved; ``which`` as in `compared`.
+    """Sets a bit of the cells over which a comparison is not proved; ``which`` as in `compared`.
 
     Args:
-        world: Where.
-        robot: What is needed.
+        world: Rig and obstacles.
+        robot: Required distances.
         which: The comparison.
-        masks: See `planner.collision.self_collision_regions`; changed.
-        word: Of the masks.
-        bit: A word with that bit alone.
+        masks: See `Robot.open_cells`; changed.
+        word: Index of the word in the masks.
+        bit: A word with only that bit set.
     """
     boxes, corners = np.empty((_DEEPEST, 6), dtype=np.int64), np.empty((8, 3))
     boxes[0, :3], boxes[0, 3:] = 0, CELLS

@@ -1,12 +1,12 @@
-"""Planes that shut in an obstacle's shadow: what an anchor may not enter, seen from its outlet.
+"""Planes that bound an obstacle's shadow: where an anchor may not be, seen from its outlet.
 
 A cable from the outlet A is too near to a convex obstacle exactly when its anchor is in the shadow
-of the obstacle grown by the needed distance, a convex set. A plane with the grown obstacle behind
+of the obstacle grown by the required distance, a convex set. A plane with the grown obstacle behind
 it and A before it (or on it) has the whole shadow behind it: an edge with both anchors before such
-a plane is free. Planes are made through A, touching the grown obstacle, and at its front faces; of
-all these the few are kept that together prove most of a lattice of positions, best ones first.
-The platform's own forbidden set, the obstacle grown by the platform, gets planes the same way.
-Which planes are kept decides how often the closed forms are asked, never what the answer is.
+a plane is free. Candidates are planes through A that touch the grown obstacle, and its front faces;
+a few are kept, best first, that together prove most of a lattice of positions. The platform's own
+forbidden set, the obstacle grown by the platform, gets planes too. The choice of planes decides how
+often the closed forms are needed, never the answer.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from planner.kernels.scene_arrays import BOX, ROUND, ConvexPiece, Integers
 
 _TURNS = 16
 _HALVINGS = 20
-"""Of a right angle: a plane is turned back from touching by some millionths at most."""
+"""Bisections of a right angle: a plane misses touching by a millionth of it at most."""
 _MOST_PLANES = 12
 _MOST_EDGES = 60
 _EYE_ROUND_OFF = 1e-13
-"""How far ``eye`` may seem past a plane through it, as part of its largest coordinate; a tenth of
-what every needed distance has on top."""
+"""Tolerance of ``eye`` on a plane through it, as part of its largest coordinate; a tenth of the
+round-off added to every required distance."""
 _LEAST_GAIN = 0.002
-"""Part of the lattice that a further plane must prove."""
+"""Part of the lattice that an additional plane must prove."""
 
 
 def cable_normals(piece: ConvexPiece, eye: Array, needed: float, slack: float) -> Array:
@@ -40,7 +40,7 @@ def cable_normals(piece: ConvexPiece, eye: Array, needed: float, slack: float) -
         piece: The obstacle.
         eye: Where the cable leaves its outlet, world frame, shape (3,), [m].
         needed: Distance by which the piece is grown, [m].
-        slack: Room left between ``eye`` and the planes, for exits that move on pulleys, [m].
+        slack: Room between ``eye`` and the planes, for exits that move on pulleys, [m].
     """
     tried = [_touching_all_round(piece, eye, needed + slack), piece.faces * -1.0]
     if len(piece.edges) <= _MOST_EDGES:
@@ -74,10 +74,10 @@ def platform_normals(piece: ConvexPiece, rotation: Array) -> Array:
 
 
 def best_first(proved: Array) -> list[int]:
-    """Which planes to keep, the most useful first (greedy cover).
+    """Indices of the planes to keep, the most useful first (greedy cover).
 
     Args:
-        proved: Which plane proves which position, shape (planes, positions), 0 or 1.
+        proved: Whether a plane proves a position, shape (planes, positions), 0 or 1.
     """
     left = np.ones(proved.shape[1])
     chosen: list[int] = []
@@ -111,10 +111,10 @@ def _two_tangents(across: Array, side: Array, needed: float) -> Array:
 
 
 def _touching_all_round(piece: ConvexPiece, eye: Array, needed: float) -> Array:
-    """Normals of planes through ``eye`` that touch the grown piece, spread evenly round it.
+    """Normals of planes through ``eye`` that touch the grown piece, evenly spread around it.
 
-    For each direction round the line of sight the normal is turned from "forward" to "sideways"
-    until the grown piece just stays behind the plane.
+    For each direction around the line of sight, the normal is rotated from "forward" to "sideways"
+    as far as the grown piece stays behind the plane.
     """
     sight = piece.points.mean(axis=0) - eye
     distance = float(np.linalg.norm(sight))
@@ -137,19 +137,19 @@ def _touching_all_round(piece: ConvexPiece, eye: Array, needed: float) -> Array:
     return touching
 
 
-# Planes about what is forbidden for certain: the cores of shadows.
+# Planes around what is certainly forbidden: the cores of shadows.
 #
-# Within a piece that is grown by the needed distance lies a box. The anchors to which a cable would
-# pass through that box are a convex set: what is behind those of its faces that the outlet is
-# before, and behind the planes through the outlet and the outline of the box. An edge that enters
-# this set is refused, after some ten products and without a distance; where it does not, closed
-# forms decide. So cores, too, decide how long an answer takes, never what it is.
+# A piece grown by the required distance contains a box. The anchors whose cables pass through that
+# box form a convex set: behind those of its faces that the outlet is before, and behind the planes
+# through the outlet and the outline of the box. An edge that enters this set is refused after some
+# ten products, without computing a distance; otherwise closed forms decide. So cores, too, decide
+# how long an answer takes, never the answer.
 
 
 _INSIDE = 1e-9
 """How far behind all planes a position must be, [m]: far beyond round-off."""
 _OUTLINE = 1e-12
-"""How far before a plane of the outline a corner may seem, [m]."""
+"""Tolerance of a corner before a plane of the outline, [m]."""
 _SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))
 _EDGES = np.array(
     [(i, j) for i, j in combinations(range(8), 2) if np.sum(_SIGNS[i] != _SIGNS[j]) == 1]
@@ -173,7 +173,7 @@ class Core:
 
 
 def core_of(piece: ConvexPiece, grown: float) -> Core | None:
-    """A box in a piece that is grown by a ball of some radius, [m]; None for hulls and meshes."""
+    """A box inside a piece grown by a ball of radius ``grown``, [m]; None for hulls and meshes."""
     middle = (piece.points.min(axis=0) + piece.points.max(axis=0)) / 2.0
     pose = Pose(middle, piece.pose.rotation)
     ball = (grown + piece.radius) * _IN_A_BALL
@@ -187,7 +187,7 @@ def core_of(piece: ConvexPiece, grown: float) -> Core | None:
 
 
 def cable_core(piece: ConvexPiece, eye: Array, arm: Array, needed: float) -> Array:
-    """Planes behind which the platform is when a cable is too near to a piece.
+    """Planes behind which the platform's position puts a cable too near to a piece.
 
     Args:
         piece: The obstacle.
@@ -197,7 +197,7 @@ def cable_core(piece: ConvexPiece, eye: Array, arm: Array, needed: float) -> Arr
 
     Returns:
         Unit normals n and limits l, shape (k, 4): a position p with n · p ≥ l for all of them is
-        forbidden. None where no such set is known.
+        forbidden. Empty where no such set is known.
     """
     core = core_of(piece, needed)
     if core is None:
@@ -258,14 +258,14 @@ def _outline(core: Core, eye: Array) -> Array:
 
 # The planes of every pair of a body and a piece, in the space of positions.
 #
-# A translation whose ends p both have ``normal · p ≤ limit`` for one of a pair's first planes keeps
-# the needed distance; one with ``normal · p ≥ limit`` somewhere for all of its last ones does not.
+# A translation whose ends p both have ``normal · p ≤ limit`` for one of a pair's proving planes
+# keeps the distance; one with ``normal · p ≥ limit`` somewhere for all its core planes does not.
 
 
 _LATTICE = 9
 _PARALLEL = 1e-13
-"""Sine of the angle at which axes count as parallel; what it moves is below the round-off that
-every needed distance has on top."""
+"""Sine of the angle at which axes count as parallel; its effect is below the round-off added to
+every required distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,10 +275,10 @@ class Bodies:
     Attributes:
         rig: The robot.
         rotation: ``world_from_platform``, shape (3, 3).
-        needed: What each body needs to any obstacle, shape (m + 1,), [m].
+        needed: Required distance of each body to any obstacle, shape (m + 1,), [m].
         eyes: Where the cables leave their outlets, world frame, shape (m, 3), [m].
         arms: From the platform's origin to the anchors, world axes, shape (m, 3), [m].
-        positions: A lattice of the workspace, on which planes are chosen, shape (n, 3), [m].
+        positions: A lattice of the workspace, for choosing planes, shape (n, 3), [m].
     """
 
     rig: Rig
@@ -318,7 +318,7 @@ def planes_of(bodies: Bodies, pieces: tuple[ConvexPiece, ...]) -> tuple[Array, I
 
 
 def sum_of_boxes(rig: Rig, piece: ConvexPiece, rotation: Array) -> Array:
-    """Half extents of a box grown by the platform, [m]; zeros where that is no box."""
+    """Half extents of a box grown by the platform, [m]; zeros where that is not a box."""
     turn = np.abs(piece.pose.rotation.T @ rotation)
     parallel = np.all(np.minimum(turn, np.abs(1.0 - turn)) <= _PARALLEL)
     if piece.kind != BOX or not parallel:
@@ -328,7 +328,7 @@ def sum_of_boxes(rig: Rig, piece: ConvexPiece, rotation: Array) -> Array:
 
 
 def _proving(bodies: Bodies, piece: ConvexPiece, body: int) -> tuple[Array, float]:
-    """The planes kept that prove one pair, shape (l, 6), and the part of positions they leave."""
+    """The planes that prove one pair, shape (l, 6), and the part of positions not proved."""
     rig, needed = bodies.rig, float(bodies.needed[body])
     if body == rig.cable_count:
         normals = platform_normals(piece, bodies.rotation)
@@ -347,15 +347,15 @@ def _proving(bodies: Bodies, piece: ConvexPiece, body: int) -> tuple[Array, floa
 
 
 def _core(bodies: Bodies, piece: ConvexPiece, body: int) -> Array:
-    """Planes about what one pair forbids for certain, shape (l, 6), the last two columns unused."""
+    """Planes of one pair's core, shape (l, 6); the last two columns are unused."""
     rig, needed = bodies.rig, float(bodies.needed[body])
     if body == rig.cable_count:
         grown = sum_of_boxes(rig, piece, bodies.rotation)
         core = platform_core(piece, rig.half_size, grown, needed)
-    elif rig.pulley_radius > 0.0:  # an exit that moves leaves no convex set
+    elif rig.pulley_radius > 0.0:  # with a moving exit point the set is not convex
         core = np.zeros((0, 4))
     else:
         core = cable_core(piece, bodies.eyes[body], bodies.arms[body], needed)
     behind = np.mean(core[:, :3] @ bodies.positions.T >= core[:, 3:], axis=1)
-    core = core[np.argsort(behind, kind="stable")]  # what leaves out most comes first
+    core = core[np.argsort(behind, kind="stable")]  # most selective first
     return np.column_stack([core, np.zeros((len(core), 2))])

@@ -1,9 +1,9 @@
-"""One body against one piece of an obstacle along a translation: in closed form where there is one.
+"""One body against one piece of an obstacle along a translation, in closed form where one exists.
 
-A cable with a point exit sweeps the triangle of its exit and its anchor before and after. The
-platform sweeps the hull of its two places; seen from the platform it is the obstacle that moves,
-which makes boxes parallel to it a segment against a larger box, and balls a segment, capsules a
-parallelogram, against the platform. All else is the distance of two hulls.
+A cable with a point exit sweeps the triangle of its exit and its two anchor positions. The platform
+sweeps the hull of its two positions. In the platform's frame the obstacle moves instead: a box
+parallel to the platform becomes a segment against a larger box, a ball a segment and a capsule a
+parallelogram against the platform. All else is the distance of two hulls.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from planner.kernels.primitives import (
     Vector,
     minus,
     plus,
+    rotated,
     row,
     segment_box_squared,
     triangle_box_apart,
     triangle_box_squared,
     triangle_point_squared,
     triangle_segment_squared,
-    turned,
 )
 from planner.kernels.scene_arrays import (
     BOX,
@@ -110,7 +110,7 @@ def cable_distance(
 ) -> float:
     """Distance of the triangle to the piece's surface, [m]; 0 or less where they touch.
 
-    From ``enough`` on any value at least that is returned.
+    Where it is ``enough`` or more, any value from ``enough`` may be returned.
     """
     kind = world.spans[piece, 0]
     if kind in (BOX, ROUND):
@@ -120,9 +120,9 @@ def cable_distance(
 
 @leaf
 def platform_distance(world: World, piece: int, start: Vector, end: Vector, enough: float) -> float:
-    """Distance of the platform's way to the piece's surface, [m]; 0 or less where they touch.
+    """Distance of the platform's path to the piece's surface, [m]; 0 or less where they touch.
 
-    From ``enough`` on any value at least that is returned.
+    Where it is ``enough`` or more, any value from ``enough`` may be returned.
     """
     if world.spans[piece, 0] == ROUND or world.pieces[piece, 15] > 0.0:
         return math.sqrt(platform_squared(world, piece, start, end)) - ball(world, piece)
@@ -149,7 +149,7 @@ def cable_squared(world: World, piece: int, exit: Vector, b: Vector, c: Vector) 
 
 @leaf
 def platform_squared(world: World, piece: int, start: Vector, end: Vector) -> float:
-    """Squared distance of the platform's way to a parallel box or a round piece's axis, [m²]."""
+    """Squared distance of the platform's path to a parallel box or a round piece's axis, [m²]."""
     if world.spans[piece, 0] == BOX:
         origin = centre(world, piece)
         return segment_box_squared(
@@ -217,13 +217,13 @@ def _triangle(a: Vector, b: Vector, c: Vector) -> Points:
 def platform_points(world: World, start: Vector, end: Vector) -> Points:
     """The corners of the platform at two positions, shape (16, 3), [m]."""
     swept = np.empty((16, 3))
-    place_corners(world, world.platform[:3], start, swept[:8])
-    place_corners(world, world.platform[:3], end, swept[8:])
+    put_corners(world, world.platform[:3], start, swept[:8])
+    put_corners(world, world.platform[:3], end, swept[8:])
     return swept
 
 
 @kernel
-def place_corners(world: World, rotation: Points, position: Vector, corners: Points) -> None:
+def put_corners(world: World, rotation: Points, position: Vector, corners: Points) -> None:
     """Writes the corners of the platform at a pose into an array, shape (8, 3), [m]."""
     half = half_size(world)
     for corner in range(8):
@@ -232,7 +232,7 @@ def place_corners(world: World, rotation: Points, position: Vector, corners: Poi
             half[1] if corner & 2 else -half[1],
             half[2] if corner & 4 else -half[2],
         )
-        corners[corner] = plus(position, turned(rotation, offset))
+        corners[corner] = plus(position, rotated(rotation, offset))
 
 
 @kernel
@@ -275,7 +275,7 @@ def points_distance(world: World, piece: int, swept: Points, enough: float) -> f
 
 @kernel
 def _settled(swept: Points, target: Points, axis: Vector, disc: float, enough: float) -> float:
-    """The distance of two hulls, or if that is at least ``enough``, something at least that."""
+    """The distance of two hulls, or where it is ``enough`` or more, a value from ``enough``."""
     low, _ = hulls_distance(swept, target, axis, disc, enough)
     if low >= enough:
         return low
@@ -284,7 +284,7 @@ def _settled(swept: Points, target: Points, axis: Vector, disc: float, enough: f
 
 @kernel
 def _boxed_apart(first: Points, second: Points, needed: float) -> bool:
-    """Whether the boxes about two sets of points, parallel to the axes, prove them apart."""
+    """Whether the axis-aligned bounding boxes of two sets of points prove them apart."""
     for axis in range(3):
         low, high = first[0, axis], first[0, axis]
         for i in range(1, len(first)):

@@ -1,7 +1,6 @@
-"""Rig and scene as plain arrays that compiled functions read.
+"""Rig and scene as plain arrays for compiled functions.
 
-Pairs of a body and a piece have planes in the space of positions:
-`planner.collision.separating_planes`.
+Pairs of a body and a piece have planes in position space: `planner.collision.separating_planes`.
 """
 
 from __future__ import annotations
@@ -16,16 +15,16 @@ from planner.collision.separating_planes import bodies_of, planes_of, sum_of_box
 from planner.kernels.scene_arrays import ConvexPiece, Integers, World, pieces_of
 
 ROUND_OFF = 1e-12
-"""Added to every needed distance, as part of the largest coordinate: some thousand times the
-round-off of the sums that are compared with it."""
+"""Added to every required distance, as part of the largest coordinate: about a thousand times the
+round-off of the sums compared with it."""
 
 
 def build_world(rig: Rig, scene: Scene, rotation: Array, clearance: float) -> World:
     """The world of a rig in a scene.
 
     Args:
-        rig: The robot, any number of cables.
-        scene: Its obstacles, any number of any shape.
+        rig: The robot, with any number of cables.
+        scene: Any number of obstacles of any shape.
         rotation: Orientation under translation, ``world_from_platform``, shape (3, 3).
         clearance: Smallest allowed distance to obstacles, [m].
 
@@ -77,7 +76,7 @@ def _spans(pieces: tuple[ConvexPiece, ...]) -> Integers:
 
 
 def _extent(rig: Rig, pieces: tuple[ConvexPiece, ...]) -> float:
-    """The largest coordinate of all that takes part, [m]."""
+    """The largest coordinate of rig and obstacles, [m]."""
     robot = [rig.outlets, rig.workspace_lower, rig.workspace_upper, 2.0 * rig.half_size]
     sizes = [float(np.abs(array).max()) for array in robot]
     sizes += [float(np.abs(p.points).max()) + p.radius + p.disc for p in pieces]

@@ -1,5 +1,4 @@
-"""Compiled geometry that the searches and proofs share.
+"""Compiled geometry shared by searches and proofs.
 
-Nothing is compiled on import: every kernel is compiled when first called, and kept in the user's
-cache.
+Importing compiles nothing: each kernel is compiled at its first call and kept in the user's cache.
 """

@@ -1,4 +1,4 @@
-"""Where a cable leaves its pulley, and a bound of how far that point travels."""
+"""Where a cable leaves its pulley, and a bound on the travel of that point."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from planner.kernels.scene_arrays import World, feed, outlet
 
 @kernel
 def exit_point(world: World, cable: int, anchor: Vector) -> Vector:
-    """The exit of a cable to an anchor in the world, [m]; not numbers where it cannot run."""
+    """The exit point of a cable to an anchor, world frame, [m]; NaN where there is none."""
     origin = outlet(world, cable)
     radius = world.pulley
     if radius == 0.0:
@@ -34,18 +34,18 @@ def exit_point(world: World, cable: int, anchor: Vector) -> Vector:
 
 @kernel
 def exit_travel(world: World, cable: int, start: Vector, end: Vector, travel: float) -> float:
-    """A bound of how far an exit travels while its anchor does; infinite where there is none.
+    """A bound on the travel of an exit point, [m]; infinite where there is none.
 
-    An anchor that moves by dB swivels the pulley by at most dB / ρ, which
-    moves the exit by at most 2 r dB / ρ, and rolls the cable by at most dB / l, which moves it by
-    r dB / l; ρ is the distance from the swivel axis, l the free length.
+    An anchor that moves by dB swivels the pulley by at most dB / ρ, which moves the exit by at most
+    2 r dB / ρ, and rolls the cable by at most dB / l, which moves it by r dB / l; ρ is the distance
+    from the swivel axis, l the free length.
 
     Args:
-        world: Where.
-        cable: Its number.
+        world: The rig.
+        cable: Its index.
         start: The anchor before, world frame, [m].
         end: The anchor after, [m].
-        travel: How far the anchor travels at most between them, [m].
+        travel: Most the anchor travels between them, [m].
     """
     radius = world.pulley
     if radius == 0.0:

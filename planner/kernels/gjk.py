@@ -1,9 +1,9 @@
 """The distance of two convex hulls, one of them grown by a disc, with a plane as the proof.
 
 Source: Gilbert, Johnson & Keerthi, "A fast procedure for computing the distance between complex
-objects", 1988. Every step knows a plane with some room between the hulls, which the distance
-cannot be below, and a point of each, the distance of which it cannot exceed. A yes always rests
-on a plane. Where round-off ends the search before either decides, the answer is no.
+objects", 1988. Every step has a plane whose room between the hulls is a lower bound of the
+distance, and a point of each hull whose distance is an upper bound. "Apart" always rests on a
+plane; where round-off ends the search before either bound decides, the answer is "not apart".
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def hulls_apart(first: Points, second: Points, axis: Vector, disc: float, needed
 
     Args:
         first: Points of the first hull, shape (k ≥ 1, 3), [m].
-        second: Points of the second, likewise.
+        second: Points of the second hull, shape (l ≥ 1, 3), [m].
         axis: Unit normal of the disc that the second is grown by.
         disc: Its radius, [m]; 0 for none.
         needed: Above 0, [m].
@@ -41,15 +41,15 @@ def hulls_apart(first: Points, second: Points, axis: Vector, disc: float, needed
 def hulls_distance(
     first: Points, second: Points, axis: Vector, disc: float, enough: float
 ) -> tuple[float, float]:
-    """Bounds of the distance of two hulls, [m]: the room at a plane, the distance of two points.
+    """Bounds of the distance of two hulls, [m]: room at a plane, and distance of two points.
 
     Args:
         first: Points of the first hull, shape (k ≥ 1, 3), [m].
-        second: Points of the second, likewise.
+        second: Points of the second hull, shape (l ≥ 1, 3), [m].
         axis: Unit normal of the disc that the second is grown by.
         disc: Its radius, [m]; 0 for none.
-        enough: The search ends where either bound decides on which side of this the distance is;
-            infinite for the distance itself, at which the bounds meet but for round-off.
+        enough: The search ends when either bound shows on which side of this the distance is;
+            infinite for the distance itself, where the bounds meet up to round-off.
     """
     corners = np.empty((4, 3))
     count = 0
@@ -132,14 +132,14 @@ def _nearest_along(points: Points, axis: Vector, disc: float, direction: Vector)
 
 @kernel
 def nearest_of_simplex(corners: Points, count: int) -> tuple[Vector, int]:
-    """The point of a simplex nearest to the origin; the corners that carry it are moved ahead.
+    """The point of a simplex nearest to the origin; its supporting corners are moved first.
 
     Args:
         corners: Shape (4, 3), [m]; the first ``count`` are used. Changed in place.
         count: 1 to 4.
 
     Returns:
-        The point, and how many corners carry it; 4 where the origin is inside a tetrahedron.
+        The point, and the number of its supporting corners; 4 with the origin in a tetrahedron.
     """
     best, best_point = np.inf, (0.0, 0.0, 0.0)
     kept = (0, -1, -1)
@@ -192,9 +192,9 @@ def _keep(corners: Points, kept: tuple[int, int, int]) -> int:
 
 @kernel
 def _share_of_edge(start: Vector, end: Vector) -> float:
-    way = minus(end, start)
-    length = dot(way, way)
-    return -dot(start, way) / length if length > 0.0 else -1.0
+    delta = minus(end, start)
+    length = dot(delta, delta)
+    return -dot(start, delta) / length if length > 0.0 else -1.0
 
 
 @kernel
@@ -209,7 +209,7 @@ def _mixed(start: Vector, end: Vector, share: float) -> Vector:
 
 @kernel
 def _foot_on_face(a: Vector, b: Vector, c: Vector) -> tuple[bool, Vector]:
-    """The foot of the origin on a triangle, if it is in its inside."""
+    """The foot of the perpendicular from the origin to a triangle, if inside it."""
     side, other = minus(b, a), minus(c, a)
     normal = (
         side[1] * other[2] - side[2] * other[1],
@@ -225,7 +225,7 @@ def _foot_on_face(a: Vector, b: Vector, c: Vector) -> tuple[bool, Vector]:
     whole = u + v + w
     if u < 0.0 or v < 0.0 or w < 0.0 or whole == 0.0:
         return False, a
-    # Mixed from the corners: a point of the triangle however thin it is.
+    # As a convex combination, this is a point of the triangle however thin it is.
     return True, (
         (u * a[0] + v * b[0] + w * c[0]) / whole,
         (u * a[1] + v * b[1] + w * c[1]) / whole,
@@ -244,7 +244,7 @@ def _volume(a: Vector, b: Vector, c: Vector) -> float:
 
 @kernel
 def _origin_inside(corners: Points) -> bool:
-    """Whether the origin is inside the tetrahedron, its own round-off not counted as inside."""
+    """Whether the origin is strictly inside the tetrahedron, up to round-off."""
     a, b, c, d = row(corners, 0), row(corners, 1), row(corners, 2), row(corners, 3)
     whole = _volume(minus(b, a), minus(c, a), minus(d, a))
     if whole == 0.0:

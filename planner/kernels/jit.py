@@ -1,8 +1,8 @@
-"""The three ways in which the planner's kernels are compiled, and arrays kept beside their code.
+"""The planner's three decorators for compiled functions, and arrays cached beside the machine code.
 
-The kernels call each other. Where the machine code is kept: `model.jit`. The folder is named after
-the content of the kernels, so a change of theirs forgets the arrays that they made. Where no folder
-can be written, arrays are recomputed.
+The kernels call each other; `model.jit` stores their machine code. Its folder is named after the
+content of the kernels, so changing a kernel also invalidates the cached arrays. Where no folder can
+be written, arrays are recomputed.
 """
 
 from __future__ import annotations
@@ -27,55 +27,55 @@ _PLANNER = Path(__file__).parents[1]
 KERNELS = tuple(
     _PLANNER / name for name in ("kernels", "collision", "wrench", "anytime", "anytime_6d", "rrt")
 )
-"""Every folder of kernels of the planner: they call each other."""
+"""All kernel folders of the planner, whose kernels call each other."""
 
 
 def planner_compilation(
     work: Literal["optimal", "turning", "paper", "maps"], listener: Listener
 ) -> AbstractContextManager[bool]:
-    """Around what compiles the planner for one of three searches, or a map, see `compilation`."""
+    """Context for compiling one of the three searches, or the maps; see `compilation`."""
     return compilation(KernelSet(work, KERNELS), "the planner", "one to three minutes", listener)
 
 
 def kernel(function: Function) -> Function:
-    """Compiles a pure function when it is first called; exact IEEE arithmetic, no GIL."""
+    """Compiles a pure function at its first call; exact IEEE arithmetic, no GIL."""
     return compiled(function, *KERNELS)
 
 
 def leaf(function: Function) -> Function:
-    """As `kernel`, for a function that makes and keeps no arrays: it counts no owners of them.
+    """As `kernel`, without reference counts; for functions that neither create nor keep arrays.
 
-    Compiled code counts the owners of each array of each tuple that a function is given or takes
-    apart. For an edge that is refused after some ten comparisons this took four fifths of the time.
-    A function that makes an array fails to compile as a leaf; it may be called by one.
+    Compiled code counts references to every array in every tuple that a function receives or
+    unpacks. For an edge refused after some ten comparisons this took four fifths of the time. A
+    function that creates an array does not compile as a leaf, but a leaf may call one.
     """
     return compiled(function, *KERNELS, counts_arrays=False)
 
 
 def inlined(function: Function) -> Function:
-    """As `leaf`, made part of its callers: a tuple of arrays is a hundred words to hand over."""
+    """As `leaf`, inlined into its callers: passing a tuple of arrays copies a hundred words."""
     return compiled(function, *KERNELS, counts_arrays=False, is_inlined=True)
 
 
-# Arrays that depend on rig and load alone, kept between runs beside the kernels that made them.
+# Arrays that depend only on rig and load, cached beside the kernels that compute them.
 
 
 Kind = TypeVar("Kind", bound=np.generic)
 
 _MOST_FILES = 200
-"""Kept of one name; the oldest go."""
+"""Most files of one name; the oldest are deleted."""
 
 
 def stored(
     name: str, key: Any, shape: tuple[int, ...], compute: Callable[[], NDArray[Kind]]
 ) -> NDArray[Kind]:
-    """An array from the user's cache, or computed and kept there.
+    """An array from the user's cache, or computed and stored there.
 
     Args:
-        name: What it is, for its file.
+        name: Beginning of the file's name.
         key: Everything it depends on, JSON-like.
-        shape: That it must have to be believed.
-        compute: Makes it.
+        shape: Required shape; another one is recomputed.
+        compute: Computes it.
     """
     folder = cache_folder(*KERNELS)
     if folder is None:
@@ -85,7 +85,7 @@ def stored(
         found = np.load(path, allow_pickle=False)
         if found.shape == shape:
             return found  # type: ignore[no-any-return]
-    except (OSError, ValueError, EOFError):  # not there yet, or cut off: recomputed below
+    except (OSError, ValueError, EOFError):  # missing or truncated: recomputed below
         pass
     made = compute()
     _keep(path, made)
@@ -98,12 +98,12 @@ def _forget_oldest(folder: Path, name: str) -> None:
         files = sorted(folder.glob(f"{name}-*.npy"), key=lambda file: file.stat().st_mtime)
         for file in files[:-_MOST_FILES]:
             file.unlink()
-    except OSError:  # another process was faster, or it is not ours to remove
+    except OSError:  # another process was faster, or the file is not ours
         return
 
 
 def _keep(path: Path, array: NDArray[Any]) -> None:
-    """Writes a file whole or not at all; a cache that cannot be written is left as it is."""
+    """Writes a file atomically; does nothing where the cache cannot be written."""
     temporary = ""
     try:
         with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:

@@ -64,7 +64,7 @@ def row(array: NDArray[np.float64], index: int) -> Vector:
 
 
 @leaf
-def turned(matrix: NDArray[np.float64], a: Vector) -> Vector:
+def rotated(matrix: NDArray[np.float64], a: Vector) -> Vector:
     """The product of a matrix, shape (3, 3), and a vector."""
     return (
         matrix[0, 0] * a[0] + matrix[0, 1] * a[1] + matrix[0, 2] * a[2],
@@ -75,9 +75,9 @@ def turned(matrix: NDArray[np.float64], a: Vector) -> Vector:
 
 # The distance of a segment to a box about the origin, in closed form.
 #
-# Along the segment half the squared distance is convex, and its slope is piecewise linear with
-# bends where the segment crosses the planes of the faces. The bends are used to shut in the zero of
-# the slope, between two of which it is then found by one division.
+# Along the segment, half the squared distance is convex and its slope piecewise linear, with bends
+# where the segment crosses the planes of the faces. The bends bracket the zero of the slope, which
+# one division then gives.
 
 
 @kernel
@@ -91,33 +91,33 @@ def segment_box_squared(start: Vector, end: Vector, half: Vector) -> float:
 def segment_box_between(start: Vector, end: Vector, half: Vector) -> Vector:
     """From the nearest point of the box |x| ≤ half to that of a segment, [m]; 0 where they touch.
 
-    A plane across it parts the two.
+    A plane normal to it separates the two.
     """
-    way = minus(end, start)
-    low_slope = _slope(start, way, half, 0.0)
+    delta = minus(end, start)
+    low_slope = _slope(start, delta, half, 0.0)
     if low_slope >= 0.0:
         return _excess(start, half)
-    high_slope = _slope(start, way, half, 1.0)
+    high_slope = _slope(start, delta, half, 1.0)
     if high_slope <= 0.0:
         return _excess(end, half)
     low, high = 0.0, 1.0
     for axis in range(3):
-        if way[axis] != 0.0:
+        if delta[axis] != 0.0:
             for face in (-half[axis], half[axis]):
-                bend = (face - start[axis]) / way[axis]
+                bend = (face - start[axis]) / delta[axis]
                 if low < bend < high:
-                    slope = _slope(start, way, half, bend)
+                    slope = _slope(start, delta, half, bend)
                     if slope < 0.0:
                         low, low_slope = bend, slope
                     else:
                         high, high_slope = bend, slope
     share = low - low_slope * (high - low) / (high_slope - low_slope)
-    return _excess(along(start, way, share), half)
+    return _excess(along(start, delta, share), half)
 
 
 @kernel
-def _slope(start: Vector, way: Vector, half: Vector, share: float) -> float:
-    return dot(way, _excess(along(start, way, share), half))
+def _slope(start: Vector, delta: Vector, half: Vector, share: float) -> float:
+    return dot(delta, _excess(along(start, delta, share), half))
 
 
 @kernel
@@ -137,18 +137,18 @@ def segment_box_definition(
 
     Args:
         start: Box frame, shape (3,), [m].
-        end: Likewise.
+        end: Box frame, shape (3,), [m].
         half: Half extents of the box, shape (3,), [m].
     """
-    way = end - start
+    delta = end - start
     shares = [0.0, 1.0]
     for region in np.ndindex(3, 3, 3):
         side = np.array(region) - 1
-        slope = np.where(side != 0, way, 0.0)
+        slope = np.where(side != 0, delta, 0.0)
         offset = np.where(side != 0, start - side * half, 0.0)
         if slope @ slope > 0.0:
             shares.append(float(np.clip(-(offset @ slope) / (slope @ slope), 0.0, 1.0)))
-    points = start + np.array(shares)[:, None] * way
+    points = start + np.array(shares)[:, None] * delta
     return float(np.min(np.linalg.norm(points - np.clip(points, -half, half), axis=1)))
 
 
@@ -166,8 +166,8 @@ def segment_pair_squared(p: Vector, q: Vector, r: Vector, s: Vector) -> float:
 def segment_pair_between(p: Vector, q: Vector, r: Vector, s: Vector) -> Vector:
     """From the nearest point of the segment p q to that of the segment r s, [m].
 
-    The nearest points are an end of one and the point of the other nearest to it, or they are
-    inside both; all cases are tried, so that parallel segments need no tolerance.
+    The nearest points are an end of one and the point of the other nearest to it, or interior to
+    both; all cases are tried, so parallel segments need no tolerance.
     """
     first, second, gap = minus(q, p), minus(s, r), minus(p, r)
     best = _to_segment(p, r, s)
@@ -186,10 +186,10 @@ def segment_pair_between(p: Vector, q: Vector, r: Vector, s: Vector) -> Vector:
 @kernel
 def _to_segment(point: Vector, start: Vector, end: Vector) -> Vector:
     """From a point to the nearest point of a segment."""
-    way, offset = minus(end, start), minus(point, start)
-    length = dot(way, way)
-    share = min(max(dot(way, offset) / length, 0.0), 1.0) if length > 0.0 else 0.0
-    return minus((share * way[0], share * way[1], share * way[2]), offset)
+    delta, offset = minus(end, start), minus(point, start)
+    length = dot(delta, delta)
+    share = min(max(dot(delta, offset) / length, 0.0), 1.0) if length > 0.0 else 0.0
+    return minus((share * delta[0], share * delta[1], share * delta[2]), offset)
 
 
 @kernel
@@ -202,7 +202,7 @@ def _back(a: Vector) -> Vector:
     return (-a[0], -a[1], -a[2])
 
 
-# The distance of a triangle to a point, in closed form; exact for triangles without area too.
+# The distance of a triangle to a point, in closed form; exact for degenerate triangles too.
 
 
 @kernel
@@ -219,10 +219,10 @@ def triangle_point_squared(a: Vector, b: Vector, c: Vector, point: Vector) -> fl
 @kernel
 def segment_point_squared(start: Vector, end: Vector, point: Vector) -> float:
     """Squared distance of a segment to a point, [m²]."""
-    way, offset = minus(end, start), minus(point, start)
-    length = dot(way, way)
-    share = min(max(dot(way, offset) / length, 0.0), 1.0) if length > 0.0 else 0.0
-    away = minus(offset, (share * way[0], share * way[1], share * way[2]))
+    delta, offset = minus(end, start), minus(point, start)
+    length = dot(delta, delta)
+    share = min(max(dot(delta, offset) / length, 0.0), 1.0) if length > 0.0 else 0.0
+    away = minus(offset, (share * delta[0], share * delta[1], share * delta[2]))
     return dot(away, away)
 
 
@@ -230,8 +230,8 @@ def segment_point_squared(start: Vector, end: Vector, point: Vector) -> float:
 def face_point_squared(a: Vector, b: Vector, c: Vector, point: Vector) -> float:
     """Squared distance of a point to its foot on the triangle's face, [m²]; else infinity.
 
-    The foot is a point of the triangle whatever round-off does to the shares, so that the value
-    is never below the true distance.
+    Whatever round-off does to the shares, the foot is a point of the triangle, so the value is
+    never below the true distance.
     """
     side, other, offset = minus(b, a), minus(c, a), minus(point, a)
     aa, ab, bb = dot(side, side), dot(side, other), dot(other, other)
@@ -256,10 +256,10 @@ def triangle_point_definition(corners: NDArray[np.float64], point: NDArray[np.fl
     """
     found = [float(np.min(np.linalg.norm(corners - point, axis=1)))]
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        way = end - start
-        if way @ way > 0.0:
-            share = np.clip((point - start) @ way / (way @ way), 0.0, 1.0)
-            found.append(float(np.linalg.norm(start + share * way - point)))
+        delta = end - start
+        if delta @ delta > 0.0:
+            share = np.clip((point - start) @ delta / (delta @ delta), 0.0, 1.0)
+            found.append(float(np.linalg.norm(start + share * delta - point)))
     sides = (corners[1:] - corners[0]).T
     shares = np.linalg.lstsq(sides, point - corners[0], rcond=None)[0]
     if np.all(shares >= 0.0) and shares.sum() <= 1.0:
@@ -269,11 +269,11 @@ def triangle_point_definition(corners: NDArray[np.float64], point: NDArray[np.fl
 
 # The distance of a triangle to a box about the origin, in closed form.
 #
-# The nearest points are either on an edge of the triangle (three segments against the box), or the
-# triangle's is in its inside; then the box lies wholly on one side of the triangle's plane and its
-# nearest point is the corner nearest to that plane, or the plane cuts the box and, since no edge of
+# The nearest point of the triangle is on an edge (three segments against the box) or in its
+# interior. In the interior, either the box lies wholly on one side of the triangle's plane, and its
+# nearest point is the corner nearest to that plane; or the plane cuts the box and, since no edge of
 # the triangle touches it, the cut lies wholly inside the triangle. In either case one point of the
-# box decides: the one where the diagonal that leaves the plane fastest comes nearest to the plane.
+# box decides: the point nearest to the plane on the diagonal most inclined to it.
 
 
 @kernel
@@ -291,8 +291,8 @@ def triangle_box_squared(a: Vector, b: Vector, c: Vector, half: Vector) -> float
 def triangle_box_apart(a: Vector, b: Vector, c: Vector, half: Vector, needed: float) -> bool:
     """Whether triangle and box are at least ``needed`` apart, [m].
 
-    The side of c and a comes first: where a search asks for a way to somewhere, it is the cable at
-    its end, which most often is the one in the way.
+    The side of c and a comes first: when a search tests an edge, it is the cable at the far end,
+    which is most often the one that touches.
     """
     squared = needed * needed
     return (
@@ -305,7 +305,7 @@ def triangle_box_apart(a: Vector, b: Vector, c: Vector, half: Vector, needed: fl
 
 @kernel
 def _face_box_squared(a: Vector, b: Vector, c: Vector, half: Vector) -> float:
-    """Squared distance of the triangle's inside to the box, where it is the least; else more."""
+    """Squared distance of the triangle's interior to the box if that is the least; else more."""
     normal = cross(minus(b, a), minus(c, a))
     reach = abs(normal[0]) * half[0] + abs(normal[1]) * half[1] + abs(normal[2]) * half[2]
     if reach == 0.0:
@@ -350,7 +350,7 @@ def _box_edges(
 def _crosses(
     corners: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> bool:
-    """Whether a segment passes through a triangle that is not in one plane with it."""
+    """Whether a segment passes through a triangle that is not coplanar with it."""
     matrix = np.column_stack([start - end, corners[1] - corners[0], corners[2] - corners[0]])
     if abs(np.linalg.det(matrix)) < 1e-300:
         return False
@@ -365,7 +365,7 @@ def _crosses(
 def triangle_segment_squared(a: Vector, b: Vector, c: Vector, start: Vector, end: Vector) -> float:
     """Squared distance of the triangle a, b, c to a segment, [m²]; 0 where they cross.
 
-    The nearest points lie on an edge and the segment, or on the face and an end, or are one.
+    The nearest points lie on an edge and the segment, or on the face and an end, or coincide.
     """
     normal = cross(minus(b, a), minus(c, a))
     first, last = dot(normal, minus(start, a)), dot(normal, minus(end, a))
@@ -386,12 +386,12 @@ def triangle_segment_squared(a: Vector, b: Vector, c: Vector, start: Vector, end
 def triangle_segment_definition(
     corners: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> float:
-    """The same distance, [m]: the least of a convex function of the place on the segment.
+    """The same distance, [m]: the minimum of a convex function of position along the segment.
 
     Args:
         corners: Of the triangle, shape (3, 3), [m].
         start: Of the segment, shape (3,), [m].
-        end: Likewise.
+        end: Of the segment, shape (3,), [m].
     """
     golden = (np.sqrt(5.0) - 1.0) / 2.0
     low, high = 0.0, 1.0

@@ -1,7 +1,7 @@
-"""What the columns of a world's arrays hold, by name.
+"""Named access to the columns of a world's arrays.
 
-A world is passed to every function, and compiled code counts the owners of each of its arrays
-whenever it does; hence few arrays with many columns.
+A world is passed to every function, and compiled code counts references to each of its arrays at
+every call; hence few arrays with many columns.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Integers = NDArray[np.int64]
 
 
 class World(NamedTuple):
-    """One rig at one orientation in one scene; `planner.collision.world.build_world` makes it.
+    """One rig at one orientation in one scene; from `planner.collision.world.build_world`.
 
     Bodies are the m cables and then the platform. A pair is one body and one piece of an obstacle.
 
@@ -41,22 +41,22 @@ class World(NamedTuple):
         platform: Rotation ``world_from_platform`` under translation, and half extents of the box,
             shape (4, 3).
         pulley: Radius of the pulleys, [m]; 0 for point exits.
-        cables: Outlet, feed direction, anchor in the platform's frame, and the same turned into
+        cables: Outlet, feed direction, anchor in the platform's frame, and the same rotated into
             the world's axes, shape (m, 12), [m].
-        bodies: What each body needs to any obstacle, radius included, and its radius, shape
-            (m + 1, 2), [m].
+        bodies: Required distance of each body to any obstacle, radius included, and its radius,
+            shape (m + 1, 2), [m].
         pieces: Rotation ``shape_from_world``, centre, half extents of a box, half extents of the
-            box grown by the platform (zeros where that is no box), radius of the ball and of the
-            disc that the piece is grown by, shape (k, 20).
-        spans: Kind (`planner.kernels.scene_arrays`), number of the obstacle, first and last + 1 of
-            its `points` and of its `triangles`, shape (k, 6).
+            box grown by the platform (zeros where that is not a box), radius of the ball and of
+            the disc by which the piece is grown, shape (k, 20).
+        spans: Kind, index of the obstacle, first and last + 1 of its `points` and of its
+            `triangles`, shape (k, 6).
         points: Of all pieces, world frame, shape (n, 3), [m].
         triangles: Of all meshes, world frame, shape (t, 3, 3), [m].
-        planes: Of all pairs, shape (l, 6): unit normal n; the limit of n · position; how little
-            the ungrown piece reaches along n; how far the exit does (-inf for the platform).
-        pairs: All pairs, those that forbid most positions first: piece, body, the first of the
-            planes before which a position is allowed, the first of those behind all of which it is
-            forbidden, and the last of these + 1, shape (k (m + 1), 5).
+        planes: Of all pairs, shape (l, 6): unit normal n; the limit of n · position; least extent
+            of the ungrown piece along n; extent of the exit along n (-inf for the platform).
+        pairs: All pairs, those that forbid most positions first: piece, body, first proving plane
+            (before one of which a position is allowed), first core plane (behind all of which it
+            is forbidden), last core plane + 1, shape (k (m + 1), 5).
     """
 
     limits: Array
@@ -121,13 +121,13 @@ def box_half(world: World, piece: int) -> Vector:
 
 @leaf
 def box_sum(world: World, piece: int) -> Vector:
-    """Half extents of a box grown by the platform, [m]; zeros where that is no box."""
+    """Half extents of a box grown by the platform, [m]; zeros where that is not a box."""
     return _triple(world.pieces, piece, 15)
 
 
 @leaf
 def disc_axis(world: World, piece: int) -> Vector:
-    """Axis of the disc that a piece is grown by, world frame."""
+    """Axis of the disc by which a piece is grown, world frame."""
     return _triple(world.pieces, piece, 6)
 
 
@@ -143,20 +143,20 @@ def in_frame(world: World, piece: int, vector: Vector) -> Vector:
 
 @leaf
 def ball(world: World, piece: int) -> float:
-    """Radius of the ball that a piece is grown by, [m]."""
+    """Radius of the ball by which a piece is grown, [m]."""
     return world.pieces[piece, 18]  # type: ignore[no-any-return]
 
 
 @leaf
 def disc(world: World, piece: int) -> float:
-    """Radius of the disc that a piece is grown by, [m]."""
+    """Radius of the disc by which a piece is grown, [m]."""
     return world.pieces[piece, 19]  # type: ignore[no-any-return]
 
 
-# Obstacles as the pieces that the compiled checks know, chosen by shape alone.
+# Obstacles as convex pieces for the compiled checks, depending on their shape alone.
 #
-# A box, ball, capsule, cylinder or hull is one piece. A mesh is a guard, its hull, which is looked
-# into, triangle by triangle, only where the guard is too near.
+# A box, ball, capsule, cylinder or hull is one piece. A mesh is represented by its hull; its
+# triangles are checked only where the hull is too near.
 
 
 BOX: Final = 0
@@ -179,7 +179,7 @@ class ConvexPiece:
         faces: Normals of faces, world frame, shape (f, 3).
         edges: Ends of edges, world frame, shape (e, 2, 3), [m].
         triangles: Of a mesh, world frame, shape (t, 3, 3), [m]; else empty.
-        owner: Number of its obstacle in the scene.
+        owner: Index of its obstacle in the scene.
     """
 
     kind: int
@@ -200,7 +200,7 @@ class ConvexPiece:
         return axis
 
     def least(self, directions: Array) -> Array:
-        """How little the piece reaches along unit vectors, shape (..., 3) → (...), [m]."""
+        """Least extent of the piece along unit vectors, shape (..., 3) → (...), [m]."""
         reach: Array = np.min(directions @ self.points.T, axis=-1) - self.radius
         if self.disc:
             along = directions @ self.disc_axis
@@ -241,7 +241,7 @@ def _sizes(shape: Shape, points: Array) -> tuple[int, Array, float, float]:
 
 
 def _features(shape: Shape, points: Array, pose: Pose) -> tuple[Array, Array]:
-    """Normals of faces and ends of edges, from which separating planes are tried."""
+    """Normals of faces and ends of edges, as candidates for separating planes."""
     match shape:
         case Box():
             signs = np.sign(shape_points(shape))

@@ -1,4 +1,4 @@
-"""The paper's planner, compiled whole: Algorithms 1 to 3, their readings, and the goal bias.
+"""The paper's planner, fully compiled: Algorithms 1 to 3, their readings, and the goal bias.
 
-Nothing is compiled on import; every kernel is when first called, and is kept in the user's cache.
+Importing compiles nothing; each kernel is compiled at its first call and kept in the user's cache.
 """

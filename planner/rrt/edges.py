@@ -1,4 +1,4 @@
-"""What edges cost and what they must keep, for compiled functions.
+"""Costs and limits of edges, for compiled functions.
 
 The cost is the length, or the integral of the kinematic cost.
 """
@@ -33,8 +33,7 @@ class CostField(NamedTuple):
     Attributes:
         lower: First point of the lattice, shape (3,), [m].
         spacing: Between its points, shape (3,), [m].
-        values: Cost per metre at its points, shape (i, j, k); of no points where every metre costs
-            the same, 1.
+        values: Cost per metre at its points, shape (i, j, k); empty for a constant cost of 1.
     """
 
     lower: Array
@@ -91,11 +90,11 @@ def _cell(at: float, lower: float, spacing: float, points: int) -> tuple[int, fl
     return cell, min(max(scaled - cell, 0.0), 1.0)
 
 
-# Everything an edge must keep, as one argument of compiled functions.
+# All limits of an edge, as one argument of compiled functions.
 
 
 class EdgeLimits(NamedTuple):
-    """What edges of one rig at one orientation in one scene must keep; see `ExactChecks`."""
+    """Limits of edges of one rig at one orientation in one scene; see `ExactChecks`."""
 
     world: World
     robot: Robot
@@ -109,7 +108,7 @@ def exact_checks(rig: Rig, scene: Scene, rotation: Array, reserve: float) -> Exa
     Args:
         rig: The robot.
         scene: Obstacles, clearances and load.
-        rotation: Orientation that is kept, shape (3, 3).
+        rotation: Constant orientation, shape (3, 3).
         reserve: [m].
     """
     return ExactChecks(

@@ -1,7 +1,7 @@
 """From start to goal with the paper's planner: search, then Algorithm 3 and what goes beyond it.
 
-Beyond it go the cheapest way through points of a path, and its corners drawn tight. Everything that
-edges keep is kept, and no step makes a path dearer.
+Beyond Algorithm 3, the cheapest path through points of the path is found and its corners are pulled
+tight. Edges keep all their limits, and no step makes a path costlier.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ IsFree = Callable[[Array, Array], bool]
 
 
 def cheapest_through(path: Array, is_free: IsFree, cost: Cost, spacing: float) -> Array:
-    """The cheapest way from start to end through points spread over a path.
+    """The cheapest path from start to end through points spread over a path.
 
-    Unlike Algorithm 3 it does not jump as far as it can but as well as it can (a shortest-path
-    search over all pairs of points).
+    Unlike Algorithm 3, which jumps as far as it can, this is a shortest-path search over all pairs
+    of points.
 
     Args:
-        path: Free from node to node, shape (k, n).
+        path: Allowed from node to node, shape (k, n).
         is_free: Whether an edge is allowed.
         cost: Of edges.
         spacing: Distance of the points spread over the edges, [m].
@@ -45,10 +45,10 @@ def cheapest_through(path: Array, is_free: IsFree, cost: Cost, spacing: float) -
             if i == j - 1 or is_free(points[i], points[j]):
                 best[j], parent[j] = totals[i], i
                 break
-    way = [len(points) - 1]
-    while way[-1] != 0:
-        way.append(int(parent[way[-1]]))
-    return points[way[::-1]]
+    kept = [len(points) - 1]
+    while kept[-1] != 0:
+        kept.append(int(parent[kept[-1]]))
+    return points[kept[::-1]]
 
 
 def drawn_tight(
@@ -57,7 +57,7 @@ def drawn_tight(
     """Moves corners, one coordinate direction at a time, while the path gets cheaper.
 
     Args:
-        path: Free from node to node, shape (k, n).
+        path: Allowed from node to node, shape (k, n).
         is_free: Whether an edge is allowed.
         cost: Of edges.
         steps: Sizes of the moves tried, largest first, [m].
@@ -72,15 +72,15 @@ def drawn_tight(
 
 
 def _move_corner(path: Array, k: int, step: float, is_free: IsFree, cost: Cost) -> bool:
-    """Tries moves of one corner in place: along its bisector and along the axes."""
+    """Tries to move one corner, in place: along its bisector and along the axes."""
     before, corner, after = path[k - 1], path[k].copy(), path[k + 1]
     now = cost.edge(before, corner) + cost.edge(corner, after)
     inward = (before + after) / 2.0 - corner
     size = float(np.linalg.norm(inward))
-    ways = np.concatenate([np.eye(len(corner)), -np.eye(len(corner))])
+    directions = np.concatenate([np.eye(len(corner)), -np.eye(len(corner))])
     if size > 0.0:
-        ways = np.concatenate([inward[None, :] / size, ways])
-    tried = corner + step * ways
+        directions = np.concatenate([inward[None, :] / size, directions])
+    tried = corner + step * directions
     totals = cost.edges(tried, before) + cost.edges(tried, after)
     for i in np.argsort(totals, kind="stable").tolist():
         if totals[i] >= now * (1.0 - 1e-6):
@@ -100,13 +100,13 @@ def _spread(path: Array, spacing: float) -> Array:
     return np.concatenate(points)
 
 
-# From start to goal with the paper's planner: search, then Algorithm 3 and what goes beyond it.
+# Search and post-processing.
 
 
 _SPREAD_POINTS = 40
 _ROUNDS = 2
 _FOR_FEWER_CORNERS = 0.003
-"""Share of its cost that a finished path may lose to have fewer corners, at which a run slows."""
+"""Share by which a finished path may cost more to have fewer corners, at which a run slows."""
 
 
 def paper_route(
@@ -116,11 +116,11 @@ def paper_route(
     kinematic: KinematicCost,
     progress: Progress | None = None,
 ) -> Route:
-    """Searches, in the rewiring mode first with room for the blends that round the corners.
+    """Searches; in the rewiring mode first with room for the blends that round the corners.
 
-    A blend leaves the path by up to the rig's blend tolerance, and toward the obstacle it goes
-    around; without room the executor would have to make it small, and slow down. Where no path has
-    that room, the search begins again without.
+    A blend deviates from the path by up to the rig's blend tolerance, toward the obstacle it goes
+    around; without room the executor would have to shrink it and slow down. Where no path has that
+    room, the search starts again without it.
 
     Raises:
         NoSolution: The search ended at its limit.
@@ -156,7 +156,7 @@ def paper_route(
 
 
 def _post_processed(raw: Array, planner: PaperPlanner, kinematic: KinematicCost) -> Array:
-    """Algorithm 3; in the rewiring mode the path is then drawn tight as well."""
+    """Algorithm 3; in the rewiring mode the path is then pulled tight as well."""
     path = planner.shortcut(raw)
     if planner.settings.mode == "paper" or len(path) == 2:
         return path
@@ -173,10 +173,10 @@ def _no_solution(
 ) -> NoSolution:
     refused = sorted(result.refused.items(), key=lambda item: -item[1])
     why = ", ".join(f"{count} for {reason}" for reason, count in refused) or "none"
-    pairs = sorted(result.in_the_way.items(), key=lambda item: -item[1])[:3]
+    pairs = sorted(result.blocking_pairs.items(), key=lambda item: -item[1])[:3]
     if pairs:
         listed = ", ".join(f"{a} – {b} ({n})" for (a, b), n in pairs)
-        why += f"; most often in the way: {listed}"
+        why += f"; most often blocking: {listed}"
     best = result.best_distance * 1000.0
     return NoSolution(
         f"no path after {iterations} iterations; the tree came within {best:.1f} mm of the"

@@ -1,6 +1,6 @@
-"""Algorithm 1 compiled: the tree grows from the start until the goal is a node of it, or on.
+"""Algorithm 1 compiled: the tree grows from the start until the goal is a node of it, or longer.
 
-As the paper stops it at the first path and never rewires children, or as RRT* does and goes on.
+It stops at the first path and never rewires children, as in the paper, or does both as RRT*.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from planner.rrt.sampling import (
     focus_node,
     forward,
     goal_bias,
-    near_way,
-    tell,
+    near_path,
+    record_outcome,
 )
-from planner.rrt.tree import Tree, add, move, nearest, squared_distance, way_to, within
+from planner.rrt.tree import Tree, add, move, nearest, nodes_to, squared_distance, within
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -35,11 +35,11 @@ NOT_REACHED = -1
 KEPT_REFUSALS = 1024
 
 _GAIN = 1e-12
-"""What a rewired edge must gain at least, so that round-off rewires nothing."""
+"""Least gain of a rewired edge, so that round-off rewires nothing."""
 
 
 class Task(NamedTuple):
-    """What is searched for; points have shape (n,)."""
+    """The task of a search; points have shape (n,)."""
 
     start: Array
     goal: Array
@@ -50,7 +50,7 @@ class Task(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """How it is searched, as numbers; see `PlannerSettings` and `AlgorithmVariant`."""
+    """The settings of a search as numbers; see `PlannerSettings` and `AlgorithmVariant`."""
 
     adaptive: bool
     rate: int
@@ -67,12 +67,12 @@ class Rules(NamedTuple):
 
 
 class Search(NamedTuple):
-    """A search that goes on.
+    """A search that can be continued.
 
     Attributes:
         tree: All nodes.
-        tallies: How expansions went.
-        counts: By name: iterations, the last one to be, edges checked, the goal's node or -1, edges
+        tallies: Outcomes of expansions.
+        counts: By name: iterations, their limit, edges checked, the goal's node or -1, edges
             refused; shape (5,).
         reasons: Edges refused by reason (`planner.rrt.edges`), shape (5,).
         refused: The latest of them, both ends, shape (KEPT_REFUSALS, 2, n).
@@ -105,7 +105,7 @@ def new_search(tree: Tree, tallies: Tallies, goal: Array, most: int) -> Search:
 
 @kernel
 def try_straight(search: Search, task: Task) -> None:
-    """Joins the goal to the root if the straight line is free."""
+    """Joins the goal to the root if the straight line is allowed."""
     if _free(search, task.limits, task.start, task.goal):
         cost = edge_cost(task.field, task.start, task.goal)
         search.counts[REACHED] = add(search.tree, task.goal, 0, cost)
@@ -114,8 +114,10 @@ def try_straight(search: Search, task: Task) -> None:
 
 
 @kernel
-def go_on(search: Search, task: Task, rules: Rules, random: Generator, iterations: int) -> None:
-    """Does a number of further iterations, fewer where the search ends before."""
+def extend_tree(
+    search: Search, task: Task, rules: Rules, random: Generator, iterations: int
+) -> None:
+    """Does further iterations, fewer if the search ends earlier."""
     counts, tree = search.counts, search.tree
     wanted = np.empty(len(task.goal))
     for _ in range(iterations):
@@ -125,12 +127,12 @@ def go_on(search: Search, task: Task, rules: Rules, random: Generator, iteration
         if counts[REACHED] == NOT_REACHED:
             draw(search, task, rules, random, wanted)
         else:
-            nodes = way_to(tree, counts[REACHED])
-            way = np.empty((len(nodes), len(wanted)))
+            nodes = nodes_to(tree, counts[REACHED])
+            path = np.empty((len(nodes), len(wanted)))
             for k in range(len(nodes)):
-                way[k] = tree.points[nodes[k]]
+                path[k] = tree.points[nodes[k]]
             spread = rules.neighbour_radius
-            wanted = near_way(random, tree, way, spread, task.lower, task.upper)
+            wanted = near_path(random, tree, path, spread, task.lower, task.upper)
         node = _grow(search, task, rules, wanted)
         if node >= 0:
             away = math.sqrt(squared_distance(tree.points, node, task.goal))
@@ -168,14 +170,14 @@ def _grow(search: Search, task: Task, rules: Rules, wanted: Array) -> int:
     near = nearest(tree, wanted)
     length = math.sqrt(squared_distance(tree.points, near, wanted))
     if length < 1e-9:  # drawn on a node: no direction to grow in
-        tell(search.tallies, near, False, rules.focus)
+        record_outcome(search.tallies, near, False, rules.focus)
         return -1
     step = rules.step if rules.full_step else min(rules.step, length)
     new = tree.points[near] + (wanted - tree.points[near]) * (step / length)
     if _crowded(tree, new, rules.spacing) or not _free(search, task.limits, tree.points[near], new):
-        tell(search.tallies, near, False, rules.focus)
+        record_outcome(search.tallies, near, False, rules.focus)
         return -1
-    tell(search.tallies, near, True, rules.focus)
+    record_outcome(search.tallies, near, True, rules.focus)
     count = within(tree, new, rules.neighbour_radius, search.found)
     costs = np.empty(count)
     for k in range(count):
@@ -189,7 +191,7 @@ def _grow(search: Search, task: Task, rules: Rules, wanted: Array) -> int:
 
 @kernel
 def _crowded(tree: Tree, new: Array, spacing: float) -> bool:
-    """Whether a candidate is nearer to a node than the spacing."""
+    """Whether a new point is nearer to a node than the spacing."""
     if spacing == 0.0:
         return False
     return math.sqrt(squared_distance(tree.points, nearest(tree, new), new)) < spacing
@@ -199,7 +201,7 @@ def _crowded(tree: Tree, new: Array, spacing: float) -> bool:
 def _best_parent(
     search: Search, task: Task, near: int, new: Array, costs: Array
 ) -> tuple[int, float]:
-    """Lines 10 to 17: the neighbour with the least cost to come whose edge is free."""
+    """Lines 10 to 17: the neighbour with the least cost-to-come whose edge is allowed."""
     tree, found = search.tree, search.found
     bound = tree.costs[near] + edge_cost(task.field, tree.points[near], new)
     totals = np.empty(len(costs))
@@ -230,7 +232,7 @@ def _rewire(search: Search, limits: EdgeLimits, node: int, costs: Array) -> None
 
 @kernel
 def _join_goal(search: Search, task: Task, rules: Rules, node: int) -> None:
-    """Adds the exact goal behind a node, or gives it a better parent, where the edge is free."""
+    """Adds the goal as a child of a node, or gives it a better parent, if the edge is allowed."""
     tree, counts = search.tree, search.counts
     reached = counts[REACHED]
     total = tree.costs[node] + edge_cost(task.field, tree.points[node], task.goal)
@@ -249,7 +251,7 @@ def _join_goal(search: Search, task: Task, rules: Rules, node: int) -> None:
 
 @kernel
 def _free(search: Search, limits: EdgeLimits, start: Array, end: Array) -> bool:
-    """Whether an edge is allowed; counts it, and keeps it where it is refused."""
+    """Whether an edge is allowed; counts it, and records it if refused."""
     counts = search.counts
     counts[CHECKS] += 1
     reason = problem(limits, start, end)

@@ -1,6 +1,6 @@
-"""Where the tree is asked to grow next: adaptive sampling, and the goal bias it is compared with.
+"""Where the tree grows next: adaptive sampling, and the goal bias it is compared with.
 
-Points have any number n of coordinates and are written into an array that the caller owns.
+Points have n coordinates and are written into an array that the caller owns.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def backward(
 ) -> None:
     """SamplingBackward, Eq. 12: outside the ball about the mean of all nodes through x_c.
 
-    Where that ball leaves no room in the bounds, the farthest of 100 points from its middle.
+    Where that ball leaves no room in the bounds, the farthest of 100 points from its centre.
     """
     centre = tree.total / tree.size[0]
     tried = np.empty((1, len(point)))
@@ -90,13 +90,13 @@ def backward(
 
 
 @kernel
-def near_way(
-    random: Generator, tree: Tree, way: Array, spread: float, lower: Array, upper: Array
+def near_path(
+    random: Generator, tree: Tree, path: Array, spread: float, lower: Array, upper: Array
 ) -> Array:
-    """A point near a path, shape (k, n), k ≥ 2, where new nodes can still make it cheaper."""
-    k = random.integers(0, len(way) - 1)
+    """A sample near a path, shape (k, n), k ≥ 2, where new nodes can make it cheaper."""
+    k = random.integers(0, len(path) - 1)
     share = random.random()
-    point = way[k] + share * (way[k + 1] - way[k])
+    point = path[k] + share * (path[k + 1] - path[k])
     for axis in range(len(point)):
         off = point[axis] + random.normal(0.0, spread)
         point[axis] = min(max(off, lower[axis]), upper[axis])
@@ -107,7 +107,7 @@ def near_way(
 def direction_by_angles(random: Generator, opening: float, point: Array) -> None:
     """A unit vector about the first axis with its angles uniform in their ranges (Eq. 10).
 
-    The last line of Eq. 10 must end in a sine, or the vector has no unit length.
+    The last line of Eq. 10 must end in a sine, or the vector is not a unit vector.
     """
     n, sines = len(point), 1.0
     for k in range(n - 1):
@@ -145,7 +145,7 @@ def direction_in_volume(random: Generator, opening: float, point: Array) -> None
 
 @kernel
 def _turn_first_axis(start: Array, goal: Array, length: float, point: Array) -> None:
-    """Turns the first axis to the direction from goal to start, by a Householder reflection."""
+    """Maps the first axis to the direction from goal to start, by a Householder reflection."""
     if length == 0.0:
         return
     mirror = (start - goal) / length
@@ -166,7 +166,7 @@ def _in_bounds(random: Generator, lower: Array, upper: Array, point: Array) -> N
         point[k] = random.uniform(lower[k], upper[k])
 
 
-# How expansions went: the failure rate e_r and the node x_c, in every reading of the text.
+# Outcomes of expansions: the failure rate e_r and the node x_c, in every reading of the text.
 
 
 Integers = NDArray[np.int64]
@@ -194,13 +194,13 @@ class Tallies(NamedTuple):
 
 
 def new_tallies(capacity: int) -> Tallies:
-    """No expansions yet; x_c is the root, with which the cone is the line from goal to start."""
+    """No expansions yet; x_c is the root, so the cone is the line from goal to start."""
     return Tallies(np.zeros((capacity, 2), dtype=np.int64), np.zeros(5, dtype=np.int64))
 
 
 @kernel
-def tell(tallies: Tallies, node: int, success: bool, focus: int) -> None:
-    """Counts an expansion of ``node``; ``focus`` is the number of the reading of x_c."""
+def record_outcome(tallies: Tallies, node: int, success: bool, focus: int) -> None:
+    """Counts an expansion of ``node``; ``focus`` is the index of the reading of x_c."""
     nodes, whole = tallies.nodes, tallies.whole
     nodes[node, 0] += 1
     whole[_SEARCHES] += 1
@@ -245,7 +245,7 @@ def _not_below(nodes: Integers, one: int, other: int) -> bool:
 
 @kernel
 def failure_rate(tallies: Tallies, reading: int) -> float:
-    """The rate e_r; ``reading`` is the number of its reading."""
+    """The rate e_r; ``reading`` is the index of its reading."""
     whole = tallies.whole
     if reading == _BY_STREAK:
         return whole[_STREAK] / (whole[_STREAK] + 1.0)  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""One search by the compiled planner, and what it found."""
+"""One search by the compiled planner, and its result."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ from planner.rrt.rrt import (
     Rules,
     Search,
     Task,
-    go_on,
+    extend_tree,
     new_search,
     try_straight,
 )
 from planner.rrt.sampling import new_tallies
-from planner.rrt.tree import new_tree, way_to
+from planner.rrt.tree import new_tree, nodes_to
 from planner.rrt.variants import FAILURE_RATES, FOCUSES
 from planner.settings import IMPROVING_ITERATIONS, PlannerSettings
 from planner.space import TranslationSpace
 
-# Algorithm 3 as meant, compiled: from each kept node to the farthest that can be reached.
+# Algorithm 3 as intended, compiled: from each kept node to the farthest that can be reached.
 #
-# As printed it takes shortcuts that are NOT free. A shortcut keeps everything that edges keep.
-# Under the kinematic cost a straight line can cost more than the way it replaces, so a shortcut
-# must not be dearer; under the length it never is.
+# As printed, it takes shortcuts that are NOT free. Here a shortcut keeps every limit of an edge.
+# Under the kinematic cost a straight line can cost more than the path it replaces, so a shortcut
+# must not be costlier; under the length it never is.
 
 
 Integers = NDArray[np.int64]
@@ -60,18 +60,18 @@ _ROUND_OFF = 1e-12
 
 @kernel
 def shortcut(
-    path: Array, limits: EdgeLimits, field: CostField, dearer: float
+    path: Array, limits: EdgeLimits, field: CostField, extra: float
 ) -> tuple[Integers, int]:
-    """The nodes of a path that Algorithm 3 keeps, the first and the last among them.
+    """The nodes of a path that Algorithm 3 keeps, the first and the last included.
 
     Args:
-        path: Free from node to node, shape (k, 3), [m].
-        limits: What edges must keep.
-        field: What they cost.
-        dearer: Share by which a shortcut may cost more than what it replaces, to save corners.
+        path: Allowed from node to node, shape (k, 3), [m].
+        limits: Of edges.
+        field: Cost of edges.
+        extra: Share by which a shortcut may cost more than what it replaces, to save corners.
 
     Returns:
-        Numbers of nodes, shape (j,), and how many edges were checked.
+        Indices of nodes, shape (j,), and the number of edges checked.
     """
     last, checks = len(path) - 1, 0
     along = np.zeros(len(path))
@@ -82,7 +82,7 @@ def shortcut(
     while i < last:
         j = last
         while j > i + 1:
-            most = (1.0 + dearer) * (along[j] - along[i]) + _ROUND_OFF
+            most = (1.0 + extra) * (along[j] - along[i]) + _ROUND_OFF
             if edge_cost(field, path[i], path[j]) <= most:
                 checks += 1
                 if problem(limits, path[i], path[j]) == FREE:
@@ -95,22 +95,22 @@ def shortcut(
 
 
 _CHUNK = 500
-"""Iterations between two reports of progress."""
+"""Iterations between progress reports."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchResult:
-    """What a search found.
+    """The result of a search.
 
     Attributes:
         points: All nodes, shape (k, n); the goal is one of them when there is a path.
         parents: Of each node, -1 for the root, shape (k,).
         path: From start to goal, both included, shape (j, n); None without one.
-        iterations: How many there were: samples drawn.
-        edge_checks: Edges that were asked about.
+        iterations: Number of samples drawn.
+        edge_checks: Number of edges checked.
         best_distance: Smallest distance of a node to the goal, [m].
         refused: Edges refused, by reason.
-        in_the_way: Of the latest edges refused for obstacles, by body and obstacle.
+        blocking_pairs: Of the latest edges refused for obstacles, by body and obstacle.
     """
 
     points: Array
@@ -120,18 +120,18 @@ class SearchResult:
     edge_checks: int
     best_distance: float
     refused: dict[str, int]
-    in_the_way: dict[tuple[str, str], int]
+    blocking_pairs: dict[tuple[str, str], int]
 
 
 class PaperPlanner:
     """The paper's planner for one rig in one scene; any number of searches.
 
     Attributes:
-        space: What is searched.
+        space: The search space.
         settings: Of the searches; their seed is not used.
-        limits: What edges must keep.
-        field: What they cost.
-        checks: Edges asked about so far.
+        limits: Of edges.
+        field: Cost of edges.
+        checks: Edges checked so far.
     """
 
     def __init__(
@@ -147,11 +147,11 @@ class PaperPlanner:
 
         Args:
             rig: The robot.
-            scene: Obstacles, clearances, load; start and goal may be others in each search.
+            scene: Obstacles, clearances, load; each search has its own start and goal.
             settings: Sampler, readings, cost, mode and sizes.
             reserve: Added to the scene's clearances, [m].
-            cost: For the rig at the scene's orientation; computed when left out and needed.
-            exact: The limits with the reserve; made when left out, to be shared by planners.
+            cost: For the rig at the scene's orientation; computed if needed and left out.
+            exact: The limits with the reserve, to share between planners; built if left out.
         """
         self.space = TranslationSpace(rig, scene.start.rotation)
         self.settings = settings
@@ -181,9 +181,9 @@ class PaperPlanner:
 
         Args:
             start: Shape (3,), [m].
-            goal: Likewise.
-            random: Drawn from.
-            progress: Called once in 500 iterations.
+            goal: Shape (3,), [m].
+            random: Random generator.
+            progress: Called every 500 iterations.
         """
         settings = self.settings
         lower, upper = np.array(self.space.lower), np.array(self.space.upper)
@@ -200,25 +200,25 @@ class PaperPlanner:
             try_straight(search, task)
         counts = search.counts
         while counts[ITERATIONS] < counts[LAST]:
-            go_on(search, task, rules, random, _CHUNK)
+            extend_tree(search, task, rules, random, _CHUNK)
             if progress is not None:
                 progress(int(counts[ITERATIONS]), int(counts[LAST]), float(search.closest[0]))
         self.checks += int(counts[CHECKS])
         return self._result(search)
 
-    def shortcut(self, path: Array, dearer: float = 0.0) -> Array:
-        """Algorithm 3: some of a path's nodes, the first and the last among them.
+    def shortcut(self, path: Array, extra: float = 0.0) -> Array:
+        """Algorithm 3: some of a path's nodes, the first and the last included.
 
         Args:
-            path: Free from node to node, shape (k, 3), [m].
-            dearer: Share by which a shortcut may cost more than what it replaces.
+            path: Allowed from node to node, shape (k, 3), [m].
+            extra: Share by which a shortcut may cost more than what it replaces.
         """
-        kept, checks = shortcut(np.ascontiguousarray(path), self.limits, self.field, dearer)
+        kept, checks = shortcut(np.ascontiguousarray(path), self.limits, self.field, extra)
         self.checks += checks
         return path[kept]
 
     def _tries_straight(self, start: Array, goal: Array) -> bool:
-        """The paper grows a tree even where the straight line is free; from near it need not."""
+        """The paper's mode grows a tree even where the straight line is free, unless near."""
         settings = self.settings
         near = float(np.linalg.norm(goal - start)) <= settings.goal_radius
         return near or settings.mode == "rewire" or settings.readings.goal_sight
@@ -232,15 +232,15 @@ class PaperPlanner:
         return SearchResult(
             points=tree.points[:size].copy(),
             parents=tree.parents[:size].copy(),
-            path=None if reached == NOT_REACHED else tree.points[way_to(tree, reached)],
+            path=None if reached == NOT_REACHED else tree.points[nodes_to(tree, reached)],
             iterations=int(search.counts[ITERATIONS]),
             edge_checks=int(search.counts[CHECKS]),
             best_distance=float(search.closest[0]),
             refused=refused,
-            in_the_way={} if reached != NOT_REACHED else self._in_the_way(search),
+            blocking_pairs={} if reached != NOT_REACHED else self._blocking_pairs(search),
         )
 
-    def _in_the_way(self, search: Search) -> dict[tuple[str, str], int]:
+    def _blocking_pairs(self, search: Search) -> dict[tuple[str, str], int]:
         found: dict[tuple[str, str], int] = {}
         for start, end in search.refused[: min(int(search.counts[REFUSALS]), KEPT_REFUSALS)]:
             if self._exact.problem(start, end) != OBSTACLE:

@@ -73,7 +73,7 @@ def nearest(tree: Tree, point: Array) -> int:
 
 @kernel
 def within(tree: Tree, point: Array, radius: float, found: Integers) -> int:
-    """Writes the nodes within ``radius`` of a point to ``found`` and returns their number."""
+    """Writes the nodes within ``radius`` of a point to ``found``; returns their number."""
     points, size, count = tree.points, tree.size[0], 0
     for node in range(size):
         if squared_distance(points, node, point) <= radius * radius:
@@ -84,7 +84,7 @@ def within(tree: Tree, point: Array, radius: float, found: Integers) -> int:
 
 @kernel
 def add(tree: Tree, point: Array, parent: int, cost: float) -> int:
-    """Adds a node and returns its number; ``cost`` is from the root."""
+    """Adds a node and returns its index; ``cost`` is from the root."""
     node = tree.size[0]
     tree.points[node] = point
     tree.total[:] += point
@@ -97,7 +97,7 @@ def add(tree: Tree, point: Array, parent: int, cost: float) -> int:
 
 @kernel
 def move(tree: Tree, node: int, parent: int, cost: float) -> None:
-    """Gives a node another parent and carries the change of cost to all below it."""
+    """Gives a node another parent and propagates the change of cost to all its descendants."""
     links, old = tree.links, tree.parents[node]
     if links[old, 0] == node:
         links[old, 0] = links[node, 1]
@@ -129,15 +129,15 @@ def _hang(tree: Tree, node: int, parent: int) -> None:
 
 
 @kernel
-def way_to(tree: Tree, node: int) -> Integers:
+def nodes_to(tree: Tree, node: int) -> Integers:
     """The nodes from the root to ``node``, shape (k,)."""
     count, current = 1, node
     while tree.parents[current] != ROOT:
         current = tree.parents[current]
         count += 1
-    way = np.empty(count, dtype=np.int64)
+    path = np.empty(count, dtype=np.int64)
     current = node
     for k in range(count - 1, -1, -1):
-        way[k] = current
+        path[k] = current
         current = tree.parents[current]
-    return way
+    return path

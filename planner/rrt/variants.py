@@ -1,4 +1,4 @@
-"""The choices that the paper leaves open, by name (docs/paper.md has the arguments for each)."""
+"""Choices that the paper leaves open, by name (docs/paper.md gives the arguments for each)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class AlgorithmVariant:
     goal_sight: bool = False
 
     def __post_init__(self) -> None:
-        """Refuses names that stand for no reading.
+        """Refuses unknown names.
 
         Raises:
             BadInput: A name is unknown or the spacing is negative or not finite.
@@ -67,4 +67,4 @@ class AlgorithmVariant:
 
 
 TEXT = AlgorithmVariant()
-"""The text as it is written, and where that is open what made the smallest trees."""
+"""The text as written; where it is ambiguous, the reading that gave the smallest trees."""

@@ -1,1 +1,1 @@
-"""Maps of what a rig can do where: in slices and volumes, as numbers and as images."""
+"""Workspace maps of a rig, in slices and volumes, as numbers and as images."""

@@ -1,4 +1,4 @@
-"""Maps over a grid, part by part, on as many processes as there are."""
+"""Maps over a grid, computed in parts on any number of processes."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Maps:
     """Values of quantities over a grid.
 
     Attributes:
-        question: For what they are.
-        grid: Where.
-        values: Shape of the grid each, SI, by name: the quantities that were asked for, and
-            the costs (`planner.workspace.maps.costs`).
+        question: Rig, scene, orientation and quantities.
+        grid: Positions.
+        values: By name, each in the shape of the grid, SI: the quantities requested, and the
+            costs (`planner.workspace.maps.costs`).
     """
 
     question: Question
@@ -46,7 +46,7 @@ class Maps:
     values: Values
 
     def __repr__(self) -> str:
-        """Where it is, its points, and the names of its values."""
+        """Name of the grid, number of points, and names of the values."""
         return f"<Maps {self.grid.name}: {self.grid.count} points of {', '.join(self.values)}>"
 
     @property
@@ -73,7 +73,7 @@ class Maps:
 
     @property
     def verdict(self) -> NDArray[np.int64]:
-        """What forbids a pose first, by its place in `VERDICTS`; 0 where nothing does."""
+        """Index in `VERDICTS` of what forbids a pose first; 0 where nothing does."""
         scene = self.question.scene
         own = scene.self_clearance if scene else 0.0
         tests = [self.closed, self.feasible, self.values["self_clearance"] >= own]
@@ -93,12 +93,11 @@ def compute(
     """Computes maps.
 
     Args:
-        question: Of what.
+        question: Rig, scene, orientation and quantities.
         extremes: For the costs.
-        grid: Where.
-        pool: Does the work, in other processes or on other machines; this process without one.
-            The values do not depend on it.
-        progress: Called with the number of points newly done.
+        grid: Positions.
+        pool: Other processes or machines; None for this process. The values do not depend on it.
+        progress: Called with the number of points just finished.
     """
     bounds = [(k, min(k + POINTS_IN_A_PART, grid.count)) for k in _starts(grid)]
     values = {name: np.empty(grid.count) for name in question.quantities}
@@ -139,7 +138,7 @@ def _part(question: Question, grid: Grid, first: int, last: int) -> Values:
 CELLS_OF_A_SLICE = 50
 CELLS_OF_THE_FRAME = 40
 POINTS_FOR_ONE_PROCESS = 20000
-"""Fewer are done before other processes have started."""
+"""Fewer points are finished before other processes would have started."""
 
 
 def workspace_grids(
@@ -151,12 +150,12 @@ def workspace_grids(
     lower: Array | None = None,
     upper: Array | None = None,
 ) -> list[Grid]:
-    """The slices, and with the volume the frame around it and the region itself.
+    """Grids of slices, and of the volume: the frame around it and the region itself.
 
     Args:
         rig: The robot.
-        slices: Axis (0 to 2) and position [m] of planes; the level one through home when left out.
-        volume: Whether the whole box is mapped too; left out, if there are no slices.
+        slices: Axis (0 to 2) and position [m] of planes; the one at home's height when left out.
+        volume: Whether the whole box is mapped too; when left out, only without slices.
         step: Distance of points, [m]; a fiftieth of the longest side when left out.
         lower: Corner of the region, shape (3,), [m]; that of the rig's workspace when left out.
         upper: The opposite corner.
@@ -187,21 +186,21 @@ def map_workspace(
     dask: str | None = None,
     listener: Listener = SILENT,
 ) -> list[Maps]:
-    """Maps of what a rig can do where; `planner.workspace.files.write_maps` writes them.
+    """Workspace maps of a rig; `planner.workspace.files.write_maps` writes them.
 
     Args:
-        question: Of what.
-        grids: Where, see `workspace_grids`.
-        workers: Processes; one a core when left out.
-        dask: Address of a Dask cluster that does the work instead.
-        listener: Receives how far it is.
+        question: Rig, scene, orientation and quantities.
+        grids: Positions, see `workspace_grids`.
+        workers: Processes; one per core when left out.
+        dask: Address of a Dask cluster to use instead.
+        listener: Receives progress.
 
     Raises:
         BadInput: Dask is not installed, or no scheduler answers.
     """
     with planner_compilation("maps", listener):
         extremes = Extremes.over_workspace(question)
-        # Compiles what is needed once, before several processes would do so.
+        # Compiles once, or every process would.
         values_at(question, question.rig.home.position[None, :])
     total = sum(grid.count for grid in grids)
     cores = 1 if total <= POINTS_FOR_ONE_PROCESS else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Images of a slice: every quantity as colours, and the two costs as surfaces (paper, Fig. 7)."""
+"""Images of maps: slices as colour maps, costs as surfaces, volumes (paper, Figs. 6 and 7)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# One look for all images of maps.
+# One style for all images of maps.
 
 
 CLOSED = "#3f9b6b"
@@ -59,13 +59,13 @@ def new_figure(
 
 _COLUMNS = 3
 _BELOW_LABELS = 0.42
-"""Where the legend begins, [in] below the axes."""
+"""Distance of the legend below the axes, [in]."""
 _COSTS = ("dexterity_cost", "wrench_cost")
 _LEAST_SPREAD = 1e-12
 
 
 def slice_figure(maps: Maps) -> Figure:
-    """Every quantity over a slice, with the line beyond which a limit is broken."""
+    """Every quantity over a slice, with the line where its limit is reached."""
     panels = [quantity for quantity in shown_in(maps) if quantity.name != "condition_number"]
     rows = -(-(1 + len(panels)) // _COLUMNS)
     figure = new_figure(11.0, rows * (2.7 * height_to_width(maps.grid) + 0.8) + 0.4)
@@ -82,7 +82,7 @@ def slice_figure(maps: Maps) -> Figure:
 
 
 def _verdict_map(axes: Axes, maps: Maps) -> None:
-    """Draws where the platform may be, and what forbids it elsewhere."""
+    """Draws the allowed positions, and what forbids the others."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
     from matplotlib.transforms import ScaledTranslation
@@ -109,9 +109,9 @@ def cost_figure(maps: Maps) -> Figure:
     figure = new_figure(11.0, 4.6)
     across, up = sides_of(maps.grid)
     grid = np.meshgrid(*_coordinates(maps.grid))
-    for place, (letter, name) in enumerate(zip("ab", _COSTS, strict=True)):
+    for index, (letter, name) in enumerate(zip("ab", _COSTS, strict=True), start=1):
         quantity = next(q for q in SHOWN if q.name == name)
-        axes: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
+        axes: Any = figure.add_subplot(1, 2, index, projection="3d")
         values = values_on_slice(maps, quantity)
         low, high = colour_range([maps], quantity)
         surface = axes.plot_surface(
@@ -127,7 +127,7 @@ def cost_figure(maps: Maps) -> Figure:
 
 
 def colour_map(axes: Axes, maps: Maps, quantity: Shown, low: float, high: float) -> Any:
-    """Draws one quantity over a slice; returns what a colour bar is made from."""
+    """Draws one quantity over a slice; returns the mappable for a colour bar."""
     x, y = _coordinates(maps.grid)
     values = values_on_slice(maps, quantity)
     coloured = axes.pcolormesh(
@@ -149,7 +149,7 @@ def _label(axes: Axes, grid: Grid) -> None:
 
 
 def colour_range(slices: list[Maps], quantity: Shown) -> tuple[float, float]:
-    """Values at the ends of the colours: all but the most extreme hundredth at each end."""
+    """Values at the ends of the colour scale: the 1st and 99th percentile."""
     values = np.concatenate([(m.values[quantity.name] * quantity.scale).ravel() for m in slices])
     finite = values[np.isfinite(values)]
     if not len(finite):
@@ -159,7 +159,7 @@ def colour_range(slices: list[Maps], quantity: Shown) -> tuple[float, float]:
 
 
 def values_on_slice(maps: Maps, quantity: Shown) -> Array:
-    """Values as an image has them: rows upward, columns to the right, in the unit shown."""
+    """Values in image order: rows upward, columns to the right, in the unit shown."""
     flat: Array = _flat(maps.values[quantity.name], maps.grid) * quantity.scale
     return flat
 
@@ -175,13 +175,13 @@ def _coordinates(grid: Grid) -> tuple[Array, Array]:
 
 
 def sides_of(grid: Grid) -> tuple[int, int]:
-    """Numbers of the axes that go to the right and upward in an image of a slice."""
+    """Indices of the axes that point right and up in an image of a slice."""
     across, up = (axis for axis in range(3) if axis != _normal(grid))
     return across, up
 
 
 def height_to_width(grid: Grid) -> float:
-    """Shape of an image of a slice, within what still can be read."""
+    """Aspect ratio of an image of a slice, within legible bounds."""
     x, y = _coordinates(grid)
     return float(np.clip(np.ptp(y) / np.ptp(x), 0.35, 2.0))
 
@@ -196,7 +196,7 @@ def _normal(grid: Grid) -> int:
     return 2 if grid.normal is None else grid.normal
 
 
-# Images of volumes: where the robot can be (paper, Fig. 6), and quantities level by level.
+# Images of volumes: the reachable space (paper, Fig. 6), and quantities level by level.
 
 
 _LIGHT = np.array([0.35, -0.5, 0.79])
@@ -216,8 +216,8 @@ def space_figure(maps: Maps) -> Figure:
         panels.append(("collision free and feasible", _allowed(maps), FREE))
     figure = new_figure(4.4 * len(panels), 4.3, layout=None)
     figure.subplots_adjust(left=0.03, right=0.96, bottom=0.06, top=0.9, wspace=0.12)
-    for place, (title, field, colour) in enumerate(panels):
-        axes: Any = figure.add_subplot(1, len(panels), place + 1, projection="3d")
+    for index, (title, field, colour) in enumerate(panels, start=1):
+        axes: Any = figure.add_subplot(1, len(panels), index, projection="3d")
         _draw_surface(axes, zero_surface(maps.grid.axes, field) * 1e3, colour)
         _draw_edges(axes, frame_edges(maps.question.rig) * 1e3, FRAME, 1.4)
         _draw_edges(axes, workspace_edges(maps.question.rig) * 1e3, MUTED, 0.8)
@@ -275,7 +275,7 @@ def _allowed(maps: Maps) -> Array:
 
 
 def frame_edges(rig: Rig) -> Array:
-    """Edges of the frame that the outlets span, shape (k, 2, 3), [m].
+    """Edges of the frame spanned by the outlets, shape (k, 2, 3), [m].
 
     Outlets all at one height are joined to the floor below them.
     """

@@ -42,14 +42,14 @@ _LEVELS_OF = (
 def write_maps(
     folder: Path, made: list[Maps], question: Question, scene: Scene | None = None
 ) -> dict[str, Any]:
-    """Writes everything and returns the summary, by name of grid.
+    """Writes all files and returns the summaries by name of grid.
 
     Args:
         folder: An existing folder.
-        made: Of slices; of a volume named ``frame`` for the image of the whole space; of other
-            volumes.
-        question: That they answer.
-        scene: With the obstacles among which they were made.
+        made: Maps of slices, of a volume named ``frame`` for the image of the whole space, and of
+            other volumes.
+        question: Rig, scene, orientation and quantities of the maps.
+        scene: With the obstacles.
     """
     where = f" in {scene.name}" if scene else ""
     title = f"Workspace of {question.rig.name}{where}"
@@ -63,10 +63,10 @@ def write_maps(
 def _lead(question: Question) -> str:
     """First sentence of the page."""
     rig = question.rig
-    turned = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform turned"
+    rotated = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform rotated"
     return (
         f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
-        f" {question.length * 1e3:.1f} mm in the condition number{turned}."
+        f" {question.length * 1e3:.1f} mm in the condition number{rotated}."
     )
 
 
@@ -114,7 +114,7 @@ def _content(maps: Maps) -> tuple[str, str, list[tuple[str, Draw]]]:
 
 
 def _picture(folder: Path, name: str, draw: Draw) -> str:
-    """Draws once and writes it for screens and for print; returns the name of the first."""
+    """Writes a figure as PNG and SVG; returns the name of the PNG."""
     import matplotlib
 
     with matplotlib.rc_context(SETTINGS):

@@ -1,4 +1,4 @@
-"""Where maps are computed: regular grids over a box, or over one plane of it."""
+"""Regular grids over a box, or over one plane of it, on which maps are computed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Grid:
     Attributes:
         name: For files and titles, such as ``slice_z_445``.
         axes: Coordinates along x, y and z, increasing, [m].
-        normal: For a slice, the number of the axis it is perpendicular to; None for a volume.
+        normal: For a slice, the index of the axis normal to it; None for a volume.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Grid:
         return int(np.prod(self.shape))
 
     def points(self, first: int, last: int) -> Array:
-        """The points numbered from ``first`` to ``last - 1``, z fastest; shape (k, 3), [m]."""
+        """The points of index ``first`` to ``last - 1``, z fastest; shape (k, 3), [m]."""
         index = np.unravel_index(np.arange(first, last), self.shape)
         return np.stack([a[i] for a, i in zip(self.axes, index, strict=True)], axis=-1)
 
@@ -57,10 +57,10 @@ def volume(name: str, lower: Array, upper: Array, step: float) -> Grid:
         step: Largest distance between neighbours along an axis, [m].
 
     Raises:
-        BadInput: The step is not positive, or so small that no computer would finish.
+        BadInput: The step is not positive or gives more than `MOST_POINTS` points.
     """
     x, y, z = (_axis(low, high, step) for low, high in zip(lower, upper, strict=True))
-    return _of_bearable_size(Grid(name, (x, y, z)), step)
+    return _limited(Grid(name, (x, y, z)), step)
 
 
 def slice_through(axis: int, value: float, lower: Array, upper: Array, step: float) -> Grid:
@@ -80,14 +80,14 @@ def slice_through(axis: int, value: float, lower: Array, upper: Array, step: flo
     sides = [_axis(low, high, step) for low, high in zip(lower, upper, strict=True)]
     sides[axis] = read_only([value])
     name = f"slice_{letter}_{value * 1e3:g}".replace("-", "minus_")
-    return _of_bearable_size(Grid(name, (sides[0], sides[1], sides[2]), normal=axis), step)
+    return _limited(Grid(name, (sides[0], sides[1], sides[2]), normal=axis), step)
 
 
 def parsed_slice(text: str) -> tuple[int, float]:
-    """Number of the axis and the value [m] of a slice such as ``z=445`` (mm).
+    """Index of the axis and the value [m] of a slice such as ``z=445`` (mm).
 
     Raises:
-        BadInput: The text is not of that form.
+        BadInput: The text does not have that form.
     """
     letter, _, number = text.partition("=")
     try:
@@ -103,7 +103,7 @@ def parsed_slice(text: str) -> tuple[int, float]:
 
 
 def frame_box(rig: Rig) -> tuple[Array, Array]:
-    """Corners of the smallest upright box that holds all outlets and the workspace box, [m]."""
+    """Corners of the axis-aligned bounding box of all outlets and the workspace box, [m]."""
     corners = np.vstack([rig.outlets, rig.workspace_lower, rig.workspace_upper])
     return corners.min(axis=0), corners.max(axis=0)
 
@@ -119,7 +119,7 @@ def _axis(low: float, high: float, step: float) -> Array:
     return read_only(np.linspace(low, high, max(1, int(np.ceil(cells))) + 1))
 
 
-def _of_bearable_size(grid: Grid, step: float) -> Grid:
+def _limited(grid: Grid, step: float) -> Grid:
     if grid.count > MOST_POINTS:
         raise _too_many(step)
     return grid
@@ -135,7 +135,7 @@ def _too_many(step: float) -> BadInput:
 # The surface on which a field over a grid is zero, as triangles (marching tetrahedra).
 #
 # Every cell of the grid is cut into six tetrahedra about its main diagonal; neighbouring cells then
-# share their cuts, so that the surface has no cracks. Source: Doi & Koide, "An efficient method of
+# share their cuts, so the surface has no cracks. Source: Doi & Koide, "An efficient method of
 # triangulating equi-valued surfaces by using tetrahedral cells", 1991.
 
 
@@ -144,11 +144,11 @@ _RIM = 1e-9
 
 
 def zero_surface(axes: tuple[Array, Array, Array], field: Array) -> Array:
-    """The boundary of where a field is positive, closed at the sides of the grid.
+    """The boundary of the region where a field is positive, closed at the sides of the grid.
 
     Args:
         axes: Coordinates along x, y and z, increasing.
-        field: Values at the points, shape (nx, ny, nz); what is not a number counts as negative.
+        field: Values at the points, shape (nx, ny, nz); NaN counts as negative.
 
     Returns:
         Triangles, shape (t, 3, 3), counter-clockwise seen from the negative side.
@@ -156,7 +156,7 @@ def zero_surface(axes: tuple[Array, Array, Array], field: Array) -> Array:
     finite = np.abs(field[np.isfinite(field)])
     largest = float(finite.max(initial=0.0)) or 1.0
     bounded = np.nan_to_num(np.clip(field, -largest, largest), nan=-largest)
-    # Zero would put whole corners on the surface; a hair below it, no triangle has an area lost.
+    # Exactly zero puts corners on the surface; slightly below, no triangle degenerates.
     bounded = np.where(bounded == 0.0, -1e-12 * largest, bounded)
     padded = np.pad(bounded, 1, constant_values=-largest)
     sides = [_with_rims(axis) for axis in axes]
@@ -166,13 +166,13 @@ def zero_surface(axes: tuple[Array, Array, Array], field: Array) -> Array:
 
 
 def _with_rims(axis: Array) -> Array:
-    """An axis with one more point at each end, so near that it closes the surface flat."""
+    """An axis with an extra point at each end, so near that it closes the surface flat."""
     rim = _RIM * (axis[-1] - axis[0])
     return np.concatenate([[axis[0] - rim], axis, [axis[-1] + rim]])
 
 
 def _cut_tetrahedra(field: Array) -> Integers:
-    """Numbers of the corners of all tetrahedra that the surface cuts, shape (k, 4)."""
+    """Indices of the corners of all tetrahedra that the surface cuts, shape (k, 4)."""
     shape = field.shape
     strides = np.array([shape[1] * shape[2], shape[2], 1], dtype=np.int64)
     last = [np.arange(n - 1, dtype=np.int64) for n in shape]
@@ -188,7 +188,7 @@ def _cut_tetrahedra(field: Array) -> Integers:
 
 
 def _triangles(points: Array, field: Array, corners: Integers) -> Array:
-    """One triangle where one corner is apart from three, two where two are from two."""
+    """One triangle where the surface separates one corner from three, two for two from two."""
     order = np.argsort(-field[corners], axis=1, kind="stable")
     sorted_corners = np.take_along_axis(corners, order, axis=1)
     positive = (field[corners] > 0.0).sum(axis=1)
@@ -214,8 +214,8 @@ def _between(
 
 
 def _outward(triangles: Array, inner: Array) -> Array:
-    """The triangles turned so that their normals point away from an inner point each."""
+    """The triangles, oriented so that each normal points away from its inner point."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     wrong = np.einsum("ki,ki->k", normals, inner - triangles[:, 0]) > 0.0
-    turned: Array = np.where(wrong[:, None, None], triangles[:, ::-1], triangles)
-    return turned
+    oriented: Array = np.where(wrong[:, None, None], triangles[:, ::-1], triangles)
+    return oriented

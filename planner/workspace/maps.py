@@ -1,7 +1,7 @@
-"""What can be mapped, and its values at many positions at once.
+"""Quantities that can be mapped, and their values at many positions at once.
 
-A pose at which a cable cannot run (its anchor at its outlet or inside its pulley) has no values:
-they are not numbers there, in every map.
+At a pose where a cable has no exit point (its anchor at its outlet or inside its pulley), every map
+is NaN.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ _POSES_AT_ONCE = 512
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Question:
-    """For what the maps are.
+    """Rig, scene, orientation and quantities of maps.
 
     Attributes:
         rig: The robot.
         scene: Its obstacles, clearances and load; without one only the robot's own weight acts.
         rotation: Orientation of the platform, ``world_from_platform``, shape (3, 3).
         length: Divides the moments in the condition number, [m].
-        quantities: Names of what is mapped, from `OF_THE_ROBOT` and `OBSTACLE_CLEARANCE`.
+        quantities: Names of those mapped, from `OF_THE_ROBOT` and `OBSTACLE_CLEARANCE`.
     """
 
     rig: Rig
@@ -59,11 +59,11 @@ class Question:
         rotation: Array | None = None,
         length: float | None = None,
     ) -> Question:
-        """All that can be said of a rig, or of a rig in a scene.
+        """All quantities of a rig, or of a rig in a scene.
 
         Args:
             rig: The robot.
-            scene: Where it is.
+            scene: Obstacles, clearances and load.
             rotation: Shape (3, 3); that of the scene's start, else of home, when left out.
             length: [m]; the root mean square radius of the anchors when left out.
 
@@ -80,14 +80,14 @@ class Question:
 
 
 def values_at(question: Question, positions: Array) -> Values:
-    """The values of every quantity asked for.
+    """The values of every quantity requested.
 
     Args:
-        question: Of what.
+        question: Rig, scene, orientation and quantities.
         positions: World frame, shape (k, 3), [m].
 
     Returns:
-        Shape (k,) each, SI, by name; not a number where a cable cannot run.
+        Shape (k,) each, SI, by name; NaN where a cable has no exit point.
     """
     anchors = question.rig.anchors @ question.rotation.T + positions[:, None, :]
     runs = _cables_run(question.rig, anchors)
@@ -117,7 +117,7 @@ class _Robots:
 
 
 def _cables_run(rig: Rig, anchors: Array) -> NDArray[np.bool_]:
-    """At which poses all cables can run; anchors shape (k, m, 3), [m]; shape (k,)."""
+    """Whether all cables have exit points; anchors shape (k, m, 3), [m]; shape (k,)."""
     try:
         cables_to(rig, anchors)
     except NoCable:
@@ -188,7 +188,7 @@ OF_THE_ROBOT: Mapping[str, Callable[[_Robots], Array]] = {
     "force_volume": _volume,
     "self_clearance": _own_clearance,
 }
-"""Name → what computes it. ``closure_margin`` [-] (`model.statics.feasibility.closure_margin`),
+"""Functions by name: ``closure_margin`` [-] (`model.statics.feasibility.closure_margin`),
 ``capacity_margin`` [N], ``condition_number`` [-], ``force_volume`` [N³], ``self_clearance`` [m]."""
 
 
@@ -209,7 +209,7 @@ class Extremes:
 
     @classmethod
     def over_workspace(cls, question: Question) -> Extremes:
-        """Those on the planner's lattice, so that maps and plans mean the same cost."""
+        """Those on the planner's lattice, so that maps and plans use the same cost."""
         rig = question.rig
         lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
         points = lattice.points(np.arange(lattice.count))

@@ -1,4 +1,4 @@
-"""The page that shows all maps; it needs neither a server nor a network."""
+"""The page with all maps; it needs neither a server nor a network."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Chapter:
 
     Attributes:
         title: Heading.
-        text: What is seen.
+        text: What the images show.
         pictures: File names of the images, each with its alternative text.
         tables: File names of the numbers.
         summary: From `planner.workspace.report.summary_of`.
@@ -63,20 +63,20 @@ def _table(summary: dict[str, Any]) -> str:
     return table(rows)
 
 
-# How each quantity is shown: its title, unit, column name, colours and the limit that matters.
+# Presentation of each quantity: title, unit, column name, colours and limit.
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """How a quantity is shown.
+    """Presentation of a quantity.
 
     Attributes:
         name: In `Maps.values`.
-        title: For people.
-        unit: With which it is shown; empty for none.
+        title: Human-readable name.
+        unit: Unit of display; empty for none.
         column: Its name in tables, unit included.
         scale: From SI to the unit.
-        colours: Name of a matplotlib colour map; bright where the robot is better off.
+        colours: Name of a matplotlib colour map; bright means better.
     """
 
     name: str
@@ -108,12 +108,12 @@ SHOWN = (
 
 
 def shown_in(maps: Maps) -> tuple[Shown, ...]:
-    """Those that the maps have."""
+    """The quantities present in the maps."""
     return tuple(quantity for quantity in SHOWN if quantity.name in maps.values)
 
 
 def limit_of(maps: Maps, quantity: Shown) -> float | None:
-    """The smallest allowed value, in the unit shown; None for what only has better and worse."""
+    """The smallest allowed value, in the unit shown; None for a quantity without a limit."""
     scene = maps.question.scene
     limits = {
         "closure_margin": 0.0,
@@ -142,10 +142,10 @@ def arrays_of(maps: Maps) -> dict[str, NDArray[Any]]:
 
 
 def csv_of(maps: Maps) -> str:
-    """One line a point; answers are 0 or 1, what is not known is empty."""
+    """One line per point; verdicts are 0 or 1, unknown values empty."""
     arrays = arrays_of(maps)
-    places = np.meshgrid(*(arrays.pop(f"{letter}_mm") for letter in AXES), indexing="ij")
-    columns = {f"{letter}_mm": p for letter, p in zip(AXES, places, strict=True)} | arrays
+    coordinates = np.meshgrid(*(arrays.pop(f"{letter}_mm") for letter in AXES), indexing="ij")
+    columns = {f"{letter}_mm": p for letter, p in zip(AXES, coordinates, strict=True)} | arrays
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(columns)
@@ -172,7 +172,7 @@ def summary_of(maps: Maps) -> dict[str, Any]:
 
 
 def summary_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """A line a map for people.
+    """Human-readable summary, one line per map.
 
     Args:
         summary: Of each map, see `summary_of`, by its name.

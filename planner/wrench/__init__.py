@@ -1,1 +1,1 @@
-"""Compiled proofs that the cables can hold the platform all along an edge."""
+"""Compiled proofs of wrench feasibility all along an edge."""

@@ -1,7 +1,7 @@
 """The capacity margin at a pose; its definition is `model.statics.feasibility.capacity_margin`.
 
-Every facet of the set of available wrenches belongs to m - 5 cables: the gains of its normal are
-zero on all others, and on these they are the vector orthogonal to their rows of the null space.
+Every facet of the available wrench set belongs to m - 5 cables: the gains of its normal are zero on
+all others, and on these they form the vector orthogonal to their rows of the null space.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from model.statics.wrench_sets import rms_anchor_radius
 from planner.costs import external_wrenches
 from planner.kernels.exit_points import exit_point
 from planner.kernels.jit import kernel
-from planner.kernels.primitives import Vector, cross, minus, norm, plus, turned
+from planner.kernels.primitives import Vector, cross, minus, norm, plus, rotated
 from planner.kernels.scene_arrays import World, anchor
 
 # The structure matrix with scaled moments, and its factors: pseudo-inverse and null space.
@@ -38,18 +38,18 @@ def structure_columns(
     """Writes the columns of the structure matrix, moments divided by ``length``, as rows.
 
     Args:
-        world: Where.
+        world: Rig and obstacles.
         rotation: ``world_from_platform``, shape (3, 3).
         position: World frame, [m].
         length: Characteristic length, [m].
-        columns: Written to; shape (m, 6); not numbers where a cable cannot run.
+        columns: Written, shape (m, 6); NaN where a cable has no exit point.
     """
     for cable in range(len(world.cables)):
-        arm = turned(rotation, anchor(world, cable))
+        arm = rotated(rotation, anchor(world, cable))
         at = plus(position, arm)
-        way = minus(exit_point(world, cable, at), at)
-        size = norm(way)
-        unit = (way[0] / size, way[1] / size, way[2] / size)
+        delta = minus(exit_point(world, cable, at), at)
+        size = norm(delta)
+        unit = (delta[0] / size, delta[1] / size, delta[2] / size)
         moment = cross(arm, unit)
         columns[cable, 0], columns[cable, 1], columns[cable, 2] = unit
         for k in range(3):
@@ -62,11 +62,11 @@ def factored(columns: Array, inverse: Array, null_space: Array) -> float:
 
     Args:
         columns: Aᵀ, shape (m ≥ 6, 6).
-        inverse: Written to: A⁺, shape (m, 6).
-        null_space: Written to: an orthonormal basis as columns, shape (m, m - 6).
+        inverse: Written: A⁺, shape (m, 6).
+        null_space: Written: an orthonormal basis as columns, shape (m, m - 6).
 
     Returns:
-        Smallest over largest absolute diagonal factor; 0 where A holds no numbers.
+        Smallest over largest absolute diagonal factor; 0 where A contains NaN.
     """
     count = len(columns)
     upper = columns.copy()
@@ -105,7 +105,7 @@ def factored(columns: Array, inverse: Array, null_space: Array) -> float:
         smallest, largest = min(smallest, abs(upper[k, k])), max(largest, abs(upper[k, k]))
     if not smallest > FLAT * largest:
         return 0.0
-    # Aᵀ = Q R, hence A⁺ Rᵀ = Q: each row solved from its end.
+    # Aᵀ = Q R, hence A⁺ Rᵀ = Q: each row by back substitution.
     for i in range(count):
         for k in range(5, -1, -1):
             value = square[i, k]
@@ -123,16 +123,16 @@ _DEPENDENT = 1e-12
 
 
 class LoadArrays(NamedTuple):
-    """What the cables must hold, and what they can; moments divided by `length`.
+    """Required wrenches and tension limits; moments divided by `length`.
 
     Attributes:
         low: Smallest tension, [N].
         high: Largest tension, [N].
         length: Characteristic length, [m].
-        wrench: That the cables must give in the middle, shape (6,), [N].
+        wrench: Centre of the required wrenches, shape (6,), [N].
         spread: Half widths of the box of wrenches about it, shape (6,), [N].
-        lever: Sum of weights times their centres, platform frame, shape (3,), [N·m]: what of the
-            wrench turns with the platform.
+        lever: Sum of weights times their centres, platform frame, shape (3,), [N·m]: the part of
+            the wrench that rotates with the platform.
         facets: Cables of each facet, shape (k, m - 5).
     """
 
@@ -146,7 +146,7 @@ class LoadArrays(NamedTuple):
 
 
 def build_load(rig: Rig, scene: Scene, rotation: Array) -> LoadArrays:
-    """What the cables of a rig must hold in a scene at one orientation, shape (3, 3)."""
+    """The required wrenches of a rig in a scene at one orientation, shape (3, 3)."""
     length = float(rms_anchor_radius(rig.anchors))
     units = np.repeat([1.0, length], 3)
     box = external_wrenches(rig, scene, rotation)
@@ -171,8 +171,8 @@ def _lever(rig: Rig, scene: Scene) -> Array:
 
 @kernel
 def load_at(load: LoadArrays, rotation: Array) -> LoadArrays:
-    """The same load with the platform turned to ``rotation``, shape (3, 3)."""
-    lever = turned(rotation, (load.lever[0], load.lever[1], load.lever[2]))
+    """The same load with the platform rotated to ``rotation``, shape (3, 3)."""
+    lever = rotated(rotation, (load.lever[0], load.lever[1], load.lever[2]))
     wrench = load.wrench.copy()
     wrench[3], wrench[4], wrench[5] = lever[1] / load.length, -lever[0] / load.length, 0.0
     return LoadArrays(
@@ -215,11 +215,11 @@ def margin_of(load: LoadArrays, inverse: Array, null_space: Array) -> float:
             for j in range(size - 1):
                 rows[j, i] = null_space[cables[i], j]
         orthogonal_vector(rows, size, gains)
-        total, reach, turned, squared, along, spread = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        total, reach, offset, squared, along, spread = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(size):
             total += gains[i] * gains[i]
             reach += abs(gains[i]) * half
-            turned += gains[i] * middle
+            offset += gains[i] * middle
         if not total > _DEPENDENT * _DEPENDENT:
             continue
         for k in range(6):
@@ -229,18 +229,18 @@ def margin_of(load: LoadArrays, inverse: Array, null_space: Array) -> float:
             squared += normal * normal
             along += normal * load.wrench[k]
             spread += abs(normal) * load.spread[k]
-        least = min(least, (reach - spread - abs(along - turned)) / math.sqrt(squared))
+        least = min(least, (reach - spread - abs(along - offset)) / math.sqrt(squared))
     return least
 
 
 @kernel
 def orthogonal_vector(rows: Array, size: int, found: Array) -> None:
-    """The generalised cross product: orthogonal to size - 1 rows, as long as their volume.
+    """The generalised cross product: orthogonal to size - 1 rows, its norm their volume.
 
     Args:
         rows: Shape (size - 1, size) or more; destroyed.
         size: Number of components.
-        found: Written to, shape (size,); zeros where the rows are dependent.
+        found: Written, shape (size,); zeros where the rows are dependent.
     """
     if size == 3:
         found[0] = rows[0, 1] * rows[1, 2] - rows[0, 2] * rows[1, 1]

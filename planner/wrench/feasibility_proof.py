@@ -2,12 +2,12 @@
 
 In the middle of a region take tensions t that give the wrench, well inside their limits. At a
 displacement d the tensions t + T d + A⁺ v, with T the exact slope that keeps the wrench to first
-order, give the wrench and any v about it but for a residual; tensions of at most its norm over the
-smallest singular value of the structure matrix there take that away (no more is needed of them
-than that they exist). The residual is bounded: a unit vector along a cable of length l changes by
-at most d / l' and leaves its tangent by at most d² / (√3 l'²), with l' = l - d the shortest length.
-Where every tension stays inside its limits, the wrench box grown by the reserve is held all over
-the region. Over pulleys, whose second derivatives are not bounded here, T is left out.
+order, give the wrench plus any v up to a residual. Further tensions, at most the residual's norm
+over the smallest singular value of the structure matrix there, cancel it (only their existence
+matters). The residual is bounded: a unit vector along a cable of length l changes by at most d / l'
+and deviates from its tangent by at most d² / (√3 l'²), with l' = l - d the shortest length. Where
+every tension stays inside its limits, the wrench box grown by the reserve is held all over the
+region. With pulleys, whose second derivatives are not bounded here, T is omitted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from planner.kernels.exit_points import exit_point
 from planner.kernels.jit import kernel
-from planner.kernels.primitives import Vector, along, dot, minus, norm, plus, row, turned
+from planner.kernels.primitives import Vector, along, dot, minus, norm, plus, rotated, row
 from planner.kernels.scene_arrays import World, anchor, feed, outlet
 from planner.wrench.capacity import LoadArrays, factored, structure_columns
 
@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 
 _ROUNDS = 12
 _WANTED_SHARE = 0.2
-"""Where the tensions of the proof keep away from their limits, as part of their range, if they
-can: a choice that makes proofs larger or smaller, never wrong."""
+"""Distance that the proof's tensions keep from their limits where possible, as part of their range:
+it decides how large a region a proof covers, never whether it is correct."""
 
 
 @kernel
@@ -40,15 +40,15 @@ def tensions_prove(
     spans: Array,
     radius: float,
 ) -> bool:
-    """Whether tensions that follow the displacement prove a region; see the module's text.
+    """Whether tensions that follow the displacement prove a region; see the module's docstring.
 
     Args:
-        world: Where.
-        load: What must be held.
-        reserve: Smallest margin wanted, [N].
+        world: Rig and obstacles.
+        load: Required wrenches.
+        reserve: Smallest margin required, [N].
         middle: Of the region, [m].
         spans: The region is the middle and shares from -1 to 1 of each row, shape (k, 3), [m].
-        radius: No point of the region is farther from its middle, [m].
+        radius: Largest distance of the region's points from its middle, [m].
     """
     count = len(world.cables)
     columns, inverse = np.empty((count, 6)), np.empty((count, 6))
@@ -79,12 +79,12 @@ def tensions_prove(
 def column_changes(
     world: World, load: LoadArrays, middle: Vector, radius: float, changes: Array, weights: Array
 ) -> bool:
-    """Bounds of how far each cable's unit vector changes over a region; False if one has none.
+    """Bounds of the change of each cable's unit vector over a region; False if one has none.
 
     Also the norms of the maps from unit vectors to columns of the structure matrix.
     """
     for cable in range(len(world.cables)):
-        arm = turned(world.platform[:3], anchor(world, cable))
+        arm = rotated(world.platform[:3], anchor(world, cable))
         reach, free = levers(world, cable, plus(middle, arm), radius)
         if not (reach > 0.0 and free > 0.0):
             return False
@@ -97,21 +97,21 @@ def column_changes(
 def levers(world: World, cable: int, at: Vector, radius: float) -> tuple[float, float]:
     """Least distance of an anchor from its swivel axis and least free length, [m].
 
-    A cable's unit vector turns by no more than its anchor's motion over the smaller of the two.
+    A cable's unit vector rotates by at most its anchor's motion over the smaller of the two.
     Without a pulley both are the free length; where there is no bound, 0 or less.
 
     Args:
-        world: Where.
-        cable: Its number.
+        world: The rig.
+        cable: Its index.
         at: Its anchor in the middle, world frame, [m].
-        radius: The anchor is never farther from there, [m].
+        radius: Largest distance of the anchor from there, [m].
     """
     if world.pulley == 0.0:
         free = norm(minus(exit_point(world, cable, at), at)) - radius
         return free, free
     offset, axis = minus(at, outlet(world, cable)), feed(world, cable)
     reach = norm(along(offset, axis, -dot(offset, axis))) - radius
-    # The exit moves too; from the anchor to the pulley's outlet no length is shorter.
+    # The exit moves too, so the free length is bounded by the distance from anchor to outlet.
     from_centre = norm(offset) - world.pulley - radius
     if not (reach > 0.0 and from_centre > world.pulley):
         return 0.0, 0.0
@@ -132,14 +132,14 @@ def tensions_stay(
     """Whether tensions that leave a small residual wrench can be corrected within their limits.
 
     Args:
-        load: What must be held.
-        reserve: Smallest margin wanted, [N].
+        load: Required wrenches.
+        reserve: Smallest margin required, [N].
         inverse: Pseudo-inverse in the middle of a region, shape (m, 6).
         tensions: There, shape (m,), [N].
-        travels: How far each goes from there so that the wrench stays, shape (m,), [N].
-        changes: How far each column changes over the region at most, shape (m,).
-        bends: What each column at its middle tension leaves to be corrected, shape (m,).
-        residual: What is left of the wrench besides, [N].
+        travels: Largest change of each that keeps the wrench to first order, shape (m,), [N].
+        changes: Largest change of each column over the region, shape (m,).
+        bends: Bound of each column's change that ``travels`` leaves out, shape (m,).
+        residual: Other residual wrench, [N].
     """
     count, squared, norm_squared = len(tensions), 0.0, 0.0
     follows = np.empty(count)
@@ -152,7 +152,7 @@ def tensions_stay(
         follows[i] = travels[i] + spread + reserve * math.sqrt(row_squared)
         residual += abs(tensions[i]) * bends[i] + follows[i] * changes[i]
         squared += changes[i] * changes[i]
-    # ‖A⁺‖ is at most its Frobenius norm; so the smallest singular value is at least one over it.
+    # ‖A⁺‖ ≤ its Frobenius norm, so the smallest singular value of A is at least one over that.
     weakest = 1.0 / math.sqrt(norm_squared) - math.sqrt(squared)
     if not weakest > 0.0:
         return False
@@ -166,7 +166,7 @@ def tensions_stay(
 
 @kernel
 def missing_wrench(load: LoadArrays, columns: Array, tensions: Array) -> float:
-    """How far the tensions are from giving the wrench, [N]: round-off, but not left out."""
+    """Residual of the wrench given by the tensions, [N]; round-off, but accounted for."""
     squared = 0.0
     for k in range(6):
         part = load.wrench[k]
@@ -178,7 +178,7 @@ def missing_wrench(load: LoadArrays, columns: Array, tensions: Array) -> float:
 
 @kernel
 def inner_tensions(load: LoadArrays, columns: Array, inverse: Array) -> Array:
-    """Tensions that give the wrench, drawn away from the limits by projections in turn."""
+    """Tensions that give the wrench, moved off the limits by alternating projections."""
     count = len(columns)
     margin = _WANTED_SHARE * (load.high - load.low)
     tensions = np.full(count, (load.low + load.high) / 2.0)
@@ -211,15 +211,15 @@ def _slopes(
     tensions: Array,
     slopes: Array,
 ) -> None:
-    """Writes T: how tensions follow a displacement so that the wrench stays, shape (m, 3)."""
+    """Writes T, the slope of tensions by displacement that keeps the wrench, shape (m, 3)."""
     change = np.zeros((6, 3))  # of the wrench with the displacement, tensions held
     for cable in range(len(columns)):
-        arm = turned(world.platform[:3], anchor(world, cable))
+        arm = rotated(world.platform[:3], anchor(world, cable))
         length = norm(minus(minus(outlet(world, cable), middle), arm))
         share = tensions[cable] / length
         unit = (columns[cable, 0], columns[cable, 1], columns[cable, 2])
         for k in range(3):
-            # The unit vector turns by -(I - u uᵀ) d / l.
+            # The unit vector changes by -(I - u uᵀ) d / l.
             bent = (
                 share * (unit[0] * unit[k] - (1.0 if k == 0 else 0.0)),
                 share * (unit[1] * unit[k] - (1.0 if k == 1 else 0.0)),

@@ -1,13 +1,13 @@
-"""Wrench feasibility proved along edges on which the platform turns, not sampled.
+"""Wrench feasibility proved, not sampled, along edges on which the platform rotates.
 
-Over a piece of the edge the pose depends on a share s from -1 to 1. An anchor at b goes at the
-velocity o + h × R b, with o half of the way and h half of the turn; its acceleration is no more
-than |h| |h × b|. With that the columns of the structure matrix, the weight's moment among them,
-have bounds of their first and second derivatives. In the middle there are tensions t, with
-the exact slope T that keeps the wrench to first order; what t + T s leaves of the wrench is fixed
-as `planner.wrench.feasibility_proof` shows. Where that does not decide, the margin in the middle
-may, which nothing lowers by more than the largest tensions times the changes of the columns. Else
-the piece is halved.
+Over an interval of the edge the pose depends on a share s from -1 to 1. An anchor at b moves at the
+velocity o + h × R b, with o half of the translation and h half of the rotation; its acceleration is
+at most |h| |h × b|. This bounds the first and second derivatives of the columns of the structure
+matrix and of the weight's moment. In the middle there are tensions t, with the exact slope T that
+keeps the wrench to first order; the residual of t + T s is corrected as in
+`planner.wrench.feasibility_proof`. Where that does not decide, the margin in the middle may: it
+decreases by at most the largest tensions times the changes of the columns. Else the interval is
+bisected.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.collision.rotating_edges import turned_by
+from planner.collision.rotating_edges import rotated_by
 from planner.collision.self_collision_regions import OPEN, PROVED, REFUTED
 from planner.kernels.exit_points import exit_point
 from planner.kernels.jit import kernel
-from planner.kernels.primitives import Vector, along, cross, dot, minus, norm, plus, turned
+from planner.kernels.primitives import Vector, along, cross, dot, minus, norm, plus, rotated
 from planner.kernels.scene_arrays import World, anchor, feed, outlet
 from planner.wrench.capacity import LoadArrays, factored, load_at, margin_of, structure_columns
 from planner.wrench.feasibility_proof import inner_tensions, levers, missing_wrench, tensions_stay
@@ -32,8 +32,8 @@ _MOST_PIECES = 1024
 _DEEPEST = 64
 _FINEST = 1e-6
 _THOROUGH = 0.13
-"""Part of an edge from which on a piece that tensions do not prove has its margin found, which
-takes ten times as long with ten cables."""
+"""Part of an edge up to which an interval that tensions do not prove has its margin computed,
+which takes ten times as long with ten cables."""
 
 
 @kernel
@@ -46,22 +46,22 @@ def turning_edge_held(
     rotation: Array,
     turn: Array,
 ) -> bool:
-    """Whether the cables hold what they must all along a straight way with a steady turn.
+    """Whether the required wrenches are held all along a straight move with a steady rotation.
 
-    Never yes where that is untrue.
+    Never True where that is violated.
 
     Args:
-        world: Where; its own orientation is not used.
-        load: What must be held; the weight's moment is turned with the platform.
-        reserve: Smallest capacity margin wanted, [N].
+        world: Rig and obstacles; its own orientation is not used.
+        load: Required wrenches; the weight's moment is rotated with the platform.
+        reserve: Smallest capacity margin required, [N].
         start: World frame, shape (3,), [m].
-        end: Likewise.
+        end: World frame, shape (3,), [m].
         rotation: ``world_from_platform`` at the start, shape (3, 3).
         turn: Rotation vector from start to end, platform frame, shape (3,), [rad].
     """
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
-    way, spin = minus(after, before), (turn[0], turn[1], turn[2])
-    size = norm(way) + load.length * norm(spin)
+    delta, spin = minus(after, before), (turn[0], turn[1], turn[2])
+    size = norm(delta) + load.length * norm(spin)
     if not math.isfinite(size):
         return False
     lows, highs = np.empty(_DEEPEST), np.empty(_DEEPEST)
@@ -72,9 +72,9 @@ def turning_edge_held(
         tried += 1
         low, high = lows[waiting], highs[waiting]
         half, middle = (high - low) / 2.0, (low + high) / 2.0
-        off = (half * way[0], half * way[1], half * way[2])
+        off = (half * delta[0], half * delta[1], half * delta[2])
         bend = (half * spin[0], half * spin[1], half * spin[2])
-        at, there = along(before, way, middle), turned_by(rotation, turn, middle)
+        at, there = along(before, delta, middle), rotated_by(rotation, turn, middle)
         thorough = high - low <= _THOROUGH
         found = piece_held(world, load, reserve, at, off, there, bend, thorough)
         if found == PROVED:
@@ -100,17 +100,17 @@ def piece_held(
     bend: Vector,
     thorough: bool,
 ) -> int:
-    """Whether wrenches are held over a piece of an edge: `PROVED`, `REFUTED` or `OPEN`.
+    """Whether wrenches are held over an interval of an edge: `PROVED`, `REFUTED` or `OPEN`.
 
     Args:
-        world: Where.
-        load: What must be held.
-        reserve: Smallest margin wanted, [N].
+        world: Rig and obstacles.
+        load: Required wrenches.
+        reserve: Smallest margin required, [N].
         middle: Position in the middle, [m].
-        off: From there to the piece's end, [m].
+        off: From there to the interval's end, [m].
         rotation: ``world_from_platform`` in the middle, shape (3, 3).
-        bend: Half of the piece's turn as a rotation vector, platform frame, [rad].
-        thorough: Whether the margin is asked where tensions prove nothing.
+        bend: Half of the interval's rotation as a rotation vector, platform frame, [rad].
+        thorough: Whether the margin is computed where tensions prove nothing.
     """
     count = len(world.cables)
     columns, inverse = np.empty((count, 6)), np.empty((count, 6))
@@ -118,8 +118,8 @@ def piece_held(
     structure_columns(world, rotation, middle, load.length, columns)
     if factored(columns, inverse, null_space) == 0.0:
         return REFUTED
-    here, spin = load_at(load, rotation), turned(rotation, bend)
-    heavy = turned(rotation, (load.lever[0], load.lever[1], load.lever[2]))
+    here, spin = load_at(load, rotation), rotated(rotation, bend)
+    heavy = rotated(rotation, (load.lever[0], load.lever[1], load.lever[2]))
     swung = cross(spin, heavy)
     changes, bends = np.empty(count), np.empty(count)
     bounded = column_motion(world, load, middle, off, rotation, spin, changes, bends)
@@ -159,12 +159,12 @@ def column_motion(
     changes: Array,
     bends: Array,
 ) -> bool:
-    """Bounds of how far each column changes over a piece, and how far it leaves its tangent.
+    """Bounds of the change of each column over an interval, and of its second-order part.
 
     False where a column has no bound.
     """
     for cable in range(len(world.cables)):
-        arm = turned(rotation, anchor(world, cable))
+        arm = rotated(rotation, anchor(world, cable))
         swing, radius = cross(spin, arm), norm(arm)
         swept = norm(swing)
         curl = swept * norm(spin)
@@ -185,16 +185,16 @@ def column_motion(
 def _unit_bend(pulley: float, speed: float, curl: float, reach: float, free: float) -> float:
     """A bound of the second derivative of the unit vector along a cable.
 
-    Along w it is 2 |w'|² / (√3 w²) + |w''| / w. Over a pulley of radius r the vector turns in the
-    plane of the pulley at the rate v / l across the cable, l itself changing at no more than
-    v + r v / l, and about the swivel axis at the rate v / ρ; the derivatives of both are added up.
+    Along w it is 2 |w'|² / (√3 w²) + |w''| / w. On a pulley of radius r the vector rotates in the
+    plane of the pulley at the rate v / l across the cable, with l changing at no more than
+    v + r v / l, and about the swivel axis at the rate v / ρ; the derivatives of both are added.
 
     Args:
         pulley: Radius r, [m]; 0 for point exits.
-        speed: Of the anchor at most.
-        curl: Its acceleration at most.
-        reach: Distance ρ from the swivel axis at least, [m].
-        free: Free length l at least, [m].
+        speed: Largest speed of the anchor.
+        curl: Its largest acceleration.
+        reach: Least distance ρ from the swivel axis, [m].
+        free: Least free length l, [m].
     """
     squared = speed * speed
     if pulley == 0.0:
@@ -218,11 +218,11 @@ def _owed(
     tensions: Array,
     owed: Array,
 ) -> None:
-    """Writes how the wrench asked for leaves the one that held tensions give, shape (6,), [N]."""
+    """Writes the first-order change of required minus given wrench, shape (6,), [N]."""
     owed[:] = 0.0
     owed[3], owed[4] = swung[1] / load.length, -swung[0] / load.length
     for cable in range(len(columns)):
-        arm = turned(rotation, anchor(world, cable))
+        arm = rotated(rotation, anchor(world, cable))
         at = plus(middle, arm)
         swing = cross(spin, arm)
         bent = _turning(world, cable, at, plus(off, swing))
@@ -236,16 +236,16 @@ def _owed(
 @kernel
 def _turning(world: World, cable: int, at: Vector, velocity: Vector) -> Vector:
     """Derivative of the unit vector from an anchor, [m], to its exit as the anchor moves."""
-    way = minus(exit_point(world, cable, at), at)
-    length = norm(way)
-    unit = (way[0] / length, way[1] / length, way[2] / length)
+    delta = minus(exit_point(world, cable, at), at)
+    length = norm(delta)
+    unit = (delta[0] / length, delta[1] / length, delta[2] / length)
     across = along(velocity, unit, -dot(unit, velocity))
     if world.pulley == 0.0:
         return (-across[0] / length, -across[1] / length, -across[2] / length)
     offset, axis = minus(at, outlet(world, cable)), feed(world, cable)
     radial = along(offset, axis, -dot(offset, axis))
     reach = norm(radial)
-    aside = cross(axis, radial)  # as long as the reach: it swivels by this much a radian
+    aside = cross(axis, radial)  # as long as the reach: motion per radian of swivel
     swivels = dot(aside, velocity) / (reach * reach)
     rolled = along(across, aside, -swivels)
     swivelled = cross(axis, unit)

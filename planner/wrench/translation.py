@@ -1,11 +1,11 @@
-"""Wrench feasibility proved over boxes and along edges of pure translation, not sampled.
+"""Wrench feasibility proved, not sampled, over boxes and along edges of pure translation.
 
-A region is proved by tensions that follow the displacement from its middle, which
-`planner.wrench.feasibility_proof` explains.
+A region is proved by tensions that follow the displacement from its middle
+(`planner.wrench.feasibility_proof`).
 
-Where this does not decide, a line may still be proved by the margin in its middle, which no
-displacement lowers by more than the largest tensions times the changes of the columns; a margin
-below the reserve there refutes it.
+Where this does not decide, the margin in the middle of a line may prove it: a displacement lowers
+the margin by at most the largest tensions times the changes of the columns. A margin below the
+reserve there refutes the line.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _FINEST = 1e-6
 
 
 class Holding(NamedTuple):
-    """Where the cables are proved to hold what they must with a reserve.
+    """Where the cables are proved to hold the required wrenches with a reserve.
 
     Attributes:
-        reserve: Smallest margin wanted, [N].
+        reserve: Smallest margin required, [N].
         cells: Whether each cell of the workspace box is proved, shape (16, 16, 16).
         everywhere: Whether all of them are.
     """
@@ -66,15 +66,15 @@ def build_holding(world: World, load: LoadArrays, reserve: float) -> Holding:
 
 @kernel
 def edge_held(world: World, load: LoadArrays, holding: Holding, start: Array, end: Array) -> bool:
-    """Whether the cables hold what they must all along a translation, the reserve on top.
+    """Whether the required wrenches are held all along a translation, with the reserve.
 
-    Never yes where that is untrue. Both ends must lie in the workspace box.
+    Never True where that is violated. Both ends must lie in the workspace box.
     """
     if holding.everywhere or _in_proved_cells(world, holding, start, end):
         return True
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
-    way = minus(after, before)
-    length = norm(way)
+    delta = minus(after, before)
+    length = norm(delta)
     if not math.isfinite(length):
         return False
     lows, highs = np.empty(_DEEPEST), np.empty(_DEEPEST)
@@ -86,8 +86,8 @@ def edge_held(world: World, load: LoadArrays, holding: Holding, start: Array, en
         low, high = lows[waiting], highs[waiting]
         half = (high - low) / 2.0
         middle = low + half
-        off = (half * way[0], half * way[1], half * way[2])
-        at = along(before, way, middle)
+        off = (half * delta[0], half * delta[1], half * delta[2])
+        at = along(before, delta, middle)
         found = line_held(world, load, holding.reserve, at, off, half * length)
         if found == PROVED:
             continue
@@ -119,9 +119,9 @@ def line_held(
     """Whether wrenches are held from ``middle - off`` to ``middle + off``, [m].
 
     Args:
-        world: Where.
-        load: What must be held.
-        reserve: Smallest margin wanted, [N].
+        world: Rig and obstacles.
+        load: Required wrenches.
+        reserve: Smallest margin required, [N].
         middle: Of the line, [m].
         off: From the middle to its end, [m].
         radius: The length of ``off``, [m].
@@ -147,7 +147,7 @@ def line_held(
 
 @kernel
 def _in_proved_cells(world: World, holding: Holding, start: Array, end: Array) -> bool:
-    """Whether all cells that the box about an edge touches are proved."""
+    """Whether all cells that the bounding box of an edge touches are proved."""
     first, last = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
     for axis in range(3):
         low, high = world.limits[0, axis], world.limits[1, axis]
@@ -170,7 +170,7 @@ def _in_proved_cells(world: World, holding: Holding, start: Array, end: Array) -
 
 @kernel
 def box_held(world: World, load: LoadArrays, reserve: float, whole: Array) -> bool:
-    """Whether a box, lower and upper corner in shape (6,), is proved by halving it."""
+    """Whether a box, lower and upper corner in shape (6,), is proved by bisection."""
     boxes, halvings = np.empty((_MOST_HALVINGS + 2, 6)), np.zeros(_MOST_HALVINGS + 2, np.int64)
     boxes[0], spans = whole, np.zeros((3, 3))
     waiting = 1

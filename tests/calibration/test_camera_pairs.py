@@ -23,7 +23,7 @@ from model.errors import BadInput
 from model.files.documents import PoseDocument
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Rig, load_rig, rig_from_document
-from model.scene import nothing_in_the_way
+from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics
 from tests.cli.program import call, one_message
@@ -71,7 +71,7 @@ def folders(two: tuple[Rig, Pose], tmp_path_factory: pytest.TempPathFactory) -> 
     for camera in (rig.cameras[0], replace(rig.cameras[1], world_from_camera=truth)):
         (root / camera.name).mkdir()
         optics = Optics(noise=1.5, cables=False)
-        eye = SyntheticCamera(rig, nothing_in_the_way(rig), camera, 7, optics)
+        eye = SyntheticCamera(rig, empty_scene(rig), camera, 7, optics)
         for number, pose in enumerate(where_it_goes(rig, 14)):
             file = root / camera.name / f"{number:02}.png"
             cv2.imwrite(str(file), eye.render(pose, number))

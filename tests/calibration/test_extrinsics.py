@@ -339,7 +339,7 @@ def test_the_stated_error_of_a_camera_pose_is_exceeded_in_one_case_of_twenty(
         camera=camera,
         by="frame tags",
         covariance=covariance,
-        half_widths=SURE * np.sqrt(np.diag(covariance)),
+        half_widths=Z_95 * np.sqrt(np.diag(covariance)),
         by_lens=None,
         points=workspace_corners(rig),
         tag_errors={},

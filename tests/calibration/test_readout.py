@@ -16,7 +16,7 @@ from calibration.result_files import load_result
 from model.errors import BadInput
 from model.pose import PlatformMotion, Pose
 from model.rig import Rig, load_rig
-from model.scene import nothing_in_the_way
+from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics
 from tests.cli.program import call, one_message
@@ -34,7 +34,7 @@ def swinging(rig: Rig, time: float) -> Pose:
 def write_film(rig: Rig, folder: Path, readout: float, images: int, still: bool = False) -> None:
     camera = replace(rig.cameras[0], readout=readout)
     optics = Optics(noise=1.5, exposure=2e-3)
-    eye = SyntheticCamera(rig, nothing_in_the_way(rig), camera, 2, optics)
+    eye = SyntheticCamera(rig, empty_scene(rig), camera, 2, optics)
     for number in range(images):
         time, step = (0.0 if still else number / RATE), 1e-4
         ends = (swinging(rig, time + sign * step) for sign in (-1.0, 1.0))

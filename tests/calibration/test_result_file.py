@@ -169,5 +169,5 @@ def test_the_covariance_of_a_camera_pose_goes_into_the_rig(rig: Rig) -> None:
     verdict = judge_extrinsics(found, 1e-3)
     result = extrinsics_result(found, verdict, rig.document, date(2026, 3, 1))
     better = rig.with_calibration(result).cameras[0]
-    np.testing.assert_allclose(better.place_covariance, np.diag((2.0 * deviations) ** 2), rtol=1e-9)
-    np.testing.assert_allclose(better.place_by_lens, by_lens, rtol=1e-9)
+    np.testing.assert_allclose(better.pose_covariance, np.diag((2.0 * deviations) ** 2), rtol=1e-9)
+    np.testing.assert_allclose(better.pose_by_lens, by_lens, rtol=1e-9)

@@ -100,7 +100,7 @@ def test_compiling_is_told_where_it_does_not_disturb_json(
     assert document(planned)["plan"] == str(tmp_path / "plan.json")
     assert "compiling the planner for this machine (once" in planned.said
     assert noted == ["optimal"]
-    monkeypatch.setattr(machine_code, "can_be_kept", lambda task: False)
+    monkeypatch.setattr(machine_code, "can_be_cached", lambda task: False)
     again = call("plan", RIG, scene, "-o", tmp_path / "second.json", "--json")
     assert "on every start" in again.said
     assert "NUMBA_CACHE_DIR" in again.said

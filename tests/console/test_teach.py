@@ -15,7 +15,7 @@ from cdpr.console.teach import MOST, TaughtPoses, scene_text
 from model.errors import BadInput, CdprError
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import load_rig
-from model.scene import load_scene, nothing_in_the_way, scene_from_document
+from model.scene import empty_scene, load_scene, scene_from_document
 from tests.cli.plans import RIG
 
 STEP = st.tuples(
@@ -88,7 +88,7 @@ def test_orientations_that_noise_tells_apart_are_made_one(tmp_path: Path) -> Non
     for k in range(3):
         noise = matrix_from_rotation_vector(np.array([2e-4, -3e-4, 4e-4]) * k)
         taught.teach(f"p{k}", Pose(pose(k).position, noise))
-    document = taught.scene(nothing_in_the_way(load_rig(RIG)), "taught")
+    document = taught.scene(empty_scene(load_rig(RIG)), "taught")
     assert document.rotation_limits is None
     scene = scene_from_document(document)
     assert scene.start.angle_to(scene.goal) == 0.0
@@ -100,7 +100,7 @@ def test_poses_that_are_turned_keep_their_orientation(tmp_path: Path) -> None:
     turn = matrix_from_rotation_vector(np.array([0.0, 0.1, 0.2]))
     taught.teach("level", pose(0))
     taught.teach("turned", Pose(pose(1).position, turn))
-    document = taught.scene(nothing_in_the_way(load_rig(RIG)), "taught")
+    document = taught.scene(empty_scene(load_rig(RIG)), "taught")
     scene = scene_from_document(document)
     assert scene.goal.angle_to(Pose(pose(1).position, turn)) < 1e-6
     limits = scene.rotation_limits
@@ -112,7 +112,7 @@ def test_one_pose_is_no_path(tmp_path: Path) -> None:
     taught = TaughtPoses(tmp_path / "poses.json")
     taught.teach("alone", pose(1))
     with pytest.raises(BadInput, match="two poses"):
-        taught.scene(nothing_in_the_way(load_rig(RIG)), "taught")
+        taught.scene(empty_scene(load_rig(RIG)), "taught")
 
 
 @pytest.mark.parametrize("name", ["", "a\nb", "\0", " "])

@@ -1,4 +1,4 @@
-"""Rigs and scenes for the tests of this folder, from the ready files and by changes to them."""
+"""Rigs and scenes for the tests of this folder, from the example files and changes to them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ IPANEMA_ANCHORS = [
 
 
 def plain(name: str) -> dict[str, Any]:
-    """The keys and values of a ready file."""
+    """The keys and values of an example file."""
     data: dict[str, Any] = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))
     return data
 
@@ -90,7 +90,7 @@ def ipanema() -> Rig:
 
 
 def poses_of(rig: Rig, largest_angle_deg: float = 25.0) -> st.SearchStrategy[Pose]:
-    """Poses in the middle four fifths of a rig's workspace, turned about any axis."""
+    """Poses in the middle four fifths of a rig's workspace, rotated about any axis."""
     share = st.floats(0.1, 0.9)
     part = st.floats(-1.0, 1.0)
     angle = np.radians(largest_angle_deg)

@@ -1,4 +1,4 @@
-"""Cables over point exits and swivelling pulleys: geometry, limits and rates."""
+"""Cables at point exits and swivelling pulleys: geometry, limits and rates."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_cable_leaves_its_pulley_on_the_rim_and_along_the_tangent(pose: Pose) 
         assert np.linalg.norm(spoke) == pytest.approx(rig.pulley_radius, abs=1e-12)
         assert abs(spoke @ cables.directions[i]) < 1e-12  # tangent
         assert abs(spoke @ normal) < 1e-12  # in the pulley's plane
-        # Travel along the rim goes on in the sense in which the cable came in: at the outlet the
+        # Travel along the rim continues in the sense in which the cable came in: at the outlet the
         # spoke is −swivel and the travel k; at the exit the travel is toward the anchor.
         entering = np.cross(-swivel, k)
         leaving = np.cross(spoke, -cables.directions[i])
@@ -79,7 +79,7 @@ def test_length_is_the_straight_part_and_the_arc_from_outlet_to_exit(pose: Pose)
         ([1e-9, 0.0, 1.0], 0.0),  # straight on: the pulley is hardly touched
     ],
 )
-def test_wrap_is_what_the_picture_shows(anchor: list[float], wrapped_deg: float | None) -> None:
+def test_wrap_angles_follow_the_geometry(anchor: list[float], wrapped_deg: float | None) -> None:
     """One pulley of 13 mm at the origin, fed upwards."""
     rig = paper_rig_with_pulleys(13.0, feed=[0, 0, 1])
     anchors = rig.outlets + np.array(anchor)
@@ -93,7 +93,7 @@ def test_wrap_is_what_the_picture_shows(anchor: list[float], wrapped_deg: float 
 
 
 @given(st.floats(0.02, 3.0), st.floats(-2.9, 1.4))
-def test_the_wrapped_length_has_no_jump(distance: float, elevation: float) -> None:
+def test_the_wrapped_length_is_continuous(distance: float, elevation: float) -> None:
     """Around the pulley at any distance, a small step of the anchor is a small step of length."""
     rig = paper_rig_with_pulleys(5.0, feed=[0, 0, 1])
     step = 1e-6
@@ -178,7 +178,7 @@ def test_many_poses_at_once_are_the_same_as_one_by_one(name: str) -> None:
     ],
 )
 def test_an_impossible_cable_is_refused_by_number(rig: Rig, offset: list[float], why: str) -> None:
-    """Never a direction that is not a number: it would pass every comparison."""
+    """Never a NaN direction, which would pass every comparison."""
     anchors = rig.home.apply(rig.anchors)
     anchors[2] = rig.outlets[2] + np.array(offset)
     with pytest.raises(NoCable, match=why) as caught:

@@ -54,10 +54,10 @@ def random_pose(rng: np.random.Generator, reach: float = 0.5) -> Pose:
 def coal_distance(first, first_pose: Pose, second, second_pose: Pose) -> float:
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.gjk_tolerance, request.gjk_max_iterations = 1e-9, 1000
-    places = [
+    transforms = [
         coal.Transform3s(p.rotation.copy(), p.position.copy()) for p in (first_pose, second_pose)
     ]
-    return coal.distance(first, places[0], second, places[1], request, result)
+    return coal.distance(first, transforms[0], second, transforms[1], request, result)
 
 
 def coal_points(points: np.ndarray):
@@ -89,11 +89,11 @@ def coal_frame(start: np.ndarray, end: np.ndarray) -> tuple[Pose, float]:
 def test_distance_of_a_segment_to_every_shape_agrees_with_coal(seed: int) -> None:
     rng = np.random.default_rng(seed)
     start, end = rng.uniform(-1, 1, (2, 3))
-    place, length = coal_frame(start, end)
+    frame, length = coal_frame(start, end)
     for shape, oracle in obstacle_kinds(rng):
         pose = random_pose(rng)
         found = separation(segment_body(start, end), convex_bodies(shape, pose)[0])
-        expected = coal_distance(coal.Capsule(1e-9, length), place, oracle, pose) + 1e-9
+        expected = coal_distance(coal.Capsule(1e-9, length), frame, oracle, pose) + 1e-9
         if expected > 1e-6:
             assert found.distance == pytest.approx(expected, abs=1e-6)
         else:
@@ -103,11 +103,11 @@ def test_distance_of_a_segment_to_every_shape_agrees_with_coal(seed: int) -> Non
 @given(seeds)
 def test_distance_of_a_box_to_every_shape_agrees_with_coal(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    size, place = rng.uniform(0.05, 0.2, 3), random_pose(rng, 1.0)
+    size, at = rng.uniform(0.05, 0.2, 3), random_pose(rng, 1.0)
     for shape, oracle in obstacle_kinds(rng):
         pose = random_pose(rng)
-        found = separation(box_body(size, place), convex_bodies(shape, pose)[0])
-        expected = coal_distance(coal.Box(*(2 * size)), place, oracle, pose)
+        found = separation(box_body(size, at), convex_bodies(shape, pose)[0])
+        expected = coal_distance(coal.Box(*(2 * size)), at, oracle, pose)
         if expected > 1e-6:
             assert found.distance == pytest.approx(expected, abs=1e-6)
         else:
@@ -129,16 +129,16 @@ def test_a_distance_proves_itself_and_its_points_lie_that_far_apart(seed: int) -
 
 
 @given(seeds)
-def test_moving_out_by_the_depth_parts_overlapping_bodies(seed: int) -> None:
+def test_moving_out_by_the_depth_separates_overlapping_bodies(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    size, place = rng.uniform(0.05, 0.2, 3), random_pose(rng, 0.1)
+    size, at = rng.uniform(0.05, 0.2, 3), random_pose(rng, 0.1)
     for shape, _ in obstacle_kinds(rng):
         pose = random_pose(rng, 0.1)
         obstacle = convex_bodies(shape, pose)[0]
-        found = separation(box_body(size, place), obstacle)
+        found = separation(box_body(size, at), obstacle)
         if found.distance >= 0.0:
             continue
-        out = Pose(place.position + (found.distance - 1e-4) * found.normal, place.rotation)
+        out = Pose(at.position + (found.distance - 1e-4) * found.normal, at.rotation)
         assert separation(box_body(size, out), obstacle).distance >= 1e-4 - 1e-6
 
 
@@ -219,7 +219,7 @@ def test_crossing_cables_pass_at_11_to_16_mm_over_the_workspace(position) -> Non
 
 
 @pytest.mark.parametrize("name", ["environment_3", "hall_pillar"])
-def test_what_is_remembered_from_other_poses_does_not_change_the_answer(name: str) -> None:
+def test_planes_cached_from_other_poses_do_not_change_the_result(name: str) -> None:
     rig = HALL if name.startswith("hall") else GACHON
     scene = load_scene(CONFIGS / f"{name}.yaml")
     used = ClearanceModel(rig, scene)
@@ -283,10 +283,10 @@ def test_self_clearances_of_many_poses_are_those_of_each(rig) -> None:
 
 
 def test_a_cable_along_a_face_of_the_platform_has_no_self_clearance() -> None:
-    """Turned far about z, cables lie across the platform: they pass through its edges."""
-    turned = Pose(GACHON.home.position, Rotation.from_euler("z", 150, degrees=True).as_matrix())
+    """Rotated far about z, cables lie across the platform: they pass through its edges."""
+    rotated = Pose(GACHON.home.position, Rotation.from_euler("z", 150, degrees=True).as_matrix())
     model = ClearanceModel(GACHON, scene_with())
-    assert model.self_clearance(turned).distance < 0.0
+    assert model.self_clearance(rotated).distance < 0.0
     assert model.self_clearance(GACHON.home).distance > 0.010
 
 
@@ -302,7 +302,7 @@ def test_cables_that_share_an_anchor_are_compared_beyond_a_stub() -> None:
     assert shared == pytest.approx(2 * model.stub * np.sin(angle / 2))
 
 
-def test_a_cable_radius_takes_off_every_distance() -> None:
+def test_the_cable_radius_reduces_every_distance() -> None:
     document = GACHON.document
     thick = document.cables.model_copy(update={"radius_mm": 2.0})
     rig = rig_from_document(document.model_copy(update={"cables": thick}))

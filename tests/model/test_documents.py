@@ -48,14 +48,14 @@ def repr_sorted(value: Any) -> str:
 
 
 def test_a_hash_stays_the_same_from_version_to_version() -> None:
-    """Plans on disk rest on it."""
+    """Plans on disk depend on it."""
     text = rb'{"a":"\u00e9","b":[1,2.5,null,true]}'
     expected = "sha256:" + hashlib.sha256(text).hexdigest()
     assert content_hash({"b": [1, 2.5, None, True], "a": "é"}) == expected
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_what_is_no_number_has_no_hash(value: float) -> None:
+def test_nan_and_infinity_have_no_hash(value: float) -> None:
     with pytest.raises(ValueError, match="not JSON compliant"):
         content_hash({"a": value})
 
@@ -105,16 +105,16 @@ def test_an_interrupted_write_leaves_no_temporary_file(
 
 
 def test_text_that_cannot_be_encoded_is_written_as_its_escape(tmp_path: Path) -> None:
-    """Such as the name of a file that is no UTF-8."""
+    """Such as the name of a file that is not UTF-8."""
     write_atomic(tmp_path / "file.json", "a \ud800")
     assert (tmp_path / "file.json").read_text() == "a \\ud800"
     assert [path.name for path in tmp_path.iterdir()] == ["file.json"]
 
 
-def test_a_folder_that_may_not_be_written_is_told(
+def test_a_folder_that_may_not_be_written_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Root may write everywhere, so the system's answer is played."""
+    """Root may write everywhere, so the system's reply is mocked."""
 
     def denied(**_: object) -> NoReturn:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))

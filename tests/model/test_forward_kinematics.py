@@ -30,7 +30,7 @@ def agree(found: Pose, true: Pose) -> None:
 @settings(max_examples=25)
 @given(data=st.data())
 def test_the_pose_comes_back_without_a_guess(name: str, data: st.DataObject) -> None:
-    """Turned by up to 25°, from starts that are all level."""
+    """Rotated by up to 25°, from starts that are all level."""
     rig = RIGS[name]
     pose = data.draw(poses_of(rig))
     found = forward_kinematics(rig, cable_lengths(rig, pose))
@@ -65,15 +65,15 @@ def test_many_poses_near_known_ones_are_found_together(name: str) -> None:
     lengths = np.array([cable_lengths(rig, pose) for pose in poses])
     guesses = np.array([pose.position for pose in poses]) + rng.uniform(-0.003, 0.003, (9, 3))
     rotations = np.array([pose.rotation for pose in poses])
-    positions, turned = poses_near(rig, lengths, guesses, rotations)
-    for pose, position, rotation in zip(poses, positions, turned, strict=True):
+    positions, turns = poses_near(rig, lengths, guesses, rotations)
+    for pose, position, rotation in zip(poses, positions, turns, strict=True):
         agree(Pose(position, rotation), pose)
 
 
 @any_rig
 @pytest.mark.parametrize("cable", [0, 5])
 def test_one_wrong_length_shows_in_the_residual(name: str, cable: int) -> None:
-    """More cables than freedoms: a cable that is 10 mm off cannot hide."""
+    """With redundant cables, one cable that is 10 mm off cannot hide."""
     rig = RIGS[name]
     lengths = cable_lengths(rig, rig.home)
     lengths[cable] += 0.01
@@ -102,12 +102,12 @@ def test_the_solution_is_the_least_squares_pose() -> None:
 @pytest.mark.parametrize(
     "lengths", [[0.7] * 7, [0.7] * 9, [0.7] * 7 + [np.nan], [0.7] * 7 + [np.inf], []]
 )
-def test_lengths_that_are_not_one_finite_number_a_cable_are_refused(lengths: list[float]) -> None:
+def test_lengths_that_are_not_one_finite_number_per_cable_are_refused(lengths: list[float]) -> None:
     with pytest.raises(BadInput, match="each of 8 cables"):
         forward_kinematics(RIGS["point exits"], np.array(lengths))
 
 
-def test_a_guess_where_no_cable_can_run_is_a_fault_with_a_next_step() -> None:
+def test_a_guess_where_cables_have_no_path_is_a_fault_with_a_next_step() -> None:
     rig: Rig = RIGS["point exits"]
     guess = Pose.level(rig.outlets[0] - rig.anchors[0])  # anchor 1 in outlet 1
     with pytest.raises(Fault, match="no pose fits") as caught:

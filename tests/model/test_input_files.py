@@ -1,4 +1,4 @@
-"""What can hurt is refused before it costs memory or time: devices, pipes, sizes, odd content."""
+"""Harmful input is refused before it costs memory or time: devices, pipes, sizes, odd content."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_file_beyond_the_limit_is_refused_by_its_stated_size(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["loop", "x" * 300, "a\0b"])
-def test_a_path_that_can_be_none_is_refused(tmp_path: Path, name: str) -> None:
+def test_an_impossible_path_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     with pytest.raises(BadInput, match=r"cannot be (read|used)"):
         read_text(tmp_path / name)
@@ -55,20 +55,20 @@ def test_a_path_that_can_be_none_is_refused(tmp_path: Path, name: str) -> None:
         "",
     ],
 )
-def test_json_that_no_program_of_ours_writes_is_refused(text: str) -> None:
+def test_json_that_our_programs_never_write_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"nested|twice|finite|not a number|digits|Expecting"):
         parse_json(text)
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_a_csv_file_is_the_same_whatever_its_line_ends(tmp_path: Path, end: str) -> None:
+def test_a_csv_file_is_the_same_with_any_line_ends(tmp_path: Path, end: str) -> None:
     (tmp_path / "a.csv").write_bytes(f"a,b{end}1,2{end}{end}3,4{end}".encode())
     file = CsvFile(tmp_path / "a.csv")
     assert file.rows == [["a", "b"], ["1", "2"], ["3", "4"]]
     assert file.lines == [1, 2, 4], "as an editor counts them"
 
 
-def test_a_field_that_never_ends_is_told_with_its_line(tmp_path: Path) -> None:
+def test_a_field_that_never_ends_is_reported_with_its_line(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text('a,b\n1,"' + "x" * 200_000)
     for reader in (CsvFile, TableFile, lambda path: read_rig_data(path, 8)):
         with pytest.raises(BadInput, match="not valid CSV") as caught:
@@ -76,7 +76,7 @@ def test_a_field_that_never_ends_is_told_with_its_line(tmp_path: Path) -> None:
         assert caught.value.where.endswith("a.csv:2")
 
 
-def test_a_whole_number_past_64_bits_in_a_table_is_told(tmp_path: Path) -> None:
+def test_a_whole_number_past_64_bits_in_a_table_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("n\n" + "9" * 30 + "\n")
     with pytest.raises(BadInput, match="whole number"):
         TableFile(tmp_path / "a.csv").ints("n")
@@ -101,7 +101,7 @@ def changed(tmp_path: Path, name: str, old: str, new: str) -> Path:
         ("channel: cdpr", "channel: " + "x" * 300),
     ],
 )
-def test_a_number_or_name_past_any_machine_is_refused(tmp_path: Path, old: str, new: str) -> None:
+def test_an_absurd_number_or_name_is_refused(tmp_path: Path, old: str, new: str) -> None:
     text = (CONFIGS / "gachon_8_6.yaml").read_text()
     if old not in text:
         old, new = "direction: 1", f"direction: 1, {new}"
@@ -112,13 +112,13 @@ def test_a_number_or_name_past_any_machine_is_refused(tmp_path: Path, old: str, 
     assert problem.line > 0
 
 
-def test_a_name_that_no_file_can_have_is_refused(tmp_path: Path) -> None:
+def test_a_name_too_long_for_a_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput) as caught:
         load_scene(changed(tmp_path, "environment_1.yaml", "name: ", f"name: {'x' * 300} "))
     assert "100 bytes" in str(caught.value)
 
 
-def test_a_hull_with_a_point_of_two_numbers_is_told_with_its_place(tmp_path: Path) -> None:
+def test_a_hull_with_a_point_of_two_numbers_is_reported_with_its_position(tmp_path: Path) -> None:
     scene = tmp_path / "scene.yaml"
     scene.write_text(
         "schema_version: 1\nname: hull\nstart: {position_mm: [0, 0, 0]}\n"

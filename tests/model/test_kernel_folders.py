@@ -1,4 +1,4 @@
-"""Where machine code is kept, which folders of it stay, and which are thrown away."""
+"""The cache of machine code: which folders are kept, and which are deleted."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from model import jit as compiled
-from model.jit import UNUSED, throw_away_unused, use_folder
+from model.jit import UNUSED, delete_unused, use_folder
 
 NOW = 1.8e9
 OLD, RECENT = NOW - UNUSED - 1.0, NOW - UNUSED + 1.0
@@ -23,30 +23,30 @@ def made(parent: Path, name: str, used: float) -> Path:
     return folder
 
 
-def test_only_versions_that_nobody_used_for_long_are_thrown_away(tmp_path: Path) -> None:
+def test_only_versions_unused_for_long_are_deleted(tmp_path: Path) -> None:
     old, recent = made(tmp_path, "a" * 16, OLD), made(tmp_path, "b" * 16, RECENT)
     other = made(tmp_path, "somebody-elses", OLD)
     left_over = made(tmp_path, "removed-x1_y2", OLD)
-    throw_away_unused(tmp_path, NOW)
+    delete_unused(tmp_path, NOW)
     assert not old.exists()
     assert not left_over.exists()
     assert sorted(tmp_path.iterdir()) == sorted([recent, other])
     assert (recent / "kernel.nbc").read_bytes() == b"code"
 
 
-def test_a_version_in_use_is_kept_however_old_and_goes_when_it_is_let_go(tmp_path: Path) -> None:
+def test_a_version_in_use_is_kept_at_any_age_and_deleted_once_released(tmp_path: Path) -> None:
     folder = made(tmp_path, "c" * 16, NOW)
     lock = os.open(folder / "in-use", os.O_RDWR | os.O_CREAT)
     fcntl.flock(lock, fcntl.LOCK_SH)
     os.utime(folder, (OLD, OLD))
-    throw_away_unused(tmp_path, NOW)
+    delete_unused(tmp_path, NOW)
     assert (folder / "kernel.nbc").exists()
     os.close(lock)
-    throw_away_unused(tmp_path, NOW)
+    delete_unused(tmp_path, NOW)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_using_a_version_holds_it_and_a_new_one_throws_old_ones_away(
+def test_using_a_version_locks_it_and_a_new_one_deletes_old_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
@@ -98,7 +98,7 @@ def test_the_cache_is_the_given_folder_and_none_where_nothing_can_be_written(
 
 
 @pytest.mark.parametrize("changed", ["own", "called"])
-def test_a_change_of_a_kernel_or_of_one_that_it_calls_begins_a_new_folder(
+def test_a_change_of_a_kernel_or_of_one_that_it_calls_starts_a_new_folder(
     changed: str, sources: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     find, version = compiled.cache_folder.__wrapped__, compiled._version

@@ -1,4 +1,4 @@
-"""What an import loads: the heavy libraries wait until a command needs them."""
+"""What an import loads: heavy libraries load only when a command needs them."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_completion_of_a_verb_imports_no_verb(words: str) -> None:
     assert loaded.isdisjoint({"numpy", *HEAVY})
 
 
-def test_reading_the_ready_files_is_light() -> None:
+def test_reading_the_example_files_is_light() -> None:
     code = (
         "from pathlib import Path; from model.rig import load_rig;"
         " from model.scene import load_scene;"
@@ -101,7 +101,7 @@ def test_reading_the_ready_files_is_light() -> None:
 
 
 @pytest.mark.parametrize("module", ["operate.requests", "start"])
-def test_verbs_that_answer_at_once_are_light(module: str) -> None:
+def test_verbs_that_must_be_fast_are_light(module: str) -> None:
     """`cdpr stop` above all."""
     assert loaded_by(f"import cdpr.cli.{module}") == set()
 
@@ -114,6 +114,6 @@ def test_what_neither_searches_nor_measures_nor_sends_loads_no_library_for_it(mo
 
 
 def test_the_real_time_process_of_a_real_bus_loads_no_compiler_and_no_camera() -> None:
-    """What it loads it loads before the drives are set up, while the operator waits."""
+    """It loads everything before the drives are set up, while the operator waits."""
     code = "import executor.realtime.child, executor.control.path_job, executor.drives"
     assert not loaded_by(code) & {"numba", "cv2", "matplotlib", "mcap"}

@@ -1,4 +1,4 @@
-"""When a task is said to be compiled: done before, with the very files that lie here."""
+"""When a task counts as compiled: run before, with exactly these files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from model.jit import KernelSet
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache, and two kernels of our own."""
+    """A cache, and two kernels."""
     monkeypatch.setattr(machine_code, "cache_folder", lambda _: tmp_path)
     kernels = tmp_path / "kernels"
     kernels.mkdir()
@@ -26,7 +26,7 @@ def task(kernels: Path, name: str) -> KernelSet:
     return KernelSet(name, (kernels,))
 
 
-def test_a_task_is_compiled_once_it_was_done_and_the_others_are_not(cache: Path) -> None:
+def test_a_task_is_compiled_once_it_has_run_and_the_others_are_not(cache: Path) -> None:
     assert not machine_code.is_compiled(task(cache / "kernels", "optimal"))
     machine_code.note_compiled(task(cache / "kernels", "optimal"))
     assert machine_code.is_compiled(task(cache / "kernels", "optimal"))
@@ -34,9 +34,7 @@ def test_a_task_is_compiled_once_it_was_done_and_the_others_are_not(cache: Path)
 
 
 @pytest.mark.parametrize("change", ["touched", "edited", "added", "elsewhere"])
-def test_code_that_numba_would_not_find_again_is_not_said_to_be_there(
-    cache: Path, change: str
-) -> None:
+def test_code_that_numba_would_not_find_does_not_count(cache: Path, change: str) -> None:
     machine_code.note_compiled(task(cache / "kernels", "optimal"))
     kernels = cache / "kernels"
     match change:
@@ -54,13 +52,13 @@ def test_code_that_numba_would_not_find_again_is_not_said_to_be_there(
     assert not machine_code.is_compiled(task(kernels, "optimal"))
 
 
-def test_without_a_folder_nothing_is_said_to_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_folder_nothing_counts_as_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_code, "cache_folder", lambda _: None)
     machine_code.note_compiled(task(Path("kernels"), "maps"))
     assert not machine_code.is_compiled(task(Path("kernels"), "maps"))
 
 
-def test_a_stamp_that_cannot_be_written_is_done_without(
+def test_a_stamp_that_cannot_be_written_is_ignored(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(machine_code, "cache_folder", lambda _: cache / "gone")

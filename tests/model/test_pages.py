@@ -104,7 +104,7 @@ def test_drawings_scroll_within_themselves_on_a_phone() -> None:
     )
 
 
-def test_a_page_fits_a_phone_and_asks_nothing_from_outside() -> None:
+def test_a_page_fits_a_phone_and_requests_nothing_from_outside() -> None:
     text = whole()
     reader = Reader(text)
     assert reader.open == []
@@ -183,7 +183,7 @@ def test_the_chart_and_the_data_of_its_script_agree() -> None:
     assert [high - v / 1000.0 * (high - low) for v in drawn] == pytest.approx([2, 4, 8], abs=1e-2)
 
 
-def test_a_line_that_does_not_count_leaves_the_range_alone() -> None:
+def test_a_line_that_does_not_fit_leaves_the_range_unchanged() -> None:
     far = ChartLine("limit", np.array([0.0, 10.0]), np.array([100.0, 100.0]), "limit", fits=False)
     near = ChartLine("", np.array([0.0, 10.0]), np.array([1.0, 2.0]), "ink")
     chart = Chart("t", "a", "q", "mm", (near, far), (0.0, 10.0))
@@ -215,7 +215,7 @@ def test_the_floor_is_below_everything_with_round_lines() -> None:
     assert sunk.segments[..., 2].max() == pytest.approx(-0.8)
 
 
-def test_arrows_begin_and_end_where_they_are_told_and_vanish_without_length() -> None:
+def test_arrows_begin_and_end_where_they_are_given_and_vanish_without_length() -> None:
     ends = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     found = arrows("a", "limit", np.zeros((2, 3)), ends).segments
     assert len(found) == 5

@@ -1,4 +1,4 @@
-"""Plan files: they come back as they were written, and nothing else is taken for a plan."""
+"""Plan files: a round trip changes nothing, and nothing else is accepted as a plan."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.model.rig_builds import paper_data, rig_of, scene_data, scene_of
 
 
 def a_plan() -> PlanDocument:
-    """Two waypoints between the ends of environment 3; not free of collisions, but whole."""
+    """Two waypoints between the ends of environment 3; not collision-free, but intact."""
     rig, scene = rig_of(paper_data()), scene_of(scene_data())
     nearest = {
         "first": "cable 1",
@@ -75,7 +75,7 @@ SAID = DOCUMENT.model_dump(mode="json", exclude_defaults=True)
 
 
 def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Paths of all that is neither a section nor a list."""
+    """Paths of all scalar values."""
     if isinstance(value, dict):
         return [p for key, part in value.items() for p in leaves(part, (*path, key))]
     if isinstance(value, list):
@@ -172,7 +172,7 @@ def test_a_plan_edited_anywhere_is_refused(
 
 @settings(max_examples=60)
 @given(path=st.sampled_from([p for p in leaves(DATA) if isinstance(p[-1], str)]), add=st.booleans())
-def test_a_plan_with_a_key_less_or_more_is_refused(
+def test_a_plan_with_a_missing_or_extra_key_is_refused(
     path: tuple[Any, ...], add: bool, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     data = copy.deepcopy(DATA)
@@ -181,14 +181,14 @@ def test_a_plan_with_a_key_less_or_more_is_refused(
     else:
         del holder_of(data, path)[path[-1]]
     folder = tmp_path_factory.mktemp("keys")
-    if add or not _stands_at_its_default(path):
+    if add or not _is_default(path):
         refused(json.dumps(data), folder)
     else:
         (folder / "plan.json").write_text(json.dumps(data))
         assert load_plan(folder / "plan.json").document == PlanDocument.model_validate(DATA)
 
 
-def _stands_at_its_default(path: tuple[Any, ...]) -> bool:
+def _is_default(path: tuple[Any, ...]) -> bool:
     if path[-1] in ("kind", "schema_version", "type"):  # they say what the file, or a part, is
         return False
     try:
@@ -197,8 +197,8 @@ def _stands_at_its_default(path: tuple[Any, ...]) -> bool:
         return True
 
 
-def test_a_plan_of_a_version_that_knew_less_is_read(tmp_path: Path) -> None:
-    """What it does not know stands at its default: the plan of a later version says the same."""
+def test_a_plan_of_a_version_with_fewer_keys_is_read(tmp_path: Path) -> None:
+    """Missing keys have their defaults, as in the plan of a later version."""
     data = {**SAID, "kind": DATA["kind"], "schema_version": DATA["schema_version"]}
     assert len(json.dumps(data)) < 0.9 * len(json.dumps(DATA))
     (tmp_path / "plan.json").write_text(json.dumps(data))
@@ -214,13 +214,13 @@ def test_waypoints_moved_or_dropped_are_refused(key: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("constant", ["NaN", "Infinity", "-Infinity", "1e999"])
-def test_a_number_that_is_none_is_refused(constant: str, tmp_path: Path) -> None:
+def test_nan_and_infinity_are_refused(constant: str, tmp_path: Path) -> None:
     text = json.dumps(DATA).replace("600.0", constant)
     error = refused(text, tmp_path)
     assert "NaN" in str(error) or "Infinity" in str(error) or "finite" in str(error)
 
 
-def test_a_plan_cut_off_anywhere_is_refused(tmp_path: Path) -> None:
+def test_a_plan_truncated_anywhere_is_refused(tmp_path: Path) -> None:
     text = json.dumps(DATA)
     for end in (0, 1, len(text) // 3, len(text) // 2, len(text) - 1):
         error = refused(text[:end], tmp_path)
@@ -229,19 +229,19 @@ def test_a_plan_cut_off_anywhere_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["[]", "1", '"plan"', "{}", '{"kind": "cdpr-run"}', "null"])
-def test_json_that_is_no_plan_is_told_in_one_sentence(text: str, tmp_path: Path) -> None:
+def test_json_that_is_not_a_plan_is_reported_in_one_sentence(text: str, tmp_path: Path) -> None:
     assert refused(text, tmp_path).what == "this is not a plan file"
 
 
-def test_a_plan_of_another_version_is_told_as_that_alone(tmp_path: Path) -> None:
+def test_a_plan_of_another_version_is_reported_as_that_alone(tmp_path: Path) -> None:
     """Whatever else the other version has: its keys are not mistakes."""
     error = refused(json.dumps({**DATA, "schema_version": 2, "newer": 1}), tmp_path)
     assert isinstance(error, InvalidFile)
     [problem] = error.problems
-    assert problem.what == "the file is of schema version 2; this program reads version 1"
+    assert problem.what == "the file has schema version 2; this program reads version 1"
 
 
-def test_keys_that_do_not_fit_are_told_by_path(tmp_path: Path) -> None:
+def test_keys_that_do_not_fit_are_reported_by_path(tmp_path: Path) -> None:
     data = copy.deepcopy(DATA)
     data["waypoints"][1]["position_mm"] = [1.0, "x", 3.0]
     data["planner"]["sead"] = data["planner"].pop("seed")
@@ -256,7 +256,7 @@ def test_keys_that_do_not_fit_are_told_by_path(tmp_path: Path) -> None:
     assert "did you mean 'seed'" in str(error)
 
 
-def test_a_key_that_stands_twice_is_refused(tmp_path: Path) -> None:
+def test_a_duplicate_key_is_refused(tmp_path: Path) -> None:
     """Another program might read the first one."""
     text = json.dumps(DATA)
     text = text.replace('"seed": 1', '"seed": 2, "seed": 1')
@@ -279,7 +279,7 @@ def test_a_plan_sealed_over_a_wrong_part_hash_is_refused(key: str, tmp_path: Pat
     assert f"the plan's {key} does not match" in error.what
 
 
-def test_a_folder_is_no_plan_and_no_place_for_one(tmp_path: Path) -> None:
+def test_a_folder_is_not_a_plan_and_cannot_be_replaced_by_one(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="this is a folder"):
         load_plan(tmp_path)
     with pytest.raises(BadInput, match="this is a folder"):
@@ -287,14 +287,14 @@ def test_a_folder_is_no_plan_and_no_place_for_one(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_missing_folder_is_told(tmp_path: Path) -> None:
+def test_a_missing_folder_is_reported(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="cannot be written") as caught:
         save_plan(DOCUMENT, tmp_path / "nowhere" / "plan.json")
     assert "existing folder" in caught.value.next_step
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_read_only_folder_is_told_and_left_as_it_was(tmp_path: Path) -> None:
+def test_a_read_only_folder_is_reported_and_left_as_it_was(tmp_path: Path) -> None:
     folder = tmp_path / "locked"
     folder.mkdir()
     folder.chmod(0o555)

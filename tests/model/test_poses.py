@@ -38,8 +38,8 @@ def unit_vectors(draw: st.DrawFn) -> Vector:
 
 
 turns = st.builds(lambda axis, angle: axis * angle, unit_vectors(), angles)
-places = st.tuples(*[st.floats(-10.0, 10.0)] * 3).map(np.array)
-poses = st.builds(lambda p, v: Pose(p, matrix_from_rotation_vector(v)), places, turns)
+points = st.tuples(*[st.floats(-10.0, 10.0)] * 3).map(np.array)
+poses = st.builds(lambda p, v: Pose(p, matrix_from_rotation_vector(v)), points, turns)
 
 
 def same(a: Pose, b: Pose, atol: float = 1e-12) -> None:
@@ -85,12 +85,12 @@ def test_a_vector_beyond_half_a_turn_gives_the_same_rotation(axis: Vector, angle
     np.testing.assert_allclose(short, long, atol=1e-13)
 
 
-@given(places, places)
+@given(points, points)
 def test_skew_is_the_cross_product(a: Vector, b: Vector) -> None:
     np.testing.assert_allclose(skew(a) @ b, np.cross(a, b), atol=1e-12)
 
 
-@given(poses, poses, poses, places)
+@given(poses, poses, poses, points)
 def test_poses_are_a_group_that_acts_on_points(a: Pose, b: Pose, c: Pose, point: Vector) -> None:
     same(a.compose(b).compose(c), a.compose(b.compose(c)), atol=1e-12)
     same(a.compose(a.inverse()), Pose.level([0, 0, 0]), atol=1e-13)
@@ -124,7 +124,7 @@ def test_interpolation_begins_and_ends_at_its_ends(a: Pose, b: Pose) -> None:
 
 
 @given(poses, poses)
-def test_angle_and_distance_are_the_same_both_ways(a: Pose, b: Pose) -> None:
+def test_angle_and_distance_are_symmetric(a: Pose, b: Pose) -> None:
     assert a.angle_to(b) == pytest.approx(b.angle_to(a), abs=1e-12)
     assert a.distance_to(b) == b.distance_to(a)
     assert 0.0 <= a.angle_to(b) <= np.pi + 1e-14

@@ -1,4 +1,4 @@
-"""The lengths that the notes on the paper give, to their printed digits."""
+"""Cable lengths given in the notes on the paper, to their printed digits."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ PRINTED_MM = {
 }
 
 
-@pytest.mark.parametrize(("place", "half_digit"), [("home", 5e-5), ("start", 5e-4), ("goal", 5e-4)])
-def test_the_papers_rig_has_the_printed_lengths(place: str, half_digit: float) -> None:
+@pytest.mark.parametrize(("name", "half_digit"), [("home", 5e-5), ("start", 5e-4), ("goal", 5e-4)])
+def test_the_papers_rig_has_the_printed_lengths(name: str, half_digit: float) -> None:
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     scene = load_scene(CONFIGS / "environment_1.yaml")
-    pose = {"home": rig.home, "start": scene.start, "goal": scene.goal}[place]
+    pose = {"home": rig.home, "start": scene.start, "goal": scene.goal}[name]
     lengths_mm = 1000.0 * cable_lengths(rig, pose)
-    np.testing.assert_allclose(lengths_mm, PRINTED_MM[place], rtol=0, atol=1.001 * half_digit)
+    np.testing.assert_allclose(lengths_mm, PRINTED_MM[name], rtol=0, atol=1.001 * half_digit)
 
 
-def test_ipanema_1_has_eight_equal_lengths_in_the_middle() -> None:
+def test_ipanema_1_has_eight_equal_lengths_at_the_centre() -> None:
     lengths = cable_lengths(ipanema(), Pose.level([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(lengths, 2.614804, rtol=0, atol=5e-7)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_the_ready_environments_have_the_papers_obstacles_and_ends(number: int) -> None:
+def test_the_example_environments_have_the_papers_obstacles_and_ends(number: int) -> None:
     scene = load_scene(CONFIGS / f"environment_{number}.yaml")
     assert len(scene.obstacles) == number
     np.testing.assert_allclose(scene.start.position, [0.18, 0.18, 0.3])

@@ -1,4 +1,4 @@
-"""Rig files: every kind of mistake is told with its place and in a plain sentence, all at once."""
+"""Rig files: all mistakes are reported at once, each with its position and a plain sentence."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ JARGON = re.compile(r"(?i)input should|valid (dictionary|list|string)|value erro
 
 
 def problems_in(text: str, tmp_path: Path) -> list[tuple[int, int, str, str]]:
-    """Line, column, key and sentence of everything that is wrong."""
+    """Line, column, key and sentence of every problem."""
     path = tmp_path / "rig.yaml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InvalidFile) as caught:
@@ -48,15 +48,15 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_told_by_key_and_sentence(mistake: str, tmp_path: Path) -> None:
+def test_a_mistake_is_reported_by_key_and_sentence(mistake: str, tmp_path: Path) -> None:
     entry = MISTAKES[mistake]
     assert entry["old"] in PAPER
     text = PAPER.replace(entry["old"], entry["new"], 1)
     # A section that is renamed away for the example is itself an unknown key.
-    told = [problem for problem in problems_in(text, tmp_path) if problem[2] != "x"]
-    assert [problem[2] for problem in told] == [entry["key"]], told
-    assert entry["sentence"] in told[0][3]
-    assert 1 <= told[0][0] <= text.count("\n") + 1
+    found = [problem for problem in problems_in(text, tmp_path) if problem[2] != "x"]
+    assert [problem[2] for problem in found] == [entry["key"]], found
+    assert entry["sentence"] in found[0][3]
+    assert 1 <= found[0][0] <= text.count("\n") + 1
 
 
 @pytest.mark.parametrize(
@@ -74,8 +74,10 @@ def test_line_and_column_are_those_of_the_key(old: str, new: str, key: str, tmp_
     assert [(p[0], p[1]) for p in problems_in(text, tmp_path)] == [(line, column)]
 
 
-def test_every_problem_of_a_file_is_told_at_once_in_the_order_of_the_file(tmp_path: Path) -> None:
-    """Also those between parts, as far as the parts that they compare are sound."""
+def test_every_problem_of_a_file_is_reported_at_once_in_the_order_of_the_file(
+    tmp_path: Path,
+) -> None:
+    """Also those between parts, as far as the parts that they compare are valid."""
     text = PAPER
     for old, new in (
         ("size_mm: [130, 130, 130]", "size_mm: [130, 130]"),
@@ -112,7 +114,7 @@ def test_every_problem_of_a_file_is_told_at_once_in_the_order_of_the_file(tmp_pa
     assert [problem[:2] for problem in found] == sorted(problem[:2] for problem in found)
 
 
-def test_a_part_that_is_unsound_is_not_judged_against_others(tmp_path: Path) -> None:
+def test_an_invalid_part_is_not_compared_with_others(tmp_path: Path) -> None:
     """One mistake is one message: no home "outside" a workspace that is not a number."""
     text = PAPER.replace("upper_mm: [250, 250, 650]", "upper_mm: [250, x, 100]")
     text = text.replace("node_id: 1,", "node_id: x,").replace("node_id: 2,", "node_id: x,")
@@ -136,12 +138,12 @@ def test_pulleys_are_checked(
     change: tuple[str, str], key: str, sentence: str, tmp_path: Path
 ) -> None:
     assert change[0] in HALL
-    [(_, _, told, what)] = problems_in(HALL.replace(*change, 1), tmp_path)
-    assert told == f"pulleys.{key}"
+    [(_, _, found, what)] = problems_in(HALL.replace(*change, 1), tmp_path)
+    assert found == f"pulleys.{key}"
     assert sentence in what
 
 
-def test_two_cameras_of_one_name_are_told(tmp_path: Path) -> None:
+def test_two_cameras_of_one_name_are_reported(tmp_path: Path) -> None:
     start = PAPER.index("  - name: front")
     [(_, _, key, what)] = problems_in(PAPER + PAPER[start:], tmp_path)
     assert (key, what) == ("cameras[1].name", "camera name 'front' appears twice")
@@ -174,11 +176,11 @@ def test_five_cables_are_too_few(tmp_path: Path) -> None:
         ("[" * 3000, 1, "nested too deeply"),
     ],
 )
-def test_text_that_is_no_rig_at_all_is_told_with_its_line(
+def test_text_that_is_not_a_rig_at_all_is_reported_with_its_line(
     text: str, line: int, sentence: str, tmp_path: Path
 ) -> None:
-    [(told_line, _, _, what)] = problems_in(text, tmp_path)
-    assert told_line == line
+    [(found_line, _, _, what)] = problems_in(text, tmp_path)
+    assert found_line == line
     assert sentence in what
 
 
@@ -191,7 +193,7 @@ def test_text_that_is_no_rig_at_all_is_told_with_its_line(
         (lambda path: path.write_bytes("a: 1".encode("utf-16")), "not UTF-8"),
     ],
 )
-def test_a_file_that_cannot_be_read_is_told(
+def test_a_file_that_cannot_be_read_is_reported(
     make: Callable[[Path], object], words: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "rig.yaml"
@@ -203,7 +205,7 @@ def test_a_file_that_cannot_be_read_is_told(
     assert "Errno" not in str(caught.value)
 
 
-def test_a_path_through_a_file_is_told(tmp_path: Path) -> None:
+def test_a_path_through_a_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match="cannot be read"):
         load_rig(tmp_path / "file" / "rig.yaml")
@@ -279,7 +281,7 @@ def with_floats(value: Any) -> Any:
     return float(value) if type(value) is int and value not in whole and value > 8 else value
 
 
-def test_the_hash_is_of_the_content_not_of_its_spelling() -> None:
+def test_the_hash_is_of_the_content_not_of_its_layout() -> None:
     data = paper_data()
     rig = rig_of(data)
     assert rig_of(shuffled(data, np.random.default_rng(1))).hash == rig.hash
@@ -309,7 +311,7 @@ def test_spelling_out_a_default_does_not_change_the_hash() -> None:
         ("motion", "speed_mm_s", 21, False),
     ],
 )
-def test_a_plan_rests_on_geometry_and_limits_only(
+def test_a_plan_depends_on_geometry_and_limits_only(
     section: str, key: str, value: object, in_plan: bool
 ) -> None:
     """So that a plan may be run over another bus, and never on another robot."""
@@ -320,7 +322,7 @@ def test_a_plan_rests_on_geometry_and_limits_only(
     assert (changed.plan_hash != rig.plan_hash) == in_plan
 
 
-def test_a_document_whose_parts_disagree_makes_no_rig() -> None:
+def test_a_document_whose_parts_disagree_is_refused() -> None:
     data = paper_data()
     data["anchors_mm"].pop()
     data["winches"][1]["node_id"] = 1
@@ -353,7 +355,7 @@ ODD = st.one_of(
 
 @settings(max_examples=150)
 @given(path=st.sampled_from(leaves(paper_data())), value=ODD)
-def test_whatever_stands_in_a_file_makes_a_rig_or_one_of_our_errors(
+def test_any_content_of_a_file_makes_a_rig_or_one_of_our_errors(
     path: tuple[Any, ...], value: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """No exception of a library ever reaches the user."""
@@ -364,9 +366,9 @@ def test_whatever_stands_in_a_file_makes_a_rig_or_one_of_our_errors(
     inner[path[-1]] = value
     file = tmp_path_factory.mktemp("odd") / "rig.yaml"
     file.write_text(yaml.safe_dump(changed, allow_unicode=True), encoding="utf-8")
-    told = ""
+    found = ""
     try:
         load_rig(file)
     except CdprError as error:
-        told = str(error)
-    assert not JARGON.search(told), told
+        found = str(error)
+    assert not JARGON.search(found), found

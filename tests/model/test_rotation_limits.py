@@ -1,4 +1,4 @@
-"""How far a platform is tilted and turned along a move, against dense samples of it."""
+"""How far a platform is tilted and rotated along a move, against dense samples of it."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from model.pose import Pose, RotationLimits, interpolate, largest_rotations
 seeds = st.integers(0, 2**32 - 1)
 
 
-def turned(rotation: Rotation) -> Pose:
+def pose_of(rotation: Rotation) -> Pose:
     return Pose(np.zeros(3), rotation.as_matrix())
 
 
 @given(seeds, st.floats(0.05, 3.0))
 def test_the_largest_tilt_and_turn_are_those_of_dense_samples(seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
-    first, last = (turned(Rotation.from_rotvec(rng.normal(size=3) * size * 0.5)) for _ in range(2))
+    first, last = (pose_of(Rotation.from_rotvec(rng.normal(size=3) * size * 0.5)) for _ in range(2))
     poses = [interpolate(first, last, s) for s in np.linspace(0.0, 1.0, 401)]
     tilts = [math.acos(min(pose.rotation[2, 2], 1.0)) for pose in poses]
     halves = [math.atan2(pose.quaternion[3], pose.quaternion[0]) for pose in poses]
     tilt, turn = largest_rotations(first.quaternion, last.quaternion)
     assert max(tilts) - 1e-7 <= tilt <= max(tilts) + 1e-3
     around = np.ptp(np.unwrap(2.0 * np.array(halves))) - abs(2.0 * (halves[-1] - halves[0]))
-    if abs(around) < 1e-6:  # no half turn on the way
+    if abs(around) < 1e-6:  # no half turn along it
         assert turn == pytest.approx(2.0 * np.abs(halves).max(), abs=1e-6)
     else:
         assert turn == math.pi
 
 
 @given(st.floats(0.0, 1.5), st.floats(-3.1, 3.1), st.floats(-3.1, 3.1))
-def test_a_tilt_after_a_turn_is_told_apart(tilt: float, turn: float, about: float) -> None:
+def test_a_tilt_after_a_turn_is_distinguished(tilt: float, turn: float, about: float) -> None:
     axis = np.array([math.cos(about), math.sin(about), 0.0])
-    pose = turned(Rotation.from_rotvec(tilt * axis) * Rotation.from_rotvec([0.0, 0.0, turn]))
+    pose = pose_of(Rotation.from_rotvec(tilt * axis) * Rotation.from_rotvec([0.0, 0.0, turn]))
     found = largest_rotations(pose.quaternion, pose.quaternion)
     assert found == pytest.approx((tilt, abs(turn)), abs=1e-6)
 
@@ -59,14 +59,14 @@ def test_a_move_between_allowed_ends_may_tilt_too_far_in_between() -> None:
     assert excess.measured == pytest.approx(in_the_middle, abs=1e-9)
 
 
-def test_what_is_exceeded_is_told_with_figures() -> None:
+def test_what_is_exceeded_is_reported_with_figures() -> None:
     limits = RotationLimits(math.radians(10.0), math.radians(30.0))
-    level = turned(Rotation.identity())
-    tipped = turned(Rotation.from_euler("y", 12, degrees=True))
-    spun = turned(Rotation.from_euler("z", -45, degrees=True))
+    level = pose_of(Rotation.identity())
+    tipped = pose_of(Rotation.from_euler("y", 12, degrees=True))
+    spun = pose_of(Rotation.from_euler("z", -45, degrees=True))
     for pose, sentence in (
         (tipped, "tilted by 12 deg, rotation_limits allow 10 deg"),
-        (spun, "turned by 45 deg, rotation_limits allow 30 deg"),
+        (spun, "rotated by 45 deg, rotation_limits allow 30 deg"),
     ):
         excess = limits.excess(level, pose)
         assert excess is not None
@@ -74,6 +74,6 @@ def test_what_is_exceeded_is_told_with_figures() -> None:
 
 
 def test_a_turn_without_limit_may_go_around_the_back() -> None:
-    first, last = (turned(Rotation.from_euler("z", a, degrees=True)) for a in (170, -170))
+    first, last = (pose_of(Rotation.from_euler("z", a, degrees=True)) for a in (170, -170))
     assert RotationLimits(0.1, math.pi).excess(first, last) is None
     assert RotationLimits(0.1, math.radians(175.0)).excess(first, last) is not None

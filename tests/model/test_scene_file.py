@@ -96,11 +96,11 @@ def problems_with(obstacles: list[dict[str, Any]], tmp_path: Path) -> list[tuple
         ),
     ],
 )
-def test_a_wrong_obstacle_is_told_by_key(
+def test_a_wrong_obstacle_is_reported_by_key(
     obstacle: dict[str, Any], key: str, sentence: str, tmp_path: Path
 ) -> None:
-    [(told, what)] = problems_with([{"name": "o", **obstacle}], tmp_path)
-    assert told == key
+    [(found, what)] = problems_with([{"name": "o", **obstacle}], tmp_path)
+    assert found == key
     assert sentence in what
 
 
@@ -115,13 +115,13 @@ def test_a_wrong_obstacle_is_told_by_key(
 def test_an_obstacle_larger_than_distances_are_proved_for_is_refused(
     parts: dict[str, Any], tmp_path: Path
 ) -> None:
-    [(told, what)] = problems_with([{"name": "floor", **parts}], tmp_path)
-    assert told == "obstacles[0]"
+    [(found, what)] = problems_with([{"name": "floor", **parts}], tmp_path)
+    assert found == "obstacles[0]"
     assert "'floor' reaches" in what
     assert "make it as large as the room" in what
 
 
-def test_two_obstacles_of_one_name_are_told_beside_other_problems(tmp_path: Path) -> None:
+def test_two_obstacles_of_one_name_are_reported_beside_other_problems(tmp_path: Path) -> None:
     box = {"size_mm": [1, 1, 1]}
     found = problems_with(
         [{"name": "a", "box": box}, {"name": "a", "box": {"size_mm": [1]}}, {"name": "b"}],
@@ -145,7 +145,7 @@ def test_two_obstacles_of_one_name_are_told_beside_other_problems(tmp_path: Path
         ("goal", "rotation_wxyz", [1, 0, 0, 1], "must be a unit quaternion"),
     ],
 )
-def test_a_wrong_number_in_a_section_is_told(
+def test_a_wrong_number_in_a_section_is_reported(
     section: str, key: str, value: object, sentence: str, tmp_path: Path
 ) -> None:
     data = scene_data()
@@ -159,7 +159,7 @@ def test_a_wrong_number_in_a_section_is_told(
     assert sentence in problem.what
 
 
-def test_every_shape_arrives_in_metres_and_in_its_place() -> None:
+def test_every_shape_arrives_in_metres_and_at_its_pose() -> None:
     data = scene_data()
     mesh = {"points_mm": TETRAHEDRON, "triangles": FACES[1:]}  # open: a surface
     shapes: list[tuple[str, dict[str, Any]]] = [
@@ -183,7 +183,7 @@ def test_every_shape_arrives_in_metres_and_in_its_place() -> None:
     assert ball.radius == 0.05
     assert (cylinder.radius, cylinder.length) == (0.02, 0.09)
     assert (capsule.radius, capsule.length) == (0.02, 0.09)
-    assert len(hull.vertices) == 4  # the inner point is no vertex
+    assert len(hull.vertices) == 4  # the inner point is not a vertex
     for body in (hull, surface):
         assert not body.vertices.flags.writeable
         assert not body.triangles.flags.writeable
@@ -201,7 +201,7 @@ def test_every_shape_arrives_in_metres_and_in_its_place() -> None:
     ],
     ids=["closed", "closed, seen from inside", "open", "closed, and a fin"],
 )
-def test_a_mesh_about_a_convex_volume_is_solid(faces: list[list[int]], kind: type) -> None:
+def test_a_mesh_around_a_convex_volume_is_solid(faces: list[list[int]], kind: type) -> None:
     data = scene_data()
     mesh = {"points_mm": [*TETRAHEDRON, [0, 0, 200]], "triangles": faces}
     data["obstacles"] = [{"name": "mesh", "mesh": mesh, "position_mm": [0, 0, 0]}]
@@ -211,7 +211,7 @@ def test_a_mesh_about_a_convex_volume_is_solid(faces: list[list[int]], kind: typ
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(4, 30))
-def test_a_hull_holds_its_points_and_looks_outward(seed: int, count: int) -> None:
+def test_a_hull_contains_its_points_and_faces_outward(seed: int, count: int) -> None:
     points = np.random.default_rng(seed).normal(size=(count, 3))
     hull = convex_hull(points)
     corners = hull.vertices[hull.triangles]
@@ -227,7 +227,7 @@ def test_a_hull_holds_its_points_and_looks_outward(seed: int, count: int) -> Non
     [Box(np.array([1.0, 2.0, 3.0])), Sphere(2.0), Cylinder(1.0, 4.0), Capsule(1.0, 4.0)],
     ids=lambda shape: type(shape).__name__,
 )
-def test_the_points_of_a_shape_grown_by_its_radius_hold_it(shape: Any) -> None:
+def test_the_points_of_a_shape_grown_by_its_radius_contain_it(shape: Any) -> None:
     points = shape_points(shape)
     radius = getattr(shape, "radius", 0.0)
     rng = np.random.default_rng(3)
@@ -274,6 +274,6 @@ def test_a_scene_cannot_be_changed_into_an_invalid_one(change: dict[str, Any]) -
 
 
 @pytest.mark.parametrize("name", ["environment_1", "environment_2", "environment_3", "hall_pillar"])
-def test_the_ready_scenes_load_alike_twice(name: str) -> None:
+def test_the_example_scenes_load_the_same_twice(name: str) -> None:
     path = CONFIGS / f"{name}.yaml"
     assert load_scene(path).hash == load_scene(path).hash

@@ -1,4 +1,4 @@
-"""Stops of a scene: what their kinds ask for, and which load every leg is run with."""
+"""Stops of a scene: requirements of their kinds, and the load of every leg."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def problems(stops: list[dict[str, Any]], path: Path, **parts: Any) -> dict[str,
         ([stop("a", payload_kg=1.0)], "stops[0].payload_kg", "unknown key 'payload_kg'"),
     ],
 )
-def test_a_stop_that_does_not_fit_is_told_with_its_place(
+def test_a_stop_that_does_not_fit_is_reported_with_its_position(
     stops: list[dict[str, Any]], key: str, words: str, tmp_path: Path
 ) -> None:
     found = problems(stops, tmp_path / "scene.yaml")
@@ -71,7 +71,7 @@ def test_a_stop_that_does_not_fit_is_told_with_its_place(
     assert words in found[key]
 
 
-def test_problems_of_stops_are_told_beside_others(tmp_path: Path) -> None:
+def test_problems_of_stops_are_reported_beside_others(tmp_path: Path) -> None:
     wrong = {"clearance": {"obstacle_mm": -1}}
     found = problems([stop("a", mass_kg=1.0)], tmp_path / "scene.yaml", **wrong)
     assert set(found) == {"clearance.obstacle_mm", "stops[0].mass_kg"}
@@ -82,7 +82,7 @@ points = st.tuples(*[st.floats(-200.0, 200.0)] * 3)
 
 
 @given(st.lists(st.tuples(masses, points), min_size=1, max_size=6))
-def test_what_is_carried_is_the_sum_and_the_mean_of_what_was_picked(
+def test_the_payload_is_the_sum_and_the_mean_of_the_masses_picked(
     parts: list[tuple[float, tuple[float, float, float]]],
 ) -> None:
     stops = [
@@ -99,7 +99,7 @@ def test_what_is_carried_is_the_sum_and_the_mean_of_what_was_picked(
 
 
 @given(st.tuples(masses, points), st.tuples(masses, points))
-def test_putting_down_what_was_picked_last_leaves_what_was_there_before(
+def test_placing_the_last_mass_restores_the_payload_before_it(
     first: tuple[float, tuple[float, float, float]],
     second: tuple[float, tuple[float, float, float]],
 ) -> None:
@@ -110,7 +110,7 @@ def test_putting_down_what_was_picked_last_leaves_what_was_there_before(
     np.testing.assert_allclose(after.centre_mm, before.centre_mm, atol=2e-6 * ratio + 1e-6)
 
 
-def test_a_place_without_a_centre_takes_from_all_that_is_carried_alike() -> None:
+def test_a_placed_mass_without_a_centre_takes_from_all_that_is_carried_alike() -> None:
     carried = Payload(2.0, (10.0, 20.0, 30.0))
     assert carried.without_mass(0.5, None) == Payload(1.5, (10.0, 20.0, 30.0))
     assert carried.without_mass(2.0, None) == Payload(0.0, (0.0, 0.0, 0.0))
@@ -161,7 +161,7 @@ def test_a_payload_that_does_not_fit_the_stops_is_refused() -> None:
 def test_a_plan_whose_marks_are_not_the_scenes_stops_is_refused(
     marks: list[tuple[str, int]], words: str, tmp_path: Path
 ) -> None:
-    """Sealed with a right hash by another program."""
+    """Sealed with a correct hash by another program."""
     x, y, z = DOCUMENT.waypoints[1].position_mm
     at = StopDocument(name="a", position_mm=[x + 1.0, y, z])
     scene = scene_of({**DOCUMENT.scene.model_dump(mode="json"), "stops": [at.model_dump()]})

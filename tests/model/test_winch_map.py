@@ -1,4 +1,4 @@
-"""From cable lengths to drive counts: home, directions, stretch, and the way back."""
+"""From cable lengths to drive counts: home, directions, stretch, and back."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ each = pytest.mark.parametrize("name", RIGS)
 
 
 @each
-def test_at_home_under_working_tensions_each_drive_stands_at_its_home_counts(name: str) -> None:
+def test_at_home_under_working_tensions_each_drive_is_at_its_home_counts(name: str) -> None:
     rig, winches = RIGS[name], MAPS[name]
     tensions = working_tensions(rig, rig.home).tensions
     unstrained = winches.unstrained(cable_lengths(rig, rig.home), tensions)
@@ -65,7 +65,7 @@ def test_lengths_and_tensions_come_back_from_rounded_counts(name: str, data: st.
     assert np.all(np.abs(back - lengths) <= half_count)
 
 
-def test_a_winch_may_have_a_cable_of_its_own_stiffness() -> None:
+def test_each_winch_may_have_its_own_cable_stiffness() -> None:
     found, of_all = RIGS["cables that differ"].cable_stiffness, RIGS["paper"].cable_stiffness
     assert found.tolist() == [of_all[0], *(5000.0 * np.arange(1, len(found)))]
 
@@ -78,8 +78,8 @@ def test_more_tension_means_less_cable_paid_out(name: str) -> None:
     slack = winches.unstrained(lengths, np.full(rig.cable_count, rig.min_tension))
     taut = winches.unstrained(lengths, np.full(rig.cable_count, rig.max_tension))
     assert np.all(taut < slack)
-    turned = winches.counts(taut) - winches.counts(slack)
-    assert np.all(turned * np.sign([w.counts_per_metre for w in rig.winches]) < 0.0)
+    moved = winches.counts(taut) - winches.counts(slack)
+    assert np.all(moved * np.sign([w.counts_per_metre for w in rig.winches]) < 0.0)
 
 
 @each
@@ -130,7 +130,7 @@ def test_working_tensions_hold_the_weight_within_the_limits(name: str, data: st.
     assert np.all(tensions <= rig.max_tension + 1e-9)
 
 
-def test_the_weight_of_a_payload_off_the_middle_turns_the_platform() -> None:
+def test_the_weight_of_a_payload_off_centre_rotates_the_platform() -> None:
     """A payload on +x pulls down: a moment about +y, whatever the position."""
     from model.scene import Load
 

@@ -1,4 +1,4 @@
-"""YAML as people mean it: numbers of YAML 1.2, and the place of everything."""
+"""YAML as users mean it: numbers of YAML 1.2, and the position of everything."""
 
 from __future__ import annotations
 
@@ -78,18 +78,18 @@ trees = st.recursive(
 
 
 @given(trees, st.sampled_from([True, False, None]))
-def test_each_value_stands_where_its_place_says(tree: Any, flow: bool | None) -> None:
+def test_each_value_is_at_its_stated_position(tree: Any, flow: bool | None) -> None:
     text = yaml.safe_dump({"top": tree}, default_flow_style=flow, width=60)
     found = parse_yaml(text)
     assert found.data == {"top": tree}
     assert found.faults == []
     lines = text.splitlines()
-    for path, (line, column) in found.places.items():
+    for path, (line, column) in found.positions.items():
         if path and isinstance(path[-1], str):
             assert lines[line - 1][column - 1 :].startswith((path[-1], "? "))
 
 
-def test_a_key_twice_is_told_at_its_second_place() -> None:
+def test_a_key_twice_is_reported_at_its_second_position() -> None:
     [fault] = parse_yaml("a:\n  x: 1\n  y: 2\n  x: 3\n").faults
     assert (fault.key, fault.line, fault.column) == (("a", "x"), 4, 3)
 
@@ -100,10 +100,10 @@ def test_a_key_that_a_merge_brings_may_be_overridden() -> None:
     assert tree.data["b"] == {"x": 5, "y": 2}
 
 
-def test_what_an_alias_repeats_has_the_place_of_the_alias() -> None:
-    places = parse_yaml("a: &a [1, 2]\nb: *a\n").places
-    assert places[("b",)] == (2, 1)
-    assert ("b", 0) not in places
+def test_what_an_alias_repeats_has_the_position_of_the_alias() -> None:
+    positions = parse_yaml("a: &a [1, 2]\nb: *a\n").positions
+    assert positions[("b",)] == (2, 1)
+    assert ("b", 0) not in positions
 
 
 def levels(line: str) -> str:
@@ -123,12 +123,12 @@ def levels(line: str) -> str:
         "- " * 100,
     ],
 )
-def test_what_would_become_too_much_is_refused_before_it_does(text: str) -> None:
+def test_a_text_that_would_expand_too_far_is_refused_first(text: str) -> None:
     with pytest.raises(YamlSyntaxError, match=r"too much to read: (more than|nested too deeply)"):
         parse_yaml(text)
 
 
-def test_a_text_that_holds_itself_is_read_without_end() -> None:
+def test_a_text_that_contains_itself_is_read_in_finite_time() -> None:
     data = parse_yaml("a: &a [*a]").data
     assert data["a"][0] is data["a"]
 
@@ -144,17 +144,17 @@ def test_a_text_that_holds_itself_is_read_without_end() -> None:
         "{? [!!int x] : 1}",
     ],
 )
-def test_a_tag_makes_nothing(text: str) -> None:
+def test_a_tag_constructs_nothing(text: str) -> None:
     tree = parse_yaml(f"a: {text}")
     assert tree.data is None
     assert "is not allowed" in tree.faults[0].what or "is not text" in tree.faults[0].what
 
 
 @given(st.text(st.sampled_from("ab:-[]{},&*!?#'\"|> \n\t%@`1.~<\x00\u2028é"), max_size=25))
-def test_any_text_is_read_or_refused_with_a_place(text: str) -> None:
-    told = None
+def test_any_text_is_read_or_refused_with_a_position(text: str) -> None:
+    found = None
     try:
         parse_yaml(text)
     except YamlSyntaxError as error:
-        told = error
-    assert told is None or (told.line >= 0 and told.what.startswith("not valid"))
+        found = error
+    assert found is None or (found.line >= 0 and found.what.startswith("not valid"))

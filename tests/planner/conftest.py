@@ -1,4 +1,4 @@
-"""The ready rigs and scenes, and scenes made from them."""
+"""The example rigs and scenes, and scenes built from them."""
 
 from __future__ import annotations
 

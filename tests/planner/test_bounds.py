@@ -43,6 +43,6 @@ def test_a_limit_just_missed_is_never_proved(seed) -> None:
     assert found.proved < truth + 1e-5
 
 
-def test_a_single_place_is_its_own_proof() -> None:
+def test_a_single_sample_is_its_own_proof() -> None:
     found = smallest_along(np.zeros(1), lambda x: x + 3.0, 1.0, 0.0, 1e-3)
     assert (found.value, found.proved, found.samples) == (3.0, 3.0, 1)

@@ -72,7 +72,7 @@ def test_an_edited_plan_through_an_obstacle_is_refused(document, ready_scene) ->
     assert refusal.value.exit_code == 3
 
 
-def test_a_thread_thin_obstacle_between_samples_is_found(gachon, scene_with) -> None:
+def test_a_needle_thin_obstacle_between_samples_is_found(gachon, scene_with) -> None:
     """A needle a cable sweeps over in passing: dense samples of the ends alone would miss it."""
     start, goal = Pose.level([0, 0, 0.40]), Pose.level([0, 0, 0.4049])
     exits = gachon.outlets[0]
@@ -90,7 +90,7 @@ def test_a_thread_thin_obstacle_between_samples_is_found(gachon, scene_with) -> 
     assert near.smallest(goal).distance > 0.0005
 
 
-def test_clearance_a_hair_below_what_is_asked_is_refused_and_a_hair_above_is_proved(
+def test_clearance_just_below_the_limit_is_refused_and_just_above_is_proved(
     gachon, document
 ) -> None:
     plan = plan_from_document(document)
@@ -173,8 +173,8 @@ def test_a_winch_too_slow_for_the_path_speed_is_a_violation(gachon, scene_with) 
 
 
 def test_a_path_that_turns_the_platform_is_checked_too(gachon, scene_with) -> None:
-    turned = Pose(gachon.home.position, Rotation.from_euler("z", 1, degrees=True).as_matrix())
-    report = check_path(gachon, scene_with(), [gachon.home, turned, gachon.home])
+    rotated = Pose(gachon.home.position, Rotation.from_euler("z", 1, degrees=True).as_matrix())
+    report = check_path(gachon, scene_with(), [gachon.home, rotated, gachon.home])
     assert report.passed
     assert report.length == 0.0
     far = Pose(gachon.home.position, Rotation.from_euler("z", 150, degrees=True).as_matrix())
@@ -199,7 +199,7 @@ def test_margin_and_self_clearance_change_no_faster_than_their_slopes(
         )
         ends = [Pose.level(position), near]
         check = _Check(rig, scene, PosePath(rig, ends))
-        motion = check.track.marks[-1]
+        motion = check.path.marks[-1]
         margins = [capacity_margins(rig, scene, p.position[None], p.rotation)[0] for p in ends]
         assert abs(margins[1] - margins[0]) <= check._margin_slope() * motion
         own = [check.model.self_clearance(p).distance for p in ends]

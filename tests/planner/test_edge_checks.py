@@ -24,7 +24,7 @@ def checks(**changes: float) -> ExactChecks:
     return ExactChecks(GACHON, SCENE, np.eye(3), **(limits | changes))
 
 
-def test_every_reason_is_told() -> None:
+def test_every_reason_is_reported() -> None:
     aside = HOME + np.array([0.1, 0.0, 0.0])
     assert checks().problem(HOME, aside) == FREE
     assert checks().problem(HOME, HOME + np.array([0.0, 0.0, 1.0])) == WORKSPACE
@@ -43,13 +43,15 @@ def test_many_edges_and_frozen_arrays_are_taken_as_one_by_one() -> None:
     assert (round(distance, 4), body, obstacle) == (0.0322, 6, 0)
 
 
-def test_turning_edges_tell_their_reason_too() -> None:
+def test_turning_edges_report_their_reason_too() -> None:
     made = checks()
-    turned = Pose(HOME, matrix_from_rotation_vector([0.0, 0.0, 0.05]))
-    assert made.turning_problem(Pose.level(HOME), turned) == FREE
-    assert made.turning_problem(SCENE.start, Pose(SCENE.goal.position, turned.rotation)) == OBSTACLE
+    rotated = Pose(HOME, matrix_from_rotation_vector([0.0, 0.0, 0.05]))
+    assert made.turning_problem(Pose.level(HOME), rotated) == FREE
+    assert (
+        made.turning_problem(SCENE.start, Pose(SCENE.goal.position, rotated.rotation)) == OBSTACLE
+    )
     assert made.turning_problem(Pose.level(HOME), Pose.level([0.0, 0.0, 2.0])) == WORKSPACE
-    assert checks(self_clearance=0.05).turning_problem(Pose.level(HOME), turned) == SELF
+    assert checks(self_clearance=0.05).turning_problem(Pose.level(HOME), rotated) == SELF
 
 
 def test_importing_the_checks_compiles_nothing() -> None:

@@ -35,7 +35,7 @@ def proved(rig, scene, settings):
         (3, 10, "goal-bias"),
     ],
 )
-def test_plans_in_the_papers_way_pass_their_check(
+def test_plans_of_the_paper_mode_pass_their_check(
     gachon, ready_scene, number, clearance_mm, sampler
 ) -> None:
     scene = ready_scene(f"environment_{number}").changed(clearance=clearance_mm / 1000)
@@ -86,12 +86,12 @@ def test_the_tree_of_a_plan_holds_its_raw_path(gachon, ready_scene) -> None:
         assert away.min() < 0.002
 
 
-def test_progress_is_told_with_iterations_and_distance(gachon, ready_scene) -> None:
-    told: list[tuple[int, int, float]] = []
-    make_plan(gachon, ready_scene("environment_1"), QUICK, lambda *now: told.append(now))
-    assert told
-    assert [t[0] for t in told] == sorted(t[0] for t in told)
-    assert all(0 <= distance < 0.6 for _, _, distance in told)
+def test_progress_is_reported_with_iterations_and_distance(gachon, ready_scene) -> None:
+    reported: list[tuple[int, int, float]] = []
+    make_plan(gachon, ready_scene("environment_1"), QUICK, lambda *now: reported.append(now))
+    assert reported
+    assert [t[0] for t in reported] == sorted(t[0] for t in reported)
+    assert all(0 <= distance < 0.6 for _, _, distance in reported)
 
 
 @pytest.mark.parametrize("mode", ["paper", "rewire"])
@@ -109,11 +109,11 @@ def test_a_free_straight_line_is_the_plan(gachon, scene_with, mode) -> None:
     assert document.quality.length_mm == pytest.approx(np.linalg.norm([100, 50, 45]), rel=1e-9)
 
 
-def test_a_turned_platform_keeps_its_orientation(gachon, scene_with) -> None:
-    turned = [float(np.cos(np.radians(0.5))), 0.0, 0.0, float(np.sin(np.radians(0.5)))]
+def test_a_rotated_platform_keeps_its_orientation(gachon, scene_with) -> None:
+    rotated = [float(np.cos(np.radians(0.5))), 0.0, 0.0, float(np.sin(np.radians(0.5)))]
     scene = scene_with(
-        start={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": turned},
-        goal={"position_mm": [60.0, 0.0, 445.0], "rotation_wxyz": turned},
+        start={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": rotated},
+        goal={"position_mm": [60.0, 0.0, 445.0], "rotation_wxyz": rotated},
     )
     plan = plan_from_document(proved(gachon, scene, QUICK))
     assert all(w.angle_to(scene.start) < 1e-9 for w in plan.waypoints)
@@ -142,14 +142,14 @@ def test_a_start_that_cannot_be_used_names_what_and_by_how_much(
         make_plan(gachon, mirrored, QUICK)
 
 
-def test_a_start_that_barely_touches_is_not_told_to_be_zero_inside(gachon, ready_scene) -> None:
+def test_a_start_that_barely_touches_is_not_reported_as_zero_inside(gachon, ready_scene) -> None:
     bad = ready_scene("environment_1").changed(start=Pose.level([-0.045 - 1e-12, 0.0, 0.3]))
     with pytest.raises(BadInput, match="platform touches obstacle_1") as refusal:
         make_plan(gachon, bad, QUICK)
     assert "inside" not in str(refusal.value)
 
 
-def test_a_start_nearer_than_the_clearance_asked_for_tells_both_figures(
+def test_a_start_nearer_than_the_clearance_asked_for_states_both_figures(
     gachon, ready_scene
 ) -> None:
     scene = ready_scene("environment_1").changed(clearance=0.040)
@@ -162,15 +162,15 @@ def test_a_load_too_heavy_for_the_cables_is_bad_input(gachon, scene_with) -> Non
         make_plan(gachon, scene_with(load={"payload_kg": 60.0}), QUICK)
 
 
-def test_start_and_goal_turned_differently_are_bad_input(gachon, scene_with) -> None:
-    turned = [float(np.cos(0.05)), 0.0, 0.0, float(np.sin(0.05))]
-    scene = scene_with(goal={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": turned})
+def test_start_and_goal_of_different_orientation_are_bad_input(gachon, scene_with) -> None:
+    rotated = [float(np.cos(0.05)), 0.0, 0.0, float(np.sin(0.05))]
+    scene = scene_with(goal={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": rotated})
     with pytest.raises(BadInput, match=r"differ in orientation by 5\.73 deg"):
         make_plan(gachon, scene, QUICK)
 
 
 @pytest.mark.parametrize("mode", ["paper", "rewire"])
-def test_no_path_within_the_limit_tells_the_best_distance_and_why(
+def test_no_path_within_the_limit_states_the_best_distance_and_why(
     gachon, ready_scene, mode
 ) -> None:
     settings = PlannerSettings(mode=mode, max_iterations=60)
@@ -194,7 +194,7 @@ def test_no_path_within_the_limit_tells_the_best_distance_and_why(
         ({"seed": -1}, "seed"),
     ],
 )
-def test_settings_that_no_search_could_use_are_refused(wrong, word) -> None:
+def test_unusable_settings_are_refused(wrong, word) -> None:
     with pytest.raises(BadInput, match=word):
         PlannerSettings(**wrong)
 
@@ -202,7 +202,7 @@ def test_settings_that_no_search_could_use_are_refused(wrong, word) -> None:
 def test_pulleys_payload_and_disturbances_are_planned_and_checked(hall, ready_scene) -> None:
     document = proved(hall, ready_scene("hall_pillar"), QUICK)
     assert document.quality.obstacle_clearance.distance_mm >= 40
-    assert len(document.waypoints) > 2  # the pillar is in the way
+    assert len(document.waypoints) > 2  # the pillar blocks the straight line
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A slice of `benchmarks/random_scenes.py`, and whether its second opinion sees what it is for."""
+"""A slice of `benchmarks/random_scenes.py`, and whether its second opinion detects violations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from model.scene import scene_from_document
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def test_a_path_through_an_obstacle_is_told_with_the_pair(gachon, ready_scene) -> None:
+def test_a_path_through_an_obstacle_is_reported_with_the_pair(gachon, ready_scene) -> None:
     scene = ready_scene("environment_1")
     ends = np.array([scene.start.position, scene.goal.position])
     opinion = second_opinion(gachon, scene, ends)
@@ -25,7 +25,7 @@ def test_a_path_through_an_obstacle_is_told_with_the_pair(gachon, ready_scene) -
     assert any("not proved" in problem for problem in opinion.problems)
 
 
-def test_a_path_that_keeps_its_clearance_by_a_hair_passes_and_one_that_misses_it_does_not(
+def test_a_path_that_barely_keeps_its_clearance_passes_and_one_that_misses_it_does_not(
     gachon, ready_scene
 ) -> None:
     """Beside the obstacle for a while, with the clearance taken from the path itself."""
@@ -33,14 +33,14 @@ def test_a_path_that_keeps_its_clearance_by_a_hair_passes_and_one_that_misses_it
     path = np.array([scene.start.position, scene.start.position + 0.2 * UP])
     scene = scene.changed(goal=Pose(path[-1], scene.goal.rotation))
     model = ClearanceModel(gachon, scene)
-    places = [Pose.level(path[0] + k / 400.0 * (path[1] - path[0])) for k in range(401)]
-    smallest = min(near.distance for p in places if (near := model.smallest(p)) is not None)
+    poses = [Pose.level(path[0] + k / 400.0 * (path[1] - path[0])) for k in range(401)]
+    smallest = min(near.distance for p in poses if (near := model.smallest(p)) is not None)
     assert second_opinion(gachon, scene.changed(clearance=smallest - 1e-4), path).problems == []
     refused = second_opinion(gachon, scene.changed(clearance=smallest + 1e-4), path)
     assert refused.problems
 
 
-def test_wrong_ends_and_loads_that_nothing_holds_are_told(gachon, ready_scene) -> None:
+def test_wrong_ends_and_loads_that_nothing_holds_are_reported(gachon, ready_scene) -> None:
     scene = ready_scene("environment_1")
     path = np.array([scene.start.position, scene.start.position + 0.01 * UP])
     problems = second_opinion(gachon, scene, path).problems

@@ -1,4 +1,4 @@
-"""Post-processing: never through an obstacle, never dearer, ends kept; about a disc in a plane."""
+"""Post-processing: never through an obstacle, never costlier, same ends; a disc in a plane."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_every_step_keeps_ends_and_freedom_and_never_costs_more(seed: int) -> No
         assert length(made) <= length(path) + 1e-9
 
 
-def test_drawing_tight_comes_within_two_percent_of_the_shortest_way() -> None:
+def test_drawing_tight_comes_within_two_percent_of_the_shortest_path() -> None:
     angles = np.linspace(np.pi, 0.0, 30)
     path = 0.5 * np.column_stack([np.cos(angles), np.sin(angles)])
     tight = path

@@ -44,15 +44,15 @@ def test_a_plan_meets_every_stop_exactly_and_passes_its_check(
     plan = load_plan(tmp_path / "plan.json")
     assert verify(plan).report.passed
     assert [mark.name for mark in plan.document.stops] == [s.name for s in scene.stops]
-    for place, at in zip(plan.stops, scene.stops, strict=True):
-        assert plan.waypoints[place].distance_to(at.pose) < 1e-9
+    for index, at in zip(plan.stops, scene.stops, strict=True):
+        assert plan.waypoints[index].distance_to(at.pose) < 1e-9
     assert plan.waypoints[0].distance_to(scene.start) < 1e-9
     assert plan.waypoints[-1].distance_to(scene.goal) < 1e-9
     tree = plan.document.tree
     assert tree.parents.count(-1) == len(scene.stops) + 1, "a root for each leg"
     nodes = np.array([*tree.positions_mm, [np.nan] * 3])
-    for place in (*plan.stops, len(plan.waypoints) - 1):
-        ends = plan.waypoints[place].position * 1000.0
+    for index in (*plan.stops, len(plan.waypoints) - 1):
+        ends = plan.waypoints[index].position * 1000.0
         assert np.nanmin(np.linalg.norm(nodes - ends, axis=1)) < 0.002
 
 
@@ -99,7 +99,7 @@ def test_a_leg_is_the_plan_that_its_ends_alone_would_have(gachon, ready_scene) -
 
 
 def test_a_leg_that_only_its_own_load_makes_impossible_fails_the_check(gachon, scene_with) -> None:
-    """12 kg are held at home and at the goal, but not at [200, 200, 600] mm on the way."""
+    """12 kg are held at home and at the goal, but not at [200, 200, 600] mm in between."""
     ends = {"start": {"position_mm": [0, 0, 300]}, "goal": {"position_mm": [200, 200, 300]}}
     high = Pose.level(np.array([0.2, 0.2, 0.6]))
     loaded = scene_with(**ends, stops=[pick("heavy", (0, 0, 445), 12.0)])
@@ -114,7 +114,7 @@ def test_a_leg_that_only_its_own_load_makes_impossible_fails_the_check(gachon, s
     assert check_path(gachon, late, before, [1, 2]).passed, "the mass is picked after it"
 
 
-def test_a_load_picked_on_the_way_is_planned_for(gachon, scene_with) -> None:
+def test_a_load_picked_in_between_is_planned_for(gachon, scene_with) -> None:
     scene = scene_with(
         start={"position_mm": [0, 0, 300]},
         goal={"position_mm": [200, 200, 300]},
@@ -135,8 +135,8 @@ def test_a_load_picked_on_the_way_is_planned_for(gachon, scene_with) -> None:
             ["stop 'high' the cables cannot hold"],
         ),
         (
-            [stop("turned", 0, 0, 445, rotation_wxyz=[0.0, 0.0, 0.0, 1.0])],
-            ["start and stop 'turned' differ in orientation by 180 deg"],
+            [stop("rotated", 0, 0, 445, rotation_wxyz=[0.0, 0.0, 0.0, 1.0])],
+            ["start and stop 'rotated' differ in orientation by 180 deg"],
         ),
     ],
 )
@@ -147,7 +147,7 @@ def test_a_stop_that_cannot_be_used_is_named(gachon, scene_with, stops, words) -
     assert all(word in str(refusal.value) for word in words)
 
 
-def test_no_path_tells_the_leg(gachon, ready_scene) -> None:
+def test_no_path_names_the_leg(gachon, ready_scene) -> None:
     scene = ready_scene("environment_3")
     near = StopDocument(name="near", position_mm=scene.document.start.position_mm)
     through = scene.changed(stops=[near])
@@ -157,9 +157,9 @@ def test_no_path_tells_the_leg(gachon, ready_scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stops", "why"), [([], "are its poses []"), ([2, 1], "[2, 1]"), ([1, 9], "between 0 and 3")]
+    ("stops", "why"), [([], "stops at poses []"), ([2, 1], "[2, 1]"), ([1, 9], "between 0 and 3")]
 )
-def test_stops_of_a_path_that_are_none_are_refused(gachon, scene_with, stops, why) -> None:
+def test_invalid_stops_of_a_path_are_refused(gachon, scene_with, stops, why) -> None:
     scene = scene_with(stops=[stop("a", 0, 0, 445), stop("b", 0, 0, 445)])
     with pytest.raises(BadInput) as refusal:
         check_path(gachon, scene, [gachon.home] * 4, stops)
@@ -175,7 +175,7 @@ def test_a_path_past_its_stop_fails_the_check(gachon, scene_with) -> None:
 
 def test_a_longest_path_and_wrong_rounds_are_refused_with_stops(gachon, scene_with) -> None:
     scene = scene_with(stops=[stop("a", 0, 0, 450)])
-    with pytest.raises(BadInput, match="limit of the path length"):
+    with pytest.raises(BadInput, match="limit on the path length"):
         make_plan(gachon, scene, OptimalSettings(longest=1.0))
     with pytest.raises(BadInput, match=r"rounds are given for 3 legs; the scene has 2"):
         make_plan(gachon, scene, OptimalSettings(), rounds=[1, 1, 1])
@@ -183,10 +183,10 @@ def test_a_longest_path_and_wrong_rounds_are_refused_with_stops(gachon, scene_wi
         make_plan(gachon, scene, PlannerSettings(), rounds=[1, 1])
 
 
-def test_a_report_of_legs_can_be_told_as_json(gachon, ready_scene) -> None:
+def test_a_report_of_legs_can_be_written_as_json(gachon, ready_scene) -> None:
     plan = plan_from_document(make_plan(gachon, ready_scene("pick_and_place"), OPTIMAL))
     report = verify(plan).report
     assert json.dumps(report.as_dict(), allow_nan=False)
     motion = sum(a.distance_to(b) for a, b in pairwise(plan.waypoints))
-    assert 0.0 <= report.obstacle_clearance.place <= motion
+    assert 0.0 <= report.obstacle_clearance.at <= motion
     assert report.length == pytest.approx(motion)

@@ -1,4 +1,4 @@
-"""Clearances proved a whole stretch at a time, against distances at dense poses."""
+"""Clearances proved over whole intervals, against distances at dense poses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from model.clearance import ClearanceModel, RobotBodies, ShiftedBodies
 from model.errors import Fault
 from model.pose import Pose, interpolate
-from planner.bounds import smallest_along, smallest_over_stretches
+from planner.bounds import smallest_along, smallest_over_intervals
 from planner.path import PosePath
 
 TOLERANCE = 0.1e-3
@@ -28,9 +28,9 @@ def random_case(gachon, scene_with, seed):
     random = np.random.default_rng(seed)
     obstacles = []
     for k in range(int(random.integers(1, 4))):
-        place = random.uniform([-300, -300, 100], [300, 300, 800])
+        position = random.uniform([-300, -300, 100], [300, 300, 800])
         shape = SHAPES[int(random.integers(len(SHAPES)))]
-        obstacles.append({"name": f"thing_{k}", "position_mm": place.tolist(), **shape})
+        obstacles.append({"name": f"thing_{k}", "position_mm": position.tolist(), **shape})
     corners = random.uniform([-200, -200, 200], [200, 200, 600], (int(random.integers(2, 5)), 3))
     rotation = np.array(gachon.home.rotation)
     poses = [Pose(corner / 1e3, rotation) for corner in corners]
@@ -41,15 +41,15 @@ def random_case(gachon, scene_with, seed):
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_smallest_clearance_is_that_of_the_bound_by_motion(gachon, scene_with, seed) -> None:
     """Overlaps are left out: how deep they are is a bound, not a distance."""
-    model, track, _ = random_case(gachon, scene_with, seed)
-    places = track.places(0.005)
+    model, path, _ = random_case(gachon, scene_with, seed)
+    samples = path.samples(0.005)
 
     def evaluate(at):
-        return np.array([model.smallest(track.pose(p)).distance for p in at.tolist()])
+        return np.array([model.smallest(path.pose(p)).distance for p in at.tolist()])
 
     required = 0.010
-    found = smallest_over_stretches(model, track, required, TOLERANCE)
-    other = smallest_along(places, evaluate, 1.0, required, TOLERANCE)
+    found = smallest_over_intervals(model, path, required, TOLERANCE)
+    other = smallest_along(samples, evaluate, 1.0, required, TOLERANCE)
     if other.proved <= 0.0:
         assert found.proved <= 1e-9
         return
@@ -61,14 +61,14 @@ def test_the_smallest_clearance_is_that_of_the_bound_by_motion(gachon, scene_wit
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_no_pose_of_a_path_is_nearer_than_is_proved(gachon, scene_with, seed) -> None:
-    model, track, poses = random_case(gachon, scene_with, seed)
-    found = smallest_over_stretches(model, track, 0.0, TOLERANCE)
+    model, path, poses = random_case(gachon, scene_with, seed)
+    found = smallest_over_intervals(model, path, 0.0, TOLERANCE)
     moves = pairwise(poses)
     sampled = [interpolate(a, b, t) for a, b in moves for t in np.linspace(0.0, 1.0, 40)]
     smallest = min(model.smallest(pose).distance for pose in sampled)
     assert found.proved <= smallest + 1e-9
     if found.value > 0.0:
-        assert found.value == pytest.approx(model.smallest(track.pose(found.at)).distance, abs=1e-9)
+        assert found.value == pytest.approx(model.smallest(path.pose(found.at)).distance, abs=1e-9)
 
 
 @settings(max_examples=50, deadline=None)
@@ -88,8 +88,8 @@ def test_shifted_bodies_reach_as_far_as_the_robot_at_any_of_the_positions(gachon
     assert (RobotBodies(gachon, between).reach(directions) <= reach + 1e-12).all()
 
 
-def test_a_distance_that_is_no_number_proves_nothing(gachon, scene_with, monkeypatch) -> None:
-    model, track, _ = random_case(gachon, scene_with, 1)
+def test_a_nan_distance_proves_nothing(gachon, scene_with, monkeypatch) -> None:
+    model, path, _ = random_case(gachon, scene_with, 1)
     monkeypatch.setattr(ClearanceModel, "smallest", lambda _model, _pose: None)
     with pytest.raises(Fault, match="unknown"):
-        smallest_over_stretches(model, track, 0.0, TOLERANCE)
+        smallest_over_intervals(model, path, 0.0, TOLERANCE)

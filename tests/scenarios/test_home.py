@@ -36,7 +36,7 @@ from model.errors import CdprError, Fault, Refused, StoppedByOperator
 from model.plan import plan_from_document
 from model.pose import Array, Pose
 from model.rig import Rig, load_rig, rig_from_document
-from model.scene import nothing_in_the_way
+from model.scene import empty_scene
 from planner.check import verify
 from simulation.camera.camera import SyntheticCamera
 from simulation.drives.cia402_rig import SimulatedCia402Rig
@@ -196,9 +196,7 @@ def test_home_then_run_then_the_tags_agree(tmp_path: Path) -> None:
         )
         place.group.close()
         home = place.rig.home.position
-        way = nothing_in_the_way(rig).changed(
-            goal=Pose.level(home + np.array([0.012, -0.006, 0.015]))
-        )
+        way = empty_scene(rig).changed(goal=Pose.level(home + np.array([0.012, -0.006, 0.015])))
         document = straight_plan(rig, way, [tuple(home * 1e3), tuple(way.goal.position * 1e3)])
         prepared = prepare(verify(plan_from_document(document), rig), rig)
         bus = place.group._bus  # type: ignore[attr-defined]
@@ -222,7 +220,7 @@ def test_home_then_run_then_the_tags_agree(tmp_path: Path) -> None:
 
 def looks(rig: Rig, *poses: Pose) -> list[object]:
     camera, tracker = (
-        SyntheticCamera(rig, nothing_in_the_way(rig), rig.cameras[0]),
+        SyntheticCamera(rig, empty_scene(rig), rig.cameras[0]),
         Tracker(rig, rig.cameras[0]),
     )
     poses = poses * 6 if len(poses) == 1 else poses
@@ -241,10 +239,10 @@ def test_a_platform_that_hangs_free_is_referenced_by_its_tags_and_goes_home(
         reference = reference_at(
             place.rig, seen.pose, stand.counts, stand.tensions, "tags", seen.uncertainty
         )
-        rig, load = referenced(place.rig, reference), nothing_in_the_way(place.rig).load
+        rig, load = referenced(place.rig, reference), empty_scene(place.rig).load
         found = current_pose(rig, stand.counts, load)
         assert found.distance_to(true) < 4.0 * seen.uncertainty
-        home = straight_way(rig, nothing_in_the_way(rig), found, rig.home)
+        home = straight_way(rig, empty_scene(rig), found, rig.home)
         prepared = prepare(verify(plan_from_document(home), rig), rig)
         bus = place.group._bus  # type: ignore[attr-defined]
         place.group.close()

@@ -10,7 +10,7 @@ import pytest
 
 from model.pose import Array, PlatformMotion, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, load_rig
-from model.scene import Scene, nothing_in_the_way
+from model.scene import Scene, empty_scene
 from simulation.camera.camera import Film, SyntheticCamera
 from simulation.ground_truth import Optics, camera_as_built
 
@@ -25,7 +25,7 @@ def rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def scene(rig: Rig) -> Scene:
-    return nothing_in_the_way(rig)
+    return empty_scene(rig)
 
 
 @pytest.fixture(scope="module")

@@ -210,7 +210,7 @@ def test_two_cameras_in_one_place_differ_by_their_noise_alone(rig: Rig, scene: S
         (
             {"cameras": [{"name": "front", "exposure_ms": 101}]},
             "simulation.cameras[0].exposure_ms",
-            "exceeds the frame period at 10 pictures/s",
+            "exceeds the frame period at 10 images/s",
         ),
     ],
 )

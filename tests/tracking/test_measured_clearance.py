@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.clearance import ClearanceModel
 from model.errors import BadInput
 from model.files.rig_file import RigDocument
@@ -63,7 +63,7 @@ def test_uncertainty_agrees_with_distances_at_scattered_poses(
         near = model.obstacles(Pose(pose.position + step[:3], rotation))
         distances.append([n.distance for n in near])
     scatter = np.std(np.array(distances), axis=0)
-    predicted = stated.uncertainties / SURE
+    predicted = stated.uncertainties / Z_95
     apart = np.array([n.distance > 0.0 for n in stated.nearest])
     assert apart.sum() >= 2
     np.testing.assert_allclose(predicted[apart], scatter[apart], rtol=0.15)
@@ -85,7 +85,7 @@ def test_touching_bodies_take_the_worst_direction(rig: Rig, crowded: Scene) -> N
     assert found is not None
     assert found.distance < 0.0
     assert np.all(np.isfinite(found.uncertainties))
-    assert found.uncertainties.max() >= 0.99 * SURE * 2e-4  # along the least known direction
+    assert found.uncertainties.max() >= 0.99 * Z_95 * 2e-4  # along the least known direction
 
 
 def test_a_scene_without_obstacles_has_no_clearance(rig: Rig, crowded: Scene) -> None:
@@ -148,7 +148,7 @@ def test_errors_of_the_camera_pose_are_propagated_to_the_clearance(
     scatter = np.std(np.array(distances), axis=0)
     apart = np.array([n.distance > 0.005 for n in stated.nearest])
     assert apart.sum() >= 2
-    np.testing.assert_allclose(stated.uncertainties[apart] / SURE, scatter[apart], rtol=0.2)
+    np.testing.assert_allclose(stated.uncertainties[apart] / Z_95, scatter[apart], rtol=0.2)
     assert stated.uncertainties.max() > 1e-3  # where 0.5 mm were stated before, whatever was known
 
 
@@ -180,7 +180,7 @@ def test_tags_that_are_off_as_stated_count_once(rig: Rig) -> None:
         camera,
         error=None,
         lens_covariance=np.zeros((count, count)),
-        place_covariance=np.zeros((6, 6)),
+        pose_covariance=np.zeros((6, 6)),
     )
     stated = replace(rig, tag_error=0.25e-3, outlet_error=0.0, anchor_error=0.0)
     shared = SharedErrors(stated, camera)
@@ -229,8 +229,8 @@ def test_a_lens_error_is_propagated_through_extrinsics_and_pose_together(
         camera,
         error=None,
         lens_covariance=np.diag(deviations**2),
-        place_covariance=by_lens @ np.diag(deviations**2) @ by_lens.T,
-        place_by_lens=by_lens,
+        pose_covariance=by_lens @ np.diag(deviations**2) @ by_lens.T,
+        pose_by_lens=by_lens,
     )
     expected = np.zeros((6, 6))
     for k in range(count):

@@ -10,7 +10,7 @@ import pytest
 
 from model.pose import PlatformMotion, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, load_rig, rig_from_document
-from model.scene import nothing_in_the_way
+from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics, camera_as_built
 from tracking.camera_model import pixels_of
@@ -34,7 +34,7 @@ def camera(rig: Rig) -> Camera:
 
 def eye_of(rig: Rig, camera: Camera, exposure: float = 0.0) -> SyntheticCamera:
     optics = Optics(noise=1.0, cables=False, exposure=exposure)
-    return SyntheticCamera(rig, nothing_in_the_way(rig), camera, 1, optics)
+    return SyntheticCamera(rig, empty_scene(rig), camera, 1, optics)
 
 
 def flown(rig: Rig, camera: Camera, stated: float, velocity: list[float], images: int = 5):

@@ -111,8 +111,8 @@ def test_margins_of_many_poses_are_those_of_each():
     assert (margins < 0.0).any()
 
 
-def test_the_margin_crosses_zero_without_a_jump():
-    """A surface drawn through zero is then where closure ends, not somewhere in a cell."""
+def test_the_margin_is_continuous_at_zero():
+    """The zero surface is then the boundary of closure, not somewhere in a cell."""
     start, end = np.array([0.0, 0.0, 0.445]), np.array([0.9, 0.3, 0.445])
     closed, lost = 0.0, 1.0
     while lost - closed > 1e-12:
@@ -136,7 +136,7 @@ def test_several_poses_at_once_are_refused():
         wrench_closure(np.zeros((2, 6, 8)))
 
 
-def test_an_answer_cannot_be_changed():
+def test_a_result_is_read_only():
     answer = wrench_closure(paper_matrix())
     for array in (answer.proof, answer.structure_matrix):
         with pytest.raises(ValueError, match="read-only"):

@@ -67,12 +67,12 @@ def test_margin_is_positive_exactly_where_a_linear_program_finds_tensions(seed, 
 @settings(max_examples=60)
 @given(seed=seeds, cables=cable_counts)
 def test_margin_inside_is_the_distance_to_the_boundary(seed, cables):
-    """The way out along the binding normal is the margin, and no other way is shorter."""
+    """The distance out along the binding normal is the margin, and no other is shorter."""
     matrix, low, high, wrench = random_problem(seed, cables)
     answer = wrench_feasible(matrix, low, high, WrenchBox.of_one(wrench), LENGTH)
     if answer.margin > 1e-5:
-        way_out = room_along(matrix, low, high, wrench, answer.binding_normal)
-        assert way_out == pytest.approx(answer.margin, rel=1e-5, abs=1e-6)
+        distance_out = room_along(matrix, low, high, wrench, answer.binding_normal)
+        assert distance_out == pytest.approx(answer.margin, rel=1e-5, abs=1e-6)
         other = np.random.default_rng(seed).normal(size=6)
         other /= np.linalg.norm(other)
         assert room_along(matrix, low, high, wrench, other) >= answer.margin - 1e-6

@@ -46,7 +46,7 @@ def any_problem(seed, cables):
 
 
 def smallest_relaxation(matrix, low, high, wrench):
-    """Return by how much all limits must give way for tensions to exist, by a linear program."""
+    """Return by how much all limits must be relaxed for tensions to exist, by a linear program."""
     cables = len(low)
     answer = linprog(
         np.append(np.zeros(cables), 1.0),
@@ -90,7 +90,7 @@ def test_tensions_exist_exactly_where_a_linear_program_finds_them_and_the_shortf
 
 @settings(max_examples=40)
 @given(seed=seeds, cables=cable_counts)
-def test_limits_that_give_way_by_the_shortfall_just_suffice(seed, cables):
+def test_limits_relaxed_by_the_shortfall_just_suffice(seed, cables):
     matrix, low, high, wrench = any_problem(seed, cables)
     try:
         solve_tensions(matrix, wrench, low, high, method="least_norm")
@@ -128,7 +128,7 @@ def test_least_norm_is_the_optimum_of_the_quadratic_program_over_tensions(seed, 
 @settings(max_examples=40)
 @given(seed=seeds)
 def test_centroid_is_the_mean_of_all_feasible_tensions(seed):
-    """Oracle: a fine grid over the feasible polygon, which knows nothing of corners."""
+    """Oracle: a fine grid over the feasible polygon, which does not use corners."""
     matrix, low, high, wrench = feasible_problem(seed, 8)
     tensions = solve_tensions(matrix, wrench, low, high, method="centroid").tensions
     null_basis = np.linalg.svd(matrix)[2][6:].T
@@ -157,7 +157,7 @@ def test_centroid_is_the_mean_of_all_feasible_tensions(seed):
         assert (np.abs(inside.mean(axis=0)) < 0.005 * extent).all()
 
 
-def test_one_cable_more_than_freedoms_takes_the_middle_of_the_interval():
+def test_one_redundant_cable_takes_the_middle_of_the_interval():
     matrix, low, high, wrench = feasible_problem(3, 7)
     tensions = solve_tensions(matrix, wrench, low, high, method="centroid").tensions
     direction = np.linalg.svd(matrix)[2][6]
@@ -183,7 +183,7 @@ def test_the_order_of_the_cables_only_reorders_the_tensions(seed):
 
 
 @given(seed=seeds)
-def test_turned_world_axes_leave_the_tensions_alone(seed):
+def test_rotated_world_axes_leave_the_tensions_alone(seed):
     matrix, low, high, wrench = feasible_problem(seed, 8)
     turn = np.kron(np.eye(2), np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0])
     for method in METHODS:
@@ -227,7 +227,7 @@ def test_tensions_of_ten_cables_are_continuous_in_the_wrench():
 @settings(max_examples=40)
 @given(seed=seeds, cables=cable_counts)
 def test_the_last_wrench_that_can_be_held_is_held(seed, cables):
-    """At the edge of the wrench set one vector of tensions is left; round-off must not lose it."""
+    """On the boundary of the wrench set one tension vector remains; round-off must not lose it."""
     matrix, low, high, _ = feasible_problem(seed, cables)
     away = np.random.default_rng(seed).normal(size=6)
     only = np.where(away @ matrix > 0.0, high, low)
@@ -237,7 +237,7 @@ def test_the_last_wrench_that_can_be_held_is_held(seed, cables):
         assert np.abs(solution.wrench_residual).max() < 1e-5
 
 
-def test_feasibility_and_capacity_margin_agree_along_a_way_out_of_the_workspace():
+def test_feasibility_and_capacity_margin_agree_along_a_path_out_of_the_workspace():
     for z in np.linspace(0.2, 1.2, 60):
         matrix = paper_matrix((0.3, 0.2, z))
         box = WrenchBox.of_one(PAPER_WEIGHT)

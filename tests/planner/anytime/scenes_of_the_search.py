@@ -1,4 +1,4 @@
-"""Problems for the compiled search: the ready scenes, walls, posts and random obstacles."""
+"""Problems for the compiled search: the example scenes, walls, posts and random obstacles."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from planner.endpoints import require_usable_ends
 from planner.settings import Weights
 from tests.planner.collision.sampled_oracle import random_scene
 
-KINDS = ("box", "turned box", "sphere", "capsule", "cylinder", "hull")
+KINDS = ("box", "rotated box", "sphere", "capsule", "cylinder", "hull")
 LENGTH = Weights(length=1.0)
 
 
@@ -34,7 +34,7 @@ def ends_of(scene: Scene) -> Array:
 
 
 def searched(asked: PathProblem, scene: Scene, rounds: int, seed: int = 0) -> AnytimeSearch:
-    """A search after so many rounds."""
+    """A search after ``rounds`` rounds."""
     search = new_search(*ends_of(scene), seed)
     advance(handle_of(asked, search), rounds)
     return search
@@ -63,7 +63,7 @@ def post(x: float, y: float, low: float, high: float, width: float = 40.0) -> di
 
 
 def random_question(rig: Rig, seed: int) -> Scene | None:
-    """A random scene with two ends that can be used; None where some draws gave none."""
+    """A random scene with two usable ends; None where some draws gave none."""
     rng = np.random.default_rng(seed)
     scene = random_scene(rng, rig, int(rng.integers(1, 4)), KINDS)
     ends: list[Pose] = []

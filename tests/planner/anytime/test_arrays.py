@@ -20,7 +20,7 @@ KEYS = st.lists(st.one_of(st.none(), st.integers(-20, 20)), max_size=80)
 
 @given(KEYS)
 def test_the_heap_gives_the_same_keys_as_heapq(steps) -> None:
-    """Numbers are pushed, None takes one out; a small room makes it grow on the way."""
+    """Numbers are pushed, None takes one out; a small room makes it grow."""
     keys, entries, count = np.empty((2, 2)), np.empty((2, 2), dtype=np.int64), 0
     oracle: list[float] = []
     for number, step in enumerate(steps):

@@ -29,7 +29,7 @@ def lattice_points(asked, stride):
 
 
 def cheapest(asked, ends, name):
-    """Cost of the cheapest way by SciPy: all neighbours joined, ends to points two steps away."""
+    """Cost of the cheapest path by SciPy: all neighbours joined, ends to points two steps away."""
     points, costs, ranks = lattice_points(asked, STRIDE)
     price = (lambda c: 1.0 + 0.0 * c) if name == "length" else (lambda c: c)
     count = len(points)
@@ -64,37 +64,37 @@ def cheapest(asked, ends, name):
 
 @pytest.mark.parametrize("name", ["length", "kinematic"])
 @pytest.mark.parametrize("number", [1, 3])
-def test_it_is_as_cheap_as_the_cheapest_way_by_scipy(gachon, ready_scene, number, name) -> None:
+def test_it_is_as_cheap_as_the_cheapest_path_by_scipy(gachon, ready_scene, number, name) -> None:
     scene = ready_scene(f"environment_{number}")
     asked, ends = problem(gachon, scene, OBJECTIVES[name]), ends_of(scene)
     points, counts = np.zeros((128, 3)), np.zeros(2, dtype=np.int64)
     found = lattice_path(asked, ends, seeded(1), STRIDE, 0.0, points, counts)
-    way = points[:found]
-    assert np.array_equal(way[[0, -1]], ends)
-    assert all(edge_allowed(asked, tuple(a), tuple(b)) for a, b in pairwise(way))
+    path = points[:found]
+    assert np.array_equal(path[[0, -1]], ends)
+    assert all(edge_allowed(asked, tuple(a), tuple(b)) for a, b in pairwise(path))
     price = np.ones(found)
     if name == "kinematic":
-        price = np.array([interpolated(asked.grid, asked.kinematic, tuple(p)) for p in way])
-    cost = ((price[1:] + price[:-1]) / 2.0 * np.linalg.norm(np.diff(way, axis=0), axis=1)).sum()
+        price = np.array([interpolated(asked.grid, asked.kinematic, tuple(p)) for p in path])
+    cost = ((price[1:] + price[:-1]) / 2.0 * np.linalg.norm(np.diff(path, axis=0), axis=1)).sum()
     assert cost == pytest.approx(cheapest(asked, ends, name), rel=1e-12)
     assert counts[1] > 0
 
 
-def test_raised_costs_give_other_ways_that_are_allowed(gachon, ready_scene) -> None:
+def test_raised_costs_give_other_paths_that_are_allowed(gachon, ready_scene) -> None:
     scene = ready_scene("environment_1")
     asked, ends, state = problem(gachon, scene), ends_of(scene), seeded(2)
     seen = set()
     for _ in range(6):
         points, counts = np.zeros((128, 3)), np.zeros(2, dtype=np.int64)
         found = lattice_path(asked, ends, state, 2, 1.0, points, counts)
-        way = points[:found]
-        pairs = pairwise(way)
+        path = points[:found]
+        pairs = pairwise(path)
         assert all(edge_allowed(asked, tuple(a), tuple(b)) for a, b in pairs)
-        seen.add(way.tobytes())
+        seen.add(path.tobytes())
     assert len(seen) > 3
 
 
-def test_a_way_without_room_is_none(gachon, ready_scene) -> None:
+def test_a_path_that_does_not_fit_is_none(gachon, ready_scene) -> None:
     scene = ready_scene("environment_1")
     asked, counts = problem(gachon, scene), np.zeros(2, dtype=np.int64)
     assert lattice_path(asked, ends_of(scene), seeded(1), 1, 0.0, np.zeros((3, 3)), counts) == 0

@@ -1,4 +1,4 @@
-"""Plans of the default planner: checked, repeatable, good at what was asked, in narrow ways too."""
+"""Plans of the default planner: checked, repeatable, good by their objective, in narrow gaps."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ def test_every_objective_makes_the_best_path_in_its_own_measure(by_objective, na
 
 
 def test_the_objectives_are_worth_naming(by_objective) -> None:
-    """Capacity is left out: on this scene the goal has the least, whatever the way."""
+    """Capacity is left out: on this scene the goal has the least, whatever the path."""
     length, kinematic = by_objective["length"], by_objective["kinematic"]
     assert integral(kinematic) < 0.98 * integral(length)
     wide = by_objective["clearance"].quality.obstacle_clearance.distance_mm
     assert wide > 30.0 > 11.0 > length.quality.obstacle_clearance.distance_mm
 
 
-def test_capacity_makes_a_way_round_where_the_straight_one_is_weak(gachon, scene_with) -> None:
-    """Upright near a corner of the workspace: half way the cables hold less than at both ends."""
+def test_capacity_makes_a_detour_where_the_straight_one_is_weak(gachon, scene_with) -> None:
+    """Upright near a corner of the workspace: halfway the cables hold less than at both ends."""
     ends = ([-200.0, 200.0, 175.0], [-200.0, 200.0, 625.0])
     scene = scene_with(start={"position_mm": ends[0]}, goal={"position_mm": ends[1]})
     strong, short = (planned(gachon, scene, name, 40) for name in ("capacity", "length"))
@@ -109,7 +109,7 @@ def test_twenty_millimetres_are_kept_where_they_are_asked_for(gachon, ready_scen
     assert 20.0 <= near <= 20.5  # the shortest path touches what it must keep
 
 
-def test_a_budget_tells_the_rounds_that_give_its_plan_again(gachon, ready_scene) -> None:
+def test_a_budget_states_the_rounds_that_reproduce_its_plan(gachon, ready_scene) -> None:
     scene, ticks = ready_scene("environment_1"), count()
     settings = OptimalSettings(budget=0.4, seed=2)
     by_time = make_plan(gachon, scene, settings, clock=lambda: 0.01 * next(ticks))
@@ -158,7 +158,7 @@ def test_a_limited_plan_is_found_again_by_its_rounds(gachon, ready_scene) -> Non
     assert again.waypoints == by_time.waypoints
 
 
-def test_a_longest_path_below_the_straight_way_is_refused_before_the_search(
+def test_a_longest_path_below_the_straight_distance_is_refused_before_the_search(
     gachon, ready_scene
 ) -> None:
     settings = OptimalSettings(longest=0.5, budget=3600.0)
@@ -169,7 +169,7 @@ def test_a_longest_path_below_the_straight_way_is_refused_before_the_search(
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_passage_a_tenth_of_a_millimetre_wide_is_found(gachon, ready_scene, seed) -> None:
-    """The widest way through environment 3 keeps 28.905 mm, less 0.05 mm that are in reserve."""
+    """The widest passage through environment 3 keeps 28.905 mm, less 0.05 mm of reserve."""
     scene = ready_scene("environment_3").changed(clearance=0.02875)
     document = planned(gachon, scene, rounds=60, seed=seed)
     assert document.quality.obstacle_clearance.distance_mm >= 28.75
@@ -195,24 +195,24 @@ def test_ends_at_the_very_clearance_are_planned_between(gachon, ready_scene) -> 
     assert planned(gachon, scene, rounds=20).quality.obstacle_clearance.distance_mm >= 32.15
 
 
-def test_progress_is_told_in_seconds_or_rounds(gachon, ready_scene) -> None:
-    told: list[tuple[float, float, float]] = []
+def test_progress_is_reported_in_seconds_or_rounds(gachon, ready_scene) -> None:
+    reported: list[tuple[float, float, float]] = []
     ticks = count()
     for settings in (OptimalSettings(rounds=30), OptimalSettings(budget=2.0)):
         make_plan(
             gachon,
             ready_scene("environment_1"),
             settings,
-            progress=lambda *now: told.append(now),
+            progress=lambda *now: reported.append(now),
             clock=lambda: 0.05 * next(ticks),
         )
-    assert {most for _, most, _ in told} == {30.0, 2.0}
+    assert {most for _, most, _ in reported} == {30.0, 2.0}
     for most in (30.0, 2.0):
-        done = [d for d, m, _ in told if m == most]
+        done = [d for d, m, _ in reported if m == most]
         assert len(done) > 3
         assert done == sorted(done)
         assert done[-1] <= most
-    assert all(cost < 1.0 for _, _, cost in told)
+    assert all(cost < 1.0 for _, _, cost in reported)
 
 
 @pytest.mark.parametrize(
@@ -226,7 +226,7 @@ def test_progress_is_told_in_seconds_or_rounds(gachon, ready_scene) -> None:
         ({"longest": math.nan}, "longest"),
     ],
 )
-def test_settings_that_no_search_could_use_are_refused(wrong, words) -> None:
+def test_unusable_settings_are_refused(wrong, words) -> None:
     with pytest.raises(BadInput, match=words):
         OptimalSettings(**wrong)
 
@@ -241,6 +241,6 @@ def test_settings_that_no_search_could_use_are_refused(wrong, words) -> None:
         ({"clearance": 1.0}, "give length a small weight"),
     ],
 )
-def test_weights_that_leave_nothing_to_make_small_are_refused(wrong, words) -> None:
+def test_weights_that_leave_nothing_to_minimise_are_refused(wrong, words) -> None:
     with pytest.raises(BadInput, match=words):
         Weights(**wrong)

@@ -58,7 +58,7 @@ def test_the_cost_of_a_path_is_that_of_its_parts(asked) -> None:
     halves = np.repeat(points, 2, axis=0)[:-1]
     halves[1::2] = (points[1:] + points[:-1]) / 2.0
     whole, parts = measure(question, polyline(points)), measure(question, polyline(halves))
-    assert parts == pytest.approx(whole, rel=2e-3)  # sampled at other places
+    assert parts == pytest.approx(whole, rel=2e-3)  # sampled at other positions
 
 
 def test_the_length_is_the_length(asked) -> None:

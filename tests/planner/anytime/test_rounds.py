@@ -30,7 +30,7 @@ from tests.planner.collision.sampled_oracle import CoalScene
 
 ROOT = Path(__file__).parents[3]
 LAST_VERTEX_PRICE = 1e-4
-"""What a vertex of the best path is worth at least, part of the straight way."""
+"""What a vertex of the best path is worth at least, part of the straight distance."""
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_another_process_finds_the_same_path(asked) -> None:
 @pytest.mark.parametrize("name", ["length", "kinematic", "clearance"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_more_rounds_never_give_a_worse_path(asked, name, seed) -> None:
-    """Worse by cost and a hundredth of a percent of the straight way for every vertex."""
+    """Worse by cost and a hundredth of a percent of the straight distance for every vertex."""
     question, scene = asked(3, name)
     search, last = new_search(*ends_of(scene), seed), np.inf
     unit = OBJECTIVES[name].length + OBJECTIVES[name].kinematic * float(question.kinematic.mean())
@@ -94,7 +94,7 @@ def test_more_rounds_never_give_a_worse_path(asked, name, seed) -> None:
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_all_paths_under_work_are_allowed_by_the_other_checks(asked, gachon, number) -> None:
+def test_all_stored_paths_are_allowed_by_the_other_checks(asked, gachon, number) -> None:
     question, scene = asked(number)
     search = searched(question, scene, 25, seed=number)
     checks = ExactChecks(
@@ -129,14 +129,14 @@ def test_paths_in_random_scenes_pass_check_and_coal(gachon, seed) -> None:
 
 
 def test_most_random_scenes_have_a_path(gachon) -> None:
-    """So that the test above looks at something."""
+    """So that the test above checks something."""
     scenes = [scene for seed in range(12) if (scene := random_question(gachon, seed)) is not None]
     found = [len(best_points(searched(problem(gachon, s), s, 14))) > 0 for s in scenes]
     assert len(scenes) >= 8
     assert sum(found) >= 6
 
 
-def test_where_wrenches_are_hardly_held_the_best_path_is_proved_or_proofs_are_asked_for(
+def test_where_wrenches_are_hardly_held_the_best_path_is_proved_or_proofs_are_required(
     hall, ready_scene
 ) -> None:
     """On this robot the cells of the workspace prove a tenth of it."""
@@ -149,7 +149,7 @@ def test_where_wrenches_are_hardly_held_the_best_path_is_proved_or_proofs_are_as
     assert search.totals[5] == 0 or question.terms[LEAST_MARGIN] == ASK_PROOF
 
 
-def test_a_grid_of_margins_that_forbids_everything_is_not_believed_for_long(asked) -> None:
+def test_a_grid_of_margins_that_forbids_everything_is_soon_ignored(asked) -> None:
     question, scene = asked(1)
     wrong = question._replace(
         holding=question.holding._replace(everywhere=False), terms=question.terms.copy()
@@ -161,7 +161,7 @@ def test_a_grid_of_margins_that_forbids_everything_is_not_believed_for_long(aske
     assert len(best_points(search)) > 2
 
 
-def test_an_end_with_little_margin_is_left_without_asking_for_proofs(hall, ready_scene) -> None:
+def test_an_end_with_little_margin_is_left_without_proofs(hall, ready_scene) -> None:
     """Margins of the grid must be large on edges, but not larger than an end's own."""
     scene = ready_scene("hall_pillar")
     reserve, low, high = MARGIN_RESERVE * hall.max_tension, 0.0, 600.0

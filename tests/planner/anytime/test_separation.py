@@ -1,4 +1,4 @@
-"""The proof that there is no path: given for a post that divides, never where a path is known."""
+"""The proof that no path exists: given for a dividing post, never where a path is known."""
 
 from __future__ import annotations
 
@@ -75,14 +75,14 @@ def test_finer_cells_forbid_no_less(gachon, divided) -> None:
     assert reached == sorted(reached, reverse=True)
 
 
-def test_a_proved_wall_is_told_with_what_stands_in_the_way(gachon, divided) -> None:
+def test_a_proved_wall_names_what_blocks_the_path(gachon, divided) -> None:
     with pytest.raises(NoSolution) as nothing:
         make_plan(gachon, divided, OptimalSettings(rounds=12))
-    said = str(nothing.value)
+    message = str(nothing.value)
     assert nothing.value.exit_code == 1
-    assert "there is no path: the obstacles separate start and goal" in said
-    assert "10 mm clearance" in said
-    assert "post at 0 0" in said
+    assert "there is no path: the obstacles separate start and goal" in message
+    assert "10 mm clearance" in message
+    assert "post at 0 0" in message
     assert nothing.value.values["proved"] == "yes"
 
 
@@ -102,15 +102,15 @@ def test_a_search_that_ends_too_early_says_that_nothing_is_proved(
         make_plan(
             gachon, scene_with(post(0.0, 0.0, 0.0, 200.0), **ACROSS), OptimalSettings(rounds=9)
         )
-    said = str(nothing.value)
-    assert "no path after 9 rounds" in said
-    assert "it is not proved that no path exists" in said
-    assert "workspace" in said
-    assert "raise --rounds" in said
+    message = str(nothing.value)
+    assert "no path after 9 rounds" in message
+    assert "it is not proved that no path exists" in message
+    assert "workspace" in message
+    assert "raise --rounds" in message
     assert "proved" not in nothing.value.values
 
 
-def test_a_limit_below_the_shortest_path_is_told(gachon, ready_scene) -> None:
+def test_a_limit_below_the_shortest_path_is_reported(gachon, ready_scene) -> None:
     settings = OptimalSettings(weights=OBJECTIVES["kinematic"], rounds=20, longest=0.6)
     with pytest.raises(NoSolution, match=r"no path of at most 600\.0 mm was found") as nothing:
         make_plan(gachon, ready_scene("environment_1"), settings)

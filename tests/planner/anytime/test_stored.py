@@ -1,4 +1,4 @@
-"""Arrays kept in the user's cache, whatever has become of it."""
+"""Arrays kept in the user's cache, damaged or not."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ def test_an_array_is_computed_once_for_a_key(folder, made) -> None:
     assert len(list(folder.glob("margins-*.npy"))) == 2
 
 
-def test_only_so_many_arrays_are_kept_and_the_oldest_go(folder, made, monkeypatch) -> None:
+def test_the_oldest_arrays_beyond_the_limit_are_deleted(folder, made, monkeypatch) -> None:
     monkeypatch.setattr(stored, "_MOST_FILES", 3)
     for number in range(6):
         take(made, key=[number])
-        for file in folder.glob("*.npy"):  # the clock of files is too coarse to tell them apart
+        for file in folder.glob("*.npy"):  # the clock of files is too coarse to distinguish them
             os.utime(file, (0, file.stat().st_mtime - 1))
     assert len(list(folder.glob("margins-*.npy"))) == 3
     take(made, key=[5])
@@ -56,7 +56,7 @@ def test_only_so_many_arrays_are_kept_and_the_oldest_go(folder, made, monkeypatc
 
 
 @pytest.mark.parametrize("damage", ["cut off", "empty", "text", "pickled", "other shape"])
-def test_a_damaged_file_is_not_believed_and_is_replaced(folder, made, damage) -> None:
+def test_a_damaged_file_is_ignored_and_replaced(folder, made, damage) -> None:
     take(made)
     (file,) = folder.iterdir()
     content = file.read_bytes()
@@ -73,7 +73,7 @@ def test_a_damaged_file_is_not_believed_and_is_replaced(folder, made, damage) ->
 
 
 @pytest.mark.parametrize("failing", ["NamedTemporaryFile", "replace"])
-def test_a_cache_that_cannot_be_written_is_done_without(folder, made, monkeypatch, failing) -> None:
+def test_a_cache_that_cannot_be_written_is_ignored(folder, made, monkeypatch, failing) -> None:
     def refuse(*_args, **_options):
         raise OSError(30, "Read-only file system")
 

@@ -29,7 +29,7 @@ HALL = load_rig(CONFIGS / "hall_10_6.yaml")
 
 
 def turning(name: str, tilt_deg: float, turn_deg: float, **parts: Any) -> Scene:
-    """A ready scene with rotation limits, and other parts replaced."""
+    """An example scene with rotation limits, and other parts replaced."""
     document = load_scene(CONFIGS / f"{name}.yaml").document.model_dump()
     limits = {"tilt_deg": tilt_deg, "turn_deg": turn_deg}
     return scene_from_document(
@@ -38,12 +38,12 @@ def turning(name: str, tilt_deg: float, turn_deg: float, **parts: Any) -> Scene:
 
 
 def problem_of(rig: Rig, scene: Scene, weights: Weights = OBJECTIVES["length"]) -> RotatingProblem:
-    """What the search of a scene is given."""
+    """The problem of a scene."""
     return turning_problem(rig, scene, weights, KinematicCost(rig, scene.start.rotation))
 
 
 def quaternion(x_deg: float, y_deg: float, z_deg: float = 0.0) -> list[float]:
-    """A unit quaternion (w, x, y, z) of turns about the axes in turn."""
+    """A unit quaternion (w, x, y, z) of rotations about the axes in sequence."""
     turn = Rotation.from_euler("zyx", [z_deg, y_deg, x_deg], degrees=True)
     return [float(q) for q in turn.as_quat(scalar_first=True)]
 
@@ -60,7 +60,7 @@ def random_pose(rng: np.random.Generator, rig: Rig, scene: Scene) -> Pose:
 
 
 class Judge:
-    """Looks at dense poses with coal, the model of self clearance and the statics."""
+    """Checks dense poses with coal, the model of self clearance and the statics."""
 
     def __init__(self, rig: Rig, scene: Scene) -> None:
         self.rig, self.scene = rig, scene
@@ -81,7 +81,7 @@ class Judge:
         return float(capacity_margin(matrix, rig.min_tension, rig.max_tension, box, length))
 
     def fault(self, start: Pose, end: Pose, samples: int) -> str:
-        """What a move does not keep at samples; empty where nothing is found."""
+        """The violation of a move at samples; empty where none is found."""
         limits = self.scene.rotation_limits
         for share in np.linspace(0.0, 1.0, samples):
             pose = interpolate(start, end, float(share))

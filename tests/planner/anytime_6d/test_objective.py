@@ -111,7 +111,7 @@ def _dense(start: Pose, end: Pose, count: int) -> list[Pose]:
     return [interpolate(start, end, float(s)) for s in np.linspace(0.0, 1.0, count)]
 
 
-def test_a_change_is_worth_the_same_as_measuring_all_anew() -> None:
+def test_a_change_is_worth_the_same_as_measuring_all_again() -> None:
     problem = problem_of(GACHON, RAMP, EVERYTHING)
     rng, tallies = np.random.default_rng(8), np.zeros(6, dtype=np.int64)
     line = new_line()
@@ -154,8 +154,8 @@ def by_objective() -> dict[str, PlanDocument]:
     return {name: planned(name) for name in OBJECTIVES}
 
 
-def way(document: PlanDocument) -> float:
-    """Length with the turning in it, [m]."""
+def rotated_length(document: PlanDocument) -> float:
+    """Length, rotation counted, [m]."""
     poses = plan_from_document(document).waypoints
     radian = problem_of(GACHON, WIDE).objective.radian
     return sum(float(move_length(row(a), row(b), radian)) for a, b in itertools.pairwise(poses))
@@ -167,8 +167,8 @@ def test_each_objective_is_best_by_its_own_measure(by_objective: dict[str, PlanD
     for name, document in by_objective.items():
         assert reports[name].passed
         assert document.planner.name == "turning"
-        assert way(by_objective["length"]) <= way(document) * 1.01
-    costs = {k: d.quality.mean_kinematic_cost * way(d) for k, d in by_objective.items()}
+        assert rotated_length(by_objective["length"]) <= rotated_length(document) * 1.01
+    costs = {k: d.quality.mean_kinematic_cost * rotated_length(d) for k, d in by_objective.items()}
     assert costs["kinematic"] < 0.9 * costs["length"]
     rooms = {k: d.quality.obstacle_clearance.distance_mm for k, d in by_objective.items()}
     assert rooms["clearance"] > rooms["length"] + 10.0
@@ -181,9 +181,9 @@ def test_each_objective_is_best_by_its_own_measure(by_objective: dict[str, PlanD
 def test_the_best_path_that_is_no_longer_keeps_the_limit(
     by_objective: dict[str, PlanDocument],
 ) -> None:
-    shortest = way(by_objective["length"])
+    shortest = rotated_length(by_objective["length"])
     limited = planned("kinematic", 60, longest=1.02 * shortest)
-    assert shortest < way(limited) <= 1.02 * shortest + 1e-9
+    assert shortest < rotated_length(limited) <= 1.02 * shortest + 1e-9
     assert limited.planner.longest_mm == pytest.approx(1.02e3 * shortest)
     with pytest.raises(NoSolution, match="no path of at most"):
         planned("kinematic", 20, longest=0.95 * shortest)

@@ -52,17 +52,17 @@ def proved(rig: Rig, scene: Scene, settings: TurningSettings) -> PlanDocument:
     return document
 
 
-def test_the_ready_scene_is_planned_and_an_independent_judge_finds_nothing() -> None:
+def test_the_example_scene_is_planned_and_an_independent_judge_finds_no_fault() -> None:
     document = proved(GACHON, RAMP, ROUNDS)
     judge, poses = Judge(GACHON, RAMP), plan_from_document(document).waypoints
     for start, end in itertools.pairwise(poses):
         assert judge.fault(start, end, 40) == ""
     assert document.quality.length_mm < 800.0
     assert document.planner.name == "turning"
-    told = dict(plan_facts(document))["rotation"]
-    tilt = float(told.removeprefix("tilted up to ").split("°")[0])
+    rotation = dict(plan_facts(document))["rotation"]
+    tilt = float(rotation.removeprefix("tilted up to ").split("°")[0])
     assert 6.0 <= tilt <= 8.0
-    assert "rotated up to" in told
+    assert "rotated up to" in rotation
     assert document.planner.rounds == [60]
 
 
@@ -74,19 +74,19 @@ def test_the_same_seed_and_rounds_give_the_same_path_and_others_another() -> Non
     assert other.path.tolist() != first.path.tolist()
 
 
-def test_more_rounds_are_never_worse_and_a_plan_with_a_budget_tells_them() -> None:
+def test_more_rounds_are_never_worse_and_a_plan_with_a_budget_states_them() -> None:
     ticks = itertools.count()
     settings = TurningSettings(budget=0.040)
     found = routed(RAMP, settings, clock=lambda: 1e-3 * next(ticks))
     again = routed(RAMP, TurningSettings(rounds=found.rounds))
     assert again.route.path.tolist() == found.route.path.tolist()
     lengths = [routed(RAMP, TurningSettings(rounds=rounds)).route.path for rounds in (15, 40, 90)]
-    ways = [_length(path) for path in lengths]
-    assert ways == sorted(ways, reverse=True)
+    sums = [_length(path) for path in lengths]
+    assert sums == sorted(sums, reverse=True)
 
 
 def _length(path: np.ndarray) -> float:
-    """Length with the turning in it, by rotation vectors of the model."""
+    """Length, rotation counted, by rotation vectors of the model."""
     poses = [Pose.from_quaternion(row[:3], row[3:]) for row in path]
     radian = rms_anchor_radius(GACHON.anchors)
     return sum(
@@ -95,7 +95,7 @@ def _length(path: np.ndarray) -> float:
     )
 
 
-def test_where_nothing_is_in_the_way_the_single_move_is_the_path() -> None:
+def test_where_nothing_blocks_it_the_single_move_is_the_path() -> None:
     goal = {"position_mm": [60, 40, 430], "rotation_wxyz": quaternion(4.0, -3.0)}
     scene = turning("environment_1", 8.0, 2.0, goal=goal, obstacles=[])
     route = routed(scene, ROUNDS)
@@ -120,33 +120,33 @@ def test_a_stop_may_be_tilted_otherwise_than_start_and_goal() -> None:
     assert len(document.planner.rounds) == 2
 
 
-def test_a_platform_whose_cables_end_off_its_box_turns_on_its_way(open_frame) -> None:
+def test_a_platform_whose_cables_end_off_its_box_rotates_along_its_path(open_frame) -> None:
     document = proved(open_frame, RAMP, ROUNDS)
     assert document.quality.self_clearance.distance_mm >= 5.0
 
 
 @pytest.mark.slow
-def test_a_robot_with_pulleys_turns_on_its_way_around_the_pillar() -> None:
+def test_a_robot_with_pulleys_rotates_along_its_path_around_the_pillar() -> None:
     goal = {"position_mm": [-700, 0, 900], "rotation_wxyz": quaternion(0.0, 6.0, 2.0)}
     document = proved(HALL, turning("hall_pillar", 8.0, 4.0, goal=goal), ROUNDS)
     assert document.quality.obstacle_clearance is not None
     assert document.quality.obstacle_clearance.distance_mm >= 40.0
 
 
-def test_without_limits_in_the_scene_the_next_step_is_told() -> None:
+def test_without_limits_in_the_scene_the_next_step_is_stated() -> None:
     scene = load_scene(CONFIGS / "environment_1.yaml")
     with pytest.raises(BadInput, match="has no limits for rotation") as caught:
         make_plan(GACHON, scene, ROUNDS)
     assert "rotation_limits: {tilt_deg" in str(caught.value)
 
 
-def test_ends_turned_differently_need_the_option() -> None:
+def test_ends_of_different_orientation_need_the_option() -> None:
     with pytest.raises(BadInput, match="differ in orientation by 6 deg") as caught:
         make_plan(GACHON, RAMP)
     assert "--free-rotation" in str(caught.value)
 
 
-def test_a_search_that_finds_nothing_tells_what_was_in_the_way() -> None:
+def test_a_search_that_finds_nothing_states_what_blocked_it() -> None:
     wall = [{"name": "wall", "box": {"size_mm": [20, 900, 900]}, "position_mm": [0, 0, 400]}]
     ends = {"start": {"position_mm": [200, 0, 400]}, "goal": {"position_mm": [-200, 0, 400]}}
     scene = turning("environment_1", 5.0, 2.0, obstacles=wall, **ends)
@@ -156,16 +156,16 @@ def test_a_search_that_finds_nothing_tells_what_was_in_the_way() -> None:
     assert caught.value.values["rounds"] == 3.0
 
 
-def test_the_check_refuses_a_path_turned_farther_than_the_scene_allows() -> None:
+def test_the_check_refuses_a_path_rotated_farther_than_the_scene_allows() -> None:
     far = Pose.from_quaternion([0.0, 0.0, 0.445], quaternion(0.0, 9.0))
     ends = {"start": {"position_mm": [0, 0, 445]}, "goal": {"position_mm": [0, 0, 445]}}
     scene = turning("environment_1", 8.0, 2.0, obstacles=[], **ends)
     report = check_path(GACHON, scene, [scene.start, far, scene.goal], ends=False)
-    said = [violation.sentence() for violation in report.violations]
-    assert any("tilted too far: 9 ° (limit 8 °)" in sentence for sentence in said)
+    sentences = [violation.sentence() for violation in report.violations]
+    assert any("tilted too far: 9 ° (limit 8 °)" in sentence for sentence in sentences)
 
 
-def test_a_goal_beyond_the_limits_is_refused_with_its_place(tmp_path) -> None:
+def test_a_goal_beyond_the_limits_is_refused_with_its_key(tmp_path) -> None:
     text = (CONFIGS / "turn.yaml").read_text().replace("tilt_deg: 8", "tilt_deg: 4")
     path = tmp_path / "scene.yaml"
     path.write_text(text)
@@ -182,6 +182,6 @@ def test_a_plan_survives_its_file(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"budget": 0.0}, {"rounds": 0}])
-def test_settings_that_no_search_can_use_are_refused(wrong) -> None:
+def test_unusable_settings_are_refused(wrong) -> None:
     with pytest.raises(BadInput):
         TurningSettings(**wrong)

@@ -125,13 +125,13 @@ def test_boxes_grow_from_the_rigs_own_to_the_wide_one(gachon) -> None:
 def test_a_batch_gives_the_same_numbers_here_in_a_pool_and_in_any_order(figure_9_batch) -> None:
     here = run_batch(figure_9_batch)
     assert [trial.seed for trial in here] == list(range(SEEDS))
-    told: list[int] = []
+    reported: list[int] = []
     single = [replace(figure_9_batch, seeds=(seed,)) for seed in figure_9_batch.seeds]
     with ThreadPoolExecutor(1) as pool:
-        elsewhere = run_all(single, pool, told.append)
+        elsewhere = run_all(single, pool, reported.append)
     assert numbers(elsewhere) == numbers(here)
-    assert numbers(run_all(single, None, told.append)) == numbers(here)
-    assert sum(told) == 2 * SEEDS
+    assert numbers(run_all(single, None, reported.append)) == numbers(here)
+    assert sum(reported) == 2 * SEEDS
 
 
 def test_a_trial_reports_what_its_search_and_the_independent_routes_find(
@@ -226,7 +226,7 @@ def test_only_seeds_with_which_both_found_a_path_are_compared(results) -> None:
     assert results.lost(FIGURE_9) == 2 * 3 * 4  # seed 0 of the random ends
 
 
-def test_tables_have_a_row_for_everything_and_their_keys_tell_arms_apart(results, work) -> None:
+def test_tables_have_a_row_for_everything_and_their_keys_distinguish_arms(results, work) -> None:
     rows = list(csv.DictReader(io.StringIO(trials_csv(results))))
     assert len(rows) == sum(len(batch.seeds) for batch in work)
     keys = [name for name in rows[0] if name not in ("nodes", "found")]
@@ -277,8 +277,8 @@ def test_the_page_has_every_claim_with_its_verdict_and_every_picture(results, tm
         assert finding.claim in reader.text
         assert finding.verdict in reader.text
     assert "gachon <8 & 6>" in reader.text
-    told = json.loads(findings_json(results, about))
-    assert len(told["findings"]) == len(findings(results))
+    reported = json.loads(findings_json(results, about))
+    assert len(reported["findings"]) == len(findings(results))
 
 
 CLUSTER = """

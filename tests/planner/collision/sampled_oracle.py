@@ -15,7 +15,7 @@ from model.rig import Rig, rig_from_document
 from model.scene import Scene, scene_from_document
 from model.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
 
-KINDS = ("box", "turned box", "sphere", "capsule", "cylinder", "hull", "convex mesh", "mesh")
+KINDS = ("box", "rotated box", "sphere", "capsule", "cylinder", "hull", "convex mesh", "mesh")
 
 
 def random_scene(rng: np.random.Generator, rig: Rig, count: int, kinds=KINDS) -> Scene:
@@ -25,8 +25,8 @@ def random_scene(rng: np.random.Generator, rig: Rig, count: int, kinds=KINDS) ->
     obstacles = []
     for k in range(count):
         kind = str(rng.choice(kinds))
-        place = rng.uniform(rig.workspace_lower - 0.3 * size, rig.workspace_upper + 0.1 * size)
-        entry: dict[str, object] = {"name": f"{kind} {k}", "position_mm": (1e3 * place).tolist()}
+        position = rng.uniform(rig.workspace_lower - 0.3 * size, rig.workspace_upper + 0.1 * size)
+        entry: dict[str, object] = {"name": f"{kind} {k}", "position_mm": (1e3 * position).tolist()}
         if kind != "box":
             entry["rotation_wxyz"] = Rotation.random(rng=rng).as_quat(scalar_first=True).tolist()
         entry |= _shape(rng, kind, 1e3 * scale)
@@ -45,7 +45,7 @@ def _shape(rng: np.random.Generator, kind: str, scale: float) -> dict[str, objec
     radius, length = scale * rng.uniform(0.03, 0.15), scale * rng.uniform(0.1, 0.6)
     cloud = scale * rng.uniform(-0.25, 0.25, (9, 3))
     match kind:
-        case "box" | "turned box":
+        case "box" | "rotated box":
             return {"box": {"size_mm": (scale * rng.uniform(0.05, 0.4, 3)).tolist()}}
         case "sphere":
             return {"sphere": {"radius_mm": radius}}
@@ -72,7 +72,7 @@ class CoalScene:
 
     def __init__(self, scene: Scene) -> None:
         self.bodies = [
-            (geometry, _place(obstacle.pose))
+            (geometry, _transform(obstacle.pose))
             for obstacle in scene.obstacles
             for geometry in _geometries(obstacle)
         ]
@@ -85,7 +85,7 @@ class CoalScene:
     def pose_distance(self, rig: Rig, pose: Pose) -> float:
         """From the robot at one pose to the nearest obstacle, primitives only; 0 if touching."""
         cables = cables_at(rig, pose)
-        found = [self._nearest(coal.Box(*(2.0 * rig.half_size)), _place(pose))]
+        found = [self._nearest(coal.Box(*(2.0 * rig.half_size)), _transform(pose))]
         for exit, anchor in zip(cables.exits, cables.anchors, strict=True):
             thread, where = _thread(exit, anchor)
             found.append(self._nearest(thread, where) + 1e-9 - rig.cable_radius)
@@ -135,15 +135,15 @@ def _cloud(points: Array):
     return coal.Convex.convexHull(cloud, False, "")
 
 
-def _place(pose: Pose):
+def _transform(pose: Pose):
     return coal.Transform3s(np.array(pose.rotation), np.array(pose.position))
 
 
 def _thread(start: Array, end: Array):
-    way = end - start
-    length = float(np.linalg.norm(way))
-    axis = way / length
+    delta = end - start
+    length = float(np.linalg.norm(delta))
+    axis = delta / length
     right = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     right /= np.linalg.norm(right)
     middle = Pose((start + end) / 2.0, np.column_stack([right, np.cross(axis, right), axis]))
-    return coal.Capsule(1e-9, length), _place(middle)
+    return coal.Capsule(1e-9, length), _transform(middle)

@@ -26,8 +26,8 @@ COAL = 1e-6
 
 def random_edge(rng: np.random.Generator, rig: Rig, reach: float) -> tuple[Array, Array]:
     start = rng.uniform(rig.workspace_lower, rig.workspace_upper)
-    way = rng.normal(size=3)
-    end = start + reach * way / np.linalg.norm(way)
+    direction = rng.normal(size=3)
+    end = start + reach * direction / np.linalg.norm(direction)
     return start, np.clip(end, rig.workspace_lower, rig.workspace_upper)
 
 

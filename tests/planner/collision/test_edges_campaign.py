@@ -18,7 +18,7 @@ GACHON = load_rig(Path(__file__).parents[3] / "configs" / "gachon_8_6.yaml")
 CLEARANCE = 0.01
 SCENES, EDGES, GRAZING = 125, 140, 20
 POSES, POSES_GRAZING = 2, 5
-"""Looked at along an edge; a grazing one touches somewhere, any other seldom comes near."""
+"""Poses checked along an edge; a grazing one touches somewhere, any other seldom comes near."""
 COAL = 1e-7
 """How far coal's own distances are trusted, [m]; those of cylinders are off by up to 1e-8."""
 

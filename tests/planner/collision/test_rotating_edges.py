@@ -14,7 +14,7 @@ from model.kinematics import cables_to
 from model.pose import Pose
 from model.rig import Rig, load_rig
 from planner.collision.edges import edge_clearance, edge_free
-from planner.collision.rotating_edges import turned_by, turning_edge_free
+from planner.collision.rotating_edges import rotated_by, turning_edge_free
 from planner.collision.world import build_world
 from planner.kernels.exit_points import exit_point, exit_travel
 from tests.planner.collision.sampled_oracle import KINDS, CoalScene, random_scene
@@ -30,22 +30,22 @@ def test_a_share_of_a_turn_is_scipys(seed: int) -> None:
     rng = np.random.default_rng(seed)
     start, turn, share = Rotation.random(rng=rng), rng.normal(size=3), rng.uniform()
     expected = (start * Rotation.from_rotvec(share * turn)).as_matrix()
-    assert np.allclose(turned_by(start.as_matrix(), turn, share), expected, rtol=0, atol=1e-14)
+    assert np.allclose(rotated_by(start.as_matrix(), turn, share), expected, rtol=0, atol=1e-14)
 
 
 @given(seeds)
 def test_exits_are_those_of_the_model_and_travel_no_farther_than_bounded(seed: int) -> None:
     rng = np.random.default_rng(seed)
     world = build_world(HALL, random_scene(rng, HALL, 0), np.eye(3), 0.01)
-    place = rng.uniform(HALL.workspace_lower, HALL.workspace_upper)
-    way = rng.normal(size=3) * 0.05
-    anchors = HALL.anchors + place + np.linspace(0.0, 1.0, 9)[:, None, None] * way
+    position = rng.uniform(HALL.workspace_lower, HALL.workspace_upper)
+    delta = rng.normal(size=3) * 0.05
+    anchors = HALL.anchors + position + np.linspace(0.0, 1.0, 9)[:, None, None] * delta
     exits = cables_to(HALL, anchors).exits
     for cable in range(HALL.cable_count):
         ends = [tuple(anchors[k, cable].tolist()) for k in (0, -1)]
         assert np.allclose(exit_point(world, cable, ends[0]), exits[0, cable], rtol=0, atol=1e-12)
         travelled = np.linalg.norm(exits[:, cable] - exits[0, cable], axis=1).max()
-        bound = exit_travel(world, cable, *ends, float(np.linalg.norm(way)))
+        bound = exit_travel(world, cable, *ends, float(np.linalg.norm(delta)))
         assert travelled <= bound + 1e-12
 
 
@@ -112,9 +112,9 @@ def test_a_platform_that_only_turns_into_an_obstacle_is_refused() -> None:
     radius = scene.obstacles[0].shape.radius
     half = float(GACHON.half_size[0])
     beside = scene.obstacles[0].pose.position - np.array([half + radius + 0.02, 0.0, 0.0])
-    place = np.clip(beside, GACHON.workspace_lower, GACHON.workspace_upper)
-    if not np.array_equal(place, beside):
+    position = np.clip(beside, GACHON.workspace_lower, GACHON.workspace_upper)
+    if not np.array_equal(position, beside):
         pytest.fail("choose a seed whose ball is inside the workspace")
     world = build_world(GACHON, scene, np.eye(3), 0.0)
     quarter = np.array([0.0, 0.0, np.pi / 2.0])
-    assert not turning_edge_free(world, place, place, np.eye(3), quarter)
+    assert not turning_edge_free(world, position, position, np.eye(3), quarter)

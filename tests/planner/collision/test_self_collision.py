@@ -92,8 +92,8 @@ def test_edges_are_decided_as_dense_sampling_decides_them(rig: Rig, share: float
     ends = np.clip(starts + rng.normal(size=(60, 3)) * 0.1 * (high - low), low, high)
     free = self_edges_free(world, robot, starts, ends)
     for start, end, allowed in zip(starts, ends, free, strict=True):
-        way = start + np.linspace(0.0, 1.0, 41)[:, None] * (end - start)
-        least = float(gaps(rig, way, level(41)).min())
+        positions = start + np.linspace(0.0, 1.0, 41)[:, None] * (end - start)
+        least = float(gaps(rig, positions, level(41)).min())
         spacing = float(np.linalg.norm(end - start)) / 40.0
         if allowed:
             assert least >= clearance - 1e-9

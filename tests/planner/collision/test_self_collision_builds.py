@@ -1,6 +1,6 @@
 """Self clearance of rigs of every build: edges and regions against `ClearanceModel`, sampled.
 
-The clearance asked for is set next to the one that an edge has, so that each answer is a close one.
+The required clearance is set next to the one that an edge has, so that each decision is close.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from tests.planner.collision.sampled_oracle import changed_rig, random_scene
 EMPTY = random_scene(np.random.default_rng(0), GACHON, 0)
 SAMPLES = 129
 CLOSE = 2e-6
-"""How near to its clearance an edge is asked for more or less, [m]."""
+"""Distance of the required clearance from that of an edge, [m]."""
 CLOSE_IF_BOUNDED = 1e-4
-"""Likewise where exits move on pulleys or the platform turns: motion is then only bounded, and an
-edge along which the room is small all the way would take more pieces than are tried."""
+"""As `CLOSE`, where exits move on pulleys or the platform rotates: motion is then only bounded, and
+an edge with little room all along would take more intervals than are tried."""
 
 
 def open_frame() -> Rig:
@@ -47,8 +47,8 @@ def edges_of(rig: Rig, rng: np.random.Generator, count: int) -> tuple[Array, Arr
 
 
 def rotations_along(first: Rotation, turn: Array, shares: Array) -> Array:
-    turned: Array = (first * Rotation.from_rotvec(shares[:, None] * turn)).as_matrix()
-    return turned
+    rotated: Array = (first * Rotation.from_rotvec(shares[:, None] * turn)).as_matrix()
+    return rotated
 
 
 class Along:
@@ -95,9 +95,9 @@ def test_rigs_with_anchors_off_the_box_of_their_platform_have_free_edges() -> No
     ends = home + np.array([[0.0, 0.0, 6e-6], [0.02, 0.0, 0.0], [-0.05, 0.04, 0.03]])
     model = ClearanceModel(rig, EMPTY)
     for end in ends:
-        way = home + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (end - home)
+        positions = home + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (end - home)
         level = np.broadcast_to(np.eye(3), (SAMPLES, 3, 3))
-        assert model.self_clearances(way, level).min() > 0.005
+        assert model.self_clearances(positions, level).min() > 0.005
     assert self_edges_free(world, robot, np.tile(home, (3, 1)), ends).all()
     turn = np.array([0.0, 0.0, 0.01])
     assert self_turning_edge_free(world, robot, home, ends[1], np.eye(3), turn)
@@ -125,7 +125,7 @@ def test_edges_of_every_build_are_free_up_to_touching_and_no_further(turns: bool
     assert min(tested.values()) > 60
 
 
-def test_edges_are_decided_alike_with_and_without_what_is_proved_beforehand() -> None:
+def test_edges_are_decided_the_same_with_and_without_precomputed_proofs() -> None:
     rng = np.random.default_rng(12)
     answers: list[bool] = []
     for _, rig in builds(10, 6):

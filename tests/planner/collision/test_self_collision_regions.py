@@ -1,4 +1,4 @@
-"""Edges ask for what is open in the cells they pass, no less and hardly more."""
+"""Edges check what is open in the cells they pass, no less and hardly more."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LIMITS = np.array([[-0.2, -0.3, 0.1], [0.3, 0.3, 0.6]])
 
 
 def passed(start: Array, end: Array, grown: float) -> list[tuple[int, ...]]:
-    """Cells, grown on all sides, that a way meets, by its shares within their slabs."""
+    """Cells, grown on all sides, that a move meets, by its shares within their slabs."""
     size = (LIMITS[1] - LIMITS[0]) / CELLS
     numbers = np.array(list(product(range(CELLS), repeat=3)))
     low = LIMITS[0] + numbers * size - grown
@@ -34,7 +34,7 @@ def passed(start: Array, end: Array, grown: float) -> list[tuple[int, ...]]:
     return [tuple(n) for n in numbers[np.maximum(enter, 0.0) <= np.minimum(leave, 1.0)]]
 
 
-def test_a_way_meets_the_cells_that_its_slabs_tell() -> None:
+def test_a_move_meets_the_cells_of_its_slabs() -> None:
     rng = np.random.default_rng(0)
     for trial in range(60):
         start, end = rng.uniform(*LIMITS, (2, 3))

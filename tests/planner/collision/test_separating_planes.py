@@ -22,7 +22,7 @@ CONFIGS = Path(__file__).parents[3] / "configs"
 GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
 
 
-@pytest.mark.parametrize("kind", ["box", "turned box", "sphere", "capsule", "cylinder"])
+@pytest.mark.parametrize("kind", ["box", "rotated box", "sphere", "capsule", "cylinder"])
 def test_an_anchor_is_behind_a_core_exactly_where_its_cable_meets_the_box(kind: str) -> None:
     rng = np.random.default_rng(KINDS.index(kind))
     behind = 0
@@ -56,7 +56,7 @@ def test_positions_behind_a_core_are_too_near_to_an_obstacle(kind: str) -> None:
             if any(_is_behind(world.planes, *pair[3:], position) for pair in world.pairs):
                 behind += 1
                 assert edge_clearance(world, position, position)[0] < clearance + 1e-12
-    assert (behind > 20) == (kind in ("box", "turned box", "sphere", "capsule", "cylinder"))
+    assert (behind > 20) == (kind in ("box", "rotated box", "sphere", "capsule", "cylinder"))
 
 
 def test_no_cores_where_the_outlet_is_inside_or_exits_move() -> None:

@@ -65,7 +65,7 @@ def test_triangle_to_box_is_the_least_over_all_features(corners, half, scale) ->
 
 
 @given(points(3), halves(), st.floats(-12.0, -3.0), st.booleans())
-def test_grazing_triangles_are_told_apart_to_round_off(corners, half, exponent, nearer) -> None:
+def test_grazing_triangles_are_separated_to_round_off(corners, half, exponent, nearer) -> None:
     distance = triangle_box_definition(corners, half)
     shift = 10.0**exponent
     needed = distance + shift if nearer else distance - shift

@@ -16,7 +16,7 @@ from planner.rrt.sampling import (
     forward,
     goal_bias,
     new_tallies,
-    tell,
+    record_outcome,
 )
 from planner.rrt.tree import add, new_tree
 from planner.rrt.variants import FAILURE_RATES, FOCUSES
@@ -131,7 +131,7 @@ def test_failure_rates_follow_their_reading(reading, expected) -> None:
     tallies, number, rates = new_tallies(5), FAILURE_RATES.index(reading), []
     assert failure_rate(tallies, number) == 0.0
     for node, success in EVENTS:
-        tell(tallies, node, success, 0)
+        record_outcome(tallies, node, success, 0)
         rates.append(failure_rate(tallies, number))
     assert rates == pytest.approx(expected)
 
@@ -149,7 +149,7 @@ def test_the_focus_follows_its_reading(reading, expected) -> None:
     tallies, number, nodes = new_tallies(5), FOCUSES.index(reading), []
     assert focus_node(tallies) == 0  # the root: the cone is the line to the start
     for node, success in EVENTS:
-        tell(tallies, node, success, number)
+        record_outcome(tallies, node, success, number)
         nodes.append(focus_node(tallies))
     assert nodes == expected
 
@@ -159,7 +159,7 @@ def test_the_highest_rate_is_what_brute_force_finds(events) -> None:
     tallies, number = new_tallies(6), FOCUSES.index("highest-rate")
     counts = np.zeros((6, 2))
     for node, success in events:
-        tell(tallies, node, success, number)
+        record_outcome(tallies, node, success, number)
         counts[node] += (1, not success)
         if counts[:, 1].any():
             rates = counts[:, 1] / np.maximum(counts[:, 0], 1)

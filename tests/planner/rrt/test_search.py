@@ -138,13 +138,13 @@ def test_the_same_random_numbers_give_the_same_tree(searched) -> None:
 
 def test_a_search_in_portions_for_its_progress_is_the_same_search(searched, ready_scene) -> None:
     planner, whole = searched(3, PAPER, seed=2)
-    scene, told = ready_scene("environment_3"), []
+    scene, reports = ready_scene("environment_3"), []
     start, goal = np.array(scene.start.position), np.array(scene.goal.position)
-    told_of = planner.search(
-        start, goal, np.random.default_rng(2), lambda *state: told.append(state)
+    reported = planner.search(
+        start, goal, np.random.default_rng(2), lambda *state: reports.append(state)
     )
-    assert np.array_equal(whole.points, told_of.points)
-    assert told
+    assert np.array_equal(whole.points, reported.points)
+    assert reports
 
 
 @pytest.mark.parametrize("sampler", ["adaptive", "goal-bias"])
@@ -153,8 +153,8 @@ def test_refusals_are_counted_and_named(searched, sampler) -> None:
     assert result.path is None
     assert result.iterations == 80
     assert result.refused["obstacle clearance"] > 0
-    assert all(obstacle.startswith("obstacle_") for _, obstacle in result.in_the_way)
-    assert sum(result.in_the_way.values()) == result.refused["obstacle clearance"]
+    assert all(obstacle.startswith("obstacle_") for _, obstacle in result.blocking_pairs)
+    assert sum(result.blocking_pairs.values()) == result.refused["obstacle clearance"]
 
 
 def test_algorithm_3_leaves_no_node_that_can_be_skipped_from_a_kept_one(searched) -> None:
@@ -169,7 +169,7 @@ def test_algorithm_3_leaves_no_node_that_can_be_skipped_from_a_kept_one(searched
             assert not planner.edge(result.path[here], result.path[skipped])
 
 
-def test_algorithm_3_takes_no_dearer_shortcut_under_the_kinematic_cost(searched, cost) -> None:
+def test_algorithm_3_takes_no_costlier_shortcut_under_the_kinematic_cost(searched, cost) -> None:
     planner, result = searched(1, replace(PAPER, cost="kinematic"), seed=4)
     kept = planner.shortcut(result.path)
     field = planner.field
@@ -203,6 +203,6 @@ def test_compiled_costs_are_those_of_the_plain_definition(cost) -> None:
         {"spacing": float("nan")},
     ],
 )
-def test_readings_that_do_not_exist_are_refused(wrong) -> None:
+def test_unknown_readings_are_refused(wrong) -> None:
     with pytest.raises(BadInput):
         AlgorithmVariant(**wrong)

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from planner.rrt.tree import ROOT, Tree, add, move, nearest, new_tree, way_to, within
+from planner.rrt.tree import ROOT, Tree, add, move, nearest, new_tree, nodes_to, within
 
 
 def edge(tree: Tree, a: int, b: int) -> float:
@@ -62,9 +62,9 @@ def test_nearest_within_and_mean_agree_with_brute_force(seed: int, dimension: in
     assert np.allclose(tree.total / tree.size[0], tree.points.mean(axis=0))
 
 
-def test_the_way_to_a_node_runs_from_the_root() -> None:
+def test_the_path_to_a_node_runs_from_the_root() -> None:
     tree = new_tree(np.zeros(3), 4)
     first = add(tree, np.ones(3), 0, 1.0)
     add(tree, np.full(3, 5.0), 0, 1.0)
     second = add(tree, 2 * np.ones(3), first, 2.0)
-    assert tree.points[way_to(tree, second)].tolist() == [[0] * 3, [1] * 3, [2] * 3]
+    assert tree.points[nodes_to(tree, second)].tolist() == [[0] * 3, [1] * 3, [2] * 3]

@@ -1,4 +1,4 @@
-"""Grids: both ends are in, points are numbered as arrays are, wrong wishes are refused."""
+"""Grids: both ends are in, points are numbered as arrays are, wrong arguments are refused."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_slice_is_read_in_millimetres(text, expected):
 
 
 @pytest.mark.parametrize("text", ["445", "w=3", "z=", "z=high", "z=nan", "=3", "xy=3"])
-def test_what_is_no_slice_is_refused(text):
+def test_what_is_not_a_slice_is_refused(text):
     with pytest.raises(BadInput, match="not a slice"):
         parsed_slice(text)
 
@@ -64,7 +64,7 @@ def test_a_slice_beside_the_region_names_the_region():
 
 
 @pytest.mark.parametrize("step", [0.0, -0.01, np.nan, np.inf, 1e-4, 1e-300])
-def test_a_step_that_no_computer_could_finish_is_refused(step):
+def test_a_step_too_small_to_finish_is_refused(step):
     with pytest.raises(BadInput):
         volume("box", LOWER, UPPER, step)
 

@@ -80,7 +80,7 @@ def test_the_costs_are_the_planner_s(gachon, extremes):
 
 @pytest.mark.parametrize("rotation_vector", [(0.0, 0.0, 0.0), (0.1, -0.05, 0.2)])
 def test_every_value_is_that_of_its_pose(hall, ready_scene, rotation_vector):
-    """Pulleys, ten cables, payload, a disturbance and round obstacles, level and turned."""
+    """Pulleys, ten cables, payload, a disturbance and round obstacles, level and rotated."""
     scene = ready_scene("hall_pillar")
     rotation = matrix_from_rotation_vector(np.array(rotation_vector))
     random = np.random.default_rng(3)
@@ -139,8 +139,8 @@ def test_other_workers_and_parts_change_no_value(gachon, extremes, monkeypatch):
         assert shared.values[name] == pytest.approx(values, rel=1e-9, abs=1e-12)
 
 
-def test_work_that_nobody_waits_for_is_cancelled(gachon, extremes, monkeypatch):
-    """Ctrl-C ends after the parts under way, not after all of them."""
+def test_work_without_a_caller_is_cancelled(gachon, extremes, monkeypatch):
+    """Ctrl-C ends after the running parts, not after all of them."""
     monkeypatch.setattr(computing, "POINTS_IN_A_PART", 8)
     question = Question.about(gachon)
     grid = volume("box", gachon.workspace_lower, gachon.workspace_upper, 0.02)

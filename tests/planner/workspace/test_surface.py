@@ -37,7 +37,7 @@ def test_a_plane_is_met_exactly():
 
 
 @pytest.mark.parametrize("radius", [0.8, 1.2, 1.6])
-def test_every_edge_belongs_to_two_triangles_that_run_along_it_opposite_ways(radius):
+def test_every_edge_belongs_to_two_triangles_that_run_along_it_in_opposite_directions(radius):
     """Also where the region cuts the body off."""
     triangles = np.round(zero_surface(AXES, ball(radius)), 12)
     edges = Counter()

@@ -1,4 +1,4 @@
-"""Which grids are mapped when a script, or `cdpr workspace`, asks for little."""
+"""Grids that are mapped by default, in a script or by `cdpr workspace`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_a_slice_alone_leaves_the_volumes_out_unless_they_are_asked_for() -> Non
     assert len(workspace_grids(rig, [(0, 0.0)], volume=True)) == 3
 
 
-def test_the_region_is_the_rigs_workspace_or_what_is_given() -> None:
+def test_the_region_is_the_rigs_workspace_or_the_given_box() -> None:
     rig = load_rig(RIG)
     lower, upper = rig.workspace_lower, (rig.workspace_lower + rig.workspace_upper) / 2.0
     (half,) = workspace_grids(rig, [(2, float(lower[2]))], lower=lower, upper=upper, step=0.02)

@@ -40,7 +40,7 @@ def test_a_slice_leaves_pictures_tables_and_a_page(folder):
     assert {"index.html", "summary.json"} <= made
 
 
-def test_the_page_shows_files_that_are_there_and_asks_nothing_of_the_network(folder):
+def test_the_page_shows_files_that_are_there_and_requests_nothing_from_the_network(folder):
     page = (folder / "index.html").read_text()
     named = re.findall(r'(?:src|href)="([^"]+)"', page)
     assert len(named) == 12
@@ -84,7 +84,7 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path):
         ["--lower-mm", "0", "0", "900"],
     ],
 )
-def test_wrong_wishes_are_bad_input_and_make_no_folder(tmp_path, wrong):
+def test_wrong_arguments_are_bad_input_and_create_no_folder(tmp_path, wrong):
     where = tmp_path / "maps"
     result = run(RIG, "-o", str(where), *wrong)
     assert isinstance(result.exception, BadInput)

@@ -97,7 +97,7 @@ def test_held_edges_keep_the_reserve_at_every_sample(
     held = edges_held(world, load, holding, starts, ends)
     least = smallest_margins(rig, scene, starts, ends)
     assert np.all(least[held] >= reserve - 1e-9)
-    # A refused edge is short of the reserve somewhere, or but a little above it.
+    # A refused edge is short of the reserve somewhere, or only slightly above it.
     assert np.all(least[~held] <= reserve * 1.02 + 0.1)
     if reserve < 1.0:
         assert held.all()

@@ -34,7 +34,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def loaded(rig: Rig, scene: Scene) -> tuple[Rig, Scene]:
-    """With centres of mass off the origin, and disturbances, which turn the wrench asked for."""
+    """With centres of mass off the origin, and disturbances, which rotate the required wrench."""
     platform = rig.document.platform.model_copy(update={"centre_of_mass_mm": [12.0, -8.0, 20.0]})
     load = scene.document.load.model_copy(
         update={
@@ -78,7 +78,7 @@ def poses_on(edge: tuple[Array, Array, Array, Array], count: int) -> list[Pose]:
 
 
 @BOTH
-def test_the_compiled_margin_of_a_turned_platform_is_that_of_the_statics(
+def test_the_compiled_margin_of_a_rotated_platform_is_that_of_the_statics(
     rig: Rig, scene: Scene
 ) -> None:
     rig, scene = loaded(rig, scene)
@@ -112,7 +112,7 @@ def test_turning_edges_that_are_held_keep_the_reserve_at_every_sample(
             assert least >= reserve - 1e-9 * rig.max_tension
         else:
             refused += 1
-            # It is short of the reserve somewhere, or but a little above it.
+            # It is short of the reserve somewhere, or only slightly above it.
             assert least <= reserve * 1.02 + 0.003 * rig.max_tension
     assert held_count >= 2
     assert refused >= 3 or share == 0.0
@@ -127,14 +127,14 @@ def test_columns_move_no_farther_than_their_bounds(seed: int) -> None:
     middle, off, bend = (start + end) / 2.0, (end - start) / 2.0, turn / 2.0
     changes, bends = np.empty(rig.cable_count), np.empty(rig.cable_count)
     spin = tuple((first @ bend).tolist())
-    places = tuple(middle.tolist()), tuple(off.tolist())
-    if not column_motion(world, load, *places, first, spin, changes, bends):
+    interval = tuple(middle.tolist()), tuple(off.tolist())
+    if not column_motion(world, load, *interval, first, spin, changes, bends):
         return
     units = np.repeat([1.0, load.length], 3)[:, None]
 
     def columns(share: float) -> Array:
-        turned = first @ Rotation.from_rotvec(share * bend).as_matrix()
-        return structure_matrix(rig, Pose(middle + share * off, turned)) / units
+        rotated = first @ Rotation.from_rotvec(share * bend).as_matrix()
+        return structure_matrix(rig, Pose(middle + share * off, rotated)) / units
 
     still, tiny = columns(0.0), 1e-5
     tangent = (columns(tiny) - columns(-tiny)) / (2.0 * tiny)
@@ -167,7 +167,7 @@ def test_a_turn_that_is_not_a_number_is_never_held() -> None:
 
 
 def test_a_turn_too_far_for_the_cables_is_refused() -> None:
-    """At both ends the cables hold; in between, upside down on the way, they do not."""
+    """At both ends the cables hold; in between, upside down, they do not."""
     world, load = made(GACHON, PAPER)
     home = GACHON.home.position
     once_around = np.array([2.0 * np.pi, 0.0, 0.0])
