@@ -81,8 +81,8 @@ class SharedErrors:
         count = 4 + camera.distortion.size
         self._extrinsics = np.zeros((6, 6))
         self._lens, self._extrinsics_by_lens = np.zeros((count, count)), np.zeros((6, count))
-        if camera.place_covariance is not None:
-            self._extrinsics = camera.place_covariance
+        if camera.pose_covariance is not None:
+            self._extrinsics = camera.pose_covariance
         if camera.lens_covariance is None:
             return
         self._lens = camera.lens_covariance
@@ -100,10 +100,10 @@ class SharedErrors:
             views: The tags used.
         """
         if self.operator_error is not None:
-            return read_only(np.diag([(self.operator_error / SURE) ** 2] * 3 + [0.0] * 3))
+            return read_only(np.diag([(self.operator_error / Z_95) ** 2] * 3 + [0.0] * 3))
         world_from_camera = self._camera.world_from_camera
         camera_from_body = world_from_camera.inverse().compose(pose)
-        by_extrinsics = carried(pose.position - world_from_camera.position)
+        by_extrinsics = lever_arm_matrix(pose.position - world_from_camera.position)
         steps = moved_by_pixels(
             self._camera,
             views,

@@ -59,7 +59,7 @@ def errors(
     rig: Rig, camera: Camera, readout: float, flight: Flight, images: int
 ) -> Iterator[tuple[float, float]]:
     """Distance to the truth [m] and NEES of each pose after the first, for a stated readout [s]."""
-    eye = SyntheticCamera(rig, nothing_in_the_way(rig), camera, 3, Optics(blur=0.6, exposure=2e-3))
+    eye = SyntheticCamera(rig, empty_scene(rig), camera, 3, Optics(blur=0.6, exposure=2e-3))
     tracker = Tracker(rig, replace(camera, readout=readout))
     for number in range(images):
         time = number / camera.rate

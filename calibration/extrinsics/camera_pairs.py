@@ -160,7 +160,7 @@ def locate_by_pairs(
     if len(pairs) < GOOD_PAIRS:
         what = f"{len(pairs)} pairs of images were used; {GOOD_PAIRS} are required"
         issues.append(Issue(what, "take more, all over what both cameras see"))
-    if reference.place_covariance is None:
+    if reference.pose_covariance is None:
         what = f"the pose covariance of camera {reference.name!r} is unknown"
         issues.append(Issue(what, "calibrate its extrinsics, and pass that result's file too"))
     error = float(np.sqrt(np.mean([body.error**2 for body, _ in observed])))
@@ -181,10 +181,12 @@ def locate_by_pairs(
 
 def _reference_covariance(reference: Camera, world_from_camera: Pose) -> Array:
     """Covariance of a pose from that of the reference camera, (6, 6); 0 if not stated."""
-    if reference.place_covariance is None:
+    if reference.pose_covariance is None:
         return np.zeros((6, 6))
-    by_position = carried(world_from_camera.position - reference.world_from_camera.position)
-    return np.asarray(by_position @ reference.place_covariance @ by_position.T)
+    by_position = lever_arm_matrix(
+        world_from_camera.position - reference.world_from_camera.position
+    )
+    return np.asarray(by_position @ reference.pose_covariance @ by_position.T)
 
 
 def _fit(observed: Sequence[tuple[BodyObservation, BodyObservation]]) -> tuple[Pose, Array, Array]:

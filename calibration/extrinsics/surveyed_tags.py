@@ -17,7 +17,7 @@ from calibration.extrinsics.result import ExtrinsicCalibration, workspace_corner
 from calibration.results import Issue
 from calibration.statistics import CONFIDENCE, widened
 from calibration.tag_map.observations import TagObservations
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.errors import BadInput
 from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
 from model.rig import Camera, Rig, Tag

@@ -34,7 +34,7 @@ from calibration.statistics import (
     widened,
 )
 from calibration.targets.boards import Board, DetectedBoard, is_mirrored
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
 from tracking.camera_model import Image
@@ -77,7 +77,7 @@ class Uncertainty:
         flat = slopes.reshape(-1, slopes.shape[-1])
         by_images = jackknife(self.without) * leverage_factor(*self.without.shape)
         larger = max(rms_bound(one, flat) for one in (self.covariance, by_images))
-        return _quantile(len(self.without)) / SURE * larger
+        return _quantile(len(self.without)) / Z_95 * larger
 
 
 def uncertainty_of(

@@ -19,7 +19,7 @@ from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, r
 from calibration.result_files import load_result
 from calibration.results import write_result
 from calibration.tag_map.observations import observe_tags
-from model.cameras import SURE
+from model.cameras import Z_95
 from model.errors import BadInput
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Rig, Tag, load_rig
