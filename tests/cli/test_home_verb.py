@@ -69,7 +69,7 @@ def test_a_no_moves_nothing(tmp_path: Path) -> None:
 
 
 def test_nobody_is_asked_without_being_told_what_for(tmp_path: Path) -> None:
-    """With --json too: what is about to happen is on standard error, before the question."""
+    """With --json too: what will happen is on standard error, before the question."""
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41990", "--json")
     asked = {
         "pretension": ("home", RIG, "--at-home", *bus),

@@ -171,7 +171,7 @@ def test_the_monitors_keys_ask_what_the_verbs_ask(monkeypatch: pytest.MonkeyPatc
     assert [one.percent for one in said[2:]] == [60, 70, 60]  # type: ignore[union-attr]
     assert list(operator.between(0.0)) == []
     assert stopped == [1]
-    assert operator.line == "stop asked for"
+    assert operator.line == "stop requested"
     assert list(operator.between(0.0)) == []
     with pytest.raises(KeyboardInterrupt):
         operator.between(0.0)
