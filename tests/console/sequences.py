@@ -236,7 +236,7 @@ class Sequences:
         if record.state is not State.MOVING:
             return
         if self._cycle % SAID_EVERY == 0:
-            self.console.look()
+            self.console.update()
             self._words()
         if self._cycle % 50 == 0:
             self._judge.look_around(self.console)

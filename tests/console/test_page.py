@@ -283,7 +283,7 @@ def test_poses_are_taught_named_ordered_forgotten_and_planned(desk: Visit) -> No
     desk.taught("one", "two", "three")
     desk.page.get_by_role("button", name="Move three up").click()
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["one", "three", "two"])
-    desk.page.get_by_role("button", name="Forget one").click()
+    desk.page.get_by_role("button", name="Remove one").click()
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["three", "two"])
     desk.page.get_by_role("textbox", name="Name of pose 2").fill("home")
     desk.page.get_by_role("textbox", name="Name of pose 2").press("Enter")
@@ -326,7 +326,7 @@ def test_nothing_known_is_shown_as_not_known(desk: Visit) -> None:
     desk.fake.ask(state={**dict.fromkeys(keys), "reference": {"counts": False, "why_not": None}})
     for name in ("x", "tilt", "clearance", "stop", "following", "lost"):
         expect(desk.page.locator(f"#value-{name}")).to_have_text("–")
-    expect(desk.page.locator("#tension-trouble")).to_contain_text("Not known")
+    expect(desk.page.locator("#tension-trouble")).to_contain_text("Unknown")
 
 
 def test_texts_of_the_server_never_become_markup(desk: Visit) -> None:
@@ -405,7 +405,7 @@ def test_control_is_taken_from_another_page_only_after_a_question(
     other.goto(desk.fake.address)
     expect(other.locator("#lamp-control")).to_have_text("Control: page 1")
     other.locator("#take-control").click()
-    expect(other.locator("#dialog")).to_contain_text("page 1 has control, and loses it at once")
+    expect(other.locator("#dialog")).to_contain_text("page 1 has control, and loses it immediately")
     other.locator(".confirm").click()
     expect(other.locator("#lamp-control")).to_have_text("You have control")
     expect(desk.page.locator("#lamp-control")).to_have_text("Control: page 2")

@@ -68,7 +68,7 @@ def test_what_it_means_for_the_reference_is_said_before(desk: Visit, homed: bool
     desk.fake.ask(set={"homed": homed, "service": True})
     desk.view("service")
     desk.page.locator("#cable-begin").click()
-    text = "the reference stays" if homed else "are not homed, and are not by this"
+    text = "the reference stays" if homed else "are not homed"
     expect(desk.page.locator("#dialog .cause")).to_contain_text(text)
     assert desk.fake.received("cable_begin") == []
 
@@ -130,8 +130,8 @@ def test_tension_and_way_are_shown(desk: Visit) -> None:
     desk.page.locator("input[name=cable][value='3']").check(force=True)
     expect(desk.page.locator("#cable-tension")).to_have_text("Cable 3: 55.1\u00a0N")
     expect(desk.page.locator("#cable-range")).to_contain_text("limit 62\u00a0N")
-    expect(desk.page.locator("#cable-way")).to_have_text(
-        "By this press 0.250\u00a0mm wound in · since the session began 1.250\u00a0mm paid out"
+    expect(desk.page.locator("#cable-travel")).to_have_text(
+        "This press: 0.250\u00a0mm wound in · since the session began 1.250\u00a0mm paid out"
     )
     expect(desk.page.locator("#cable-limit")).to_have_text(limit)
 

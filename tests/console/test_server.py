@@ -44,7 +44,7 @@ class Served:
         self.console = Console(files)
         self.said: list[tuple[str, dict[str, Any]]] = []
         self.started: list[tuple[str, list[str]]] = []
-        self.console.watch.say = self._say  # type: ignore[method-assign]
+        self.console.watch.send = self._say  # type: ignore[method-assign]
         self.console.verbs.start = self._start  # type: ignore[method-assign]
         self.server = ConsoleServer(self.console)
 
@@ -186,7 +186,7 @@ def test_stop_waits_for_no_other_command_of_any_page(
             assert (answer["to"], answer["what"]) == (7, "nothing moves")
         for _ in range(2 * MOST_WAITING):
             me.send(json.dumps(load))
-        assert "not done yet" in command(me, "hold")["what"]
+        assert "not finished yet" in command(me, "hold")["what"]
 
 
 def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
@@ -203,7 +203,7 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
     with advertised() as listeners:
         silent = f"process {os.getpid()} moves a robot and does not answer; wait, or stop it"
         assert [asked("reset"), asked("service_begin")] == [silent] * 2
-        state = console.look()
+        state = console.update()
         assert state["motion"] is None
         here: Any = MovesOn(state["bus"])
         with commands(listeners, LocalRequests(), here):
@@ -543,7 +543,7 @@ def test_a_console_that_only_shows_does_nothing_but_stop(
     with serving(Served(read_only=True)) as served, served.page() as page:
         assert state(page)["read_only"]
         for name in ("take_control", "home", "run", "jog_begin", "hold", "release", "reset"):
-            assert "only shows" in command(page, name)["what"]
+            assert "read-only" in command(page, name)["what"]
         assert command(page, "stop")["what"] == "nothing moves"
         assert not served.started
         assert not served.said

@@ -63,8 +63,8 @@ def test_list_and_file_agree_with_a_plain_list(
         else:
             assert ok
             names = expected
-        assert [one["name"] for one in taught.told()] == names
-        assert TaughtPoses(path).told() == taught.told()
+        assert [one["name"] for one in taught.as_dicts()] == names
+        assert TaughtPoses(path).as_dicts() == taught.as_dicts()
 
 
 def test_they_become_a_scene_that_is_read_again(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import chi2
 
-from cdpr.console.view import SURE_IN_SPACE, RobotView, measured_data, nearest_data
+from cdpr.console.view import ELLIPSOID_SCALE, RobotView, measured_data, nearest_data
 from executor.recording.run_folder import RunFolder
 from executor.remote import status
 from model.clearance import ClearanceModel
@@ -91,14 +91,14 @@ def test_the_ellipsoid_is_that_of_the_covariance(root: Array) -> None:
     covariance = root @ root.T
     shown = measured_data(told(covariance), 0.1)
     axes = np.array(shown["half_axes_mm"])
-    assert axes.T @ axes / SURE_IN_SPACE**2 == pytest.approx(covariance, abs=2e-3)
+    assert axes.T @ axes / ELLIPSOID_SCALE**2 == pytest.approx(covariance, abs=2e-3)
     apart = axes @ axes.T
     assert apart - np.diag(np.diag(apart)) == pytest.approx(np.zeros((3, 3)), abs=2e-2)
     assert shown["within_mm"] == pytest.approx(np.linalg.norm(axes, axis=1).max(), abs=2e-3)
 
 
 def test_the_ellipsoid_holds_95_percent() -> None:
-    assert chi2.cdf(SURE_IN_SPACE**2, 3) == pytest.approx(0.95, abs=1e-5)
+    assert chi2.cdf(ELLIPSOID_SCALE**2, 3) == pytest.approx(0.95, abs=1e-5)
 
 
 def test_a_run_states_all_errors_of_a_measured_position() -> None:
