@@ -315,8 +315,8 @@ def test_drives_that_were_turned_by_hand_between_two_readings_are_believed(bench
 def test_a_position_with_its_sign_flipped_is_not_believed() -> None:
     check = ReplyCheck({1: "drive 1"}, (500.0,))
     check.begin_cycle()
-    assert check.believed(0, 40_000)
-    assert not check.believed(0, -40_000)
+    assert check.accept(0, 40_000)
+    assert not check.accept(0, -40_000)
     assert check.rejected == 1
 
 
@@ -330,13 +330,13 @@ def test_a_position_is_believed_exactly_when_the_drum_can_have_turned_so_far(
 ) -> None:
     check = ReplyCheck({1: "drive 1"}, (500.0,))
     check.begin_cycle()
-    assert check.believed(0, start)
+    assert check.accept(0, start)
     check.end_cycle()
     for _ in range(gap):
         check.begin_cycle()
         check.end_cycle()
     check.begin_cycle()
-    believed = check.believed(0, start + step)
+    believed = check.accept(0, start + step)
     assert believed == (abs(step) <= 500 * (gap + 1))
 
 

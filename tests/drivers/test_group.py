@@ -489,7 +489,7 @@ def test_while_one_drive_is_slow_to_enable_the_others_hold_and_do_not_sag(
     assert bench.group.state is GroupState.ENABLING
     bench.until(GroupState.FAULT, limit=120)
     assert bench.status.faults[0][0] == 8
-    assert "on the way to operation enabled" in bench.status.faults[0][1]
+    assert "instead of operation enabled" in bench.status.faults[0][1]
     bench.cycle()
     assert [d.state for d in bench.drives[:7]] == [HOLDING] * 7
 

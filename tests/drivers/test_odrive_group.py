@@ -240,7 +240,7 @@ def test_a_drive_that_is_not_calibrated_is_named_and_no_other_stays_enabled(
     status = bench.cycles(105)
     assert status.state is GroupState.FAULT
     told = status.faults[0][1]
-    assert told.startswith("cable 6 (drive 6) stays idle on the way to closed loop control")
+    assert told.startswith("cable 6 (drive 6) stays idle instead of closed loop control")
     assert "not calibrated" in told
     bench.cycles(15)
     assert states(bench) == {AxisState.IDLE}

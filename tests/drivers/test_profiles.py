@@ -520,7 +520,7 @@ def test_an_object_that_the_profile_denies_must_not_hold_another_value(
     if not held:
         set_up(theirs, bus)
         return
-    with pytest.raises(Refused, match="its profile says that it is absent") as caught:
+    with pytest.raises(Refused, match="the profile declares it absent") as caught:
         set_up(theirs, bus)
     assert caught.value.values["node"] == 5
     assert not downloads(bus)
@@ -561,15 +561,15 @@ def test_doctor_names_what_a_profile_of_ones_own_says(rig: Rig) -> None:
     for key in ((0x1006, 0), (0x6066, 0), (0x6007, 0)):
         bus.drives[2].aborts[key] = 0x06020000
     change = {row.object[:8]: row.change for row in examined(rig, bus).rows}
-    assert change["6066h:00"] == "name it as absent in a drive profile of your own"
-    assert change["1006h:00"].startswith("name it as absent in a drive profile of your own, with")
+    assert change["6066h:00"] == "list it as absent in your own drive profile"
+    assert change["1006h:00"].startswith("list it as absent in your own drive profile, with")
     assert "monitoring: heartbeat" in change["1006h:00"]
     assert "no profile" in change["6007h:00"]
 
 
 def test_doctor_prints_mappings_as_manuals_do(rig: Rig) -> None:
     (row,) = (row for row in examined(rig, eight_of("cia402")).rows if row.object[:8] == "1600h:02")
-    assert row.needed == "607A0020h, written at set-up"
+    assert row.needed == "607A0020h, written at configuration"
 
 
 @pytest.mark.parametrize(("word", "said"), [(0x0240, "voltage enabled"), (0x0050, "remote")])

@@ -98,7 +98,7 @@ def test_a_drive_that_is_not_enabled_in_time_says_what_keeps_it(word: int, said:
     wanted = (DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED)
     (found,) = late_drives({4: "cable 1", 5: "cable 2"}, (word, 0x0237), wanted, 1.0)
     assert found[0] == 4
-    assert found[1].startswith(f"cable 1 is in {state_of(word).value} on the way to operation")
+    assert found[1].startswith(f"cable 1 is in {state_of(word).value} instead of operation")
     assert said in found[1]
     assert (";" in found[1]) == bool(said)
     assert ("bit 9" in found[1]) == (said == "remote")
