@@ -289,7 +289,7 @@ def torques_out_and_back(rig: Rig, friction: float) -> list[float]:
             for drive in rehearsal.drives:
                 drive.motor.position += turned
             rehearsal._feel()
-            rehearsal._finish_feeling()
+            rehearsal._finish_torque_update()
             torques.append(rehearsal.drives[0].torque)
     return torques
 
