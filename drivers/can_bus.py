@@ -292,7 +292,7 @@ def transmit(bus: can.BusABC, message: can.Message) -> None:
         raise bus_fault("a frame could not be sent", bus_name(bus), error) from error
 
 
-def take(bus: can.BusABC, timeout: float) -> can.Message | None:
+def receive_frame(bus: can.BusABC, timeout: float) -> can.Message | None:
     """The next frame, or None if none arrives within the time [s].
 
     Raises:

@@ -9,7 +9,14 @@ from typing import Protocol
 
 import can
 
-from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, lost_frames, take, transmit
+from drivers.can_bus import (
+    EchoFilter,
+    bus_name,
+    echoes_own_frames,
+    lost_frames,
+    receive_frame,
+    transmit,
+)
 from drivers.can_errors import SETTING_UP, BusFault, ErrorFrames, ForeignMaster, ReceiveOverflow
 from drivers.can_load import check_bus_load
 from drivers.drive_group import WHOLE_BUS, CycleStatus, GroupState, Pump
@@ -92,7 +99,7 @@ class CyclicBus:
         Raises:
             BusFault: The bus failed.
         """
-        while take(self._bus, 0.0) is not None:
+        while receive_frame(self._bus, 0.0) is not None:
             pass
         self._lost = lost_frames(self._bus)
 
@@ -103,7 +110,7 @@ class CyclicBus:
             BusFault: The bus failed, or is flooded.
         """
         for _ in range(MOST_STALE):
-            message = take(self._bus, 0.0)
+            message = receive_frame(self._bus, 0.0)
             if message is None:
                 return
             self._hand_over(message, listener, stale=True)
@@ -120,7 +127,7 @@ class CyclicBus:
         for _ in range(MOST_STALE):
             if listener.complete or left < 0.0:  # other frames must not delay the cycle
                 return
-            message = take(self._bus, left)
+            message = receive_frame(self._bus, left)
             if message is None:
                 return
             self._hand_over(message, listener, stale=False)
@@ -167,7 +174,7 @@ class CyclicBus:
             listener.take(message.arbitration_id, message.data, stale=stale)
 
 
-class GroupWatch(ReplyListener, Protocol):
+class GroupMonitor(ReplyListener, Protocol):
     """Last state of every drive."""
 
     def end_cycle(self) -> None:
@@ -194,7 +201,7 @@ class CyclicGroup(ABC):
 
     @property
     @abstractmethod
-    def _heard(self) -> GroupWatch:
+    def _heard(self) -> GroupMonitor:
         """Processes frames of the drives."""
 
     @abstractmethod

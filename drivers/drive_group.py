@@ -171,7 +171,7 @@ class DriveGroup(Protocol):
 
     @property
     def state(self) -> GroupState:
-        """Where the group stands."""
+        """State of the group."""
         ...
 
     @property
@@ -285,7 +285,7 @@ class DriveGroup(Protocol):
         """Whether drives still monitor this master, until all have confirmed the end."""
         ...
 
-    def look(self, pace: Pace) -> CycleStatus:
+    def read_state(self, pace: Pace) -> CycleStatus:
         """Reads the state of every drive after the last cycle, without sending another.
 
         A drive without an answer is missing; one that missed the last cycle gets the time of one

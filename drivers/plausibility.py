@@ -58,7 +58,7 @@ class ReplyCheck:
         self._heard = [0] * len(self._names)
         self._reasons = [""] * len(self._names)
 
-    def hear(self, drive: int) -> None:
+    def count_reply(self, drive: int) -> None:
         """Counts a reply of a drive, in time or late."""
         self._heard[drive] += 1
 

@@ -84,7 +84,7 @@ class FaultBus(can.BusABC):
             wait = 0.0
         return heapq.heappop(self._came)[2] if self._has_come() else None
 
-    def say(self, message: can.Message) -> None:
+    def inject(self, message: can.Message) -> None:
         """Sends a frame past the rules, as another device would."""
         self._bus.send(message)
 

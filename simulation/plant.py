@@ -192,7 +192,7 @@ class Plant:
     def __init__(
         self, rig: Rig, pose: Pose, load: Load | None = None, stiffness: Array | None = None
     ) -> None:
-        """Places the platform at a pose under its working tensions.
+        """Sets the platform at a pose under its working tensions.
 
         Args:
             rig: The robot.

@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import can
 import numpy as np
 
-from drivers.can_bus import SentFrame, take, transmit
+from drivers.can_bus import SentFrame, receive_frame, transmit
 from drivers.can_errors import BusDown
 from model.kinematics import cables_at
 from model.pose import Array, Pose
@@ -374,7 +374,7 @@ class SimulatedRig(ABC, Generic[Drive]):
     def _receive(self, wait: float) -> can.Message | None:
         """The next frame within a time [s]; None while the interface is down."""
         try:
-            return take(self._bus, wait)
+            return receive_frame(self._bus, wait)
         except BusDown:
             time.sleep(IDLE_WAIT)  # the kernel returns at once, but time must pass
             return None

@@ -248,8 +248,8 @@ class Cia402Group(CyclicGroup):
         jobs = self._unwatching
         return jobs is None or bool(jobs.unfinished() | jobs.refused())
 
-    def look(self, pace: Pace) -> CycleStatus:
-        """Reads the state of every drive by SDO; see `DriveGroup.look`."""
+    def read_state(self, pace: Pace) -> CycleStatus:
+        """Reads the state of every drive by SDO; see `DriveGroup.read_state`."""
         self._online()
         jobs = SdoJobs(dict.fromkeys(self._nodes, STANDING), self._again_after)
         silent = {self._nodes[i] for i, heard in enumerate(self._watch.answered) if not heard}

@@ -112,7 +112,7 @@ class DriveMonitor:
             if other is not None:
                 other(can_id & 0x7F, data)
             return
-        self._check.hear(drive)
+        self._check.count_reply(drive)
         if stale or self.answered[drive]:
             return
         reply = parse_reply(data)

@@ -17,7 +17,7 @@ from math import ceil
 
 import can
 
-from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, take, transmit
+from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, receive_frame, transmit
 from drivers.can_errors import SETTING_UP, ForeignMaster, error_frame_fault
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import (
@@ -151,7 +151,7 @@ class SetupNetwork:
 
     def discard_waiting(self) -> None:
         """Discards frames received earlier."""
-        while take(self._bus, 0.0) is not None:
+        while receive_frame(self._bus, 0.0) is not None:
             pass
 
     def hand_over(self, timeout: float) -> bool:
@@ -164,7 +164,7 @@ class SetupNetwork:
         if self._pump is not None:
             self._pump()
             timeout = 0.0  # simulated drives have answered by now, or never will
-        message = take(self._bus, timeout)
+        message = receive_frame(self._bus, timeout)
         if message is None:
             return False
         if message.is_error_frame:

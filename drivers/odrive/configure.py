@@ -9,7 +9,14 @@ from pathlib import Path
 
 import can
 
-from drivers.can_bus import EchoFilter, SentFrame, bus_name, echoes_own_frames, take, transmit
+from drivers.can_bus import (
+    EchoFilter,
+    SentFrame,
+    bus_name,
+    echoes_own_frames,
+    receive_frame,
+    transmit,
+)
 from drivers.can_errors import (
     SETTING_UP,
     ForeignMaster,
@@ -119,7 +126,7 @@ class SetupLink:
 
     def _frames(self, timeout: float) -> Iterator[can.Message]:
         for left in self._waits(timeout):
-            while (message := take(self._bus, left)) is not None:
+            while (message := receive_frame(self._bus, left)) is not None:
                 if message.is_error_frame:
                     fault = error_frame_fault(
                         message.arbitration_id, message.data, bus_name(self._bus)

@@ -38,7 +38,7 @@ from drivers.odrive.messages import (
     read_layouts,
     state_text,
 )
-from drivers.odrive.monitor import OdriveWatch
+from drivers.odrive.monitor import OdriveMonitor
 from drivers.plausibility import largest_steps, winding_signs
 from model.errors import HardwareMissing, Refused
 from model.files.rig_file import OdriveDocument
@@ -89,7 +89,7 @@ class OdriveGroup(CyclicGroup):
     def _reset_memory(self) -> None:
         ids = commanding_ids(self._layouts, self._nodes)
         self._cyclic = CyclicBus(self._bus, ids, foreign_master_message)
-        self._watch = OdriveWatch(self._rig, self._document, self._layouts, self._max_steps)
+        self._watch = OdriveMonitor(self._rig, self._document, self._layouts, self._max_steps)
         self._recent: deque[list[int]] = deque(maxlen=self._watch.window)
         self._stop = _Stop.NONE
         self._waited = 0
@@ -113,7 +113,7 @@ class OdriveGroup(CyclicGroup):
         )
 
     @property
-    def _heard(self) -> OdriveWatch:
+    def _heard(self) -> OdriveMonitor:
         return self._watch
 
     @property
@@ -242,8 +242,8 @@ class OdriveGroup(CyclicGroup):
         """False, as axes at rest monitor nothing; see `DriveGroup.is_monitored`."""
         return False
 
-    def look(self, pace: Pace) -> CycleStatus:
-        """Reads positions and states again; see `DriveGroup.look`."""
+    def read_state(self, pace: Pace) -> CycleStatus:
+        """Reads positions and states again; see `DriveGroup.read_state`."""
         return self.read_positions(pace)
 
     def _last(self) -> list[int]:
@@ -370,7 +370,7 @@ def read_axes(
     layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
     nodes = [winch.node_id for winch in rig.winches]
     cyclic = CyclicBus(bus, commanding_ids(layouts, nodes), foreign_master_message)
-    watch = OdriveWatch(rig, document, layouts, largest_steps(rig, rig.cycle))
+    watch = OdriveMonitor(rig, document, layouts, largest_steps(rig, rig.cycle))
     cyclic.forget_waiting()
     for _ in range(ATTEMPTS):
         watch.begin_cycle()

@@ -21,7 +21,7 @@ positions."""
 NEVER = 10**6
 
 
-class OdriveWatch:
+class OdriveMonitor:
     """The last heartbeat, estimate and torque of every drive.
 
     Attributes:

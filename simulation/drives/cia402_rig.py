@@ -10,7 +10,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from drivers.can_bus import take
+from drivers.can_bus import receive_frame
 from drivers.cia402.pdo import (
     HEARTBEAT_BASE,
     MASTER_NODE,
@@ -114,7 +114,7 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
             Fault: The bus failed, or the platform has no equilibrium.
         """
         idle, synced = True, False
-        while (message := take(self._bus, 0.0)) is not None:
+        while (message := receive_frame(self._bus, 0.0)) is not None:
             idle = False
             if message.arbitration_id in self._cyclic and not self._begun:
                 self._advance(self._cycle)

@@ -17,7 +17,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from drivers.can_bus import take
+from drivers.can_bus import receive_frame
 from drivers.odrive.endpoints import read_endpoints
 from drivers.odrive.messages import (
     OWN_DBC,
@@ -165,7 +165,7 @@ class SimulatedOdrive:
                 self._due[kind] += getattr(self.settings, kind)
                 self._send_periodic(kind)
 
-    def hear(self, command: int, data: Frame) -> None:
+    def receive(self, command: int, data: Frame) -> None:
         """Processes a frame for this drive."""
         if self.deaf:
             return
@@ -304,7 +304,7 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
 
     def pump(self) -> None:
         """Processes every waiting frame, then advances a cycle; see `SimulatedRig.pump`."""
-        while (message := take(self._bus, 0.0)) is not None:
+        while (message := receive_frame(self._bus, 0.0)) is not None:
             self._handle(message)
         self._advance(self._cycle)
         self._finish_torque_update()
@@ -324,7 +324,7 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         node, command = node_and_command(message.arbitration_id)
         drive = self._by_node.get(node)
         if drive is not None:
-            drive.hear(command, message.data)
+            drive.receive(command, message.data)
 
 
 def _settings(document: OdriveDocument) -> OdriveSettings:

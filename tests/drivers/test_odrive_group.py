@@ -255,11 +255,11 @@ class OdriveRehearsalTwin:
     """Two devices with one node id: each question is answered twice."""
 
     def __init__(self, bench: OdriveBench) -> None:
-        self._hear = bench.rehearsal._by_node[4].hear
+        self._receive = bench.rehearsal._by_node[4].receive
 
-    def hear(self, command: int, data: bytes) -> None:
-        self._hear(command, data)
-        self._hear(command, data)
+    def receive(self, command: int, data: bytes) -> None:
+        self._receive(command, data)
+        self._receive(command, data)
 
 
 REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]] = {

@@ -123,7 +123,7 @@ def test_rules_follow_each_other(line: Line) -> None:
 
 def test_what_another_device_says_no_rule_touches(line: Line) -> None:
     line.faulty.outgoing.append(lose(range(0x800)))
-    line.faulty.say(frame(7))
+    line.faulty.inject(frame(7))
     assert line.went() == [7]
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from cdpr.cli.operate.supervision import RunSupervisor, confirmation, say
+from cdpr.cli.operate.supervision import RunSupervisor, confirmation, print_safely
 from cdpr.cli.options import (
     CalibrationOption,
     ChannelOption,
@@ -150,7 +150,7 @@ def show_files(result: RunResult, as_json: bool) -> None:
     """Shows the path of a run's report, and what could not be written."""
     if result.report is not None and not as_json:
         line = f"report: {result.report}"
-        say(lambda: show_line(line), result)
+        print_safely(lambda: show_line(line), result)
     if missing := result.missing_text():
         show_line(f"error: {missing}", err)
 

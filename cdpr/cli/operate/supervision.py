@@ -146,7 +146,7 @@ class RunSupervisor(SignalSupervisor):
     def on_verdict(self, result: Any) -> None:
         """See `Supervisor`."""
         self.code = result.exit_code
-        say(lambda: self._show(result), result)
+        print_safely(lambda: self._show(result), result)
 
     def leaves_files_out(self) -> bool:
         """See `Supervisor`."""
@@ -169,7 +169,7 @@ class RunSupervisor(SignalSupervisor):
             os.write(2, _GIVING_UP)  # print is not safe in a signal handler
 
 
-def say(write: Callable[[], None], result: Any) -> None:
+def print_safely(write: Callable[[], None], result: Any) -> None:
     """Writes to standard output; where that fails, the verdict to standard error.
 
     Args:
