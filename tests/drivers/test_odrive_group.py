@@ -248,7 +248,7 @@ def test_a_drive_that_is_not_calibrated_is_named_and_no_other_stays_enabled(
 
 def _twin(bench: OdriveBench) -> None:
     twin = OdriveRehearsalTwin(bench)
-    bench.rehearsal._by_node[4].hear = twin.hear  # type: ignore[method-assign]
+    bench.rehearsal._by_node[4].receive = twin.receive  # type: ignore[method-assign]
 
 
 class OdriveRehearsalTwin:
