@@ -146,7 +146,7 @@ def _program(*arguments: str | Path, **how: object) -> subprocess.CompletedProce
     )
 
 
-def test_a_full_disk_behind_standard_output_is_told() -> None:
+def test_a_full_disk_behind_standard_output_is_reported() -> None:
     with open("/dev/full", "w") as full:
         done = _program("--version", stdout=full)
     assert done.returncode == 1

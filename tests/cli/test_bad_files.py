@@ -32,7 +32,7 @@ RIG_MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", RIG_MISTAKES)
-def test_a_mistake_in_a_rig_file_is_told_with_its_line(tmp_path: Path, mistake: str) -> None:
+def test_a_mistake_in_a_rig_file_is_reported_with_its_line(tmp_path: Path, mistake: str) -> None:
     old, new, parts = RIG_MISTAKES[mistake]
     text = RIG.read_text()
     assert old in text
@@ -75,7 +75,7 @@ SCENE_MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", SCENE_MISTAKES)
-def test_a_mistake_in_a_scene_file_is_told_with_its_line(tmp_path: Path, mistake: str) -> None:
+def test_a_mistake_in_a_scene_file_is_reported_with_its_line(tmp_path: Path, mistake: str) -> None:
     old, new, parts = SCENE_MISTAKES[mistake]
     text = SCENE.read_text()
     assert old in text
@@ -120,7 +120,7 @@ def test_files_in_another_order_are_named_for_what_they_are(tmp_path: Path) -> N
         one_message(call("check", RIG), 2, "a file of another kind", "pass another file")
 
 
-def test_a_missing_folder_and_a_read_only_one_are_told_apart(tmp_path: Path) -> None:
+def test_a_missing_folder_and_a_read_only_one_are_distinguished(tmp_path: Path) -> None:
     missing = tmp_path / "not there"
     one_message(call("plan", RIG, SCENE, "-o", missing / "p.json"), 2, f"no folder {missing}")
     (tmp_path / "file").touch()

@@ -52,7 +52,7 @@ def test_an_edited_plan_is_not_used(short_plan: Path, tmp_path: Path, verb: str)
         ("incomplete", '{"kind": "cdpr-plan", "schema_version": 1}', "waypoints"),
     ],
 )
-def test_a_file_that_is_no_plan_is_told_so(
+def test_a_file_that_is_not_a_plan_is_reported_as_such(
     tmp_path: Path, verb: str, name: str, text: str | None, part: str
 ) -> None:
     plan = tmp_path / f"{name}.json"
@@ -100,7 +100,7 @@ def test_a_whole_plan_that_collides_is_refused_before_anything_moves(tmp_path: P
     one_message(answer, 3, "the plan fails its check", "obstacle_1", "limit 10 mm")
 
 
-def test_check_tells_every_violation_with_its_place_and_exits_3(tmp_path: Path) -> None:
+def test_check_reports_every_violation_with_its_position_and_exits_3(tmp_path: Path) -> None:
     plan = colliding_plan(tmp_path / "plan.json")
     answer = use("check", plan, tmp_path)
     assert answer.code == 3

@@ -65,7 +65,7 @@ def folder(tmp_path: Path, short_plan: Path) -> Path:
         ("--start-mm", "0 0 100", ["start", "workspace", "150"]),
     ],
 )
-def test_a_start_or_goal_that_cannot_be_used_is_told_with_what_and_how_much(
+def test_an_unusable_start_or_goal_is_reported_with_reason_and_amount(
     tmp_path: Path, option: str, place: str, parts: list[str]
 ) -> None:
     with nothing_written(tmp_path):
@@ -73,7 +73,7 @@ def test_a_start_or_goal_that_cannot_be_used_is_told_with_what_and_how_much(
     one_message(answer, 2, *parts)
 
 
-def test_a_goal_that_is_not_reached_tells_how_near_the_search_came(tmp_path: Path) -> None:
+def test_a_goal_that_is_not_reached_reports_the_closest_distance(tmp_path: Path) -> None:
     hard = CONFIGS / "environment_3.yaml"
     with nothing_written(tmp_path):
         options = ("--planner", "adaptive", "--max-iterations", "5")
@@ -109,9 +109,7 @@ def test_a_demo_does_not_write_into_an_existing_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("verb", ["plan", "track"])
-def test_a_result_in_a_folder_that_is_not_there_is_told_before_the_work(
-    folder: Path, verb: str
-) -> None:
+def test_a_result_in_a_missing_folder_is_reported_before_the_work(folder: Path, verb: str) -> None:
     place = folder / "no such folder" / "result"
     rest = {
         "plan": [RIG, SCENE],
@@ -121,7 +119,7 @@ def test_a_result_in_a_folder_that_is_not_there_is_told_before_the_work(
         one_message(call(verb, *rest, "-o", place), 2, str(place))
 
 
-def test_a_run_folder_below_a_file_is_told_before_the_work(folder: Path) -> None:
+def test_a_run_folder_below_a_file_is_reported_before_the_work(folder: Path) -> None:
     (folder / "file").touch()
     rest = ("--rig", RIG, "--fast", "--no-camera", "-o", folder / "file" / "above" / "run")
     with nothing_written(folder):
@@ -147,7 +145,7 @@ def read_only(short_plan: Path) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("verb", ["plan", "run", "demo"])
-def test_a_read_only_folder_is_told_before_the_work(read_only: Path, verb: str) -> None:
+def test_a_read_only_folder_is_reported_before_the_work(read_only: Path, verb: str) -> None:
     """In a process of its own, without the right of root to write anywhere."""
     rest = {
         "plan": [RIG, SCENE, "-o", "new.json"],
@@ -195,7 +193,7 @@ def test_a_kernel_bus_that_is_not_there_names_the_command_that_brings_it_up(fold
     )
 
 
-def test_a_platform_that_stands_elsewhere_is_not_moved(folder: Path) -> None:
+def test_a_platform_at_another_pose_is_not_moved(folder: Path) -> None:
     refused(
         folder,
         3,
@@ -224,7 +222,7 @@ def test_a_drive_that_does_not_answer_is_named(
     refused(folder, 4, "drive 5", "answer", "check power", rig=RIG, fast=True, no_camera=True)
 
 
-def test_a_bus_without_drives_is_told_before_anything_is_enabled(
+def test_a_bus_without_drives_is_reported_before_anything_is_enabled(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sdo, "RESPONSE_TIMEOUT", 0.01)
@@ -260,7 +258,7 @@ def test_a_real_bus_moves_only_after_a_yes(folder: Path, answers: str) -> None:
 # The camera.
 
 
-def test_a_camera_that_is_not_there_is_told_before_anything_moves(folder: Path) -> None:
+def test_a_missing_camera_is_reported_before_anything_moves(folder: Path) -> None:
     refused(folder, 4, "camera front (77)", "/dev/video", rig=RIG, camera=77)
 
 
@@ -316,7 +314,7 @@ def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:
         ),
     ],
 )
-def test_wishes_that_contradict_each_other_are_told(
+def test_contradictory_options_are_reported(
     folder: Path, options: dict[str, object], parts: list[str]
 ) -> None:
     refused(folder, 2, *parts, rig=RIG, **options)
@@ -362,7 +360,7 @@ def test_a_report_needs_a_whole_run_folder(tmp_path: Path, finished_run: Path) -
 
 
 @pytest.mark.parametrize("name", ["cycles.csv", "clearance.csv", "poses.csv", "summary.json"])
-def test_a_damaged_run_folder_is_told_by_file(
+def test_a_damaged_run_folder_is_reported_by_file(
     tmp_path: Path, finished_run: Path, name: str
 ) -> None:
     broken = tmp_path / "broken"

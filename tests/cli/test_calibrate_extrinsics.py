@@ -108,7 +108,7 @@ def run(short_plan: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_run_tells_its_poses_by_the_drives(run: Path) -> None:
+def test_a_run_gives_its_poses_from_the_encoders(run: Path) -> None:
     answer = call("calibrate", "extrinsics", RIG, run / "pictures", "--poses", run, "--json")
     assert answer.code == 3, answer  # a short straight path does not tell much
     found = json.loads(answer.out)
@@ -172,7 +172,7 @@ def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: st
     one_message(answer, 2, named)
 
 
-def test_folders_that_cannot_be_used_are_told(folder, tmp_path) -> None:
+def test_unusable_folders_are_reported(folder, tmp_path) -> None:
     out = tmp_path / "out"
     answer = call("calibrate", "extrinsics", RIG, tmp_path / "nowhere", "-o", out)
     one_message(answer, 2, "not a folder of images")

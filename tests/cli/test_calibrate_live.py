@@ -51,7 +51,7 @@ def test_pictures_are_taken_with_advice_and_then_used(video: Path, tmp_path: Pat
     assert "# # #" in answer.err
 
 
-def test_a_video_in_place_of_a_folder_is_used(video: Path) -> None:
+def test_a_video_is_used_instead_of_a_folder(video: Path) -> None:
     """Of every view one picture is used, as nothing moved to the next."""
     answer = call("calibrate", "camera", video, *BOARD, "--json")
     assert answer.code in (0, 3), answer
@@ -60,7 +60,7 @@ def test_a_video_in_place_of_a_folder_is_used(video: Path) -> None:
     assert all("nothing moved" in why for why in found["unused"].values())
 
 
-def test_a_board_that_is_never_seen_is_told(video: Path, tmp_path: Path) -> None:
+def test_a_board_that_is_never_detected_is_reported(video: Path, tmp_path: Path) -> None:
     other = ("--board", "charuco", "--columns", "5", "--rows", "4", "--square-mm", "25")
     other += ("--marker-mm", "20")
     answer = call("calibrate", "camera", tmp_path / "taken", "--live", video, *other)
@@ -75,7 +75,7 @@ def test_a_board_that_is_never_seen_is_told(video: Path, tmp_path: Path) -> None
         (("--pictures", "12"), 2, "are for capturing images"),
     ],
 )
-def test_cameras_that_are_none_are_told(tmp_path: Path, options, code: int, named: str) -> None:
+def test_invalid_cameras_are_reported(tmp_path: Path, options, code: int, named: str) -> None:
     answer = call("calibrate", "camera", tmp_path / "taken", *options, *BOARD)
     one_message(answer, code, named)
 

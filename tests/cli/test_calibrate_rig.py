@@ -143,7 +143,7 @@ def changed(file: Path, tmp_path: Path, how: str) -> Path:
         ("deviation", "a standard deviation is not positive"),
     ],
 )
-def test_a_file_that_cannot_be_used_is_refused_with_its_place(
+def test_an_unusable_file_is_refused_with_its_location(
     file: Path, tmp_path: Path, how: str, what: str
 ) -> None:
     folder = tmp_path / "out"
@@ -159,7 +159,7 @@ def test_a_file_that_is_named_twice_is_refused(file: Path) -> None:
     assert "given twice" in done.err
 
 
-def test_poses_that_no_such_rig_can_hold_are_told_of_file_and_rig(tmp_path: Path) -> None:
+def test_poses_that_no_such_rig_can_hold_are_reported_with_file_and_rig(tmp_path: Path) -> None:
     """x in inches: near the middle of the rig, and the outlets that would fit cannot hold home."""
     names, *lines = (SESSION / "places.csv").read_text(encoding="utf-8").splitlines()
     x, rows = names.split(",").index("x_mm"), [line.split(",") for line in lines]
@@ -177,7 +177,7 @@ def test_poses_that_no_such_rig_can_hold_are_told_of_file_and_rig(tmp_path: Path
     assert not list(folder.glob("*"))
 
 
-def test_a_file_in_place_of_the_folder_is_told_with_a_next_step(file: Path) -> None:
+def test_a_file_instead_of_the_folder_is_reported_with_a_next_step(file: Path) -> None:
     other = file.with_name("other")
     other.write_text("mine")
     done = call("calibrate", "rig", RIG, file, "-o", other, "--json")
@@ -202,7 +202,7 @@ def test_the_options_have_the_deviations_that_poses_are_chosen_by() -> None:
         assert options[f"{group}_{unit}"].default == pytest.approx(deviation * scale), group
 
 
-def test_a_run_with_too_few_rests_is_told_so(finished_run: Path) -> None:
+def test_a_run_with_too_few_rests_is_reported(finished_run: Path) -> None:
     """Without a camera; it stands still at its start and its goal, if at all."""
     done = call("calibrate", "rig", ROOT / "configs/gachon_8_6.yaml", finished_run, "--json")
     assert done.code == 2

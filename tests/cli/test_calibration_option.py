@@ -42,7 +42,7 @@ def test_results_about_another_camera_are_refused_by_name(tmp_path: Path, verb: 
 
 
 @pytest.mark.parametrize("good", [True, False])
-def test_a_result_that_is_not_good_enough_is_used_and_told(tmp_path: Path, good: bool) -> None:
+def test_a_result_that_is_not_good_enough_is_used_and_reported(tmp_path: Path, good: bool) -> None:
     why = "not good enough: few [images]"
     changes = {} if good else {"good_enough": False, "verdict": why}
     result = write_result(tmp_path, camera_result_of().model_copy(update=changes))

@@ -55,7 +55,7 @@ def kernel_with_can(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "kernel_support", lambda: MachineCheck("kernel", True, "there"))
 
 
-def test_a_healthy_interface_has_nothing_to_mend() -> None:
+def test_a_healthy_interface_has_nothing_to_fix() -> None:
     answers = looked()
     assert len(answers) == 4
     assert all(answer.good for answer in answers.values())
@@ -127,7 +127,7 @@ def test_other_interfaces_are_left_out() -> None:
     assert parse_interfaces("") == ()
 
 
-def test_an_ip_that_says_something_else_is_told(tmp_path: Path) -> None:
+def test_unexpected_output_of_ip_is_reported(tmp_path: Path) -> None:
     program = tmp_path / "ip"
     program.write_text("#!/bin/sh\necho no idea\n")
     program.chmod(0o755)
@@ -206,7 +206,7 @@ def test_a_camera_needs_the_rig_that_describes_it() -> None:
     assert "cdpr doctor RIG --camera INDEX" in answer.said
 
 
-def test_a_bus_too_slow_and_an_interface_missing_are_both_told(tmp_path: Path) -> None:
+def test_a_bus_too_slow_and_an_interface_missing_are_both_reported(tmp_path: Path) -> None:
     text = RIG.read_text().replace("interface: virtual", "interface: socketcan")
     rig = tmp_path / "rig.yaml"
     rig.write_text(
@@ -238,7 +238,7 @@ def test_objects_of_all_drives_are_read_in_one_table(tmp_path: Path) -> None:
     assert {one["verdict"] for one in told["drives"]["objects"]} <= {"ok", "remark"}
 
 
-def test_drives_of_another_make_are_told_with_what_to_change(
+def test_drives_of_another_make_are_reported_with_what_to_change(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Drives of the standard have no current limit of Maxon's, and no units."""

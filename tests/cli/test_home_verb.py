@@ -68,7 +68,7 @@ def test_a_no_moves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.json"))
 
 
-def test_nobody_is_asked_without_being_told_what_for(tmp_path: Path) -> None:
+def test_every_question_is_preceded_by_what_will_happen(tmp_path: Path) -> None:
     """With --json too: what will happen is on standard error, before the question."""
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41990", "--json")
     asked = {
@@ -83,7 +83,7 @@ def test_nobody_is_asked_without_being_told_what_for(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.json"))
 
 
-def test_a_rehearsal_tells_the_reference_and_keeps_nothing(tmp_path: Path) -> None:
+def test_a_rehearsal_shows_the_reference_and_stores_nothing(tmp_path: Path) -> None:
     answer = call("home", RIG, "--camera", "synthetic", "--pictures", "5", "--fast", "--json")
     assert answer.code == 0, answer
     told = json.loads(answer.out)
@@ -124,7 +124,7 @@ def test_a_stop_while_the_camera_looks_ends_it(monkeypatch: pytest.MonkeyPatch) 
     assert asked == [0, 0, 1]
 
 
-def test_one_cable_on_a_taut_platform_ends_in_a_stop_that_is_told() -> None:
+def test_one_cable_on_a_taut_platform_ends_in_a_reported_stop() -> None:
     answer = call("jog", RIG, "--cable", "3", "--mm", "-5", "--fast")
     assert answer.code == 1
     assert "more than" in answer.err

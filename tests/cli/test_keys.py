@@ -42,7 +42,7 @@ SENT = {name: b"\x1b[" + code for code, name in NAMES.items()} | {
 
 
 @given(st.lists(st.sampled_from([*SENT, "unknown"])))
-def test_keys_are_told_apart_however_many_come_at_once(keys: list[str]) -> None:
+def test_keys_are_distinguished_however_many_come_at_once(keys: list[str]) -> None:
     data = b"".join(SENT.get(key, b"\x1b[1;5P") for key in keys)
     assert names_of(data) == [key for key in keys if key != "unknown"]
 

@@ -33,7 +33,7 @@ def watched(
     return board, told
 
 
-def test_when_the_last_camera_fails_that_is_told_and_the_run_is_stopped_for_it() -> None:
+def test_failure_of_the_last_camera_is_reported_and_stops_the_run() -> None:
     board, told = watched(5, 0.0, Scripted("front", [0, -2]))
     why = "the process of camera front ended without an answer"
     assert told == [("camera", f"camera front failed ({why}); clearance is not measured")]

@@ -65,7 +65,7 @@ def test_nothing_asked_shows_the_help() -> None:
     assert " demo " in answer.said
 
 
-def test_version_is_told() -> None:
+def test_version_is_shown() -> None:
     answer = call("--version")
     assert answer.code == 0
     assert re.fullmatch(r"cdpr \d+\.\d+\.\d+\S*\n", answer.out)
@@ -89,7 +89,7 @@ def test_json_of_plan_and_check(tmp_path: Path) -> None:
     assert document(checked)["hash"] == document(planned)["hash"]
 
 
-def test_compiling_is_told_where_it_does_not_disturb_json(
+def test_compiling_is_reported_without_disturbing_json(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     noted: list[str] = []
@@ -173,7 +173,7 @@ def test_an_error_is_json_too_when_json_was_asked_for(
     assert "error: " in answer.err
 
 
-def test_nothing_but_the_result_is_on_standard_output_and_no_escape_codes_where_nobody_looks(
+def test_only_the_result_is_on_standard_output_without_escape_codes(
     short_plan: Path, finished_run: Path
 ) -> None:
     for arguments in (["check", short_plan], ["report", finished_run], ["doctor"]):

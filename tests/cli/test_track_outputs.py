@@ -70,7 +70,7 @@ def test_poses_clearance_mcap_and_pictures_agree(plan: Path, tmp_path: Path) -> 
     assert greenish.sum() > 100, "outlines of the tags"
 
 
-def test_a_picture_of_another_size_is_skipped_and_told(tmp_path: Path) -> None:
+def test_an_image_of_another_size_is_skipped_and_reported(tmp_path: Path) -> None:
     for picture in picture_files(SESSION)[:2]:
         (tmp_path / picture.name).write_bytes(picture.read_bytes())
     cv2.imwrite(str(tmp_path / "a[0].png"), np.zeros((48, 64), np.uint8))
@@ -83,7 +83,7 @@ def test_a_picture_of_another_size_is_skipped_and_told(tmp_path: Path) -> None:
     assert "skipped: a[0].png has 64 x 48 px" in " ".join(answer.err.split())
 
 
-def test_mirrored_pictures_are_told(tmp_path: Path) -> None:
+def test_mirrored_images_are_reported(tmp_path: Path) -> None:
     grey = read_picture(picture_files(SESSION)[0])
     assert grey is not None
     cv2.imwrite(str(tmp_path / "a.png"), grey[:, ::-1])
@@ -94,7 +94,7 @@ def test_mirrored_pictures_are_told(tmp_path: Path) -> None:
     )
 
 
-def test_tags_that_are_not_as_told_are_named_as_the_cause(tmp_path: Path) -> None:
+def test_tags_that_differ_from_the_rig_file_are_named_as_the_cause(tmp_path: Path) -> None:
     (tmp_path / "pictures").mkdir()
     picture = picture_files(SESSION)[0]
     (tmp_path / "pictures" / picture.name).write_bytes(picture.read_bytes())
@@ -146,7 +146,7 @@ def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -
         ("there.avi", "the file exists already"),
     ],
 )
-def test_a_place_that_cannot_be_drawn_to_is_refused(
+def test_an_output_that_cannot_be_written_is_refused(
     plan: Path, tmp_path: Path, name: str, words: str
 ) -> None:
     (tmp_path / "there.avi").write_text("kept")
@@ -156,7 +156,7 @@ def test_a_place_that_cannot_be_drawn_to_is_refused(
     one_message(answer, 2, words, name)
 
 
-def test_a_detector_nobody_knows_is_refused(plan: Path, tmp_path: Path) -> None:
+def test_an_unknown_detector_is_refused(plan: Path, tmp_path: Path) -> None:
     arguments = ("synthetic", "--plan", plan, "-o", tmp_path / "poses.csv", "--detector", "eyes")
     with nothing_written(tmp_path):
         answer = call("track", RIG, *arguments)

@@ -101,7 +101,7 @@ def test_a_client_sees_robot_scene_drives_clearance_and_events(told: dict[str, A
     assert 0.0 < seen["/clearance"]["distance_mm"] < 1000.0
 
 
-def test_a_port_that_is_taken_is_told() -> None:
+def test_a_port_in_use_is_reported() -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

@@ -17,7 +17,9 @@ STALE = re.compile("No data from the console’s server")
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_stop_is_at_the_same_place_in_every_view(browser: Browser, fake: Fake, size: str) -> None:
+def test_stop_is_at_the_same_position_in_every_view(
+    browser: Browser, fake: Fake, size: str
+) -> None:
     """The lower left corner; whole, large enough for a finger, and in front of everything."""
     with visit(browser, fake, size) as found:
         boxes = []

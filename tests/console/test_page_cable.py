@@ -100,7 +100,7 @@ def test_a_key_that_is_held_ends_with_a_finger_and_begins_nothing(desk: Visit) -
 @pytest.mark.parametrize(
     ("axes", "sense"), [([0, -0.5, 0, 0], "wind_in"), ([0, 0, 0, 0.6], "pay_out")]
 )
-def test_a_stick_winds_in_and_pays_out_and_ends_where_it_is_turned(
+def test_a_stick_winds_in_and_pays_out_and_ends_when_it_changes_direction(
     desk: Visit, axes: list[float], sense: str
 ) -> None:
     desk.ready_to_jog_cables()
@@ -116,7 +116,7 @@ def test_a_stick_winds_in_and_pays_out_and_ends_where_it_is_turned(
     assert desk.fake.let_pass(desk.page)["received"][-1]["kind"] == "let_go", "not the other way"
 
 
-def test_tension_and_way_are_shown(desk: Visit) -> None:
+def test_tension_and_travel_are_shown(desk: Visit) -> None:
     desk.ready_to_jog_cables()
     cable = {**AT_REST, "ready": True, "cable": 3, "press_mm": -0.25, "limit_n": 62.0}
     way = [0.0, 0.0, 1.25, 0.0, 0.0, 0.0, 0.0, 0.0]

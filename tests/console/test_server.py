@@ -219,7 +219,7 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/scene", "/api/files", "/runs/one/report.html"])
-def test_nothing_is_told_without_the_token(served: Served, path: str) -> None:
+def test_nothing_is_sent_without_the_token(served: Served, path: str) -> None:
     assert served.get(path, token=False)[0] == 403
     assert served.get(f"{path}?token=wrong", token=False)[0] == 403
     assert served.get(path)[0] == 200
@@ -289,7 +289,7 @@ def test_help_is_given_by_code(served: Served) -> None:
     assert b"# " in body
 
 
-def test_the_fake_server_tells_what_this_one_tells(served: Served) -> None:
+def test_the_fake_server_sends_what_this_one_sends(served: Served) -> None:
     """What the page's own tests rest on; a key that one has and the other lacks is found here."""
     with served.page() as page:
         real = state(page)

@@ -41,7 +41,7 @@ def test_a_missing_kernel_interface_says_how_to_bring_it_up() -> None:
     ("flags", "queue", "what"),
     [("0x40080", 128, "down"), ("0x40081", 10, "transmit queue")],
 )
-def test_a_kernel_interface_that_is_down_or_short_of_queue_is_told(
+def test_a_kernel_interface_that_is_down_or_short_of_queue_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, queue: int, what: str
 ) -> None:
     folder = tmp_path / "can0"

@@ -208,7 +208,7 @@ class TestAnotherProgramWhileDrivesAreSetUp:
             (0x605, "objects of drive 5"),
         ],
     )
-    def test_is_told(self, bench: Bench, can_id: int, words: str) -> None:
+    def test_is_reported(self, bench: Bench, can_id: int, words: str) -> None:
         reply = bench.drives[0]._bus_send
         read = bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0))
         bench.drives[0]._bus_send = lambda i, d: (say(bench, can_id, read), reply(i, d))
@@ -218,7 +218,7 @@ class TestAnotherProgramWhileDrivesAreSetUp:
         assert bench.group.state is GroupState.OFFLINE
 
 
-def test_two_devices_with_one_node_id_are_told_before_anything_is_written(bench: Bench) -> None:
+def test_two_devices_with_one_node_id_are_reported_before_anything_is_written(bench: Bench) -> None:
     send = bench.drives[4]._bus_send
     bench.drives[4]._bus_send = lambda i, d: (send(i, d), send(i, d))
     with pytest.raises(Refused, match="drive 5 answered twice"):
@@ -303,7 +303,7 @@ def test_a_first_position_that_is_wrong_becomes_no_target(bench: Bench) -> None:
     assert bench.group.read_positions().positions.tolist() == true
 
 
-def test_drives_that_were_turned_by_hand_between_two_readings_are_believed(bench: Bench) -> None:
+def test_drives_rotated_by_hand_between_two_readings_are_accepted(bench: Bench) -> None:
     bench.group.configure()
     bench.group.read_positions()
     for drive, position in zip(bench.drives, bench.lifted(0.05), strict=True):
@@ -312,7 +312,7 @@ def test_drives_that_were_turned_by_hand_between_two_readings_are_believed(bench
     assert bench.group.read_positions().positions.tolist() == true
 
 
-def test_a_position_with_its_sign_flipped_is_not_believed() -> None:
+def test_a_position_with_its_sign_flipped_is_not_accepted() -> None:
     check = ReplyCheck({1: "drive 1"}, (500.0,))
     check.begin_cycle()
     assert check.accept(0, 40_000)
@@ -325,7 +325,7 @@ def test_a_position_with_its_sign_flipped_is_not_believed() -> None:
     gap=st.integers(0, 5),
     start=st.integers(-(2**30), 2**30),
 )
-def test_a_position_is_believed_exactly_when_the_drum_can_have_turned_so_far(
+def test_a_position_is_accepted_exactly_when_the_drum_can_have_rotated_that_far(
     step: int, gap: int, start: int
 ) -> None:
     check = ReplyCheck({1: "drive 1"}, (500.0,))
@@ -355,7 +355,7 @@ def test_where_a_sender_hears_itself_only_what_was_not_sent_is_foreign(script: l
             assert own.is_foreign(0x080)
 
 
-def test_drives_with_few_heartbeat_entries_are_told_of(bench: Bench) -> None:
+def test_drives_with_few_heartbeat_entries_are_reported(bench: Bench) -> None:
     assert bench.group.configure() == ()
     bench.group.close()
     for drive in (2, 6):

@@ -141,7 +141,7 @@ OF_ANOTHER_TOOL = {
 }
 
 
-def test_identifiers_of_a_master_are_told_by_what_it_does() -> None:
+def test_identifiers_of_a_master_are_described_by_what_it_does() -> None:
     assert commanding_ids([1, 8]) == OF_ANOTHER_MASTER.keys()
     assert set_up_ids([1, 8]) == OF_ANOTHER_MASTER.keys() | OF_ANOTHER_TOOL.keys()
     for can_id, told in (OF_ANOTHER_MASTER | OF_ANOTHER_TOOL).items():

@@ -112,7 +112,7 @@ def test_a_drive_that_falls_silent_after_set_up_is_named(bench: Bench) -> None:
         bench.group.read_positions()
 
 
-def test_a_drive_that_was_switched_on_since_it_was_set_up_is_told(bench: Bench) -> None:
+def test_a_drive_power_cycled_since_its_configuration_is_reported(bench: Bench) -> None:
     assert bench.group.restarted == ()
     bench.group.configure()
     assert bench.group.restarted == tuple(range(1, 9)), "never set up"
@@ -254,7 +254,7 @@ def test_a_fault_is_latched_until_it_is_reset(bench: Bench) -> None:
     bench.until(GroupState.ENABLED)
 
 
-def test_a_silent_drive_is_told_every_cycle_and_left_to_the_executor(bench: Bench) -> None:
+def test_a_silent_drive_is_reported_every_cycle_and_left_to_the_executor(bench: Bench) -> None:
     bench.enable()
     bench.drives[7].silent = True
     for _ in range(4):

@@ -132,7 +132,7 @@ def test_without_cantools_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) ->
     assert "cdpr[odrive]" in caught.value.next_step
 
 
-def test_errors_and_states_are_told_in_words() -> None:
+def test_errors_and_states_are_shown_as_text() -> None:
     assert "watchdog" in error_text(AxisError.WATCHDOG_TIMER_EXPIRED)
     both = error_text(0x2000 | AxisError.ESTOP_REQUESTED)
     assert "motor over-temperature, emergency stop" in both

@@ -34,7 +34,7 @@ def states(bench: OdriveBench) -> set[AxisState]:
     return {drive.state for drive in bench.drives}
 
 
-def test_all_drives_are_enabled_where_they_stand_and_follow(bench: OdriveBench) -> None:
+def test_all_drives_are_enabled_at_their_positions_and_follow(bench: OdriveBench) -> None:
     status = bench.enable()
     assert status.state is GroupState.ENABLED
     assert status.holding
@@ -303,7 +303,7 @@ def test_drives_that_are_not_fit_are_refused_before_anything_is_enabled(
     assert bench.group.state is GroupState.OFFLINE
 
 
-def test_without_endpoints_it_is_told_that_settings_were_not_read_back(bench: OdriveBench) -> None:
+def test_without_endpoints_settings_not_read_back_are_reported(bench: OdriveBench) -> None:
     (remark,) = bench.group.configure()
     assert "not read back" in remark
 
@@ -390,7 +390,7 @@ def test_drives_in_fault_are_taken_to_be_reset(bench: OdriveBench) -> None:
     assert bench.cycles(10).state is GroupState.CONFIGURED
 
 
-def test_what_drives_tell_is_the_rig_files(bench: OdriveBench) -> None:
+def test_capabilities_of_the_drives_are_the_rig_files(bench: OdriveBench) -> None:
     told = bench.group.capabilities
     assert (told.sync, told.has_brake, told.watchdog_ms) == (False, True, 100.0)
     with odrive_bench(odrive_rig(brakes=False, watchdog_ms=None)) as other:
@@ -405,14 +405,14 @@ def with_counts(rig: Rig, counts_per_rev: int) -> Rig:
     return rig_from_document(rig.document.model_copy(update={"winches": winches}))
 
 
-def test_counts_that_a_float_cannot_tell_apart_are_refused() -> None:
+def test_counts_that_a_float_cannot_resolve_are_refused() -> None:
     check_resolution(with_counts(odrive_rig(), 100_000))
     with pytest.raises(BadInput, match="an ODrive's set-point does not resolve") as caught:
         check_resolution(with_counts(odrive_rig(), 2_000_000))
     assert "counts_per_rev" in caught.value.next_step
 
 
-def test_who_only_looks_sends_nothing(bench: OdriveBench) -> None:
+def test_reading_alone_sends_nothing(bench: OdriveBench) -> None:
     seen = read_drives(bench.rig, bench.group._bus, bench.rehearsal.pump)
     assert seen.positions.tolist() == [round(drive.motor.position) for drive in bench.drives]
     assert not seen.torques.any(), "their brakes hold"
@@ -431,7 +431,7 @@ def test_released_drives_are_disarmed_and_their_brakes_hold(bench: OdriveBench) 
     assert states(bench) == {AxisState.IDLE}
 
 
-def test_who_only_looks_believes_no_count_that_may_have_begun_anew() -> None:
+def test_reading_alone_trusts_no_count_that_may_have_restarted() -> None:
     """As `configure` has it: an ODrive does not tell whether its power was gone."""
     document = odrive_rig().document
     counting = [winch.model_copy(update={"encoder": "incremental"}) for winch in document.winches]

@@ -93,7 +93,7 @@ def test_drives_of_a_profile_are_set_up_with_it(rig: Rig, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["akd", "epos4", "nanotec-c5e"])
-def test_with_another_profile_everything_wrong_is_told_at_once(rig: Rig, name: str) -> None:
+def test_with_another_profile_everything_wrong_is_reported_at_once(rig: Rig, name: str) -> None:
     bus = eight_of("cia402" if name == "akd" else name)
     if name == "akd":
         for drive in bus.drives.values():
@@ -217,7 +217,7 @@ def test_a_slow_drive_is_set_up_all_the_same(rig: Rig) -> None:
     assert set_up(rig, bus) == ()
 
 
-def test_doctor_tells_all_objects_of_all_drives_and_writes_nothing(rig: Rig) -> None:
+def test_doctor_reports_all_objects_of_all_drives_and_writes_nothing(rig: Rig) -> None:
     bus = eight_of("epos4")
     bus.drives[7].values[0x6502, 0] = 0x65
     found = examined(rig, bus)
@@ -258,16 +258,20 @@ TURN = 131072
     ("objects", "verdict", "text"),
     [
         ({}, "ok", "absent"),
-        ({0x608F: (TURN, 1)}, "ok", f"{TURN} by 608Fh"),
-        ({0x6092: (10 * TURN, 1), 0x6091: (10, 1)}, "ok", f"{TURN} by 6092h/6091h"),
-        ({0x6092: (3 * TURN, 3)}, "ok", f"{TURN} by 6092h/6091h"),
+        ({0x608F: (TURN, 1)}, "ok", f"{TURN} from 608Fh"),
+        ({0x6092: (10 * TURN, 1), 0x6091: (10, 1)}, "ok", f"{TURN} from 6092h/6091h"),
+        ({0x6092: (3 * TURN, 3)}, "ok", f"{TURN} from 6092h/6091h"),
         (
             {0x6092: (TURN, 1), 0x608F: (1 << 22, 1)},
             "ok",
-            f"{TURN} by 6092h/6091h, 4194304 by 608Fh",
+            f"{TURN} from 6092h/6091h, 4194304 from 608Fh",
         ),
-        ({0x6092: (3600, 1), 0x608F: (2000, 1)}, "remark", "3600 by 6092h/6091h, 2000 by 608Fh"),
-        ({0x608F: (TURN + 1, 1)}, "remark", f"{TURN + 1} by 608Fh"),
+        (
+            {0x6092: (3600, 1), 0x608F: (2000, 1)},
+            "remark",
+            "3600 from 6092h/6091h, 2000 from 608Fh",
+        ),
+        ({0x608F: (TURN + 1, 1)}, "remark", f"{TURN + 1} from 608Fh"),
         ({0x608F: (TURN, 0)}, "ok", "absent"),
     ],
 )

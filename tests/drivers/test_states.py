@@ -109,7 +109,7 @@ def test_only_a_drive_with_torque_and_no_fault_holds() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(DriveState), st.booleans()), min_size=1, max_size=8))
-def test_a_stop_tells_every_drive_to_stop_whatever_it_said(
+def test_a_stop_commands_every_drive_to_stop_whatever_it_reported(
     drives: list[tuple[DriveState, bool]],
 ) -> None:
     states, told = zip(*drives, strict=True)

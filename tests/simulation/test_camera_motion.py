@@ -59,7 +59,7 @@ def variance(columns: Array, share: Array) -> float:
 
 
 @pytest.mark.parametrize(("speed", "exposure"), [(0.5, 0.008), (0.25, 0.012), (-1.0, 0.006)])
-def test_a_smear_is_as_long_as_the_way_while_exposed(
+def test_a_smear_is_as_long_as_the_motion_during_exposure(
     rig: Rig, scene: Scene, facing: Camera, speed: float, exposure: float
 ) -> None:
     """An edge smeared over L pixels is a ramp, whose slope has the variance L² / 12 more."""

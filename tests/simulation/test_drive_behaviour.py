@@ -266,7 +266,7 @@ def test_noise_is_in_what_is_reported_only(name: str, at: int) -> None:
     assert line.drive.motor.position == 1000.0
 
 
-def test_stick_slip_stands_and_then_jumps() -> None:
+def test_stick_slip_rests_and_then_jumps() -> None:
     line = named("stick-slip=40")
     line.enable()
     positions = []

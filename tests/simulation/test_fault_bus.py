@@ -63,7 +63,7 @@ def line() -> Iterator[Line]:
         yield made
 
 
-def test_without_rules_frames_pass_both_ways_in_order(line: Line) -> None:
+def test_without_rules_frames_pass_in_both_directions_in_order(line: Line) -> None:
     assert line.in_order([3, 1, 2]) == [3, 1, 2]
     for number in (5, 4):
         line.faulty.send(frame(number))

@@ -62,7 +62,7 @@ def scene() -> Scene:
     return load_scene(ROOT / "configs/environment_3.yaml")
 
 
-def test_a_rig_built_as_its_file_says_stands_where_its_counts_say(rig: Rig) -> None:
+def test_a_rig_built_as_its_file_says_is_where_its_counts_say(rig: Rig) -> None:
     pose = Pose.level(rig.home.apply([0.08, -0.06, 0.05]))
     for robot in (rig, imperfect(rig, as_built=as_told(rig))):
         assert rehearsal_of(robot, pose).pose.distance_to(pose) < 5e-6  # whole counts
@@ -123,7 +123,7 @@ def test_a_drum_is_within_half_its_backlash_of_its_motor(way: list[float], play:
         before = drum
 
 
-def test_a_drum_with_steps_stands_only_at_whole_ones() -> None:
+def test_a_drum_with_steps_rests_only_at_whole_ones() -> None:
     transmission = Transmission(np.zeros(3), 8.0, np.zeros(3))
     assert transmission.drums(np.array([3.9, 4.1, -21.0])) == pytest.approx([0.0, 8.0, -24.0])
 
@@ -145,7 +145,7 @@ def told_torques(robot: Rig) -> list[list[float]]:
     return told[-20:]
 
 
-def test_tensions_are_told_with_noise_and_with_the_same_noise_again(rig: Rig) -> None:
+def test_tensions_are_reported_with_noise_and_with_the_same_noise_again(rig: Rig) -> None:
     noisy = imperfect(rig, seed=3, winches={"tension_noise_n": 0.5})
     told = told_torques(noisy)
     assert told == told_torques(noisy)
@@ -153,7 +153,7 @@ def test_tensions_are_told_with_noise_and_with_the_same_noise_again(rig: Rig) ->
     assert np.std(told_torques(rig), axis=0).max() == 0.0
 
 
-def test_pictures_are_taken_through_the_true_lens_and_the_tracker_is_told_another(
+def test_images_are_taken_through_the_true_lens_and_the_tracker_assumes_another(
     rig: Rig, scene: Scene
 ) -> None:
     camera = rig.cameras[0]
@@ -187,7 +187,7 @@ def test_less_light_and_no_cables_show_in_the_picture(rig: Rig, scene: Scene) ->
     assert 100 < np.count_nonzero(shown() != full) < full.size / 20  # thin cables
 
 
-def test_two_cameras_in_one_place_differ_by_their_noise_alone(rig: Rig, scene: Scene) -> None:
+def test_two_cameras_at_one_pose_differ_only_by_their_noise(rig: Rig, scene: Scene) -> None:
     first = rig.document.cameras[0]
     second = first.model_copy(update={"name": "second"})
     two = rig_from_document(rig.document.model_copy(update={"cameras": [first, second]}))

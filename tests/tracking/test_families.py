@@ -65,7 +65,7 @@ def test_a_number_that_the_family_does_not_have_is_refused(rig: Rig) -> None:
         rig_from_document(small)
 
 
-def test_a_detector_nobody_knows_is_refused() -> None:
+def test_an_unknown_detector_is_refused() -> None:
     with pytest.raises(BadInput, match="unknown tag detector 'eyes'"):
         make_detector("eyes", FAMILY)
 
