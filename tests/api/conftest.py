@@ -1,4 +1,4 @@
-"""Runs of a test are its own: nobody else's stop reaches them, and its stops reach nobody else."""
+"""Separate run folders for each test, so that stops do not affect other tests' runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rig and scene files that cannot be used: every problem with its place, and nothing is written."""
+"""Unusable rig and scene files: every problem with its location, and nothing is written."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RIG_MISTAKES = {
     "not a number": ("mass_kg: 0.4", "mass_kg: .nan", ["platform.mass_kg"]),
     "a word for a number": ("mass_kg: 0.4", "mass_kg: heavy", ["platform.mass_kg"]),
     "seven anchors": ("  - [65, -65, 65]\n", "", ["anchors_mm", "7", "8"]),
-    "tensions the wrong way round": (
+    "tensions in the wrong order": (
         "max_tension_n: 100",
         "max_tension_n: 4",
         ["max_tension_n", "min_tension_n"],
@@ -60,9 +60,9 @@ def test_all_problems_of_a_file_come_at_once_in_the_order_of_their_lines(tmp_pat
     rig.write_text(text)
     answer = call("plan", rig, SCENE, "-o", tmp_path / "plan.json")
     one_message(answer, 2, "platform.mass_kg", "cables.radius", "bus.cycle_ms")
-    places = [int(part.split(":")[0]) for part in answer.err.split(f"{rig}:")[1:]]
-    assert places == sorted(places)
-    assert len(places) >= 3
+    lines = [int(part.split(":")[0]) for part in answer.err.split(f"{rig}:")[1:]]
+    assert lines == sorted(lines)
+    assert len(lines) >= 3
 
 
 SCENE_MISTAKES = {

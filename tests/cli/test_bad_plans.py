@@ -107,7 +107,7 @@ def test_check_reports_every_violation_with_its_position_and_exits_3(tmp_path: P
     assert "violated" in answer.out
     assert "obstacle_1" in answer.out
     assert "not passed" in answer.out
-    told = call("check", plan, "--json")
-    assert told.code == 3
-    assert json.loads(told.out)["passed"] is False
-    assert json.loads(told.out)["violations"]
+    checked = call("check", plan, "--json")
+    assert checked.code == 3
+    assert json.loads(checked.out)["passed"] is False
+    assert json.loads(checked.out)["violations"]

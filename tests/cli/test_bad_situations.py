@@ -1,4 +1,4 @@
-"""Files are good, but the world is not: places, drives, cameras and folders that cannot be used."""
+"""Valid files, but unusable positions, drives, cameras and folders."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def folder(tmp_path: Path, short_plan: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("option", "place", "parts"),
+    ("option", "position", "parts"),
     [
         ("--start-mm", "-150 0 300", ["start", "obstacle_1", "mm"]),
         ("--goal-mm", "-150 -100 300", ["goal", "obstacle_1", "mm"]),
@@ -66,10 +66,10 @@ def folder(tmp_path: Path, short_plan: Path) -> Path:
     ],
 )
 def test_an_unusable_start_or_goal_is_reported_with_reason_and_amount(
-    tmp_path: Path, option: str, place: str, parts: list[str]
+    tmp_path: Path, option: str, position: str, parts: list[str]
 ) -> None:
     with nothing_written(tmp_path):
-        answer = call("plan", RIG, SCENE, "-o", tmp_path / "plan.json", option, *place.split())
+        answer = call("plan", RIG, SCENE, "-o", tmp_path / "plan.json", option, *position.split())
     one_message(answer, 2, *parts)
 
 
@@ -110,13 +110,13 @@ def test_a_demo_does_not_write_into_an_existing_folder(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("verb", ["plan", "track"])
 def test_a_result_in_a_missing_folder_is_reported_before_the_work(folder: Path, verb: str) -> None:
-    place = folder / "no such folder" / "result"
+    missing = folder / "no such folder" / "result"
     rest = {
         "plan": [RIG, SCENE],
         "track": [RIG, "synthetic", "--plan", folder / "plan.json"],
     }[verb]
     with nothing_written(folder):
-        one_message(call(verb, *rest, "-o", place), 2, str(place))
+        one_message(call(verb, *rest, "-o", missing), 2, str(missing))
 
 
 def test_a_run_folder_below_a_file_is_reported_before_the_work(folder: Path) -> None:
@@ -135,13 +135,13 @@ def test_without_a_rig_file_no_bus_is_moved(folder: Path) -> None:
 @pytest.fixture
 def read_only(short_plan: Path) -> Iterator[Path]:
     """A folder that its user may read and not write, with a plan in it; removed afterwards."""
-    place = Path(tempfile.mkdtemp(dir="/tmp", prefix="read only "))
-    shutil.copy(short_plan, place / "plan.json")
-    (place / "plan.json").chmod(0o644)
-    place.chmod(stat.S_IRUSR | stat.S_IXUSR | stat.S_IROTH | stat.S_IXOTH)
-    yield place
-    place.chmod(0o700)
-    shutil.rmtree(place)
+    read_only_folder = Path(tempfile.mkdtemp(dir="/tmp", prefix="read only "))
+    shutil.copy(short_plan, read_only_folder / "plan.json")
+    (read_only_folder / "plan.json").chmod(0o644)
+    read_only_folder.chmod(stat.S_IRUSR | stat.S_IXUSR | stat.S_IROTH | stat.S_IXOTH)
+    yield read_only_folder
+    read_only_folder.chmod(0o700)
+    shutil.rmtree(read_only_folder)
 
 
 @pytest.mark.parametrize("verb", ["plan", "run", "demo"])
@@ -335,9 +335,9 @@ def test_a_source_that_shows_nothing_leaves_no_pose_log(
 ) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.mp4").write_text("no video")
-    place = source if source.isdigit() or source == "synthetic" else tmp_path / source
+    opened = source if source.isdigit() or source == "synthetic" else tmp_path / source
     with nothing_written(tmp_path):
-        answer = call("track", RIG, place, "-o", tmp_path / "poses.csv")
+        answer = call("track", RIG, opened, "-o", tmp_path / "poses.csv")
     one_message(answer, code, part)
 
 

@@ -1,4 +1,4 @@
-"""`cdpr calibrate camera --live`, with a video in place of a camera."""
+"""`cdpr calibrate camera --live`, with a video instead of a camera."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ TURNS = ([0.5, 0, 0], [-0.5, 0, 0], [0, 0.5, 0], [0, -0.5, 0], [0.3, 0.3, 0.2])
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A board that is held at nine places, two images each, and tilted every way."""
-    places = [(x, y) for x in (-0.11, 0.0, 0.11) for y in (-0.08, 0.0, 0.08)]
-    held = [(*place, [0.0, 0.0, 0.0]) for place in places] + [(0.0, 0.0, turn) for turn in TURNS]
+    """A board held at nine positions, two images each, and tilted in every direction."""
+    positions = [(x, y) for x in (-0.11, 0.0, 0.11) for y in (-0.08, 0.0, 0.08)]
+    held = [(*position, [0.0, 0.0, 0.0]) for position in positions] + [
+        (0.0, 0.0, turn) for turn in TURNS
+    ]
     path = tmp_path_factory.mktemp("live") / "board.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, SIZE)
     for x, y, turn in held:

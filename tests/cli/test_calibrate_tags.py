@@ -51,7 +51,7 @@ def as_glued() -> Rig:
 
 
 def before_the_camera(count: int) -> list[Pose]:
-    """Poses ``camera_from_platform``: turned every way, no face straight at the camera."""
+    """Poses ``camera_from_platform``: rotated in all directions, no face square to the camera."""
     rng, poses = np.random.default_rng(8), []
     while len(poses) < count:
         turn = Rotation.random(random_state=rng).as_matrix()

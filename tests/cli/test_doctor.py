@@ -1,4 +1,4 @@
-"""`cdpr doctor` says what is missing, each with the command that mends it."""
+"""`cdpr doctor` lists what is missing, each with the command that fixes it."""
 
 from __future__ import annotations
 
@@ -214,11 +214,11 @@ def test_a_bus_too_slow_and_an_interface_missing_are_both_reported(tmp_path: Pat
     )
     answer = call("doctor", rig, "--json")
     assert answer.code == 4
-    told = {one["name"]: one for one in json.loads(answer.out)}
-    assert not told["bus load"]["good"]
-    assert "4 or more" in told["bus load"]["fix"]
-    assert not told["interface can77"]["good"]
-    assert "real-time priority" in told
+    document = {one["name"]: one for one in json.loads(answer.out)}
+    assert not document["bus load"]["good"]
+    assert "4 or more" in document["bus load"]["fix"]
+    assert not document["interface can77"]["good"]
+    assert "real-time priority" in document
 
 
 def with_profile(tmp_path: Path, profile: str) -> Path:
@@ -233,9 +233,9 @@ def test_objects_of_all_drives_are_read_in_one_table(tmp_path: Path) -> None:
     assert "of 8 drives read, nothing written; 0 to change" in answer.out
     assert "stop by SYNC after 30 ms: up to 0.7 mm" in answer.out
     answer = call("doctor", RIG, "--drives", "--json")
-    told = json.loads(answer.out)
-    assert told["drives"]["answered"] == list(range(1, 9))
-    assert {one["verdict"] for one in told["drives"]["objects"]} <= {"ok", "remark"}
+    document = json.loads(answer.out)
+    assert document["drives"]["answered"] == list(range(1, 9))
+    assert {one["verdict"] for one in document["drives"]["objects"]} <= {"ok", "remark"}
 
 
 def test_drives_of_another_make_are_reported_with_what_to_change(

@@ -76,21 +76,21 @@ def test_every_question_is_preceded_by_what_will_happen(tmp_path: Path) -> None:
         "cable 1 (drive 1)": ("jog", RIG, "--cable", "1", "--mm", "1", *bus),
         "no fault latched": ("reset", RIG, *bus),
     }
-    for told, arguments in asked.items():
+    for title, arguments in asked.items():
         answer = call(*arguments, answers="n\n")
         assert (answer.code, json.loads(answer.out)["error"]) == (130, "stopped")
-        assert 0 <= answer.err.index(told) < answer.err.index("[y/N]")
+        assert 0 <= answer.err.index(title) < answer.err.index("[y/N]")
     assert not list(tmp_path.rglob("*.json"))
 
 
 def test_a_rehearsal_shows_the_reference_and_stores_nothing(tmp_path: Path) -> None:
     answer = call("home", RIG, "--camera", "synthetic", "--pictures", "5", "--fast", "--json")
     assert answer.code == 0, answer
-    told = json.loads(answer.out)
-    assert told["file"] is None
-    assert 0.0 < told["uncertainty_mm"] < 0.5
-    assert len(told["home_counts"]) == 8
-    assert min(told["tensions_n"]) >= 7.5
+    document = json.loads(answer.out)
+    assert document["file"] is None
+    assert 0.0 < document["uncertainty_mm"] < 0.5
+    assert len(document["home_counts"]) == 8
+    assert min(document["tensions_n"]) >= 7.5
     assert not list(tmp_path.rglob("*.json"))
 
 

@@ -85,7 +85,7 @@ def test_a_pipe_has_no_keys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 
 class Typed:
-    """Keys by simulated time, in place of a terminal."""
+    """Keys by simulated time, instead of a terminal."""
 
     def __init__(self, script: Sequence[tuple[float, float, str]]) -> None:
         self._script, self.now = script, 0.0
@@ -100,7 +100,7 @@ class Typed:
 
 
 def jogged(script: Sequence[tuple[float, float, str]]) -> list[tuple[float, Any]]:
-    """Time and place of the platform, cycle by cycle, from when the drives are ready."""
+    """Time and position of the platform in every cycle once the drives are ready."""
     typed, seen = Typed(script), []
     keys = JogKeys(typed, 20.0)  # type: ignore[arg-type]
     begun: list[float] = []
@@ -120,13 +120,13 @@ def jogged(script: Sequence[tuple[float, float, str]]) -> list[tuple[float, Any]
 
 def test_the_platform_moves_while_a_key_repeats_and_rests_soon_after() -> None:
     seen = jogged([(1.0, 2.0, "right"), (4.0, 9.0, "q")])
-    times, places = np.array([t for t, _ in seen]), np.array([p for _, p in seen])
-    moved = places[-1] - places[0]
+    times, positions = np.array([t for t, _ in seen]), np.array([p for _, p in seen])
+    moved = positions[-1] - positions[0]
     assert moved[0] > 0.010
     assert np.abs(moved[1:]).max() < 1e-9
     rig = load_rig(RIG)
     to_rest = 0.020 / rig.motion.acceleration + rig.motion.acceleration / rig.motion.jerk
-    rests = places[times > 2.0 + TIMEOUT + to_rest + 0.1]
+    rests = positions[times > 2.0 + TIMEOUT + to_rest + 0.1]
     assert len(rests) > 20
     assert np.ptp(rests, axis=0).max() == 0.0
     assert times[-1] < 5.0, "q ends the session"
@@ -199,8 +199,8 @@ def test_a_run_is_waited_for_and_takes_what_it_is_sent(monkeypatch: pytest.Monke
         return [make_line("hold")]
 
     monkeypatch.setattr(client, "find_runs", later)
-    told = WinchStatus(load_rig(RIG), board, simulated_time=False)
-    with advertised() as listeners, serving(listeners, board, told):
+    run_status = WinchStatus(load_rig(RIG), board, simulated_time=False)
+    with advertised() as listeners, serving(listeners, board, run_status):
         following = follow_run(None, 10.0, waits=True, between=between)
         first = next(following)
         assert passed[0] == pytest.approx(2 * client.LOOK)
@@ -218,8 +218,8 @@ def test_the_monitor_shows_where_the_platform_is_by_the_runs_own_rig(tmp_path: P
         | {"set_counts": int(counts), "tension_n": float(run.cycles.planned_tensions[k, i])}
         for i, counts in enumerate(run.cycles.set_counts[k])
     ]
-    told = status(folder=str(folder.path), drives=drives)
-    seen = monitor._Robot().seen(told)
+    run_status = status(folder=str(folder.path), drives=drives)
+    seen = monitor._Robot().seen(run_status)
     assert seen is not None
     view, robot = seen
     np.testing.assert_allclose(robot.pose.position, run.cycles.planned[k], atol=2e-5)

@@ -16,7 +16,7 @@ from cdpr.cli.operate.run import show
 from cdpr.cli.output import progress_bar
 from executor.interlock.interlock import ReferenceStatus
 from executor.recording.verdict import page_text
-from executor.remote.client import request_run as told
+from executor.remote.client import request_run as request
 from executor.run_result import RunResult
 from executor.service import StatusResult
 from model.errors import Fault
@@ -120,7 +120,7 @@ def test_status_says_what_has_to_be_done_before_a_run() -> None:
 
 def test_monitor_calls_itself_by_its_name() -> None:
     with pytest.raises(Fault, match="no active run") as caught:
-        told("status", None, verb="monitor")
+        request("status", None, verb="monitor")
     assert caught.value.where == "cdpr monitor"
     assert "cdpr status" not in str(caught.value)
     answer = call("monitor", "--once")

@@ -118,10 +118,10 @@ def test_json_of_report_doctor_and_stop(finished_run: Path) -> None:
     "verb", [("hold",), ("resume",), ("speed", "50"), ("monitor",), ("monitor", "--once", "--json")]
 )
 def test_a_wish_that_reaches_no_run_is_no_success(verb: tuple[str, ...]) -> None:
-    told = call(*verb)
-    assert told.code == 1
-    assert "no active run found" in told.err
-    assert "emergency stop" in told.err
+    reply = call(*verb)
+    assert reply.code == 1
+    assert "no active run found" in reply.err
+    assert "emergency stop" in reply.err
 
 
 @pytest.mark.parametrize("percent", ["0", "101", "-5", "fast"])
@@ -131,10 +131,10 @@ def test_a_speed_that_is_none_is_bad_input(percent: str) -> None:
 
 def test_a_stop_that_stops_nothing_is_no_success() -> None:
     """Who presses stop and sees something move must not read that all is well."""
-    told = call("stop")
-    assert told.code == 1
-    assert "no active run found" in told.err
-    assert "emergency stop" in told.err
+    reply = call("stop")
+    assert reply.code == 1
+    assert "no active run found" in reply.err
+    assert "emergency stop" in reply.err
     nobody = {"stopped_processes": [], "silent_processes": []}
     assert document(call("stop", "--json")) == nobody
     assert call("stop", "--json").code == 1
@@ -165,11 +165,11 @@ def test_an_error_is_json_too_when_json_was_asked_for(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     answer = call(*arguments, "--json")
-    told = document(answer)
+    reply = document(answer)
     assert answer.code == code
-    assert told["exit_code"] == code
-    assert told["what"]
-    assert told["next_step"]
+    assert reply["exit_code"] == code
+    assert reply["what"]
+    assert reply["next_step"]
     assert "error: " in answer.err
 
 

@@ -2,7 +2,7 @@
 
     python -m tests.console.fake_server --port 8402
 
-It moves the platform of the paper's rig on a circle and obeys commands in a simple way. `POST
+It moves the platform of the paper's rig on a circle and executes commands in simplified form. `POST
 /fake` lays values over the states that it sends (`{"state": {…}}`) and over its own (`{"set":
 {…}}`), makes it silent (`{"silent": true}`), hang up (`{"hang_up": true}`), refuse sockets
 (`{"refuse": true}`) or begin again (`{"renew": true}`). `GET /fake` gives what came in.
@@ -183,9 +183,9 @@ class Fake:
             self.spent, self.held = max(self.spent, self.held["hold"]), None
         if self.held and self.cable_ready:
             sign = 1.0 if self.held["sense"] == "pay_out" else -1.0
-            way = sign * self.held["speed_mm_s"] * PERIOD_S
-            self.cables_mm[self.held["cable"] - 1] += way
-            self.press_mm += way
+            travel = sign * self.held["speed_mm_s"] * PERIOD_S
+            self.cables_mm[self.held["cable"] - 1] += travel
+            self.press_mm += travel
         elif self.held:
             step = np.array(self.held["direction"]) * self.held["speed_mm_s"] * PERIOD_S / 1e3
             self.position = np.clip(self.position + step, RIG.workspace_lower, RIG.workspace_upper)

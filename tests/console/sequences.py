@@ -115,7 +115,7 @@ class Judge:
         ]
 
     def begin(self) -> None:
-        """A new session; the drives stand."""
+        """A new session, with the drives at rest."""
         self._last, self.heard = None, float("-inf")
         if self.heard_of is not None:
             self.heard_of = {}
@@ -445,7 +445,7 @@ def sequences(count: int, seed: int, *, cables: bool = False) -> Figures:
     before, interval = held(), sys.getswitchinterval()
     patience = watch.PATIENCE, watch.ANSWERED_WITHIN
     sys.setswitchinterval(1e-4)  # the session and its socket's thread take turns all the time
-    # Time stands still while the session is asked: a busy computer makes no word late in it.
+    # Time stops while the session is queried, so that a busy computer delays no message.
     watch.PATIENCE = watch.ANSWERED_WITHIN = PATIENCE
     try:
         figures = Sequences(seed, cables=cables).run(count)

@@ -163,7 +163,7 @@ def test_a_holder_is_named_when_control_is_refused(moving: bool) -> None:
 
 
 def test_two_consoles_at_once_never_number_a_press_alike() -> None:
-    """A console that begins anew, or a second one, goes on with no press of another."""
+    """A restarted or second console continues no press of another."""
     times = iter(range(1_000, 2_000))
     consoles = [PageControl(lambda: next(times)) for _ in range(2)]
     pages = [control.join("a") for control in consoles]

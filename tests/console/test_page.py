@@ -192,7 +192,7 @@ def test_after_a_reconnection_nothing_goes_on_by_itself(desk: Visit) -> None:
     expect(desk.page.locator("#stale")).to_be_visible()
     expect(desk.page.locator("#stale")).to_be_hidden()
     after = desk.fake.let_pass(desk.page)["received"][before:]
-    # What was on its way when the socket was closed; nothing since, though the mouse is still down.
+    # Messages in transit when the socket was closed; none since, though the mouse is still down.
     assert len([m for m in after if m["kind"] == "held"]) <= 3
     assert [m for m in after if m["kind"] == "command"] == []
     count = len(desk.fake.ask()["received"])

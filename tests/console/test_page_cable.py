@@ -113,17 +113,19 @@ def test_a_stick_winds_in_and_pays_out_and_ends_when_it_changes_direction(
     assert found["sense"] == sense
     desk.page.evaluate("(axes) => { fakePad.axes = axes.map((v) => -v); }", axes)
     desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
-    assert desk.fake.let_pass(desk.page)["received"][-1]["kind"] == "let_go", "not the other way"
+    assert desk.fake.let_pass(desk.page)["received"][-1]["kind"] == "let_go", (
+        "not the other direction"
+    )
 
 
 def test_tension_and_travel_are_shown(desk: Visit) -> None:
     desk.ready_to_jog_cables()
     cable = {**AT_REST, "ready": True, "cable": 3, "press_mm": -0.25, "limit_n": 62.0}
-    way = [0.0, 0.0, 1.25, 0.0, 0.0, 0.0, 0.0, 0.0]
+    travel = [0.0, 0.0, 1.25, 0.0, 0.0, 0.0, 0.0, 0.0]
     limit = "cable 3 carries 55.1 N, near the limit of 62 N"
     desk.fake.ask(
         state={
-            "cable": {**cable, "session_mm": way, "limit": limit},
+            "cable": {**cable, "session_mm": travel, "limit": limit},
             "tensions_n": [20.0, 20.0, 55.1, 20.0, 20.0, 20.0, 20.0, 20.0],
         }
     )

@@ -107,7 +107,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class MovesOn:
-    """Stands in for `RunStatus`: of a run, nothing but its bus."""
+    """A minimal `RunStatus` with only the bus of a run."""
 
     def __init__(self, bus: str) -> None:
         self._bus = bus
@@ -140,7 +140,7 @@ def state(page: ClientConnection) -> dict[str, Any]:
             return message
 
 
-def told(page: ClientConnection, text: str) -> dict[str, Any]:
+def answer_to(page: ClientConnection, text: str) -> dict[str, Any]:
     """The answer to what is sent."""
     page.send(text)
     while True:
@@ -151,7 +151,7 @@ def told(page: ClientConnection, text: str) -> dict[str, Any]:
 
 
 def command(page: ClientConnection, name: str, **values: Any) -> dict[str, Any]:
-    return told(page, json.dumps({"kind": "command", "id": 7, "command": name, **values}))
+    return answer_to(page, json.dumps({"kind": "command", "id": 7, "command": name, **values}))
 
 
 def held(hold: int) -> str:
@@ -423,7 +423,7 @@ def test_what_names_no_cable_and_sense_moves_nothing(
     with served.something_moves(), served.page() as page:
         command(page, "take_control")
         command(page, "service_begin")
-        assert told(page, held_cable(1, **changes))["ok"] is False
+        assert answer_to(page, held_cable(1, **changes))["ok"] is False
         assert served.said == []
 
 
@@ -521,7 +521,7 @@ SMALL = st.recursive(
 @given(said=SMALL)
 def test_nonsense_is_refused_and_nothing_starts(served: Served, said: Any) -> None:
     with served.page() as page:
-        answer = told(page, json.dumps(said))
+        answer = answer_to(page, json.dumps(said))
         assert not answer["ok"]
         assert answer["what"]
     assert not served.started

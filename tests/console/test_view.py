@@ -75,7 +75,7 @@ def test_a_run_that_is_under_way_is_seen_in_its_own_scene(tmp_path: Path) -> Non
     assert view.scene.obstacles != SCENE.obstacles
 
 
-def told(covariance: Array) -> dict[str, Any]:
+def measurement_with(covariance: Array) -> dict[str, Any]:
     flat = covariance.reshape(-1).tolist()
     return {
         "position_mm": [1.0, 2.0, 3.0],
@@ -89,7 +89,7 @@ def told(covariance: Array) -> dict[str, Any]:
 def test_the_ellipsoid_is_that_of_the_covariance(root: Array) -> None:
     """Its half axes are at right angles, and their squares add up to the covariance."""
     covariance = root @ root.T
-    shown = measured_data(told(covariance), 0.1)
+    shown = measured_data(measurement_with(covariance), 0.1)
     axes = np.array(shown["half_axes_mm"])
     assert axes.T @ axes / ELLIPSOID_SCALE**2 == pytest.approx(covariance, abs=2e-3)
     apart = axes @ axes.T
@@ -102,7 +102,7 @@ def test_the_ellipsoid_holds_95_percent() -> None:
 
 
 def test_a_run_states_all_errors_of_a_measured_position() -> None:
-    """Those that all images share count as much as the scatter; rotations have no place in it."""
+    """Errors common to all images count as much as the scatter; rotations are left out."""
     own, shared = np.diag([1e-8] * 3 + [1.0] * 3), np.diag([3e-8] * 3 + [1.0] * 3)
     pose = Pose(np.array([0.1, -0.2, 0.3]), np.eye(3))
     found = PoseMeasurement(1.25, pose, own, (1,), 0.1, "tracked", shared, unstated=False)

@@ -37,7 +37,7 @@ class Bench:
         return self.rehearsal.drives
 
     def cycle(self, targets: list[int] | None = None) -> CycleStatus:
-        """One cycle; without targets the drives stay where they were told to be."""
+        """One cycle; without targets the drives keep their last targets."""
         self.before_cycle()
         self.group.send_cycle(self.group.targets.tolist() if targets is None else targets)
         self.status = self.group.receive(self.reply_timeout)

@@ -151,7 +151,7 @@ def test_it_stops_the_drives_and_is_latched(
     with pytest.raises(kind) as caught:
         bench.cycle()
     assert bench.group.state is GroupState.FAULT
-    status = bench.cycle()  # told once; what the drives do now is still taken in
+    status = bench.cycle()  # raised once; replies of the drives are still processed
     assert (WHOLE_BUS, caught.value.what) in status.faults
     bench.cycle()
     assert [d.state for d in bench.drives] == [HOLDING] * 8
@@ -159,7 +159,7 @@ def test_it_stops_the_drives_and_is_latched(
         bench.group.command(GroupCommand.ENABLE)
     bench.group.command(GroupCommand.RESET_FAULT)
     happens(bench)
-    with pytest.raises(kind):  # what is still wrong is told again
+    with pytest.raises(kind):  # a persisting fault is raised again
         bench.cycle()
 
 
@@ -249,7 +249,7 @@ def test_an_answer_to_another_question_is_no_silence(bench: Bench) -> None:
 
 
 def spoil(bench: Bench, drive: int, times: int, change: Callable[[bytes], bytes]) -> None:
-    """Changes the next replies of a drive on their way."""
+    """Changes the next replies of a drive in transit."""
     send, left = bench.drives[drive]._bus_send, [times]
 
     def on_its_way(can_id: int, data: bytes) -> None:

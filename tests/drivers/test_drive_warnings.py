@@ -83,6 +83,6 @@ def test_a_reason_that_is_over_is_reported_as_such() -> None:
 def test_the_group_goes_on_while_its_drive_does(bench: Bench) -> None:
     bench.enable()
     bench.drives[2]._emergency(HOT)
-    told = [bench.cycle() for _ in range(3)]
-    assert all(status.state is GroupState.ENABLED and not status.faults for status in told)
-    assert [warning.stops for status in told for warning in status.warnings] == [True]
+    statuses = [bench.cycle() for _ in range(3)]
+    assert all(status.state is GroupState.ENABLED and not status.faults for status in statuses)
+    assert [warning.stops for status in statuses for warning in status.warnings] == [True]

@@ -22,7 +22,7 @@ HOLDING = DriveState.QUICK_STOP_ACTIVE
 
 
 class TestFromSetUpToPowerOff:
-    """The whole way, the same on every kind of bus."""
+    """All steps, the same on every kind of bus."""
 
     def test_configure_enable_follow_stop_disable(self, served_bench: Bench) -> None:
         bench = served_bench
@@ -46,7 +46,7 @@ class TestFromSetUpToPowerOff:
             status = bench.cycle(bench.lifted(height(cycle)))
             assert not status.missing.any()
             assert not status.faults
-            # An ideal drive is at a SYNC where the set-point of the cycle before told it to be.
+            # At a SYNC an ideal drive is at the set-point of the previous cycle.
             assert np.abs(status.positions - status.demands).max() <= 1
             assert (status.torques > 0).all()  # positive is pulling
         group.command(GroupCommand.QUICK_STOP)
@@ -125,10 +125,10 @@ def test_a_drive_power_cycled_since_its_configuration_is_reported(bench: Bench) 
 
 def test_what_cannot_be_noted_is_not_wiped_out(bench: Bench) -> None:
     """The set-up of drives that restarted is the only thing that tells of it."""
-    told: list[tuple[int, ...]] = []
+    reported: list[tuple[int, ...]] = []
 
     def not_kept(nodes: tuple[int, ...]) -> None:
-        told.append(nodes)
+        reported.append(nodes)
         raise Refused("the homing reference cannot be written")
 
     bench.group.configure()
@@ -136,7 +136,7 @@ def test_what_cannot_be_noted_is_not_wiped_out(bench: Bench) -> None:
     for _ in range(2):
         with pytest.raises(Refused, match="cannot be written"):
             bench.group.configure(on_restarted=not_kept)
-    assert told == [(5,), (5,)]
+    assert reported == [(5,), (5,)]
 
 
 def needed(settings: Sequence[Setting]) -> dict[tuple[int, int], int]:
@@ -224,9 +224,9 @@ def test_a_fault_of_one_while_moving_stops_the_others(bench: Bench) -> None:
     states = [d.state for d in bench.drives]
     assert states == [HOLDING] * 2 + [DriveState.FAULT] + [HOLDING] * 5
     assert bench.group.state is GroupState.FAULT
-    told = [text for node, text in bench.status.faults if node == 3]
-    assert len(told) == 1, "the emergency, and not its state once more"
-    assert "over-current" in told[0]
+    reported = [text for node, text in bench.status.faults if node == 3]
+    assert len(reported) == 1, "the emergency, and not its state once more"
+    assert "over-current" in reported[0]
 
 
 def test_a_fault_is_latched_until_it_is_reset(bench: Bench) -> None:
@@ -322,8 +322,8 @@ def test_torque_that_goes_while_drives_hold_is_a_fault_of_that_cycle(
         bench.group.read_positions()
     bench.drives[6].state = DriveState.SWITCH_ON_DISABLED
     bench.cycle()
-    told = ((7, "cable 7 (drive 7) lost its torque: switch on disabled"),)
-    assert bench.status.faults == told
+    reported = ((7, "cable 7 (drive 7) lost its torque: switch on disabled"),)
+    assert bench.status.faults == reported
     assert bench.group.state is GroupState.FAULT
 
 
@@ -451,7 +451,7 @@ def test_stale_replies_are_not_taken_for_new_ones(bench: Bench) -> None:
     moved = bench.lifted(0.0001)
     bench.cycle(moved)
     bench.group.send_cycle(moved)
-    bench.rehearsal.pump()  # replies from the new place wait in the queue; nobody takes them
+    bench.rehearsal.pump()  # replies from the new position wait unread in the queue
     bench.drives[3].silent = True
     bench.group.send_cycle(moved)
     status = bench.group.receive(0.0)

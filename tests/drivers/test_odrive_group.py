@@ -56,8 +56,8 @@ def test_torques_are_tensions_in_per_mille_of_rated_torque(bench: OdriveBench) -
     bench.enable()
     status = bench.cycles(3)
     rated = np.array([w.torque_constant for w in bench.rig.winches])
-    told = status.torques / 1000.0 * rated
-    assert told == pytest.approx(bench.rehearsal.tensions, abs=0.51e-3 * rated.max())
+    reported = status.torques / 1000.0 * rated
+    assert reported == pytest.approx(bench.rehearsal.tensions, abs=0.51e-3 * rated.max())
     assert (status.torques > 0).all()
 
 
@@ -239,9 +239,9 @@ def test_a_drive_that_is_not_calibrated_is_named_and_no_other_stays_enabled(
     bench.group.command(GroupCommand.ENABLE)
     status = bench.cycles(105)
     assert status.state is GroupState.FAULT
-    told = status.faults[0][1]
-    assert told.startswith("cable 6 (drive 6) stays idle instead of closed loop control")
-    assert "not calibrated" in told
+    reported = status.faults[0][1]
+    assert reported.startswith("cable 6 (drive 6) stays idle instead of closed loop control")
+    assert "not calibrated" in reported
     bench.cycles(15)
     assert states(bench) == {AxisState.IDLE}
 
@@ -391,8 +391,8 @@ def test_drives_in_fault_are_taken_to_be_reset(bench: OdriveBench) -> None:
 
 
 def test_capabilities_of_the_drives_are_the_rig_files(bench: OdriveBench) -> None:
-    told = bench.group.capabilities
-    assert (told.sync, told.has_brake, told.watchdog_ms) == (False, True, 100.0)
+    reported = bench.group.capabilities
+    assert (reported.sync, reported.has_brake, reported.watchdog_ms) == (False, True, 100.0)
     with odrive_bench(odrive_rig(brakes=False, watchdog_ms=None)) as other:
         assert not other.group.capabilities.has_brake
         assert other.group.capabilities.watchdog_ms is None
@@ -418,8 +418,8 @@ def test_reading_alone_sends_nothing(bench: OdriveBench) -> None:
     assert not seen.torques.any(), "their brakes hold"
     assert seen.restarted == ()
     assert all("idle" in state for state in drive_states(bench.rig, seen.status_words.tolist()))
-    told = {node_and_command(message.arbitration_id)[1] for message in bench.frames()}
-    assert told == {HEARTBEAT, ENCODER_ESTIMATES, TORQUES}
+    reported = {node_and_command(message.arbitration_id)[1] for message in bench.frames()}
+    assert reported == {HEARTBEAT, ENCODER_ESTIMATES, TORQUES}
 
 
 def test_released_drives_are_disarmed_and_their_brakes_hold(bench: OdriveBench) -> None:
@@ -432,7 +432,7 @@ def test_released_drives_are_disarmed_and_their_brakes_hold(bench: OdriveBench) 
 
 
 def test_reading_alone_trusts_no_count_that_may_have_restarted() -> None:
-    """As `configure` has it: an ODrive does not tell whether its power was gone."""
+    """As in `configure`: an ODrive does not report a loss of power."""
     document = odrive_rig().document
     counting = [winch.model_copy(update={"encoder": "incremental"}) for winch in document.winches]
     rig = rig_from_document(document.model_copy(update={"winches": counting}))

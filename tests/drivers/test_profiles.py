@@ -104,11 +104,11 @@ def test_with_another_profile_everything_wrong_is_reported_at_once(rig: Rig, nam
             drive.aborts[0x6007, 0] = 0x06010002
     with pytest.raises(Refused) as caught:
         set_up(rig, bus)
-    told = caught.value.what
+    message = caught.value.what
     wanted = {"akd": ("1006h", "6072h"), "epos4": ("1006h", "6072h")}
     for index in wanted.get(name, ("6072h", "6007h")):
-        assert index in told
-    assert "drive 1, 2, 3, 4, 5, 6, 7, 8" in told
+        assert index in message
+    assert "drive 1, 2, 3, 4, 5, 6, 7, 8" in message
     assert "cdpr doctor RIG --drives" in caught.value.next_step
     starts = [m for m in bus.sent if m.arbitration_id == 0 and m.data[0] == 0x01]
     assert not starts, "no drive is started"
@@ -306,8 +306,8 @@ def test_doctor_reads_the_pdos_that_a_set_up_switches_off(rig: Rig, index: int, 
     (row,) = (row for row in found.rows if row.object.startswith(f"{index:04X}h:01"))
     assert found.good
     assert row.verdict == ("ok" if code in NOT_THERE else "remark")
-    (told,) = (text for text, nodes in row.found.items() if 3 in nodes)
-    assert told.startswith("absent" if code in NOT_THERE else "refused: ")
+    (message,) = (text for text, nodes in row.found.items() if 3 in nodes)
+    assert message.startswith("absent" if code in NOT_THERE else "refused: ")
 
 
 def test_doctor_names_silent_drives_and_reads_the_others(rig: Rig) -> None:
@@ -419,7 +419,7 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "told"),
+    ("line", "message"),
     [
         ('absent: ["6073h:00"]', "6072h:00"),
         ("abscent: []", "absent"),
@@ -434,14 +434,14 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
     ],
 )
 def test_a_wrong_profile_file_says_what_where_and_what_there_is(
-    tmp_path: Path, line: str, told: str
+    tmp_path: Path, line: str, message: str
 ) -> None:
     path = tmp_path / "lab.yaml"
     path.write_text(f"name: Ours\nsources: [our bench]\n{line}\n")
     with pytest.raises(InvalidFile) as caught:
         load_profile(str(path))
     text = str(caught.value)
-    assert told in text
+    assert message in text
     assert "lab.yaml:3" in text or ":3:" in text
 
 

@@ -42,7 +42,7 @@ def test_words_never_free_a_cable_and_enable_all_or_none(
     goal: Goal, drives: list[tuple[DriveState, bool]]
 ) -> None:
     states = [state for state, _ in drives]
-    words = next_words(goal, states, [told for _, told in drives])
+    words = next_words(goal, states, [commanded for _, commanded in drives])
     assert len(words) == len(states)
     assert all(word & 0x02 for word in words)
     if ControlWord.ENABLE_OPERATION in words:
@@ -51,7 +51,7 @@ def test_words_never_free_a_cable_and_enable_all_or_none(
         assert set(states) <= READY
     for state, word in zip(states, words, strict=True):
         if state is DriveState.QUICK_STOP_ACTIVE:
-            # Holding drives are only told to go on holding, or to follow again with all others.
+            # Holding drives are only commanded to keep holding, or to follow again with all others.
             assert word in (ControlWord.QUICK_STOP, ControlWord.ENABLE_OPERATION)
         if state is DriveState.OPERATION_ENABLED and word is ControlWord.SHUTDOWN:
             pytest.fail("shutdown of a drive under torque")

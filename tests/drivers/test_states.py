@@ -112,5 +112,5 @@ def test_only_a_drive_with_torque_and_no_fault_holds() -> None:
 def test_a_stop_commands_every_drive_to_stop_whatever_it_reported(
     drives: list[tuple[DriveState, bool]],
 ) -> None:
-    states, told = zip(*drives, strict=True)
-    assert next_words(Goal.STOP, states, told) == (ControlWord.QUICK_STOP,) * len(states)
+    states, commanded = zip(*drives, strict=True)
+    assert next_words(Goal.STOP, states, commanded) == (ControlWord.QUICK_STOP,) * len(states)

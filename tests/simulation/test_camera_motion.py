@@ -1,4 +1,4 @@
-"""The synthetic camera's exposure: what moves is smeared, what stands still is not."""
+"""The synthetic camera's exposure: moving objects are blurred, resting ones are not."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_film_smears_by_the_velocity_since_the_picture_before(
     assert np.array_equal(film.picture(0.0, before, 0), camera.render(before, 0))
     motion = PlatformMotion(np.array([0.2, 0.0, 0.1]), np.array([0.0, 0.0, 0.5]))
     assert np.array_equal(film.picture(0.1, rig.home, 1), camera.render(rig.home, 1, motion))
-    again = film.picture(0.1, before, 2)  # at the same time: told anew, not moved
+    again = film.picture(0.1, before, 2)  # at the same time: the pose is restated, not moved
     assert np.array_equal(again, camera.render(before, 2))
 
 

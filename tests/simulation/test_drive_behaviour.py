@@ -285,9 +285,9 @@ def torques_out_and_back(rig: Rig, friction: float) -> list[float]:
         torques = []
         for drive in rehearsal.drives:
             drive.state = DriveState.OPERATION_ENABLED
-        for turned in (2.0, -2.0, 0.0):
+        for rotation in (2.0, -2.0, 0.0):
             for drive in rehearsal.drives:
-                drive.motor.position += turned
+                drive.motor.position += rotation
             rehearsal._feel()
             rehearsal._finish_torque_update()
             torques.append(rehearsal.drives[0].torque)
