@@ -113,7 +113,7 @@ class CyclicBus:
             message = receive_frame(self._bus, 0.0)
             if message is None:
                 return
-            self._hand_over(message, listener, stale=True)
+            self._process(message, listener, stale=True)
         raise ReceiveOverflow(f"more than {MOST_STALE} frames waited to be read", self._where)
 
     def take_replies(self, listener: ReplyListener, timeout: float) -> None:
@@ -130,7 +130,7 @@ class CyclicBus:
             message = receive_frame(self._bus, left)
             if message is None:
                 return
-            self._hand_over(message, listener, stale=False)
+            self._process(message, listener, stale=False)
             if timeout > 0.0:  # with 0 all waiting frames are processed
                 left = deadline - time.monotonic()
 
@@ -161,7 +161,7 @@ class CyclicBus:
         if fault is not None:
             self._found.append(fault)
 
-    def _hand_over(self, message: can.Message, listener: ReplyListener, *, stale: bool) -> None:
+    def _process(self, message: can.Message, listener: ReplyListener, *, stale: bool) -> None:
         if message.is_error_frame:
             self._find(self._errors.take(message.arbitration_id, message.data))
         elif message.is_extended_id or message.is_remote_frame:
@@ -201,7 +201,7 @@ class CyclicGroup(ABC):
 
     @property
     @abstractmethod
-    def _heard(self) -> GroupMonitor:
+    def _listener(self) -> GroupMonitor:
         """Processes frames of the drives."""
 
     @abstractmethod
@@ -232,12 +232,12 @@ class CyclicGroup(ABC):
             self._pump()
             timeout_s = 0.0
         try:
-            self._cyclic.take_replies(self._heard, timeout_s)
+            self._cyclic.take_replies(self._listener, timeout_s)
             self._cyclic.end_cycle()
         except BusFault as fault:
             self._latch_bus(fault)
             raise
-        self._heard.end_cycle()
+        self._listener.end_cycle()
         self._look_for_faults()
         self._advance()
         return self._status()
@@ -253,7 +253,7 @@ class CyclicGroup(ABC):
             BusFault: The bus failed; the group is stopped.
         """
         try:
-            self._cyclic.discard_stale(self._heard)
+            self._cyclic.discard_stale(self._listener)
         except BusFault as fault:
             self._latch_bus(fault)
             raise

@@ -40,7 +40,7 @@ class ReplyCheck:
         self._names, self._max_steps = tuple(names.items()), tuple(max_steps)
         self._positions: list[int | None] = [None] * count
         self._age = [1] * count
-        self._heard = [0] * count
+        self._replies = [0] * count
         self._reasons: list[str] = [""] * count
         self._bad_cycles = [0] * count
         self._repeats = [0] * count
@@ -52,15 +52,15 @@ class ReplyCheck:
     def begin_cycle(self) -> None:
         """Starts a cycle; counts drives that answered the last SYNC more than once."""
         self._repeats = [
-            repeats + 1 if heard > 1 else 0
-            for repeats, heard in zip(self._repeats, self._heard, strict=True)
+            repeats + 1 if replies > 1 else 0
+            for repeats, replies in zip(self._repeats, self._replies, strict=True)
         ]
-        self._heard = [0] * len(self._names)
+        self._replies = [0] * len(self._names)
         self._reasons = [""] * len(self._names)
 
     def count_reply(self, drive: int) -> None:
         """Counts a reply of a drive, in time or late."""
-        self._heard[drive] += 1
+        self._replies[drive] += 1
 
     def accept(self, drive: int, position: int) -> bool:
         """Whether a position [counts] is plausible; it then becomes the drive's."""

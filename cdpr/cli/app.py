@@ -232,21 +232,21 @@ def main() -> None:
     # Imports create some 10^5 permanent objects; garbage collection over them took a tenth of
     # the time of a plan.
     gc.set_threshold(100_000, 50, 50)
-    _print_anything()
+    _escape_unprintable()
     try:
         build_app()()
     except SystemExit:
-        _end_of_output()
+        _flush_output()
         raise
     except CdprError as error:
-        _end(error)
+        _exit_with(error)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
     except OSError as error:
-        _end(_of_the_system(error))
+        _exit_with(_from_os_error(error))
     except MemoryError:
-        _end(
+        _exit_with(
             Fault(
                 "not enough memory",
                 next_step="reduce the problem size, or use a computer with more memory",
@@ -260,39 +260,39 @@ def main() -> None:
         gc.freeze()
 
 
-def _print_anything() -> None:
+def _escape_unprintable() -> None:
     """Escapes characters that the terminal or its encoding cannot show, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
-def _end(error: CdprError) -> NoReturn:
+def _exit_with(error: CdprError) -> NoReturn:
     with suppress(OSError):  # the cause may be that nothing can be written
         _print_error(error)
     with suppress(OSError):
         sys.stdout.flush()
-    _forget_output()
+    _discard_output()
     sys.exit(error.exit_code)
 
 
-def _end_of_output() -> None:
+def _flush_output() -> None:
     """Flushes the output before the command exits with success."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:  # such as `cdpr … | head`
-        _forget_output()
+        _discard_output()
     except OSError as error:
-        _end(_of_the_system(error))
+        _exit_with(_from_os_error(error))
 
 
-def _forget_output() -> None:
+def _discard_output() -> None:
     """Discards unwritten output; the interpreter would retry at exit and complain."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _of_the_system(error: OSError) -> CdprError:
+def _from_os_error(error: OSError) -> CdprError:
     """An `OSError` that no verb handled, as bad input (a path) or a fault (the output)."""
     why = error.strerror or str(error)
     if error.filename is not None:

@@ -138,7 +138,7 @@ class BusOptions:
         return rig_on_bus(path, self.interface, self.channel, self.calibration)
 
 
-RIGS_OWN = BusOptions()
+DEFAULT_BUS = BusOptions()
 
 
 def rig_on_bus(

@@ -30,15 +30,15 @@ from cdpr.console.commands import (
     TakeCommand,
 )
 from cdpr.console.state import (
-    Kept,
     StartedVerb,
+    StoredState,
     cable_state,
-    file_here,
     jog_state,
-    kept_state,
+    local_file,
     measured_state,
     outcome_state,
     preview,
+    stored_state,
 )
 from cdpr.console.teach import TaughtPoses, scene_text
 from cdpr.console.view import RobotNow, RobotView, nearest_data, pose_data
@@ -59,7 +59,7 @@ from model.rig import Rig
 from model.scene import Scene, load_scene, nothing_in_the_way
 
 #: Shortest period of reading the fault latch and the reference, [s].
-KEPT_EVERY = 0.5
+STORED_EVERY = 0.5
 #: Folder of the plans and scenes that the console writes.
 MADE = Path("console")
 
@@ -117,7 +117,7 @@ class Console:
         self._at_rest: Future[StatusResult] | None = None
         self._asks = ThreadPoolExecutor(1, "cdpr-drives")
         self._was_busy = True  # so that the drives are read at the start
-        self._kept_at, self._kept = float("-inf"), Kept(None, False, None)
+        self._stored_at, self._stored = float("-inf"), StoredState(None, False, None)
 
     # State.
     def update(self) -> dict[str, Any]:
@@ -129,7 +129,7 @@ class Console:
             self._robot = seen or self._robot
         self.pictures.watch(report.status, self.view.rig)
         self._ask_at_rest(report.status is not None or self.verbs.verb is not None)
-        self._read_kept()
+        self._read_stored()
         return self._state(report.status, time.monotonic() - report.at)
 
     def close(self) -> None:
@@ -164,7 +164,7 @@ class Console:
             "rig": rig.name,
             "bus": bus_name(rig),
             "simulated": is_simulated(rig),
-            **kept_state(self._kept),
+            **stored_state(self._stored),
             "busy": None if verb is None else {"verb": verb, "text": self._line},
             "outcome": outcome_state(self.verbs.outcome),
             "motion": None if status is None else {**status, "age_s": round(age, 3)},
@@ -181,14 +181,14 @@ class Console:
             "poses": self.poses.as_dicts(),
         }
 
-    def _read_kept(self) -> None:
+    def _read_stored(self) -> None:
         """Reads the fault latch and the reference of the bus from their files."""
         now = time.monotonic()
-        if now - self._kept_at < KEPT_EVERY:
+        if now - self._stored_at < STORED_EVERY:
             return
-        self._kept_at = now
+        self._stored_at = now
         if is_simulated(self.rig):
-            self._kept = Kept(None, True, None)
+            self._stored = StoredState(None, True, None)
             return
         fault, is_moving = None, self.watch.last.status is not None
         try:
@@ -197,7 +197,9 @@ class Console:
             why = reference.why_not
         except CdprError as error:
             why = error.what
-        self._kept = Kept(None if fault is None or is_moving else fault.cause, not why, why)
+        self._stored = StoredState(
+            None if fault is None or is_moving else fault.cause, not why, why
+        )
 
     # Commands.
 
@@ -256,9 +258,9 @@ class Console:
             case SpeedCommand():
                 return self.watch.send("speed", percent=message.percent)
             case FileCommand():
-                self.load_plan(file_here(message.file))
+                self.load_plan(local_file(message.file))
             case CompareCommand():
-                self.compare_plan(None if message.file is None else file_here(message.file))
+                self.compare_plan(None if message.file is None else local_file(message.file))
             case PlanCommand():
                 self._plan(message)
             case NameCommand():
@@ -344,7 +346,7 @@ class Console:
         return ""
 
     def _plan(self, message: PlanCommand) -> None:
-        scene = self._taught_scene() if message.scene is None else file_here(message.scene)
+        scene = self._taught_scene() if message.scene is None else local_file(message.scene)
         output = MADE / f"{scene.stem}.plan.json"
         cost = [] if message.objective == "shortest" else ["--cost", message.objective]
         if load_scene(scene).rotation_limits is not None:

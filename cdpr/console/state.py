@@ -128,7 +128,7 @@ def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
     )
 
 
-def file_here(name: str) -> Path:
+def local_file(name: str) -> Path:
     """A file below the console's working folder.
 
     Raises:
@@ -145,7 +145,7 @@ def file_here(name: str) -> Path:
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class StoredState:
     """Stored state of a bus.
 
     Attributes:
@@ -159,10 +159,10 @@ class Kept:
     why_not: str | None
 
 
-def kept_state(kept: Kept) -> dict[str, Any]:
+def stored_state(stored: StoredState) -> dict[str, Any]:
     """The fault latch and the homing reference."""
-    reference = {"counts": kept.referenced, "why_not": kept.why_not}
-    return {"latched": kept.latched, "reference": reference}
+    reference = {"counts": stored.referenced, "why_not": stored.why_not}
+    return {"latched": stored.latched, "reference": reference}
 
 
 def outcome_state(ended: VerbOutcome | None) -> dict[str, Any] | None:

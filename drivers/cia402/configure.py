@@ -114,18 +114,18 @@ def configure_drives(
     network.discard_waiting()
     require_answers(network, nodes)
     _refuse_duplicates(network)
-    wrong = WrongObjects()
+    refusals = Refusals()
     entries: list[int] = []
     for drive, node in enumerate(nodes):
         for expected in (*BEFORE, *identifiers(node), *identity(rig), *expected_by(profile)):
-            wrong.note(require_expected, network, node, expected)
-        wrong.note(require_idle, network, node, to_reset)
+            refusals.note(require_expected, network, node, expected)
+        refusals.note(require_idle, network, node, to_reset)
         for setting in settings[drive]:
-            wrong.note(require_there, network, node, setting)
+            refusals.note(require_there, network, node, setting)
         for setting in stated_absent(rig, drive, winch_map, max_tension):
-            wrong.note(require_absent, network, node, setting)
-        wrong.note(count_heartbeats, network, node, profile, entries)
-    wrong.refuse()
+            refusals.note(require_absent, network, node, setting)
+        refusals.note(count_heartbeats, network, node, profile, entries)
+    refusals.raise_any()
     _refuse_duplicates(network)
     on_restarted(
         tuple(n for n, s in zip(nodes, settings, strict=True) if not is_still_set_up(network, n, s))
@@ -133,21 +133,21 @@ def configure_drives(
     absent: dict[str, list[int]] = {}
     for drive, node in enumerate(nodes):
         network.command(NmtCommand.PRE_OPERATIONAL, node)
-        wrong.note(_switch_off_used, network, node, profile)
+        refusals.note(_switch_off_used, network, node, profile)
         refused: list[str] = []  # switched off before another PDO takes its identifier
-        wrong.note(_switch_off_unused, network, node, profile, refused)
-        refused += _write_all(network, node, settings[drive], wrong)
-        _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), wrong)
+        refusals.note(_switch_off_unused, network, node, profile, refused)
+        refused += _write_all(network, node, settings[drive], refusals)
+        _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), refusals)
         for remark in refused:
             absent.setdefault(remark, []).append(node)
-    wrong.refuse()  # before waiting for a mode that was refused
+    refusals.raise_any()  # before waiting for a mode that was refused
     if not profile.mode_display_when_enabled:
         for node in nodes:
-            wrong.note(_await_mode, network, node)
-    wrong.refuse()
+            refusals.note(_await_mode, network, node)
+    refusals.raise_any()
     for node in nodes:
         network.command(NmtCommand.START, node)
-    network.take_waiting()
+    network.process_waiting()
     for remark in left_out(profile):
         absent.setdefault(remark, []).extend(nodes)
     remarks = (*_absent(absent), *_unwatched_peers(nodes, entries, profile))
@@ -157,7 +157,7 @@ def configure_drives(
     return SetUp(remarks, tuple(watched))
 
 
-class WrongObjects:
+class Refusals:
     """Collects refusals of drives, so that one message reports all."""
 
     def __init__(self) -> None:
@@ -177,7 +177,7 @@ class WrongObjects:
             return False
         return True
 
-    def refuse(self) -> None:
+    def raise_any(self) -> None:
         """Raises if a refusal was recorded.
 
         Raises:
@@ -273,7 +273,7 @@ def _await_mode(network: SetupNetwork, node: int) -> None:
 
 
 def _write_all(
-    network: SetupNetwork, node: int, settings: Sequence[Setting], wrong: WrongObjects
+    network: SetupNetwork, node: int, settings: Sequence[Setting], refusals: Refusals
 ) -> list[str]:
     """Writes settings and reads them back; returns remarks on missing optional objects."""
     remarks: list[str] = []
@@ -282,7 +282,7 @@ def _write_all(
         # If a PDO refuses one object, the others fail for the same reason.
         if setting.index & PDO_OBJECTS in refused:
             continue
-        if not wrong.note(_write, network, node, setting, remarks) and _is_pdo(setting.index):
+        if not refusals.note(_write, network, node, setting, remarks) and _is_pdo(setting.index):
             refused.add(setting.index & PDO_OBJECTS)
     return remarks
 

@@ -18,7 +18,7 @@ from drivers.cia402.sdo_jobs import (
     ASKED_AGAIN_AFTER,
     MODE_WAIT,
     REQUESTS_A_CYCLE,
-    STANDING,
+    STATE_REQUESTS,
     AnswerListener,
     ModeCheck,
     SdoJobs,
@@ -101,7 +101,7 @@ class Cia402Group(CyclicGroup):
         self._cycles_to_goal = 0
         self._left_stop = False  # "enable operation" was commanded since the last release began
         self._known = False
-        self._unwatching: SdoJobs | None = None
+        self._monitoring_off: SdoJobs | None = None
         self._modes: ModeCheck | None = None
 
     @property
@@ -123,7 +123,7 @@ class Cia402Group(CyclicGroup):
         )
 
     @property
-    def _heard(self) -> DriveMonitor:
+    def _listener(self) -> DriveMonitor:
         return self._watch
 
     @property
@@ -193,7 +193,7 @@ class Cia402Group(CyclicGroup):
         self._online()
         self._discard_stale()
         if self._goal is not Goal.RESET_FAULT:  # faults since the last cycle stop this one
-            self._latch(self._news())
+            self._latch(self._new_messages())
         following = self._state is GroupState.ENABLED
         words = next_words(self._goal, self._watch.states, self._stop_commanded)
         if self._goal in (Goal.ENABLE, Goal.RELEASE) and self._watch.is_unjudged:
@@ -212,7 +212,7 @@ class Cia402Group(CyclicGroup):
         self._cycle += 1
         if self._cycle % self._heartbeat_cycles == 0:
             self._cyclic.send((self._frames.heartbeat,))
-        for jobs in (self._modes, self._unwatching):
+        for jobs in (self._modes, self._monitoring_off):
             if jobs is not None:
                 self._ask(jobs, REQUESTS_A_CYCLE)
 
@@ -226,7 +226,7 @@ class Cia402Group(CyclicGroup):
         elif command is GroupCommand.RELEASE:
             self._begin_release()
         elif command is GroupCommand.END_MONITORING:
-            self._begin_unwatching()
+            self._begin_monitoring_off()
         else:
             self._reset_fault()
 
@@ -238,24 +238,24 @@ class Cia402Group(CyclicGroup):
     @property
     def ending(self) -> frozenset[int]:
         """Drives whose monitoring is being switched off; see `DriveGroup.ending`."""
-        if self._unwatching is None:
+        if self._monitoring_off is None:
             return frozenset()
-        return frozenset(map(self._nodes.index, self._unwatching.unfinished()))
+        return frozenset(map(self._nodes.index, self._monitoring_off.unfinished()))
 
     @property
     def is_monitored(self) -> bool:
         """Whether drives still monitor this master; see `DriveGroup.is_monitored`."""
-        jobs = self._unwatching
+        jobs = self._monitoring_off
         return jobs is None or bool(jobs.unfinished() | jobs.refused())
 
     def read_state(self, pace: Pace) -> CycleStatus:
         """Reads the state of every drive by SDO; see `DriveGroup.read_state`."""
         self._online()
-        jobs = SdoJobs(dict.fromkeys(self._nodes, STANDING), self._again_after)
+        jobs = SdoJobs(dict.fromkeys(self._nodes, STATE_REQUESTS), self._again_after)
         silent = {self._nodes[i] for i, heard in enumerate(self._watch.answered) if not heard}
         self._watch.begin_cycle()
         self._watch.on_answer = jobs.take
-        for number in range(round(len(STANDING) * self._answer_time / self._cycle_s)):
+        for number in range(round(len(STATE_REQUESTS) * self._answer_time / self._cycle_s)):
             waited_for = jobs.unfinished()
             if number * self._cycle_s >= self._answer_time:  # drives without any answer are lost
                 waited_for -= silent - {node for node, _ in jobs.values}
@@ -267,21 +267,21 @@ class Cia402Group(CyclicGroup):
                 self._pump()
                 left = 0.0
             self._cyclic.take_replies(AnswerListener(self._watch.take, jobs), left)
-        self._watch.take_standing(jobs.values)
+        self._watch.take_states(jobs.values)
         self._look_for_faults()
         return self._status()
 
     def _ask(self, jobs: SdoJobs | ModeCheck, most: int) -> None:
         self._cyclic.send(SentFrame(can_id, data) for can_id, data in jobs.next_requests(most))
 
-    def _begin_unwatching(self) -> None:
+    def _begin_monitoring_off(self) -> None:
         """Switches monitoring off, heartbeat first, SYNC last; both are sent until then."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             raise Refused("enabled drives must monitor this program", where="drive group")
         off = (monitoring_off(count, self._profile.rpdo) for count in self._heartbeats)
-        self._unwatching = SdoJobs(dict(zip(self._nodes, off, strict=True)), self._again_after)
+        self._monitoring_off = SdoJobs(dict(zip(self._nodes, off, strict=True)), self._again_after)
         self._modes = None
-        self._watch.on_answer = self._unwatching.take
+        self._watch.on_answer = self._monitoring_off.take
 
     def _send(self, words: tuple[ControlWord, ...], may_send: Callable[[bool], bool]) -> None:
         """Sends one cycle's frames; the words are remembered even if the bus fails."""
@@ -309,13 +309,13 @@ class Cia402Group(CyclicGroup):
         powered = self._goal in (Goal.ENABLE, Goal.RELEASE)
         warnings = self._watch.warnings()
         self._warnings = warnings if powered else ()
-        found = [*self._news(), *self._stopped_by_themselves()]
+        found = [*self._new_messages(), *self._autonomous_stops()]
         known = {text for _, text in (*self._faults, *found)}
         found += self._watch.state_faults(known, powered=powered)
         if self._goal is not Goal.RESET_FAULT:
             self._latch(found)
 
-    def _news(self) -> list[tuple[int, str]]:
+    def _new_messages(self) -> list[tuple[int, str]]:
         """Messages since the last call that are faults regardless of the replies."""
         found = self._watch.news()
         if self._goal in (Goal.ENABLE, Goal.RELEASE):
@@ -323,20 +323,20 @@ class Cia402Group(CyclicGroup):
         # An emergency of a drive at rest only explains its state.
         return [(node, text) for node, text in found if node in self._watch.restarted]
 
-    def _stopped_by_themselves(self) -> list[tuple[int, str]]:
+    def _autonomous_stops(self) -> list[tuple[int, str]]:
         """Drives that left a state without a command, except those in fault.
 
         During a release they change to SWITCHED ON; one that returned to quick stop after it was
         enabled must not be enabled again.
         """
-        dropped, let_go = self._watch.dropped(), self._watch.let_go()
+        dropped, torque_lost = self._watch.dropped(), self._watch.torque_lost()
         states = dict(zip(self._nodes, self._watch.states, strict=True))
         if self._goal is Goal.ENABLE:
             return [fault for fault in dropped if states[fault[0]] not in FAULTED]
         if self._goal is Goal.RELEASE and self._left_stop:
             back = DriveState.QUICK_STOP_ACTIVE
             return [fault for fault in dropped if states[fault[0]] is back]
-        return let_go if self._goal in (Goal.STOP, Goal.IDLE) else []
+        return torque_lost if self._goal in (Goal.STOP, Goal.IDLE) else []
 
     def _latch(self, found: list[tuple[int, str]]) -> None:
         for fault in found:

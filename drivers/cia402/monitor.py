@@ -16,7 +16,7 @@ from drivers.cia402.pdo import (
     parse_heartbeat,
     parse_reply,
 )
-from drivers.cia402.sdo_jobs import STANDING, SdoRequest
+from drivers.cia402.sdo_jobs import STATE_REQUESTS, SdoRequest
 from drivers.cia402.state_machine import FAULTED, HOLDS, TORQUE_ON, DriveState, state_of
 from drivers.drive_group import DriveWarning
 from drivers.plausibility import ReplyCheck
@@ -62,9 +62,9 @@ class DriveMonitor:
         self._reported: list[DriveWarning] = []  # in this cycle; the drive may be about to stop
         self._to_judge: list[DriveWarning] = []  # the drive's next reply says whether it stopped
         self._warnings: list[DriveWarning] = []
-        self._news: list[tuple[int, str]] = []
+        self._new_messages: list[tuple[int, str]] = []
         self._dropped: list[tuple[int, str]] = []
-        self._let_go: list[tuple[int, str]] = []
+        self._torque_lost: list[tuple[int, str]] = []
         self._emergencies: dict[int, str] = {}
         self._over: set[int] = set()
         self._replies = {TPDO1_BASE + node: i for i, node in enumerate(nodes)}
@@ -130,7 +130,7 @@ class DriveMonitor:
         if before is DriveState.OPERATION_ENABLED and state is not before:
             self._dropped.append(self._with_cause(drive, f"stopped on its own: {state.value}"))
         if before in HOLDS and state not in TORQUE_ON and state not in FAULTED:
-            self._let_go.append(self._with_cause(drive, f"lost its torque: {state.value}"))
+            self._torque_lost.append(self._with_cause(drive, f"lost its torque: {state.value}"))
 
     def _with_cause(self, drive: int, what: str) -> tuple[int, str]:
         node = self.nodes[drive]
@@ -158,16 +158,16 @@ class DriveMonitor:
         warnings, self._warnings = tuple(self._warnings), []
         return warnings
 
-    def take_standing(self, values: Mapping[tuple[int, SdoRequest], int]) -> None:
-        """Takes the SDO answers of `STANDING`; a drive with all of them counts as answered."""
+    def take_states(self, values: Mapping[tuple[int, SdoRequest], int]) -> None:
+        """Takes the answers to `STATE_REQUESTS`; a drive with all of them counts as answered."""
         for drive, node in enumerate(self.nodes):
-            if all((node, job) in values for job in STANDING):
-                word, position, torque = (values[node, job] for job in STANDING)
+            if all((node, job) in values for job in STATE_REQUESTS):
+                word, position, torque = (values[node, job] for job in STATE_REQUESTS)
                 self._note(drive, Reply(word, _signed(position, 32), _signed(torque, 16)))
 
     def news(self) -> list[tuple[int, str]]:
         """Emergencies of drives not enabled, restarts and NMT states, since the last call."""
-        news, self._news = self._news, []
+        news, self._new_messages = self._new_messages, []
         return news
 
     def dropped(self) -> list[tuple[int, str]]:
@@ -175,10 +175,10 @@ class DriveMonitor:
         dropped, self._dropped = self._dropped, []
         return dropped
 
-    def let_go(self) -> list[tuple[int, str]]:
+    def torque_lost(self) -> list[tuple[int, str]]:
         """Drives that lost their holding torque without a fault, since the last call."""
-        let_go, self._let_go = self._let_go, []
-        return let_go
+        torque_lost, self._torque_lost = self._torque_lost, []
+        return torque_lost
 
     @property
     def is_unjudged(self) -> bool:
@@ -234,7 +234,7 @@ class DriveMonitor:
         """Clears all emergencies after a reset by the operator."""
         self._emergencies.clear()
         self._over.clear()
-        self._news.clear()
+        self._new_messages.clear()
         self._reported, self._to_judge, self._warnings = [], [], []
 
     def _emergency(self, node: int, data: bytes | bytearray) -> None:
@@ -255,7 +255,7 @@ class DriveMonitor:
         if self._is_warning(code) and state not in FAULTED:
             self._reported.append(DriveWarning(node, f"{message}, a warning", stops=False))
         elif state is not DriveState.OPERATION_ENABLED:
-            self._news.append((node, message))
+            self._new_messages.append((node, message))
         else:
             self._reported.append(DriveWarning(node, message, stops=True))
 
@@ -268,11 +268,11 @@ class DriveMonitor:
             self._wrong_lengths += 1
         elif state == NmtState.BOOT_UP:
             self.restarted.add(node)
-            self._news.append(
+            self._new_messages.append(
                 (node, f"{self._names[node]} restarted: its configuration and position are lost")
             )
         elif state != NmtState.OPERATIONAL:
-            self._news.append((node, f"{self._names[node]} left the NMT state operational"))
+            self._new_messages.append((node, f"{self._names[node]} left the NMT state operational"))
 
 
 def _signed(value: int, bits: int) -> int:

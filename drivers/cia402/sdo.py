@@ -134,19 +134,19 @@ class SetupNetwork:
         """Receives answers until all have arrived or the deadline has passed."""
         while any(client.waits for client in clients):
             left = deadline - self.clock()
-            if left <= 0.0 or (not self.hand_over(left) and self._pump is not None):
+            if left <= 0.0 or (not self.process_frame(left) and self._pump is not None):
                 return
 
     def nodes_answering_twice(self) -> list[int]:
         """Nodes that sent more answers than they got requests."""
         deadline = self.clock() + ECHO_WAIT
-        while (left := deadline - self.clock()) > 0.0 and self.hand_over(left):
+        while (left := deadline - self.clock()) > 0.0 and self.process_frame(left):
             pass
         return [node for node, client in self._clients.items() if client.has_surplus]
 
-    def take_waiting(self) -> None:
+    def process_waiting(self) -> None:
         """Processes all frames received so far."""
-        while self.hand_over(0.0):
+        while self.process_frame(0.0):
             pass
 
     def discard_waiting(self) -> None:
@@ -154,7 +154,7 @@ class SetupNetwork:
         while receive_frame(self._bus, 0.0) is not None:
             pass
 
-    def hand_over(self, timeout: float) -> bool:
+    def process_frame(self, timeout: float) -> bool:
         """Processes one frame; False if none arrives within the time [s].
 
         Raises:
@@ -180,7 +180,7 @@ class SetupNetwork:
         """Processes frames for some time; returns at once with simulated drives."""
         deadline = self.clock() + seconds
         while (left := deadline - self.clock()) > 0.0:
-            if not self.hand_over(left) and self._pump is not None:
+            if not self.process_frame(left) and self._pump is not None:
                 return
 
     def _judge_error(self, message: can.Message) -> None:
@@ -332,7 +332,7 @@ class Client:
         deadline = self._network.clock() + self._network.timeout
         while self._answer is None:
             left = deadline - self._network.clock()
-            if left <= 0.0 or not self._network.hand_over(left):
+            if left <= 0.0 or not self._network.process_frame(left):
                 self.give_up()
                 raise _NoAnswer
         answer, self._wanted, self._answer = self._answer, None, None

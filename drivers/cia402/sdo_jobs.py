@@ -62,7 +62,11 @@ class SdoRequest:
 
 
 #: State of a drive: status word, position [counts] and torque [per mille].
-STANDING = (SdoRequest(0x6041, 0, size=2), SdoRequest(0x6064, 0), SdoRequest(0x6077, 0, size=2))
+STATE_REQUESTS = (
+    SdoRequest(0x6041, 0, size=2),
+    SdoRequest(0x6064, 0),
+    SdoRequest(0x6077, 0, size=2),
+)
 
 
 def time_to_end(heartbeats: Iterable[int], cycle: float, answer: float) -> float:

@@ -115,13 +115,13 @@ def late_drives(
     """
     late = f"instead of {wanted[-1].value} after {seconds:g} s (enable_timeout_ms of its profile)"
     return [
-        (node, f"{name} is in {state_of(word).value} {late}{_obstacle(word)}")
+        (node, f"{name} is in {state_of(word).value} {late}{_reason_for(word)}")
         for (node, name), word in zip(names.items(), status_words, strict=True)
         if state_of(word) not in wanted
     ]
 
 
-def _obstacle(status_word: int) -> str:
+def _reason_for(status_word: int) -> str:
     """Why a drive stays in its state, as far as its status word shows."""
     state = state_of(status_word)
     if state is DriveState.QUICK_STOP_ACTIVE:

@@ -113,7 +113,7 @@ class OdriveGroup(CyclicGroup):
         )
 
     @property
-    def _heard(self) -> OdriveMonitor:
+    def _listener(self) -> OdriveMonitor:
         return self._watch
 
     @property

@@ -172,7 +172,7 @@ def _between(count: int) -> tuple[Array, Array]:
 # Image sequences.
 
 
-class Film:
+class ImageSequence:
     """Images of one camera, each with motion blur from the motion since the previous one.
 
     The first is sharp. Between images the platform moves uniformly.

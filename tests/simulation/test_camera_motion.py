@@ -11,7 +11,7 @@ import pytest
 from model.pose import Array, PlatformMotion, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, load_rig
 from model.scene import Scene, nothing_in_the_way
-from simulation.camera.camera import Film, SyntheticCamera
+from simulation.camera.camera import ImageSequence, SyntheticCamera
 from simulation.ground_truth import Optics, camera_as_built
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -103,7 +103,7 @@ def test_a_film_smears_by_the_velocity_since_the_picture_before(
 ) -> None:
     camera = SyntheticCamera(rig, scene, facing, optics=Optics(noise=0.0, exposure=0.01))
     before = Pose(rig.home.position - [0.02, 0.0, 0.01], matrix_from_rotation_vector([0, 0, -0.05]))
-    film = Film(camera)
+    film = ImageSequence(camera)
     assert np.array_equal(film.picture(0.0, before, 0), camera.render(before, 0))
     motion = PlatformMotion(np.array([0.2, 0.0, 0.1]), np.array([0.0, 0.0, 0.5]))
     assert np.array_equal(film.picture(0.1, rig.home, 1), camera.render(rig.home, 1, motion))

@@ -168,14 +168,14 @@ class VerbFuzzer:
         encoding = chance.choice(("utf-8", "utf-8", "ascii"))
         child = os.fork()
         if child == 0:
-            _be_the_verb(arguments, output, str(log), encoding)
+            _run_verb(arguments, output, str(log), encoding)
         code = _waited(child, LONG_S if arguments[0] in LONG else SILENT_S)
         if code == -signal.SIGPROF:
             code = None
         return code, log.read_text(errors="replace") if log.exists() else ""
 
 
-def _be_the_verb(arguments: list[str], output: str, log: str, encoding: str) -> None:
+def _run_verb(arguments: list[str], output: str, log: str, encoding: str) -> None:
     """Runs the command line in the child process, then exits."""
     code = 99
     try:

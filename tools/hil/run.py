@@ -82,10 +82,10 @@ def main() -> int:
         _require_tools()
         if _host_has_can():
             print(f"hil: on this machine's {CHANNEL}; traces in {artefacts}", flush=True)
-            with _alone():
+            with _exclusive():
                 return _on_host(tests, artefacts)
         print(f"hil: no AF_CAN here, so in a virtual machine; traces in {artefacts}", flush=True)
-        with _alone():
+        with _exclusive():
             _compile(plans=options.part in MAKES)
             boot_files(_cache())
         return run_in_vm(_job(tests), artefacts, _cache(), options.limit_s)
@@ -100,7 +100,7 @@ def _cache() -> Path:
 
 
 @contextmanager
-def _alone() -> Iterator[None]:
+def _exclusive() -> Iterator[None]:
     """Excludes other parts, which wait for the bus or for shared files."""
     _cache().mkdir(parents=True, exist_ok=True)
     with (_cache() / "lock").open("w") as lock:

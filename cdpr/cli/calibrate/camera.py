@@ -18,7 +18,7 @@ from calibration.results import require_file_name
 from calibration.targets.boards import Board
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.output import (
-    NOWHERE,
+    DEFAULT_RESULT,
     CameraOption,
     ResultOptions,
     WantedOption,
@@ -69,7 +69,7 @@ def camera(
     lens: Annotated[
         LensChoice, typer.Option(help="lens model; auto: the one that fits held-out images best")
     ] = "auto",
-    result: ResultOptions = NOWHERE,
+    result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
     """Calibrate a camera's matrix and lens distortion, and state the accuracy.
 
@@ -174,7 +174,7 @@ def readout(
     ] = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 0.1,
-    result: ResultOptions = NOWHERE,
+    result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
     """Measure a rolling shutter, from images of the platform while it moves.
 

@@ -15,7 +15,7 @@ from calibration.pictures import USUAL_PICTURES, USUAL_TAG_PICTURES, Pictures, p
 from calibration.procedures import locate_camera, locate_tags
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.output import (
-    NOWHERE,
+    DEFAULT_RESULT,
     CameraOption,
     PicturesOption,
     ResultOptions,
@@ -75,7 +75,7 @@ def extrinsics(
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 1.0,
-    result: ResultOptions = NOWHERE,
+    result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
     """Find a camera's pose, from surveyed tags on the frame or from the rig's motion.
 
@@ -149,7 +149,7 @@ def tags(
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 0.2,
-    result: ResultOptions = NOWHERE,
+    result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
     """Find the tags' poses on the platform, from images that each show two or more.
 

@@ -68,4 +68,4 @@ class ResultOptions:
             raise typer.Exit(3)
 
 
-NOWHERE = ResultOptions()
+DEFAULT_RESULT = ResultOptions()

@@ -13,7 +13,7 @@ import typer
 
 from calibration.geometry.pose_selection import measurement_poses
 from calibration.procedures import calibrate_rig
-from cdpr.cli.calibrate.output import NOWHERE, ResultOptions, WantedOption
+from cdpr.cli.calibrate.output import DEFAULT_RESULT, ResultOptions, WantedOption
 from cdpr.cli.options import (
     CalibrationOption,
     JsonOption,
@@ -136,7 +136,7 @@ class Deviations:
         ),
     ] = None
 
-    def but(self, known: Sequence[GroupName]) -> dict[str, float]:
+    def without(self, known: Sequence[GroupName]) -> dict[str, float]:
         """By group, in [m], [rad] or as a fraction, without the known groups."""
         deviations = {
             "outlets": self.outlets_mm / 1e3,
@@ -175,7 +175,7 @@ class Accuracies:
         }
 
 
-DRAWING, USUAL = Deviations(), Accuracies()
+DEFAULT_DEVIATIONS, DEFAULT_ACCURACIES = Deviations(), Accuracies()
 
 
 @with_option_groups
@@ -202,8 +202,8 @@ def rig(
         list[GroupName] | None,
         typer.Option(help="parameters to keep as in the rig file; repeatable"),
     ] = None,
-    deviations: Deviations = DRAWING,
-    accuracies: Accuracies = USUAL,
+    deviations: Deviations = DEFAULT_DEVIATIONS,
+    accuracies: Accuracies = DEFAULT_ACCURACIES,
     tilt_deg: Annotated[
         float,
         typer.Option(
@@ -212,7 +212,7 @@ def rig(
     ] = 5.0,
     wanted_mm: WantedOption = 1.0,
     name: Annotated[str, typer.Option(help="name of the result")] = "rig",
-    result: ResultOptions = NOWHERE,
+    result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
     """Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.
 
@@ -228,7 +228,7 @@ def rig(
     made = calibrate_rig(
         load_rig(rig),
         data,
-        deviations=deviations.but(known or []),
+        deviations=deviations.without(known or []),
         **accuracies.in_si(),
         without_poses=without_poses,
         reflector=[x / 1e3 for x in reflector_mm],

@@ -9,7 +9,7 @@ import typer
 
 from cdpr import console as page  # loads the server where it is asked for
 from cdpr.cli.options import (
-    RIGS_OWN,
+    DEFAULT_BUS,
     BusOptions,
     RigArgument,
     WithoutRealTimeOption,
@@ -54,7 +54,7 @@ def console(
             metavar="SOURCE",
         ),
     ] = None,
-    bus: BusOptions = RIGS_OWN,
+    bus: BusOptions = DEFAULT_BUS,
     without_real_time: WithoutRealTimeOption = False,
 ) -> None:
     """Serve the operator's page: live view, jog, teach, preview, run, hold, stop.

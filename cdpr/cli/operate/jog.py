@@ -24,7 +24,7 @@ from cdpr.cli.operate.supervision import (
     speed_by_key,
 )
 from cdpr.cli.options import (
-    RIGS_OWN,
+    DEFAULT_BUS,
     BusOptions,
     FastOption,
     RigArgument,
@@ -138,7 +138,7 @@ DIRECTIONS = {
 HELP = "arrows x and y · page up and down z · + and - speed · f frame · space stop · q end"
 #: Update period of the line with the position, [s].
 SHOWN_EVERY = 0.2
-DEFAULT_PATH, NOT_HELD, MOVED = PathOptions(), HeldOptions(), DriveOptions()
+DEFAULT_PATH, DEFAULT_HELD, DEFAULT_DRIVES = PathOptions(), HeldOptions(), DriveOptions()
 
 
 @with_option_groups
@@ -151,7 +151,7 @@ def jog(
     mm: Annotated[
         float | None, typer.Option("--mm", help="length to pay out, at most 50; negative: wind in")
     ] = None,
-    held: HeldOptions = NOT_HELD,
+    held: HeldOptions = DEFAULT_HELD,
     limit_n: Annotated[
         float | None,
         typer.Option(
@@ -161,8 +161,8 @@ def jog(
     speed_mm_s: Annotated[
         float, typer.Option(min=0.1, max=1000.0 * FASTEST, help="largest speed, at most the rig's")
     ] = 1000.0 * SPEED,
-    bus: BusOptions = RIGS_OWN,
-    drives: DriveOptions = MOVED,
+    bus: BusOptions = DEFAULT_BUS,
+    drives: DriveOptions = DEFAULT_DRIVES,
 ) -> None:
     """Move the platform slowly and straight by a few millimetres from its present pose.
 
@@ -196,7 +196,7 @@ def jog(
     require_unused(
         "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path uses the rig's limits"
     )
-    if held != NOT_HELD:
+    if held != DEFAULT_HELD:
         _held(the_rig, path, held, speed, drives)
         return
     by = None if path.by_mm is None else millimetres(list(path.by_mm))

@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
-    RIGS_OWN,
+    DEFAULT_BUS,
     BusOptions,
     JsonOption,
     NoQuestionOption,
@@ -21,7 +21,7 @@ from executor import service
 @with_option_groups
 def status(
     rig: RigArgument,
-    bus: BusOptions = RIGS_OWN,
+    bus: BusOptions = DEFAULT_BUS,
     as_json: JsonOption = False,
 ) -> None:
     """Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.
@@ -50,7 +50,7 @@ def status(
 @with_option_groups
 def reset(
     rig: RigArgument,
-    bus: BusOptions = RIGS_OWN,
+    bus: BusOptions = DEFAULT_BUS,
     yes: NoQuestionOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -87,7 +87,7 @@ def reset(
 @with_option_groups
 def release(
     rig: RigArgument,
-    bus: BusOptions = RIGS_OWN,
+    bus: BusOptions = DEFAULT_BUS,
     yes: NoQuestionOption = False,
     without_real_time: WithoutRealTimeOption = False,
     as_json: JsonOption = False,
