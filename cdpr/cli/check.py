@@ -22,7 +22,7 @@ def check(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Verify a plan by an independent method: distances at dense poses, with bounds between.
+    """Verify a plan independently: distances at dense poses, with bounds in between.
 
     Exit code 3 where a value violates the scene's requirements.
 

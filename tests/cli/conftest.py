@@ -1,4 +1,4 @@
-"""One plan and one run for all tests of the command line."""
+"""A plan and a run shared by all tests of the command line."""
 
 from __future__ import annotations
 

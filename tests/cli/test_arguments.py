@@ -1,4 +1,4 @@
-"""What no verb can use is refused before anything is opened: overwriting, odd paths and numbers."""
+"""Invalid arguments of any verb are refused first: overwriting, odd paths and numbers."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def test_a_file_that_is_no_rig_file_is_named(tmp_path: Path, verb: str, kind: st
 
 
 def test_files_in_another_order_are_named_for_what_they_are(tmp_path: Path) -> None:
-    """Not as a dozen keys to mend in a file that is whole."""
+    """Not as a dozen wrong keys in a valid file."""
     plan = tmp_path / "plan.json"
     with nothing_written(tmp_path):
         one_message(call("plan", SCENE, RIG, "-o", plan), 2, "a scene file, not a rig file")

@@ -1,4 +1,4 @@
-"""Plan files that cannot be used, for `cdpr check` and `cdpr run` alike."""
+"""Unusable plan files, for `cdpr check` and `cdpr run`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.cli.program import Answer, call, nothing_written, one_message
 
 
 def use(verb: str, plan: Path, folder: Path, rig: Path = RIG) -> Answer:
-    """`cdpr check` or `cdpr run` of a plan, which must leave the folder as it is."""
+    """`cdpr check` or `cdpr run` of a plan, which must leave the folder unchanged."""
     rest = ["-o", folder / "run", "--fast", "--no-camera"] if verb == "run" else []
     with nothing_written(folder):
         return call(verb, plan, "--rig", rig, *rest)
@@ -87,7 +87,7 @@ def test_a_plan_of_the_rig_before_it_was_changed_names_the_part(
 
 
 def colliding_plan(path: Path) -> Path:
-    """A plan whose file is whole, straight through the obstacle of environment 1."""
+    """A valid plan file, straight through the obstacle of environment 1."""
     scene = load_scene(CONFIGS / "environment_1.yaml")
     corners = [(180.0, 180.0, 300.0), (-180.0, -180.0, 400.0)]
     save_plan(straight_plan(load_rig(RIG), scene, corners), path)

@@ -127,7 +127,7 @@ def test_a_run_folder_below_a_file_is_reported_before_the_work(folder: Path) -> 
 
 
 def test_without_a_rig_file_no_bus_is_moved(folder: Path) -> None:
-    """A plan is a file from anywhere; which drives move is for the rig file of this machine."""
+    """A plan may come from anywhere; only this machine's rig file decides which drives move."""
     refused(folder, 2, "--rig", interface="udp_multicast", no_camera=True, yes=True)
     refused(folder, 2, "--rig", channel="can0", no_camera=True, yes=True)
 
@@ -146,7 +146,7 @@ def read_only(short_plan: Path) -> Iterator[Path]:
 
 @pytest.mark.parametrize("verb", ["plan", "run", "demo"])
 def test_a_read_only_folder_is_reported_before_the_work(read_only: Path, verb: str) -> None:
-    """In a process of its own, without the right of root to write anywhere."""
+    """In a separate process, without root's permission to write anywhere."""
     rest = {
         "plan": [RIG, SCENE, "-o", "new.json"],
         "run": ["plan.json", "--rig", RIG, "-o", "run", "--fast", "--no-camera"],
@@ -265,7 +265,7 @@ def test_a_missing_camera_is_reported_before_anything_moves(folder: Path) -> Non
 def test_ctrl_c_is_heard_while_a_camera_that_hangs_is_opened(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its server takes the connection and says nothing more."""
+    """Its server accepts the connection and sends nothing."""
     is_ready, asked = CameraProcess.is_ready, []
 
     def stop_at_first(process: CameraProcess, within: float) -> bool:

@@ -1,4 +1,4 @@
-"""`cdpr calibrate camera` on folders as people have them."""
+"""`cdpr calibrate camera` on typical folders."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def save(path: Path, image: np.ndarray) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Fourteen good images in several formats, and files that are of no use."""
+    """Fourteen good images in several formats, and unusable files."""
     folder = tmp_path_factory.mktemp("my images")
     for k, image in enumerate(pictures(14, 0.09)):
         if k == 0:

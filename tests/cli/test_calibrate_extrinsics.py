@@ -42,7 +42,7 @@ def truth() -> Pose:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, truth: Pose) -> Path:
-    """Ten images, a file of the platform's poses, and files that are of no use."""
+    """Ten images, a file of the platform's poses, and unusable files."""
     folder = tmp_path_factory.mktemp("rig images")
     rig = load_rig(RIG)
     scene = replace(load_scene(CONFIGS / "environment_1.yaml"), obstacles=())

@@ -54,7 +54,7 @@ def test_pictures_are_taken_with_advice_and_then_used(video: Path, tmp_path: Pat
 
 
 def test_a_video_is_used_instead_of_a_folder(video: Path) -> None:
-    """Of every view one picture is used, as nothing moved to the next."""
+    """One image of every view is used, as nothing moved to the next."""
     answer = call("calibrate", "camera", video, *BOARD, "--json")
     assert answer.code in (0, 3), answer
     found = json.loads(answer.out)

@@ -1,4 +1,4 @@
-"""`cdpr calibrate print`: a file in exact size, or one clear message."""
+"""`cdpr calibrate print`: a file at exact scale, or one clear message."""
 
 from __future__ import annotations
 

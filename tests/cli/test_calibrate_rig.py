@@ -1,4 +1,4 @@
-"""`cdpr calibrate rig` on files as people have them."""
+"""`cdpr calibrate rig` on typical files."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:
 
 
 def test_the_options_have_the_deviations_that_poses_are_chosen_by() -> None:
-    """The options have units of their own, so the defaults are written there once more."""
+    """The options have other units, so the defaults are repeated there."""
     options = inspect.signature(rig_verb.rig).parameters
     for group, deviation in DEFAULT_DEVIATIONS.items():
         percent = group in ("drum_scale", "stiffness")

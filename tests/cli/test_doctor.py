@@ -166,7 +166,7 @@ class FakeCapture:
         return True
 
     def set(self, *_: object) -> None:
-        """Cameras take settings and do as they like."""
+        """Cameras accept settings and may ignore them."""
 
     def read(self) -> tuple[bool, np.ndarray]:
         return True, np.zeros(self.size, dtype=np.uint8)

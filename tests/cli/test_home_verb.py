@@ -1,4 +1,4 @@
-"""`cdpr home` and `cdpr jog --cable` as typed: what is not clearly meant is denied."""
+"""`cdpr home` and `cdpr jog --cable` as typed: ambiguous commands are refused."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_camera_that_is_not_there_is_found_out_before_anything_moves(
 
 
 def test_a_stop_while_the_camera_looks_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C is heard though the camera does not answer any more."""
+    """Ctrl-C works although the camera has stopped answering."""
     ask, asked = CameraProcess.ask, []
 
     def stop_at_second(process: CameraProcess, trigger: FrameRequest) -> None:

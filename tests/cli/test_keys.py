@@ -1,4 +1,4 @@
-"""Keys of the terminal: read as they are pressed, they watch and steer a run, and hold a jog."""
+"""Keys of the terminal: they monitor and control a run, and hold a jog."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_no_bytes_are_too_odd(data: bytes) -> None:
 
 @contextmanager
 def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    """A terminal as standard input; its other end."""
+    """The other end of a terminal that is standard input."""
     operator, program = pty.openpty()
     with os.fdopen(program) as stream, monkeypatch.context() as patched:
         patched.setattr(sys, "stdin", stream)
@@ -152,7 +152,7 @@ def test_space_stops_the_session_while_it_moves() -> None:
 
 
 class Script:
-    """Keys one call after the other."""
+    """Scripted keys, one list per call."""
 
     def __init__(self, *keys: str) -> None:
         self._keys = list(keys)

@@ -1,4 +1,4 @@
-"""What `cdpr monitor` shows of a status, without a run."""
+"""Output of `cdpr monitor` for a status, without a run."""
 
 from __future__ import annotations
 

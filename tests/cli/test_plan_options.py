@@ -1,4 +1,4 @@
-"""Options of `cdpr plan`: each planner takes its own, and says what it cannot heed."""
+"""Options of `cdpr plan`: each planner accepts its own and refuses others."""
 
 from __future__ import annotations
 

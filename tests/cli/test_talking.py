@@ -1,4 +1,4 @@
-"""How the program talks: help with examples, JSON for programs, plain text where nobody looks."""
+"""Output of the program: help with examples, JSON for programs, plain text outside terminals."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_a_speed_that_is_none_is_bad_input(percent: str) -> None:
 
 
 def test_a_stop_that_stops_nothing_is_no_success() -> None:
-    """Who presses stop and sees something move must not read that all is well."""
+    """An operator who stops while something moves must not read that all is well."""
     reply = call("stop")
     assert reply.code == 1
     assert "no active run found" in reply.err
@@ -199,7 +199,7 @@ def test_no_sentence_is_broken_where_a_program_reads_it(
 
 
 def in_terminal(*arguments: str | Path, **variables: str) -> str:
-    """What the program writes when its standard output is a terminal."""
+    """Output of the program when its standard output is a terminal."""
     main_end, far_end = pty.openpty()
     program = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cdpr.cli import main; main()"
     environment = {"PATH": os.environ["PATH"], "TERM": "xterm-256color", **variables}

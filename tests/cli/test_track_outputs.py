@@ -1,4 +1,4 @@
-"""`cdpr track`: pose log, clearance, MCAP, and images with what was measured in them."""
+"""`cdpr track`: pose log, clearance, MCAP, and images with the measurements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A TCP connection to a server that can fall silent or be cut, as a network does it."""
+"""A TCP proxy that can go silent or cut the connection, like a network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class CutConnection:
     """
 
     def __init__(self, to: int) -> None:
-        """In front of a port of this machine."""
+        """A proxy for a local port."""
         self._to = to
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]

@@ -1,4 +1,4 @@
-"""Who may operate, and which press is meant, for any order of pages, presses and leavings."""
+"""Control and press numbers, for any order of pages, presses and disconnections."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cdpr.console.commands import PageControl
 
 
 class ControlMachine(RuleBasedStateMachine):
-    """Pages come, go, take, give, hold and let go; the oracle keeps what was forwarded."""
+    """Pages join, leave, take and release control, hold and release; the oracle tracks presses."""
 
     def __init__(self) -> None:
         super().__init__()

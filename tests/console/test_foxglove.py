@@ -1,4 +1,4 @@
-"""What a program sees that connects as Foxglove does, by the schemas that it is given."""
+"""Messages that a client like Foxglove receives, decoded by the announced schemas."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def run_status(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def decoded(channel: dict[str, Any], data: bytes) -> Any:
-    """A message by nothing but the schema that the server gave with its channel."""
+    """A message decoded only by the schema of its channel."""
     if channel["encoding"] == "json":
         return json.loads(data)
     files = descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(channel["schema"]))

@@ -1,4 +1,4 @@
-"""The console's page in a real browser: STOP, stale data, what it asks before, what it shows."""
+"""The console's page in a real browser: STOP, stale data, confirmations, contents."""
 
 from __future__ import annotations
 

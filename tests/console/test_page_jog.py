@@ -1,4 +1,4 @@
-"""Jogging from the page, in a real browser: whatever ends a press ends it for good."""
+"""Jogging from the page, in a real browser: a press that ended never continues."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The console's server: who may look, who may operate, and what it makes of anything else."""
+"""The console's server: access, control, and refusal of everything else."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tests.console import fake_server
 
 
 class Served:
-    """A console of the paper's rig, simulated in the process of a verb; a server around it."""
+    """A console of the paper's simulated rig, with its server."""
 
     def __init__(self, *, read_only: bool = False) -> None:
         rig = load_rig(RIG)
@@ -118,7 +118,7 @@ class MovesOn:
 
 @pytest.fixture(autouse=True)
 def own_announcements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No run of another test is seen here."""
+    """Hides the runs of other tests."""
     for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
@@ -132,7 +132,7 @@ def served(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
 
 
 def state(page: ClientConnection) -> dict[str, Any]:
-    """The next state; answers before it are left out."""
+    """The next state; skips answers."""
     while True:
         message = json.loads(page.recv(timeout=10))
         if message["kind"] == "state":
@@ -141,7 +141,7 @@ def state(page: ClientConnection) -> dict[str, Any]:
 
 
 def answer_to(page: ClientConnection, text: str) -> dict[str, Any]:
-    """The answer to what is sent."""
+    """Sends a message and returns its answer."""
     page.send(text)
     while True:
         message = json.loads(page.recv(timeout=30))

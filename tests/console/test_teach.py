@@ -1,4 +1,4 @@
-"""Taught poses: what is in the file is what is in the list, whatever is done to them."""
+"""Taught poses: file and list agree after any operation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the page is given of the robot: the closest pair, the measured pose with its ellipsoid."""
+"""Data for the page: the closest pair, and the measured pose with its ellipsoid."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ THE_RIG = load_rig(RIG)
 
 
 def status_at(pose: Pose) -> dict[str, Any]:
-    """What a motion says whose drives hold the platform there."""
+    """Status of a motion whose drives hold the platform at a pose."""
     winches, tensions = WinchMap(THE_RIG), working_tensions(THE_RIG, pose, SCENE.load).tensions
     counts = winches.counts(winches.unstrained(cable_lengths(THE_RIG, pose), tensions))
     drives = [

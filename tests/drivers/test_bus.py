@@ -1,4 +1,4 @@
-"""Opening a bus, and how full it gets."""
+"""Opening a bus, and its load."""
 
 from __future__ import annotations
 

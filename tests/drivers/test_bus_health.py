@@ -1,4 +1,4 @@
-"""What is wrong with the bus, or with what comes over it, ends in a fault with a name."""
+"""Problems of the bus or its frames end in a fault with a code."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_what_a_back_end_raises_gets_a_name(error: Exception, kind: type[BusFaul
 
 
 def test_an_error_number_may_be_in_the_cause() -> None:
-    """The UDP back end tells it only there."""
+    """The UDP back end gives it only there."""
     error = can.CanOperationError("failed to send via socket")
     error.__cause__ = OSError(errno.ENETDOWN, "Network is down")
     assert type(bus_fault("sending", "bus", error)) is BusDown
@@ -125,7 +125,7 @@ def test_a_bus_without_a_socket_loses_nothing_that_could_be_counted() -> None:
 
 
 def say(bench: Bench, can_id: int, data: bytes = b"", *, error: bool = False) -> None:
-    """Somebody else on the bus sends a frame."""
+    """Another device on the bus sends a frame."""
     bench._ear.send(
         can.Message(arbitration_id=can_id, data=data, is_extended_id=False, is_error_frame=error)
     )

@@ -1,4 +1,4 @@
-"""Simulated drives say so themselves; what says anything else, or nothing, is a real drive."""
+"""Simulated drives identify themselves; any others count as real."""
 
 from __future__ import annotations
 

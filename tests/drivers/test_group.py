@@ -124,7 +124,7 @@ def test_a_drive_power_cycled_since_its_configuration_is_reported(bench: Bench) 
 
 
 def test_what_cannot_be_noted_is_not_wiped_out(bench: Bench) -> None:
-    """The set-up of drives that restarted is the only thing that tells of it."""
+    """Only the missing configuration shows that drives restarted."""
     reported: list[tuple[int, ...]] = []
 
     def not_kept(nodes: tuple[int, ...]) -> None:
@@ -140,13 +140,13 @@ def test_what_cannot_be_noted_is_not_wiped_out(bench: Bench) -> None:
 
 
 def needed(settings: Sequence[Setting]) -> dict[tuple[int, int], int]:
-    """What every drive must hold in the end; an inhibit time only where there is one."""
+    """Final values of every drive; an inhibit time only where it exists."""
     kept = {(s.index, s.sub): s.value for s in settings if not s.transient}
     return {key: value for key, value in kept.items() if key != (0x1800, 3)}
 
 
 def written_objects(bench: Bench) -> dict[tuple[int, int], int]:
-    """What node 6 must hold in the end."""
+    """Final values of node 6."""
     settings_of_6 = settings_for(bench.rig, 5, bench.rehearsal.plant.winch_map)
     written = needed(settings_of_6)
     return {**written, (0x1016, 1): 127 << 16 | 100, (0x1016, 8): 8 << 16 | 100}
@@ -414,7 +414,7 @@ def test_a_frame_that_the_bus_refuses_does_not_hold_up_the_stop(
 
 
 def test_a_bus_that_fails_is_a_fault_of_ours(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No exception of python-can leaks, and it says what the drives do now."""
+    """No exception of python-can leaks, and the message says what the drives do."""
 
     def down(timeout: float) -> None:
         raise can.CanOperationError("Network is down")

@@ -1,4 +1,4 @@
-"""What is written to a drive: the values that the stop rules rest on."""
+"""Values written to a drive on which the stop rules depend."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ODrives as one group: looked at, enabled together, stopped together, never one alone."""
+"""ODrives as one group: read, enabled and stopped together, never one alone."""
 
 from __future__ import annotations
 
@@ -252,7 +252,7 @@ def _twin(bench: OdriveBench) -> None:
 
 
 class OdriveRehearsalTwin:
-    """Two devices with one node id: each question is answered twice."""
+    """Two devices with one node id: each request is answered twice."""
 
     def __init__(self, bench: OdriveBench) -> None:
         self._receive = bench.rehearsal._by_node[4].receive

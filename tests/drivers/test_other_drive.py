@@ -1,4 +1,4 @@
-"""The master moves a drive that it shares no code with: only the standards are relied on."""
+"""The master moves a drive without shared code, based only on the standards."""
 
 from __future__ import annotations
 

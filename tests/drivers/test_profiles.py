@@ -1,4 +1,4 @@
-"""Drive profiles: makers' drives are set up with theirs, refused with reasons without."""
+"""Drive profiles: real drives are configured with theirs, and refused with reasons without."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def eight_of(profile: str) -> ScriptedBus:
 
 @pytest.fixture(autouse=True)
 def _simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The set-up waits in the time of the scripted bus."""
+    """The configuration waits in the time of the scripted bus."""
 
     class Timed(SetupNetwork):
         def __init__(self, bus: can.BusABC, *arguments: object, timeout: float) -> None:
@@ -211,7 +211,7 @@ def test_a_pdo_that_is_there_but_not_now_is_refused(rig: Rig, index: int, code: 
 
 
 def test_a_slow_drive_is_set_up_all_the_same(rig: Rig) -> None:
-    """Answers after 0.7 s were blamed on other objects."""
+    """Answers after 0.7 s were attributed to other objects."""
     bus = eight_of("cia402")
     bus.times = lambda node, _key: (0.7,) if node == 3 else (0.001,)
     assert set_up(rig, bus) == ()
@@ -299,7 +299,7 @@ def test_doctor_reads_the_mode_that_a_set_up_waits_for(rig: Rig) -> None:
 @pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
 @pytest.mark.parametrize("code", ABORTS, ids=hex)
 def test_doctor_reads_the_pdos_that_a_set_up_switches_off(rig: Rig, index: int, code: int) -> None:
-    """It says what the set-up will say: a remark, or nothing."""
+    """It reports the same as the configuration: a remark, or nothing."""
     bus = eight_of("cia402")
     bus.drives[3].aborts[index, 1] = code
     found = examined(rig, bus)
@@ -512,7 +512,7 @@ def test_process_data_beyond_the_fourth_is_switched_off(rig: Rig) -> None:
 def test_an_object_that_the_profile_denies_must_not_hold_another_value(
     rig: Rig, tmp_path: Path, held: int
 ) -> None:
-    """What an earlier program wrote there would count unseen."""
+    """A value written by an earlier program would be active unnoticed."""
     bus = eight_of("cia402")
     for drive in bus.drives.values():
         drive.values[0x1006, 0] = 0

@@ -1,4 +1,4 @@
-"""What the standards let a drive do and makers' drives do: monitoring, named behaviours."""
+"""Behaviour of drives within the standards: monitoring, named behaviours."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_heartbeat_loss_as_a_fault(
 
 
 def answers(line: Line, seconds: float) -> list[float]:
-    """Times after the question at which answers come, [s]."""
+    """Delays of the answers, [s]."""
     line.ask(0x40, 0x1000, 0)
     times = [0.0] * len(line.take(0x585))
     for step in range(1, round(seconds / 0.01) + 1):

@@ -1,4 +1,4 @@
-"""The bus with faults: rules do what they say, in both directions, and the wire takes its time."""
+"""The bus with faults: rules work in both directions, and frames take their time on the wire."""
 
 from __future__ import annotations
 

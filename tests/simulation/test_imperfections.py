@@ -1,4 +1,4 @@
-"""A rig that is not built as its file says: drums, anchors, play, noise, lens, light."""
+"""A rig that differs from its file: drums, anchors, backlash, noise, lens, light."""
 
 from __future__ import annotations
 

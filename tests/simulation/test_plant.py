@@ -1,4 +1,4 @@
-"""The plant against statics by another route: equilibrium, stiffness, slack, energy."""
+"""The plant against independent statics: equilibrium, stiffness, slack, energy."""
 
 from __future__ import annotations
 

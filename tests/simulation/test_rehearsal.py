@@ -1,4 +1,4 @@
-"""Drives and plant together: what the drums do is what the platform and the torques show."""
+"""Drives and plant together: platform and torques follow the drums."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_without_torque_the_brakes_hold_the_platform(rig: Rig, channel: BusSetti
 
 
 class ManualTime:
-    """A clock that tells the time it is given, and ends the service after some readings."""
+    """A manual clock that ends the service after some readings."""
 
     def __init__(self, stop: threading.Event, readings: int, step: float) -> None:
         self._stop, self._left, self._step, self._now = stop, readings, step, 0.0
@@ -140,7 +140,7 @@ class ManualTime:
 def test_served_drives_stop_by_themselves_when_the_master_is_gone(
     rig: Rig, channel: BusSettings
 ) -> None:
-    """No frame comes any more; the time-outs run on the clock alone."""
+    """No frame arrives; the time-outs depend only on the clock."""
     stop, statuses = threading.Event(), list[RehearsalStatus]()
     with open_bus(channel) as master, open_bus(channel) as bus:
         rehearsal = SimulatedCia402Rig(rig, bus, rig.home)
