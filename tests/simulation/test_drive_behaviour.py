@@ -288,7 +288,7 @@ def torques_out_and_back(rig: Rig, friction: float) -> list[float]:
         for rotation in (2.0, -2.0, 0.0):
             for drive in rehearsal.drives:
                 drive.motor.position += rotation
-            rehearsal._feel()
+            rehearsal._begin_torque_update()
             rehearsal._finish_torque_update()
             torques.append(rehearsal.drives[0].torque)
     return torques
