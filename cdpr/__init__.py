@@ -1,7 +1,7 @@
-"""Plans, proves, runs and measures paths of cable-driven parallel robots.
+"""Plan, prove, run and measure paths of cable-driven parallel robots.
 
-One function for each verb of the command line, with its defaults; lengths in metres, forces in
-newtons, angles in radians. Nothing is loaded before it is used.
+One function per verb of the command line, with the same defaults; lengths in metres, forces in
+newtons, angles in radians. Every name is loaded at first use.
 """
 
 from __future__ import annotations

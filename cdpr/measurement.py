@@ -1,4 +1,4 @@
-"""Cameras and calibrations: what `cdpr track` and `cdpr calibrate` do, as functions."""
+"""Functions behind `cdpr track`, and cameras and calibration results for scripts."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from model.scene import Scene
 def open_camera(
     rig: Rig, source: str | int | Path, camera: str | None = None
 ) -> ImageFolder | VideoFile | LiveCamera:
-    """The images of a camera of the rig: iterate over it; a live camera is a context manager too.
+    """The images of one of the rig's cameras, as an iterable; a live one is a context manager.
 
     Args:
-        rig: Its cameras.
+        rig: The robot with its cameras.
         source: A folder of images, a video file, or the index or address of a live camera.
-        camera: Which of the rig's cameras took them; the first when left out.
+        camera: Name of the rig's camera that took them (default: the first).
 
     Raises:
         BadInput: The source cannot be used, or the rig has no such camera.
@@ -51,22 +51,22 @@ def track(
     overlay: str | Path | None = None,
     listener: Listener = SILENT,
 ) -> TrackResult:
-    """Measures the platform's pose image by image, by one camera or several together.
+    """Measures the platform's pose image by image, with one camera or several fused.
 
     Args:
         rig: The robot, with its tags and cameras.
         source: A folder of images, a video file, the index or address of a live camera, or
-            ``synthetic``; of several cameras by their names.
-        camera: Which of the rig's cameras took a single source; the first when left out.
-        scene: Its obstacles, to which the clearance is measured; the plan's when left out.
-        plan: Followed by the platform that synthetic cameras see.
-        pictures: How many of each camera at most.
-        overlay: New folder or video into which the images are drawn with what was measured.
-        listener: Receives the progress, and which files are not used.
+            ``synthetic``; for several cameras, a mapping by name.
+        camera: Name of the rig's camera for a single source (default: the first).
+        scene: Obstacles to which the clearance is measured (default: the plan's).
+        plan: Path of the platform in synthetic images.
+        pictures: Largest number of images per camera.
+        overlay: New folder or video for the images with the measurements drawn in.
+        listener: Receives the progress, and the files that are not used.
 
     Raises:
         NoPlatformSeen: No image gave a pose.
-        BadInput: A source cannot be used, or an image is of another size.
+        BadInput: A source cannot be used, or an image has another size.
     """
     if isinstance(source, Mapping):
         sources = [f"{name}={one}" for name, one in source.items()]

@@ -1,4 +1,4 @@
-"""Plans and runs: what `cdpr plan`, `check`, `workspace`, `stop`, `hold` … `report` do."""
+"""Functions behind `cdpr plan`, `check`, `workspace`, `stop`, `hold` … `report`."""
 
 from __future__ import annotations
 
@@ -45,24 +45,24 @@ def plan(
     Args:
         rig: The robot.
         scene: Obstacles, clearances, load, start, stops and goal.
-        planner: ``optimal``, or those of the paper: ``adaptive`` and ``goal-bias``.
-        cost: What to optimise: ``length`` (default), ``kinematic``, ``clearance``, ``capacity``.
-        weights: Instead of a cost: weights of a sum of them, by name.
-        budget: How long paths are sought and improved, [s]; 0.05 when left out, 0.5 with
-            `free_rotation`. How far a budget goes depends on the computer.
-        rounds: Instead of a budget: rounds for all legs between stops, or for each. The same rounds
-            and seed give the same path.
-        seed: Of the random numbers.
-        longest: The best path that is no longer, [m].
+        planner: ``optimal``, or the paper's ``adaptive`` and ``goal-bias``.
+        cost: Objective: ``length`` (default), ``kinematic``, ``clearance``, ``capacity``.
+        weights: Instead of a cost: weights of a weighted sum, by objective.
+        budget: Time for search and improvement, [s] (default: 0.05; 0.5 with `free_rotation`).
+            The result depends on the computer's speed.
+        rounds: Instead of a budget: number of rounds, for all segments between stops or for each.
+            The same rounds and seed give the same path.
+        seed: Random seed.
+        longest: Upper limit of the path length, [m].
         free_rotation: The platform may rotate, within the scene's limits.
-        start: Instead of the scene's, ``world_from_platform``.
-        goal: Instead of the scene's, ``world_from_platform``.
-        clearance: To obstacles, instead of the scene's, [m].
-        max_iterations: The paper's planners: samples after which the search ends.
+        start: Overrides the scene's start, ``world_from_platform``.
+        goal: Overrides the scene's goal, ``world_from_platform``.
+        clearance: Overrides the scene's obstacle clearance, [m].
+        max_iterations: The paper's planners: largest number of samples.
         listener: Receives the progress of a long search.
 
     Returns:
-        The plan, which passed the check of `cdpr.check`.
+        The plan, which has passed `cdpr.check`.
 
     Raises:
         BadInput: Start, goal or a stop cannot be used, or arguments contradict each other.
@@ -88,18 +88,18 @@ def plan(
 
 
 def check(plan: Plan, rig: Rig | None = None) -> CheckReport:
-    """Proves a plan by an independent route: distances at dense poses, bounds proved between them.
+    """Verifies a plan by an independent method: distances at dense poses, with bounds between.
 
     Args:
-        plan: The plan, with the scene it carries.
-        rig: The robot as it is now; the plan's own when left out.
+        plan: The plan, with its scene.
+        rig: The robot as it is now (default: the plan's).
 
     Returns:
-        The figures of the path; `proved_` ones hold everywhere on it.
+        The figures of the path; those named `proved_` hold everywhere on it.
 
     Raises:
         BadInput: The plan was made for another rig.
-        PlanRejected: With every violation, what by how much and where.
+        PlanRejected: With every violation: what, by how much, and where.
     """
     the_rig = plan.rig if rig is None else rig
     require_same_rig(plan, the_rig, f"plan for {plan.rig.name} in {plan.scene.name}")
@@ -117,20 +117,20 @@ def workspace_map(
     workers: int | None = None,
     listener: Listener = SILENT,
 ) -> list[Maps]:
-    """Where the robot can hold its load, and how well, over planes and volumes.
+    """Maps where the robot can hold its load, and how well, over planes and volumes.
 
     Args:
         rig: The robot.
-        scene: Its obstacles and load; the robot alone when left out.
-        slices: Axis and position [m] of planes; the level one through home when left out.
-        volume: Map the whole workspace too; left out, if there are no slices.
-        step: Distance of points, [m]; a fiftieth of the longest side when left out.
-        rotation: Of the platform, shape (3, 3); that of the start, or of home, when left out.
-        workers: Processes; one a core when left out.
+        scene: Obstacles and load (default: none).
+        slices: Axis and position [m] of planes (default: the horizontal one through home).
+        volume: Map the whole workspace too (default: only without slices).
+        step: Grid spacing, [m] (default: a fiftieth of the longest side).
+        rotation: Of the platform, shape (3, 3) (default: the scene's start, else home).
+        workers: Number of processes (default: one per core).
         listener: Receives the progress.
 
     Returns:
-        For each plane or volume its grid, and arrays of values by name.
+        The grid of each plane or volume, with arrays of values by name.
 
     Raises:
         BadInput: A plane is outside the workspace, or there are too many points.
@@ -150,7 +150,7 @@ def stop() -> list[int]:
         Numbers of the processes that stop.
 
     Raises:
-        Fault: No run is under way, or one does not answer.
+        Fault: No run is in progress, or one does not answer.
     """
     result = stop_runs()
     if not (result.stopped or result.silent):
@@ -161,7 +161,7 @@ def stop() -> list[int]:
 
 
 def hold(process: int | None = None) -> dict[str, Any]:
-    """Feed hold: the platform slows down along the path, waits there, and keeps its tension.
+    """Feed hold: the platform slows down along the path and waits there under tension.
 
     Args:
         process: Number of the run; None for the only one.
@@ -170,14 +170,14 @@ def hold(process: int | None = None) -> dict[str, Any]:
         The status of the run.
 
     Raises:
-        Fault: No run is under way, or it does not answer.
-        BadInput: It is not clear which run is meant.
+        Fault: No run is in progress, or it does not answer.
+        BadInput: Several runs are in progress, and `process` is None.
     """
     return request_run("hold", process)
 
 
 def resume(process: int | None = None) -> dict[str, Any]:
-    """Continues after `hold`, at the speed that was set last; arguments as for `hold`."""
+    """Continues after `hold`, at the last requested speed; arguments as for `hold`."""
     return request_run("resume", process)
 
 
@@ -187,9 +187,9 @@ def set_speed(percent: int, process: int | None = None) -> dict[str, Any]:
 
 
 def report(folder: str | Path) -> Path:
-    """Writes the report of a run again, from its files alone; returns the page.
+    """Rewrites the report of a run from its files; returns the path of the page.
 
-    Of a run whose program was killed, or whose disk was full, it writes what is missing too.
+    For a run that was killed, or whose disk was full, missing results are recovered too.
 
     Raises:
         BadInput: There is no such folder, or a file of the run was changed.

@@ -1,4 +1,4 @@
-"""Drives and cameras: the CAN bus, drive groups of one interface, and sources of images."""
+"""Drives and cameras: CAN bus, drive groups behind one interface, and image sources."""
 
 from __future__ import annotations
 

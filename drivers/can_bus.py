@@ -1,4 +1,4 @@
-"""The CAN bus a rig names, opened through python-can, and the CAN interfaces that Linux reports."""
+"""The CAN bus of a rig, opened through python-can, and the CAN interfaces of Linux."""
 
 from __future__ import annotations
 
@@ -23,46 +23,46 @@ from model.errors import BadInput, HardwareMissing
 from model.rig import Rig
 
 UDP_DEFAULT_GROUP = "239.74.163.2"
-"""python-can's own IPv4 group. Source: python-can, interfaces/udp_multicast."""
+"""Default IPv4 group. Source: python-can, interfaces/udp_multicast."""
 
 UDP_DEFAULT_PORT = 43113
-"""python-can's own. Source: python-can, interfaces/udp_multicast."""
+"""Default port. Source: python-can, interfaces/udp_multicast."""
 
 IN_PROCESS = "virtual"
-"""python-can's interface inside one process; on it the drives are simulated in a run's own."""
+"""python-can's interface within one process; a run simulates its drives on it."""
 
 RECEIVE_BUFFER_BYTES = 4 * 2**20
-"""A socket of the default size drops the newest frames after 278 without a word."""
+"""A default socket silently drops frames after the first 278."""
 
 SO_MEMINFO = 55
 MEMINFO_BYTES = 36
-"""Nine counters, the last of them the frames thrown away. Source: linux/sock_diag.h."""
+"""Nine counters; the last is the number of dropped frames. Source: linux/sock_diag.h."""
 
 MIN_TRANSMIT_QUEUE = 64
-"""Frames a kernel CAN interface must queue: a cycle and a stop in one burst, with room to spare."""
+"""Frames that a kernel CAN interface must queue: a cycle and a stop in one burst, and a margin."""
 
 INTERFACES = Path("/sys/class/net")
 
 
 class SentFrame(can.Message):
-    """A classic frame whose data is replaced and never changed: copies may share it."""
+    """A classic frame whose data is replaced, never modified, so that copies may share it."""
 
     __slots__ = ()
 
     def __init__(self, can_id: int, data: bytes | bytearray) -> None:
-        """Holds data for an 11-bit identifier."""
+        """A frame with an 11-bit identifier."""
         super().__init__(arbitration_id=can_id, data=data, is_extended_id=False)
 
 
 class InProcessBus(VirtualBus):
-    """python-can's virtual bus with shorter paths for sent frames and for `recv` without a wait.
+    """python-can's virtual bus with faster sending, and faster `recv` without a wait.
 
-    A run in simulated time sends some twenty frames a cycle. Whole copies of them for every
-    listener, and locks for every look into an empty queue, took as long as the simulated drives.
+    A run in simulated time sends about twenty frames per cycle. Deep copies for every listener
+    and locks for every check of an empty queue took as long as the simulated drives.
     """
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Hands a copy to every other end; of a `SentFrame` one that shares its data."""
+        """Gives every other end a copy; copies of a `SentFrame` share its data."""
         if not isinstance(msg, SentFrame) or self.receive_own_messages:
             super().send(msg, timeout)
             return
@@ -73,7 +73,7 @@ class InProcessBus(VirtualBus):
                 inbox.put(self._arrived(msg, now))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame, or None when there is none within the time [s]."""
+        """The next frame, or None if none arrives within the time [s]."""
         if timeout != 0.0 or self._filters is not None:
             return super().recv(timeout)
         self._check_if_open()
@@ -94,12 +94,12 @@ class InProcessBus(VirtualBus):
 
 @dataclass(frozen=True, slots=True)
 class BusSettings:
-    """How a bus is opened.
+    """Settings for opening a bus.
 
     Attributes:
         interface: python-can's name, such as ``socketcan``, ``udp_multicast`` or ``virtual``.
-        channel: What the interface calls its channel. For ``udp_multicast``: ``group[:port]``.
-        bitrate: [bit/s]; where the interface sets it (socketcan's is set with ``ip link``).
+        channel: Channel of the interface; for ``udp_multicast`` ``group[:port]``.
+        bitrate: [bit/s]; ignored by socketcan, where ``ip link`` sets it.
     """
 
     interface: str
@@ -114,7 +114,7 @@ class BusSettings:
 
     @property
     def canonical(self) -> str:
-        """The same text for every spelling of one bus: what a channel leaves out is filled in."""
+        """The same text for every spelling of a bus, with defaults filled in."""
         interface, channel = self.interface.strip().lower(), self.channel.strip()
         if interface == "udp_multicast":
             options = _udp_options(self)
@@ -122,7 +122,7 @@ class BusSettings:
         return f"{interface} {channel}"
 
     def __str__(self) -> str:
-        """Interface and channel, as messages name the bus."""
+        """Interface and channel, for messages."""
         return f"{self.interface} {self.channel}".strip()
 
 
@@ -131,7 +131,7 @@ def open_bus(settings: BusSettings) -> can.BusABC:
 
     Raises:
         BadInput: python-can has no such interface, or the channel is not one of its channels.
-        HardwareMissing: It cannot be opened; with the cause and the next step.
+        HardwareMissing: It cannot be opened.
     """
     known = sorted(can.VALID_INTERFACES)
     if settings.interface not in known:
@@ -147,7 +147,7 @@ def open_bus(settings: BusSettings) -> can.BusABC:
     options = _options(settings)
     try:
         bus = can.Bus(interface=settings.interface, ignore_config=True, **options)
-    # Back ends raise whatever their maker's library raises: every one means that it did not open.
+    # Back ends raise errors of their vendors' libraries; each means that the bus did not open.
     except Exception as error:
         raise _cannot_open(settings, error) from error
     _prepare_socket(bus)
@@ -161,10 +161,10 @@ def _options(settings: BusSettings) -> dict[str, Any]:
 
 
 def _udp_options(settings: BusSettings) -> dict[str, Any]:
-    """A hop limit of 0 keeps the frames on this machine; set-points do not go out to a network."""
+    """Options of a multicast bus; hop limit 0 keeps set-points on this machine."""
     group, _, port = settings.channel.partition(":") if "." in settings.channel else ("", "", "")
     if settings.channel and not group:
-        group = settings.channel  # an IPv6 group; its colons are its own
+        group = settings.channel  # an IPv6 group, which contains colons
     options: dict[str, Any] = {
         "channel": group or UDP_DEFAULT_GROUP,
         "hop_limit": 0,
@@ -182,14 +182,14 @@ def _udp_options(settings: BusSettings) -> dict[str, Any]:
 
 
 def _check_kernel_interface(settings: BusSettings) -> None:
-    """Raises what python-can finds only at the first frame: no interface, down, short queue."""
+    """Checks what python-can notices only at the first frame: missing, down, short queue."""
     folder = INTERFACES / settings.channel
     if not settings.channel or not folder.exists():
-        there = sorted(p.name for p in INTERFACES.glob("*can*"))
+        present = sorted(p.name for p in INTERFACES.glob("*can*"))
         raise HardwareMissing(
             f"there is no network interface {settings.channel!r}",
             where=f"bus {settings}",
-            why=f"CAN interfaces here: {', '.join(there) or 'none'}",
+            why=f"CAN interfaces here: {', '.join(present) or 'none'}",
             next_step=bring_up(settings),
         )
     if not int((folder / "flags").read_text(), 16) & 1:  # IFF_UP
@@ -211,7 +211,7 @@ def _check_kernel_interface(settings: BusSettings) -> None:
 
 
 def bring_up(settings: BusSettings) -> str:
-    """The command that makes a kernel CAN interface ready."""
+    """The command that brings a kernel CAN interface up."""
     name = settings.channel or "can0"
     if name.startswith("vcan"):
         return (
@@ -240,7 +240,7 @@ def _cannot_open(settings: BusSettings, error: Exception) -> HardwareMissing:
 
 
 def _prepare_socket(bus: can.BusABC) -> None:
-    """Room for frames that wait, and on IP sockets no frames of groups joined by others."""
+    """Enlarges the receive buffer; on IP sockets refuses groups joined by other sockets."""
     try:
         descriptor = bus.fileno()
     except NotImplementedError:  # not every bus has a socket
@@ -255,14 +255,14 @@ def _prepare_socket(bus: can.BusABC) -> None:
 
 
 def echoes_own_frames(bus: can.BusABC) -> bool:
-    """Whether a sender receives its own frames; multicast brings them back, CAN does not."""
+    """Whether a sender receives its own frames, as with multicast but not on CAN."""
     return isinstance(bus, UdpMulticastBus)
 
 
 def lost_frames(bus: can.BusABC) -> int:
-    """Frames the kernel dropped since the bus was opened, because they were not read in time.
+    """Number of frames the kernel dropped since opening, because they were not read in time.
 
-    0 for buses without a socket; there only missing replies show it.
+    0 for buses without a socket, where only missing replies indicate a loss.
     """
     try:
         descriptor = bus.fileno()
@@ -272,7 +272,7 @@ def lost_frames(bus: can.BusABC) -> int:
         return 0
     bus_socket = socket.socket(fileno=descriptor)
     try:
-        # python-can refuses the control message of SO_RXQ_OVFL; this asks for the same counter.
+        # python-can rejects the control message of SO_RXQ_OVFL; this reads the same counter.
         memory = bus_socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO_BYTES)
     finally:
         bus_socket.detach()
@@ -284,7 +284,7 @@ def transmit(bus: can.BusABC, message: can.Message) -> None:
     """Sends one frame.
 
     Raises:
-        BusFault: The bus did not take it. A full queue is one too: a set-point sent late is wrong.
+        BusFault: The bus did not accept it. A full queue counts too: a late set-point is wrong.
     """
     try:
         bus.send(message)
@@ -292,8 +292,8 @@ def transmit(bus: can.BusABC, message: can.Message) -> None:
         raise bus_fault("a frame could not be sent", bus_name(bus), error) from error
 
 
-def take(bus: can.BusABC, timeout: float) -> can.Message | None:
-    """The next frame, or None when there is none within the time [s].
+def receive_frame(bus: can.BusABC, timeout: float) -> can.Message | None:
+    """The next frame, or None if none arrives within the time [s].
 
     Raises:
         BusFault: The bus failed.
@@ -305,34 +305,34 @@ def take(bus: can.BusABC, timeout: float) -> can.Message | None:
 
 
 def bus_name(bus: can.BusABC) -> str:
-    """The bus as messages name it."""
+    """Name of the bus for messages."""
     return f"bus {bus.channel_info}"
 
 
-# Distinguishes own frames of a master's kind from those of another master. No bus.
+# Distinguishes this master's frames from those of another master. No bus.
 
 
 class EchoFilter:
-    """What was sent, so that a bus on which a sender hears itself does not look like two masters.
+    """Counts sent frames, so that their echoes are not taken for another master's frames.
 
-    On such a bus each frame that was sent excuses one that comes in.
+    On a bus with echoes each sent frame excuses one received frame.
     """
 
-    #: Frames of one identifier that may be on their way back; lost ones excuse no more than these.
+    #: Largest number of pending echoes per identifier, which limits the credit of lost frames.
     MOST_CREDIT = 8
 
     def __init__(self, ids: frozenset[int], *, echoes_own_frames: bool) -> None:
-        """Takes the identifiers to watch and whether the bus brings back what was sent."""
+        """Takes the identifiers to watch, and whether the bus echoes sent frames."""
         self._ids = ids
         self._credit: dict[int, int] | None = dict.fromkeys(ids, 0) if echoes_own_frames else None
 
     def sent(self, can_id: int) -> None:
-        """Notes a frame that was sent."""
+        """Counts a sent frame."""
         if self._credit is not None and can_id in self._credit:
             self._credit[can_id] = min(self.MOST_CREDIT, self._credit[can_id] + 1)
 
     def is_foreign(self, can_id: int) -> bool:
-        """Whether a frame that came in is another master's."""
+        """Whether a received frame is another master's."""
         if can_id not in self._ids:
             return False
         if self._credit is None:
@@ -343,10 +343,8 @@ class EchoFilter:
         return True
 
 
-# What Linux reports about a CAN interface: there, up, bit rate, queue, state of its controller.
-
-
-#: Where `ip` is for users whose PATH has no system folders.
+# CAN interfaces of Linux: state, bit rate, queue, state of the controller.
+#: Folders of `ip` for users whose PATH has no system folders.
 SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
 
 
@@ -356,11 +354,11 @@ class KernelInterface:
 
     Attributes:
         name: Such as ``can0``.
-        kind: ``can``, or ``vcan`` for one without hardware.
-        up: It was brought up.
-        queue: Frames that may wait to be sent.
-        bitrate: [bit/s]; None where it has none or none was set.
-        state: Of the controller, such as ``ERROR-ACTIVE``; empty where it has none.
+        kind: ``can``, or ``vcan`` without hardware.
+        up: Whether it is up.
+        queue: Length of the transmit queue, [frames].
+        bitrate: [bit/s]; None if not set.
+        state: Of the controller, such as ``ERROR-ACTIVE``; may be empty.
     """
 
     name: str
@@ -372,15 +370,15 @@ class KernelInterface:
 
     @property
     def has_hardware(self) -> bool:
-        """A controller with a bit rate, not a virtual bus."""
+        """Whether it has a controller with a bit rate."""
         return self.kind == "can"
 
 
 def parse_interfaces(text: str) -> tuple[KernelInterface, ...]:
-    """CAN interfaces in what ``ip -details -json link show`` prints.
+    """CAN interfaces in the output of ``ip -details -json link show``.
 
     Raises:
-        ValueError: It is not that.
+        ValueError: The text is not such output.
     """
     listed = json.loads(text or "[]")
     return tuple(_interface(link) for link in listed if link.get("link_type") == "can")
@@ -422,5 +420,5 @@ def can_interfaces() -> tuple[KernelInterface, ...]:
         raise HardwareMissing(
             f"`ip` did not list the interfaces: {shown.stderr.strip() or error}",
             where="SocketCAN",
-            next_step="run `ip -details -json link show` by hand",
+            next_step="run `ip -details -json link show` manually",
         ) from error

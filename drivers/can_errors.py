@@ -1,4 +1,4 @@
-"""What can be wrong with a bus while it is used, each with a name, its causes and the next step."""
+"""Faults of a bus in use, each with a code, its likely cause and the next step."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from model.errors import Fault, Refused
 
 
 class BusFault(Fault):
-    """The bus itself fails; the drives stop by themselves when they miss the master."""
+    """The bus failed; the drives stop on their own when they lose the master."""
 
     code = "bus_failed"
     cause: ClassVar[str] = "the adapter or its driver reported an error"
     remedy: ClassVar[str] = "check adapter, cable and termination, then start again"
 
     def __init__(self, what: str, where: str, values: dict[str, float | str] | None = None) -> None:
-        """Takes what was seen and on which bus."""
+        """Takes the symptom and the bus."""
         step = f"the drives stop on their own; {self.remedy}"
         super().__init__(what, where=where, why=self.cause, next_step=step, values=values)
 
@@ -27,12 +27,12 @@ class BusDown(BusFault):
     """The network interface was taken down."""
 
     code = "bus_down"
-    cause = "the interface was set down by a user, or by its driver after an error"
+    cause = "a user took the interface down, or its driver did after an error"
     remedy = "bring it up again (`cdpr doctor RIG` shows how), then start again"
 
 
 class BusGone(BusFault):
-    """The network interface is not there any more."""
+    """The network interface has disappeared."""
 
     code = "bus_gone"
     cause = "the adapter was unplugged or lost its power"
@@ -40,7 +40,7 @@ class BusGone(BusFault):
 
 
 class BusOff(BusFault):
-    """The controller has left the bus after too many errors of its own frames."""
+    """The controller left the bus after too many transmit errors."""
 
     code = "bus_off"
     cause = "a short circuit, a wrong bit rate, or missing termination"
@@ -48,7 +48,7 @@ class BusOff(BusFault):
 
 
 class BusPassive(BusFault):
-    """The controller's error counter is too high to signal errors any longer."""
+    """The controller is error-passive: its error counter exceeds the limit."""
 
     code = "bus_passive"
     cause = "no node acknowledges frames (drives without power, broken cable), or a wrong bit rate"
@@ -56,7 +56,7 @@ class BusPassive(BusFault):
 
 
 class BusErrors(BusFault):
-    """Error frames cycle after cycle."""
+    """Error frames in every cycle."""
 
     code = "bus_errors"
     cause = "a loose contact, missing termination, interference, or a cable that is too long"
@@ -64,7 +64,7 @@ class BusErrors(BusFault):
 
 
 class TransmitQueueFull(BusFault):
-    """A frame was not taken because others still wait; sent late, a set-point is wrong."""
+    """The transmit queue is full; a late set-point would be wrong."""
 
     code = "transmit_queue_full"
     cause = "no node acknowledges frames, the bus is overloaded, or txqueuelen is too short"
@@ -72,7 +72,7 @@ class TransmitQueueFull(BusFault):
 
 
 class ReceiveOverflow(BusFault):
-    """Frames were lost because they were not fetched in time."""
+    """Received frames were lost because they were not read in time."""
 
     code = "receive_overflow"
     cause = "this program was delayed, or another node floods the bus"
@@ -88,7 +88,7 @@ class ForeignMaster(BusFault):
 
 
 SOCKET_FULL = "Transmit buffer full"
-"""python-can's words, without a number, for a socket whose frames wait to be sent."""
+"""python-can's message, without an error number, for a full socket."""
 
 _BY_NUMBER: dict[int, type[BusFault]] = {
     errno.ENETDOWN: BusDown,
@@ -99,12 +99,12 @@ _BY_NUMBER: dict[int, type[BusFault]] = {
 
 
 def bus_fault(what: str, where: str, error: Exception) -> BusFault:
-    """The fault behind what a back end raised, by its error number where it has one.
+    """The fault for an error of a back end, by its error number if it has one.
 
     Args:
-        what: What was being done.
+        what: The operation that failed.
         where: The bus.
-        error: What the back end raised; its number may be in the error that caused it.
+        error: Raised by the back end; its cause may hold the number.
     """
     number = getattr(error, "error_code", None) or getattr(error.__cause__, "errno", None)
     if str(error) == SOCKET_FULL:
@@ -113,26 +113,25 @@ def bus_fault(what: str, where: str, error: Exception) -> BusFault:
     return kind(f"{what}: {str(error) or type(error).__name__}", where)
 
 
-# Error frames of CAN controllers: what they mean, and when one ends a run. Pure.
+# Error frames of CAN controllers: meaning, and when they end a run. Pure.
 #
-# Source: Linux, include/uapi/linux/can/error.h. Other back ends of python-can mark a message as an
-# error frame without stating the class; it then counts as an error on the bus.
+# Source: Linux, include/uapi/linux/can/error.h. Other back ends of python-can give error frames
+# without a class; these count as errors on the bus.
 
 
 ERROR_CYCLES = 10
-"""Cycles in a row with error frames that are one too many: frames are repeated, and a stop with
-them."""
+"""Consecutive cycles with error frames that end a run: retransmissions would delay a stop."""
 
 
 class ErrorClass(IntFlag):
-    """What an error frame is about; in its identifier."""
+    """Class of an error frame, in its identifier."""
 
     CONTROLLER = 0x04
     BUS_OFF = 0x40
 
 
 class ControllerState(IntFlag):
-    """Of the controller; in the second byte of an error frame of class CONTROLLER."""
+    """State of the controller, in the second byte of an error frame of class CONTROLLER."""
 
     RECEIVE_OVERFLOW = 0x01
     RECEIVE_PASSIVE = 0x10
@@ -140,11 +139,11 @@ class ControllerState(IntFlag):
 
 
 def error_frame_fault(identifier: int, data: bytes | bytearray, where: str) -> BusFault | None:
-    """The fault that one error frame reports; None for an error that the controller recovers from.
+    """The fault reported by an error frame; None if the controller recovers on its own.
 
     Args:
         identifier: Of the error frame, without its flags.
-        data: Its eight bytes, or none.
+        data: Eight bytes, or empty.
         where: The bus.
     """
     if identifier & ErrorClass.BUS_OFF:
@@ -159,14 +158,14 @@ def error_frame_fault(identifier: int, data: bytes | bytearray, where: str) -> B
 
 
 class ErrorFrames:
-    """Error frames of a bus, counted cycle by cycle.
+    """Counts the error frames of a bus per cycle.
 
     Attributes:
-        total: All that came.
+        total: Number of all error frames.
     """
 
     def __init__(self, where: str) -> None:
-        """Takes the bus as messages name it."""
+        """Takes the name of the bus for messages."""
         self.total = 0
         self._where = where
         self._now = 0
@@ -179,7 +178,7 @@ class ErrorFrames:
         return error_frame_fault(identifier, data, self._where)
 
     def end_cycle(self) -> BusFault | None:
-        """Closes a cycle; a fault when errors do not cease."""
+        """Ends a cycle; returns a fault if errors persist."""
         self._in_a_row = self._in_a_row + 1 if self._now else 0
         self._now = 0
         if self._in_a_row < ERROR_CYCLES:
@@ -188,14 +187,14 @@ class ErrorFrames:
         return BusErrors(what, self._where, {"error_frames": self.total})
 
 
-# Why drives are not set up, whatever they speak.
+# Refusals of the configuration, independent of the protocol.
 
 
 SETTING_UP = "configuring the drives"
 
 
 def answers_twice(node: int) -> Refused:
-    """Two devices have the node id of a drive."""
+    """Two devices have the same node id."""
     return Refused(
         f"drive {node} answered twice",
         where=SETTING_UP,
@@ -206,7 +205,7 @@ def answers_twice(node: int) -> Refused:
 
 
 def moved_by_another(node: int, what: str, where: str) -> Refused:
-    """A drive is not at rest: it is ``what``, as reported in ``where``."""
+    """A drive is not at rest, but ``what``, as reported in ``where``."""
     return Refused(
         f"drive {node} is {what}",
         where=f"drive {node}, {where}",
@@ -217,7 +216,7 @@ def moved_by_another(node: int, what: str, where: str) -> Refused:
 
 
 def in_fault(node: int, what: str, where: str, why: str) -> Refused:
-    """A drive stopped itself; ``what`` it reports in ``where``, and what that means."""
+    """A drive is in fault: ``what`` it reports in ``where``, and ``why``."""
     return Refused(
         f"drive {node} is in fault{what}",
         where=f"drive {node}, {where}",
@@ -227,36 +226,38 @@ def in_fault(node: int, what: str, where: str, why: str) -> Refused:
     )
 
 
-def keeps_another(node: int, place: str, found: str, wanted: str, why: str, manual: str) -> Refused:
-    """A drive does not keep a setting.
+def wrong_setting(
+    node: int, setting: str, found: str, wanted: str, why: str, manual: str
+) -> Refused:
+    """A drive holds a wrong value of a setting.
 
     Args:
         node: Of the drive.
-        place: Of the setting, such as ``object 6007h:00 abort connection option code``.
-        found: What it holds.
-        wanted: What it must hold.
-        why: What that is needed for.
-        manual: Where the setting is described.
+        setting: Such as ``object 6007h:00 abort connection option code``.
+        found: Value in the drive.
+        wanted: Required value.
+        why: Reason for the required value.
+        manual: Document that describes the setting.
     """
     return Refused(
         f"the drive has {found}; {wanted} is required",
-        where=f"drive {node}, {place}",
+        where=f"drive {node}, {setting}",
         why=f"required because: {why}",
         next_step=f"see {manual}; the drives were not changed",
-        values={"node": node, "object": place, "found": found, "wanted": wanted},
+        values={"node": node, "object": setting, "found": found, "wanted": wanted},
     )
 
 
-def all_of_them(refusals: Sequence[Refused]) -> Refused:
-    """One refusal that says everything that was found, the same of several drives once."""
+def combined_refusal(refusals: Sequence[Refused]) -> Refused:
+    """One refusal that lists all others, with equal ones of several drives merged."""
     nodes: dict[str, list[str]] = {}
     for each in refusals:
         node = str(each.values.get("node", ""))
-        place = each.where.removeprefix(f"drive {node}, ")
+        setting = each.where.removeprefix(f"drive {node}, ")
         why = f" ({each.why})" if each.why else ""
-        told = nodes.setdefault(f"{place}: {each.what}{why}", [])
-        if node not in told:
-            told.append(node)
+        listed = nodes.setdefault(f"{setting}: {each.what}{why}", [])
+        if node not in listed:
+            listed.append(node)
     drives = {node for each in nodes.values() for node in each}
     if len(nodes) == len(drives) == 1:
         return refusals[0]

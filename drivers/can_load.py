@@ -1,4 +1,4 @@
-"""How much of a CAN bus the cyclic traffic needs, at worst."""
+"""Worst-case load of a CAN bus by the cyclic traffic."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 
 MAX_LOAD = 0.70
-"""Above it, a stop frame may wait too long behind others."""
+"""Above this load a stop frame may wait too long behind others."""
 
 TESTED_HZ = 250.0
-"""The tested ceiling; arming refuses shorter cycles, so none is ever advised."""
+"""Highest tested rate; arming refuses shorter cycles."""
 
 FASTEST_TENTHS_MS = round(10_000.0 / TESTED_HZ)
 SLOWEST_TENTHS_MS = 1000
-"""Cycles that may be advised, [0.1 ms]; a rig file allows up to 100 ms."""
+"""Longest cycle of a rig file, [0.1 ms]."""
 
 HEARTBEAT_PERIOD = 0.03
-"""Between two heartbeats of the master and of each drive, [s]; two may be lost."""
+"""Period of the heartbeats of master and drives, [s]; two in a row may be lost."""
 
 HEARTBEAT_TIMEOUT = 0.1
-"""Without the heartbeat of master or peer for so long a drive stops itself, [s]."""
+"""Time without a heartbeat of master or peer after which a drive stops itself, [s]."""
 
 HEARTBEATS_WAITED = 3.2
-"""Periods after which a heartbeat is missed; two may be lost."""
+"""Periods after which a heartbeat counts as lost; two in a row may be missed."""
 
 _SET_POINT_BYTES = 6
 _REPLY_BYTES = 8
@@ -35,7 +35,7 @@ _HEARTBEAT_BYTES = 1
 
 
 def frame_bits(data_bytes: int) -> int:
-    """Longest a CAN 2.0A data frame can be on the wire, with the space after it, [bit].
+    """Largest length of a CAN 2.0A data frame on the wire with interframe space, [bit].
 
     Source: R. I. Davis et al., "Controller Area Network (CAN) schedulability analysis", 2007,
     Eq. 1: 34 of the 47 bits of overhead and all data bits are stuffed, one bit after each four.
@@ -45,23 +45,23 @@ def frame_bits(data_bytes: int) -> int:
 
 
 def cycle_bits(drives: int) -> int:
-    """Bits of one cycle: a set-point and a reply a drive and the SYNC, worst stuffing."""
+    """Bits of one cycle with worst-case stuffing: SYNC, and a set-point and a reply per drive."""
     pdos = frame_bits(_SET_POINT_BYTES) + frame_bits(_REPLY_BYTES)
     return drives * pdos + frame_bits(_SYNC_BYTES)
 
 
 def heartbeat_cycles(cycle: float) -> int:
-    """Cycles between two heartbeats of the master; ``cycle`` in [s]."""
+    """Number of cycles between two heartbeats of the master; ``cycle`` in [s]."""
     return max(1, math.floor(HEARTBEAT_PERIOD / cycle + 1e-9))
 
 
 def heartbeat_timeout(cycle: float) -> float:
-    """When a heartbeat is missed, [s]; more than three of its periods, ``cycle`` in [s]."""
+    """Heartbeat time-out, [s]: more than three periods; ``cycle`` in [s]."""
     return max(HEARTBEAT_TIMEOUT, HEARTBEATS_WAITED * cycle * heartbeat_cycles(cycle))
 
 
 def bus_load(drives: int, cycle: float, bitrate: int) -> float:
-    """Share of the bus that CiA 402 drives need with their heartbeats, worst stuffing.
+    """Bus load of CiA 402 drives with heartbeats, as a fraction, with worst-case stuffing.
 
     Args:
         drives: Number of drives m.
@@ -72,14 +72,17 @@ def bus_load(drives: int, cycle: float, bitrate: int) -> float:
     return (cycle_bits(drives) + heartbeats) / (cycle * bitrate)
 
 
-def odrive_bus_load(drives: int, cycle: float, bitrate: int, told: OdriveDocument) -> float:
-    """The same of ODrives, which send estimates, torques and heartbeats when it is their time."""
-    periods = (cycle, *(ms / 1e3 for ms in (told.estimates_ms, told.torques_ms, told.heartbeat_ms)))
+def odrive_bus_load(drives: int, cycle: float, bitrate: int, settings: OdriveDocument) -> float:
+    """Bus load of ODrives, which send estimates, torques and heartbeats periodically."""
+    periods = (
+        cycle,
+        *(ms / 1e3 for ms in (settings.estimates_ms, settings.torques_ms, settings.heartbeat_ms)),
+    )
     return drives * frame_bits(_ODRIVE_BYTES) * sum(1.0 / period for period in periods) / bitrate
 
 
 def _load(rig: Rig, cycle: float) -> float:
-    """Of a rig's own drives and bit rate, at a cycle [s]."""
+    """Load of a rig's bus at a cycle [s]."""
     drives, bitrate = rig.document.drives, rig.document.bus.bitrate
     if isinstance(drives, OdriveDocument):
         return odrive_bus_load(rig.cable_count, cycle, bitrate, drives)
@@ -87,7 +90,7 @@ def _load(rig: Rig, cycle: float) -> float:
 
 
 def check_bus_load(rig: Rig) -> float:
-    """The load of a rig's bus.
+    """The load of a rig's bus, as a fraction.
 
     Raises:
         Refused: It is above 70 %.
@@ -99,7 +102,7 @@ def check_bus_load(rig: Rig) -> float:
             f"{rig.cable_count} drives every {bus.cycle_ms:g} ms need {load:.0%} of a bus of"
             f" {bus.bitrate} bit/s; the limit is {MAX_LOAD:.0%}",
             where=f"rig {rig.name}: bus",
-            why=f"a cycle is {load * bus.bitrate * bus.cycle_ms / 1e3:.0f} bits at worst;"
+            why=f"a cycle takes {load * bus.bitrate * bus.cycle_ms / 1e3:.0f} bits at worst;"
             " a stop must still fit",
             next_step=_advice(rig),
             values={"load": load, "limit": MAX_LOAD, "cycle_ms": bus.cycle_ms},
@@ -108,9 +111,9 @@ def check_bus_load(rig: Rig) -> float:
 
 
 def _advice(rig: Rig) -> str:
-    """The shortest cycle with room for everything, but none that arming would refuse."""
-    seldom = ", or lengthen drives.*_ms" if rig.document.drives.type == "odrive" else ""
+    """Advises the shortest cycle that keeps the limit and that arming accepts."""
+    option = ", or lengthen drives.*_ms" if rig.document.drives.type == "odrive" else ""
     for tenths in range(FASTEST_TENTHS_MS, SLOWEST_TENTHS_MS + 1):
         if _load(rig, tenths / 10_000.0) <= MAX_LOAD:
-            return f"set bus.cycle_ms to {tenths / 10.0:g} or more{seldom}, or raise the bitrate"
-    return f"raise the bitrate{seldom}; no permitted cycle is long enough at this rate"
+            return f"set bus.cycle_ms to {tenths / 10.0:g} or more{option}, or raise the bitrate"
+    return f"raise the bitrate{option}; no permitted cycle is long enough at this rate"

@@ -1,4 +1,4 @@
-"""What groups of drives have in common, whatever their protocol: one thread, one bus, one state."""
+"""Common base of drive groups of all protocols: one thread, one bus, one state."""
 
 from __future__ import annotations
 
@@ -9,7 +9,14 @@ from typing import Protocol
 
 import can
 
-from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, lost_frames, take, transmit
+from drivers.can_bus import (
+    EchoFilter,
+    bus_name,
+    echoes_own_frames,
+    lost_frames,
+    receive_frame,
+    transmit,
+)
 from drivers.can_errors import SETTING_UP, BusFault, ErrorFrames, ForeignMaster, ReceiveOverflow
 from drivers.can_load import check_bus_load
 from drivers.drive_group import WHOLE_BUS, CycleStatus, GroupState, Pump
@@ -17,31 +24,31 @@ from drivers.plausibility import largest_steps
 from model.errors import Refused
 from model.rig import Rig
 
-# What every cycle does on a bus: frames out, replies in, a look at the bus. One thread.
+# One cycle on a bus: send frames, receive replies, check the bus. One thread.
 
 
 MOST_STALE = 4096
-"""Frames that may wait at the beginning of a cycle; more than any bus carries in a few of them."""
+"""Largest number of waiting frames per cycle; more than any bus carries in a few cycles."""
 
 
 class ReplyListener(Protocol):
-    """Takes in what drives send."""
+    """Processes frames of the drives."""
 
     @property
     def complete(self) -> bool:
-        """Every drive has answered in this cycle."""
+        """Whether every drive has answered in this cycle."""
         ...
 
     def take(self, can_id: int, data: bytes | bytearray, *, stale: bool = False) -> None:
-        """Takes in one frame; a reply that is stale belongs to a cycle that is over."""
+        """Processes one frame; a stale reply belongs to an earlier cycle."""
         ...
 
 
 class CyclicBus:
-    """Sends and takes what belongs to a cycle.
+    """Sends and receives the frames of a cycle.
 
-    What is wrong with the bus itself is kept until `end_cycle` raises it, so that the replies of
-    the cycle are taken in all the same. Each kind is raised once.
+    Bus faults are kept until `end_cycle` raises them, so that the replies of the cycle are still
+    processed. Each kind is raised once.
     """
 
     def __init__(
@@ -53,9 +60,9 @@ class CyclicBus:
         """Takes an open bus.
 
         Args:
-            bus: The caller's.
+            bus: Owned by the caller.
             commanding: Identifiers that only a master sends.
-            foreign_master_message: What another master does that sends a frame of an identifier.
+            foreign_master_message: Message about another master, by identifier of its frame.
         """
         self._bus, self._where = bus, bus_name(bus)
         self._own = EchoFilter(commanding, echoes_own_frames=echoes_own_frames(bus))
@@ -67,14 +74,14 @@ class CyclicBus:
 
     @property
     def error_frames(self) -> int:
-        """Error frames that came so far."""
+        """Number of error frames so far."""
         return self._errors.total
 
     def send(self, messages: Iterable[can.Message]) -> None:
         """Sends frames back to back.
 
         Raises:
-            BusFault: The bus did not take a frame; the others were sent all the same.
+            BusFault: The bus did not accept a frame; the others were still sent.
         """
         failure: BusFault | None = None
         for message in messages:
@@ -87,30 +94,30 @@ class CyclicBus:
             raise failure
 
     def forget_waiting(self) -> None:
-        """Drops what arrived while nothing was read; an overflow then is not a fault.
+        """Discards waiting frames; an overflow until now is not a fault.
 
         Raises:
             BusFault: The bus failed.
         """
-        while take(self._bus, 0.0) is not None:
+        while receive_frame(self._bus, 0.0) is not None:
             pass
         self._lost = lost_frames(self._bus)
 
     def discard_stale(self, listener: ReplyListener) -> None:
-        """Replies that came too late for their cycle are thrown away, never used as new ones.
+        """Discards replies that came too late for their cycle.
 
         Raises:
             BusFault: The bus failed, or is flooded.
         """
         for _ in range(MOST_STALE):
-            message = take(self._bus, 0.0)
+            message = receive_frame(self._bus, 0.0)
             if message is None:
                 return
-            self._hand_over(message, listener, stale=True)
+            self._process(message, listener, stale=True)
         raise ReceiveOverflow(f"more than {MOST_STALE} frames waited to be read", self._where)
 
     def take_replies(self, listener: ReplyListener, timeout: float) -> None:
-        """Hands frames over until every drive has answered or the time [s] is over.
+        """Processes frames until every drive has answered or the time [s] is over.
 
         Raises:
             BusFault: The bus failed.
@@ -118,25 +125,25 @@ class CyclicBus:
         deadline = time.monotonic() + timeout
         left = timeout
         for _ in range(MOST_STALE):
-            if listener.complete or left < 0.0:  # a bus full of other frames must not hold us up
+            if listener.complete or left < 0.0:  # other frames must not delay the cycle
                 return
-            message = take(self._bus, left)
+            message = receive_frame(self._bus, left)
             if message is None:
                 return
-            self._hand_over(message, listener, stale=False)
-            if timeout > 0.0:  # with 0 all that has arrived is taken
+            self._process(message, listener, stale=False)
+            if timeout > 0.0:  # with 0 all waiting frames are processed
                 left = deadline - time.monotonic()
 
     def forget_faults(self) -> None:
-        """After a reset by the operator: what is still wrong is raised again."""
+        """Forgets faults after a reset by the operator; persisting ones are raised again."""
         self._found.clear()
         self._raised.clear()
 
     def end_cycle(self) -> None:
-        """Looks at the health of the bus.
+        """Checks the bus.
 
         Raises:
-            BusFault: Something about it is wrong, for the first time.
+            BusFault: A new fault was found.
         """
         self._find(self._errors.end_cycle())
         lost = lost_frames(self._bus)
@@ -154,7 +161,7 @@ class CyclicBus:
         if fault is not None:
             self._found.append(fault)
 
-    def _hand_over(self, message: can.Message, listener: ReplyListener, *, stale: bool) -> None:
+    def _process(self, message: can.Message, listener: ReplyListener, *, stale: bool) -> None:
         if message.is_error_frame:
             self._find(self._errors.take(message.arbitration_id, message.data))
         elif message.is_extended_id or message.is_remote_frame:
@@ -167,18 +174,18 @@ class CyclicBus:
             listener.take(message.arbitration_id, message.data, stale=stale)
 
 
-class GroupWatch(ReplyListener, Protocol):
-    """The last word of every drive."""
+class GroupMonitor(ReplyListener, Protocol):
+    """Last state of every drive."""
 
     def end_cycle(self) -> None:
-        """A cycle is over."""
+        """Ends a cycle."""
         ...
 
 
 class CyclicGroup(ABC):
-    """A group that is sent to and heard once a cycle; see `drivers.drive_group.DriveGroup`.
+    """A group with cyclic frames and replies; see `drivers.drive_group.DriveGroup`.
 
-    What a protocol adds makes new `_cyclic` and `_watch` with every set-up.
+    Subclasses create `_cyclic` and `_watch` with every configuration.
     """
 
     _cyclic: CyclicBus
@@ -194,12 +201,12 @@ class CyclicGroup(ABC):
 
     @property
     @abstractmethod
-    def _heard(self) -> GroupWatch:
-        """Takes in what the drives send."""
+    def _listener(self) -> GroupMonitor:
+        """Processes frames of the drives."""
 
     @abstractmethod
     def _latch(self, found: list[tuple[int, str]]) -> None:
-        """Keeps faults; the group stops for good when there are some."""
+        """Latches faults; the group stops if there are any."""
 
     @abstractmethod
     def _look_for_faults(self) -> None:
@@ -215,44 +222,44 @@ class CyclicGroup(ABC):
 
     @property
     def state(self) -> GroupState:
-        """Where the group stands."""
+        """State of the group."""
         return self._state
 
     def receive(self, timeout_s: float) -> CycleStatus:
-        """Takes what the drives report in this cycle; see `DriveGroup.receive`."""
+        """Receives the replies of this cycle; see `DriveGroup.receive`."""
         self._online()
         if self._pump is not None:
             self._pump()
             timeout_s = 0.0
         try:
-            self._cyclic.take_replies(self._heard, timeout_s)
+            self._cyclic.take_replies(self._listener, timeout_s)
             self._cyclic.end_cycle()
         except BusFault as fault:
             self._latch_bus(fault)
             raise
-        self._heard.end_cycle()
+        self._listener.end_cycle()
         self._look_for_faults()
         self._advance()
         return self._status()
 
     def close(self) -> None:
-        """Lets go of the bus without sending anything."""
+        """Detaches from the bus without sending anything."""
         self._state = GroupState.OFFLINE
 
     def _discard_stale(self) -> None:
-        """What came too late for its cycle counts for none.
+        """Discards replies that came too late for their cycle.
 
         Raises:
             BusFault: The bus failed; the group is stopped.
         """
         try:
-            self._cyclic.discard_stale(self._heard)
+            self._cyclic.discard_stale(self._listener)
         except BusFault as fault:
             self._latch_bus(fault)
             raise
 
     def _latch_bus(self, fault: BusFault) -> None:
-        """A bus that fails stops the group for good, whatever the caller does with the error."""
+        """Latches a bus fault, so that the group stops even if the caller ignores the error."""
         self._latch([(WHOLE_BUS, fault.what)])
 
     def _online(self) -> None:
@@ -264,10 +271,10 @@ class CyclicGroup(ABC):
             )
 
     def _refuse_enabled(self) -> None:
-        """Drives that follow set-points, or are still to be stopped, are not set up.
+        """Refuses configuration while drives are enabled or stopping.
 
         Raises:
-            Refused: They do.
+            Refused: They are.
         """
         if self._state in (GroupState.ENABLING, GroupState.ENABLED) or self.stopping:
             raise Refused(
@@ -278,11 +285,11 @@ class CyclicGroup(ABC):
 
     @property
     def stopping(self) -> bool:
-        """A stop is under way that needs more cycles; never where drives finish it themselves."""
+        """Whether a stop needs more cycles; False if the drives finish it themselves."""
         return False
 
     def _refuse_latched(self, wish: str) -> None:
-        """After a fault nothing is done to the drives but stopping and resetting them.
+        """Refuses a command after a fault; only stop and reset are allowed.
 
         Raises:
             Refused: A fault is latched.

@@ -1,4 +1,4 @@
-"""What the executor sees of the drives, whatever their protocol: one group, commanded together."""
+"""Interface of the drives for the executor, independent of the protocol."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from numpy.typing import NDArray
 
 Counts = NDArray[np.int64]
 Pump = Callable[[], None]
-"""Lets drives that live in the caller's process work off what the bus holds for them."""
+"""Steps drives simulated in this process, which process the waiting frames."""
 
 Pace = Callable[[], float]
-"""Waits for the moment of a cycle; the time that replies have, [s]."""
+"""Waits until a cycle is due; returns the time for its replies, [s]."""
 
 OnRestarted = Callable[[tuple[int, ...]], None]
-"""Takes note of nodes that were found without this program's set-up; see `DriveGroup.configure`."""
+"""Called with nodes found without this program's configuration; see `DriveGroup.configure`."""
 
 
 WHOLE_BUS = 0
-"""In place of a node: the fault is not one drive's."""
+"""Used instead of a node for a fault of the whole bus."""
 
 
 class GroupState(Enum):
-    """Where the whole group stands; it never moves towards power without a command."""
+    """State of the group; drives are enabled only by a command."""
 
     OFFLINE = auto()
     """Not configured."""
     CONFIGURED = auto()
-    """Set up and read back; positions are valid after the first cycle; no drive is enabled."""
+    """Configured and verified; positions are valid after the first cycle; no drive is enabled."""
     ENABLING = auto()
-    """On the way to ENABLED; each drive is commanded to hold its position. The group gives up,
-    in FAULT, when a drive takes too long."""
+    """Changing to ENABLED, with each drive commanded to hold its position. If a drive takes too
+    long, the group changes to FAULT."""
     ENABLED = auto()
     """All drives follow the set-points."""
     QUICK_STOP = auto()
@@ -42,41 +42,39 @@ class GroupState(Enum):
     FAULT = auto()
     """As QUICK_STOP, because of a fault; latched until RESET_FAULT."""
     RELEASED = auto()
-    """No drive has torque any more; brakes, where there are such, are closed."""
+    """No drive has torque; brakes, if any, are closed."""
 
 
 class GroupCommand(Enum):
-    """What an operator or the executor may ask of the group."""
+    """Commands to the group."""
 
     ENABLE = auto()
     QUICK_STOP = auto()
     RELEASE = auto()
-    """Brakes close, then the torque goes, of all drives together: for a platform that stands on
-    something."""
+    """Close brakes, then remove the torque of all drives together; needs a supported platform."""
     RESET_FAULT = auto()
     END_MONITORING = auto()
-    """Drives that follow nothing stop watching this master, which is about to leave; one step a
-    cycle, until `DriveGroup.is_monitored` is false."""
+    """Drives at rest stop monitoring this master, which is about to leave; one step per cycle until
+    `DriveGroup.is_monitored` is false."""
 
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What drives do by themselves; arming decides on it.
+    """Autonomous functions of the drives, on which arming depends.
 
     Attributes:
-        sync: All drives take their set-points at one SYNC.
+        sync: All drives apply their set-points at the same SYNC.
         holds_on_comm_loss: A drive that loses its master stops and holds under torque.
         holds_on_quick_stop: A quick stop ends in holding under torque.
-        has_brake: Every winch has a brake that closes before the torque goes.
-        max_hz: Highest tested rate of cycles, [Hz].
+        has_brake: Every winch has a brake that closes before the torque is removed.
+        max_hz: Highest tested cycle rate, [Hz].
         watchdog_ms: A drive without SYNC disarms itself, which closes its brake, after this time
-            without a set-point, [ms]; None where there is no such watchdog.
-        sync_timeout: Cycles without SYNC after which a drive stops by itself; None where drives
-            know no SYNC.
-        master_timeout: Longest time after which a drive acts on the loss of this master, [s].
-        unmonitored_within: Longest time that drives which answer may take to confirm that they
-            monitor this master no more, [s].
-        simulated: All drives say that they are simulated; known once they are configured.
+            without a set-point, [ms]; None without such a watchdog.
+        sync_timeout: Cycles without SYNC after which a drive stops itself; None without SYNC.
+        master_timeout: Longest time until a drive reacts to the loss of this master, [s].
+        unmonitored_within: Longest time until answering drives confirm that they no longer monitor
+            this master, [s].
+        simulated: All drives identify themselves as simulated; known once configured.
     """
 
     sync: bool
@@ -93,12 +91,12 @@ class Capabilities:
 
 @dataclass(frozen=True, slots=True)
 class DriveWarning:
-    """What a drive reported in a cycle although it stays enabled.
+    """An emergency of a drive that stays enabled.
 
     Attributes:
         node: Of the drive.
-        text: What, with cable and drive.
-        stops: The path must stop for it; false for a mere warning.
+        text: Message with cable and drive.
+        stops: Whether it must stop the path; false for a minor warning.
     """
 
     node: int
@@ -108,27 +106,27 @@ class DriveWarning:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleStatus:
-    """What the drives reported in one cycle; arrays are read-only and in the order of the winches.
+    """Replies of the drives in one cycle; arrays are read-only, in the order of the winches.
 
     Attributes:
         positions: Actual positions at the cycle's SYNC, or as reported in it, shape (m,), [counts];
-            the last known one where a drive is missing.
-        demands: Commanded positions when the drives reported theirs, shape (m,), [counts]:
-            at a SYNC the targets of one cycle before. `positions - demands` is the following error.
-        torques: Actual torques, positive where they pull the cable in, shape (m,), [per mille of
+            the last known one for a missing drive.
+        demands: Commanded positions at the time of `positions`, shape (m,), [counts]: at a SYNC the
+            targets of the previous cycle. `positions - demands` is the following error.
+        torques: Actual torques, positive when winding in, shape (m,), [per mille of
             rated torque]. Tension at rest is torque / 1000 times the winch's `torque_constant`.
-        status_words: The state of each drive in its protocol's code, shape (m,); `drive_states`
-            gives their meaning.
-        missing: True for drives from which this cycle's answer is overdue, shape (m,).
+        status_words: State of each drive in the code of its protocol, shape (m,); see
+            `drive_states`.
+        missing: True for drives whose reply of this cycle is overdue, shape (m,).
         faults: Node and text of every fault since the last reset, oldest first; the text names
-            cable and drive, and the node is `WHOLE_BUS` where it is the bus that failed.
+            cable and drive, and the node is `WHOLE_BUS` for a fault of the bus.
         state: State of the group.
-        holding: Every cable is held: by its drive under torque, or by its closed brake.
-        stopped: Every drive reported in this cycle that it follows no set-points.
-        rejected: Frames thrown away since `configure` because their length or their content could
-            not be true.
-        error_frames: Error frames of the bus since `configure`.
-        warnings: What drives that stay enabled reported in this cycle; none of it is latched.
+        holding: Whether every cable is held, by its drive under torque or by its closed brake.
+        stopped: Whether every drive reported in this cycle that it follows no set-points.
+        rejected: Number of frames rejected since `configure` for wrong length or implausible
+            content.
+        error_frames: Number of error frames since `configure`.
+        warnings: Warnings of enabled drives in this cycle; not latched.
     """
 
     positions: Counts
@@ -147,14 +145,14 @@ class CycleStatus:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveSnapshot:
-    """State of drives that are only read; in the order of the winches, as in `CycleStatus`.
+    """State of drives read without configuring them, in the order of the winches.
 
     Attributes:
         positions: Shape (m,), [counts].
-        torques: Positive where they pull the cable in, shape (m,), [per mille of rated torque].
-        status_words: Shape (m,); `drive_states` gives their meaning.
-        restarted: Nodes that do not hold this program's set-up: switched on since, or never set up.
-            Of drives that keep their settings without power all whose encoder is not absolute.
+        torques: Positive when winding in, shape (m,), [per mille of rated torque].
+        status_words: Shape (m,); see `drive_states`.
+        restarted: Nodes without this program's configuration: power-cycled, or never configured.
+            For drives with non-volatile settings, all without an absolute encoder.
     """
 
     positions: Counts
@@ -164,64 +162,64 @@ class DriveSnapshot:
 
 
 class DriveGroup(Protocol):
-    """All drives of a rig, enabled, moved and stopped together."""
+    """All drives of a rig, which are enabled, moved and stopped together."""
 
     @property
     def capabilities(self) -> Capabilities:
-        """What the drives do by themselves."""
+        """Autonomous functions of the drives."""
         ...
 
     @property
     def state(self) -> GroupState:
-        """Where the group stands."""
+        """State of the group."""
         ...
 
     @property
     def restarted(self) -> tuple[int, ...]:
-        """Nodes that `configure` found without this program's set-up.
+        """Nodes that `configure` found without this program's configuration.
 
-        They were switched on since they were last set up, or never were.
+        They were power-cycled since, or never configured.
         """
         ...
 
     @property
     def stopping(self) -> bool:
-        """A stop is under way that needs more cycles: the drives do not finish it by themselves."""
+        """Whether a stop needs more cycles, as the drives do not finish it themselves."""
         ...
 
     @property
     def targets(self) -> Counts:
-        """Targets last sent, shape (m,), [counts]; motion after ENABLING starts from them."""
+        """Last targets sent, shape (m,), [counts]; motion after ENABLING starts from them."""
         ...
 
     def configure(
         self, *, to_reset: bool = False, on_restarted: OnRestarted | None = None
     ) -> tuple[str, ...]:
-        """Sets every drive up and reads every setting back.
+        """Configures every drive and reads every setting back.
 
         Args:
-            to_reset: Also takes drives in fault, which are going to be reset.
-            on_restarted: Called with `restarted` before the first setting is written: the set-up
-                wipes out its evidence. What it raises leaves the drives as they were.
+            to_reset: Accepts drives in fault too, which will be reset.
+            on_restarted: Called with `restarted` before the first setting is written, as writing
+                erases the evidence. An exception leaves the drives unchanged.
 
         Returns:
-            Remarks for the operator: what drives cannot do although a run would use it.
+            Remarks for the operator on functions that drives lack although a run would use them.
 
         Raises:
             HardwareMissing: A drive does not answer.
-            Refused: A drive refuses a setting, does not keep it, or is being moved by another.
+            Refused: A drive refuses or changes a setting, or another program moves it.
         """
         ...
 
     def read_positions(self, pace: Pace | None = None) -> CycleStatus:
-        """Waits until every drive has reported its position; changes no drive's state.
+        """Waits until every drive has reported its position; changes no state.
 
         Args:
-            pace: Called before each cycle that is sent: waits for its moment and returns the time
-                in which replies must come, [s]; left out, cycles follow on each other at once.
+            pace: Called before each cycle: waits until it is due and returns the time for replies,
+                [s] (default: no wait between cycles).
 
         Raises:
-            HardwareMissing: A drive does not answer; with its node.
+            HardwareMissing: A drive does not answer.
             Fault: The bus failed.
         """
         ...
@@ -229,25 +227,24 @@ class DriveGroup(Protocol):
     def send_cycle(
         self, targets: Sequence[int], may_send: Callable[[bool], bool] = lambda _enables: True
     ) -> None:
-        """Sends one cycle: all set-points, and what makes them count together where there is such.
+        """Sends one cycle: all set-points, then SYNC where the protocol has it.
 
         Args:
-            targets: One position a drive, [counts]. They count in state ENABLED; in every other
-                state each drive is commanded to stay where it is.
-            may_send: Called at the last moment, just before the frame that makes set-points count,
-                with whether one of them enables a drive. Where it returns false no drive is
-                commanded to follow: such a cycle becomes a quick stop of all drives, for good.
+            targets: One position per drive, [counts]. They apply in state ENABLED; in every other
+                state each drive is commanded to hold its position.
+            may_send: Called immediately before SYNC with whether a set-point enables a drive. If
+                it returns False, the cycle becomes a permanent quick stop of all drives.
 
         Raises:
-            Fault: The bus did not take a frame.
+            Fault: The bus did not accept a frame.
         """
         ...
 
     def receive(self, timeout_s: float) -> CycleStatus:
-        """Takes the replies of this cycle until all are there or the time is over.
+        """Receives the replies of this cycle until all have arrived or the time is over.
 
         Args:
-            timeout_s: [s]; 0 takes only what has already arrived.
+            timeout_s: [s]; 0 processes only waiting frames.
 
         Raises:
             Fault: The bus failed.
@@ -255,47 +252,47 @@ class DriveGroup(Protocol):
         ...
 
     def command(self, command: GroupCommand) -> None:
-        """Sets where the group goes; the way is one step a cycle, all drives together.
+        """Sets the goal of the group, reached in steps of one cycle by all drives together.
 
         Raises:
-            Refused: The command would leave the platform less safe than it is.
+            Refused: The command would make the platform less safe.
         """
         ...
 
     def require_releasable(self) -> None:
-        """Whether RELEASE may be commanded where the drives are now.
+        """Checks whether RELEASE may be commanded at the present positions.
 
         Raises:
-            Refused: It would leave the platform less safe than it is.
+            Refused: It would make the platform less safe.
         """
         ...
 
     def quick_stop_now(self) -> None:
-        """Sends the stop to all drives in one batch; waits for nothing.
+        """Sends the stop to all drives in one batch, without waiting.
 
         Raises:
-            Fault: The bus did not take a frame; the others were sent all the same.
+            Fault: The bus did not accept a frame; the others were still sent.
         """
         ...
 
     @property
     def ending(self) -> frozenset[int]:
-        """Drives, from 0, that have not answered all that ends their monitoring of this master."""
+        """Indices of drives that have not confirmed the end of their monitoring."""
         ...
 
     @property
     def is_monitored(self) -> bool:
-        """Whether drives still watch this master, as far as they have confirmed the contrary."""
+        """Whether drives still monitor this master, until all have confirmed the end."""
         ...
 
-    def look(self, pace: Pace) -> CycleStatus:
-        """Asks every drive how it stands without sending a cycle: after the last one.
+    def read_state(self, pace: Pace) -> CycleStatus:
+        """Reads the state of every drive after the last cycle, without sending another.
 
-        A drive that does not answer now is missing; one that did not answer the last cycle is
-        waited for no longer than one answer takes.
+        A drive without an answer is missing; one that missed the last cycle gets the time of one
+        answer.
 
         Args:
-            pace: Called before each question, as for `read_positions`.
+            pace: Called before each request, as for `read_positions`.
 
         Raises:
             Fault: The bus failed.
@@ -303,5 +300,5 @@ class DriveGroup(Protocol):
         ...
 
     def close(self) -> None:
-        """Lets go of the bus without sending anything; the bus itself is the caller's."""
+        """Detaches from the bus, which the caller owns, without sending anything."""
         ...

@@ -1,6 +1,6 @@
-"""Makes the drive group that a rig's file names, and reads the state of its drives.
+"""Creates the drive group of a rig file, and reads the state of its drives.
 
-A protocol and its libraries are loaded only when drives that speak it are asked for.
+A protocol and its libraries are loaded only when used.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from model.rig import Rig
 
 
 def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
-    """What status words of a `CycleStatus` say, for people."""
+    """Text of the status words of a `CycleStatus`."""
     if rig.document.drives.type == "odrive":
         from drivers.odrive.messages import state_text
 
@@ -25,13 +25,13 @@ def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
 
 
 def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
-    """Whether drives are as they should be once their master is lost.
+    """Whether drives are in the state expected after the loss of their master.
 
-    Of CiA 402 drives, in quick stop under torque. ODrives are disarmed then, and a brake holds.
+    CiA 402 drives are then in quick stop under torque; ODrives are disarmed, and a brake holds.
 
     Args:
         rig: The robot.
-        status_words: As drives report them, one each.
+        status_words: Reported status word of each drive.
     """
     if rig.document.drives.type == "odrive":
         return (True,) * len(status_words)
@@ -45,7 +45,7 @@ def read_drives(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveSna
 
     Args:
         rig: The robot; its winches name the nodes.
-        bus: An open bus; it stays the caller's.
+        bus: An open bus, owned by the caller.
         pump: As for `make_drive_group`.
 
     Raises:
@@ -66,20 +66,20 @@ def read_drives(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveSna
 def make_drive_group(
     rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, max_tension: float | None = None
 ) -> DriveGroup:
-    """The drives of a rig, not yet configured.
+    """The drives of a rig, not configured yet.
 
     Args:
         rig: The robot; its winches name the nodes.
-        bus: An open bus; it stays the caller's.
-        pump: Given when the drives are simulated in this process (`SimulatedCia402Rig.pump`):
-            called wherever an answer is waited for, and nothing is waited for after it.
-        max_tension: From which the drives' torque limit comes, [N]; the rig's own if None. One that
-            is below what a drive holds lets its cable slip as soon as `configure` writes it.
+        bus: An open bus, owned by the caller.
+        pump: For drives simulated in this process (`SimulatedCia402Rig.pump`): called instead of
+            waiting for answers.
+        max_tension: Tension that sets the torque limit, [N]; the rig's if None. A limit below the
+            present tension lets the cable slip as soon as `configure` writes it.
 
     Raises:
         Refused: The bus is too slow for the rig's cycle.
-        BadInput: The rig's numbers do not fit the drives, or a package or file that they need is
-            not there.
+        BadInput: The rig's numbers do not fit the drives, or a required package or file is
+            missing.
     """
     if rig.document.drives.type == "odrive":
         from drivers.odrive.group import OdriveGroup

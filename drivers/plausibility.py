@@ -1,4 +1,4 @@
-"""Which replies of drives are believed: right length, one a cycle, no jump. No bus, no clock."""
+"""Plausibility of drives' replies: length, one per cycle, no jump. No bus, no clock."""
 
 from __future__ import annotations
 
@@ -13,57 +13,57 @@ from model.rig import Rig
 from model.winches import WinchMap
 
 BAD_CYCLES = 2
-"""Cycles in a row that are one too many: one bad frame may happen, two are a defect."""
+"""Consecutive bad cycles that are a fault: one bad frame may happen, two are a defect."""
 
 JUMP_RESERVE, JUMP_COUNTS = 4.0, 8.0
-"""A position that changes this much faster than its winch may turn is no position; a few counts to
-and fro are, however coarse the encoder."""
+"""Largest plausible change of a position in a cycle: a multiple of the winch's motion at top speed,
+and at least some counts of noise."""
 
 
 def largest_steps(rig: Rig, cycle: float) -> tuple[float, ...]:
-    """How far each drive's position can change in a cycle [s], [counts]."""
+    """Largest change of each drive's position in a cycle [s], [counts]."""
     fastest = [w.max_speed * cycle * abs(w.counts_per_metre) for w in rig.winches]
     return tuple(max(JUMP_COUNTS, JUMP_RESERVE * step) for step in fastest)
 
 
 class ReplyCheck:
-    """Looks at every reply before it counts.
+    """Checks every reply before it is used.
 
     Attributes:
-        rejected: Replies that were not believed, of all drives.
+        rejected: Number of rejected replies of all drives.
     """
 
     def __init__(self, names: Mapping[int, str], max_steps: Sequence[float]) -> None:
-        """Takes names by node id, and how far each position can change in a cycle, [counts]."""
+        """Takes names by node id, and the largest change of each position per cycle, [counts]."""
         count = len(names)
         self.rejected = 0
         self._names, self._max_steps = tuple(names.items()), tuple(max_steps)
         self._positions: list[int | None] = [None] * count
         self._age = [1] * count
-        self._heard = [0] * count
+        self._replies = [0] * count
         self._reasons: list[str] = [""] * count
         self._bad_cycles = [0] * count
         self._repeats = [0] * count
 
     def forget_positions(self) -> None:
-        """The next position of each drive is believed whatever it is."""
+        """Accepts any next position of each drive."""
         self._positions = [None] * len(self._names)
 
     def begin_cycle(self) -> None:
-        """Counts who answered the last SYNC more than once, up to now, when the next one goes."""
+        """Starts a cycle; counts drives that answered the last SYNC more than once."""
         self._repeats = [
-            repeats + 1 if heard > 1 else 0
-            for repeats, heard in zip(self._repeats, self._heard, strict=True)
+            repeats + 1 if replies > 1 else 0
+            for repeats, replies in zip(self._repeats, self._replies, strict=True)
         ]
-        self._heard = [0] * len(self._names)
+        self._replies = [0] * len(self._names)
         self._reasons = [""] * len(self._names)
 
-    def hear(self, drive: int) -> None:
-        """Notes that a drive answered, in time or late."""
-        self._heard[drive] += 1
+    def count_reply(self, drive: int) -> None:
+        """Counts a reply of a drive, in time or late."""
+        self._replies[drive] += 1
 
-    def believed(self, drive: int, position: int) -> bool:
-        """Whether a position [counts] can be true; it then counts as the drive's."""
+    def accept(self, drive: int, position: int) -> bool:
+        """Whether a position [counts] is plausible; it then becomes the drive's."""
         last = self._positions[drive]
         if last is not None:
             step, allowed = abs(position - last), self._max_steps[drive] * self._age[drive]
@@ -77,12 +77,12 @@ class ReplyCheck:
         return True
 
     def reject(self, drive: int, reason: str) -> None:
-        """A reply was thrown away."""
+        """Records a rejected reply."""
         self.rejected += 1
         self._reasons[drive] = reason
 
     def end_cycle(self) -> None:
-        """Counts the cycles in which a drive sent nothing that could be believed."""
+        """Ends a cycle; counts consecutive cycles without a plausible reply."""
         self._age = [age + 1 for age in self._age]
         self._bad_cycles = [
             bad + 1 if reason else 0
@@ -90,7 +90,7 @@ class ReplyCheck:
         ]
 
     def faults(self) -> list[tuple[int, str]]:
-        """Drives whose answers cannot be relied on, by node."""
+        """Drives whose replies are unreliable, by node."""
         found = [
             (node, f"{name}: {reason}, {bad} cycles in a row")
             for (node, name), reason, bad in zip(
@@ -106,11 +106,11 @@ class ReplyCheck:
         return found
 
 
-# How far a winch's drive may ever have to turn.
+# Range of a winch's drive.
 
 
 def position_limits(rig: Rig, drive: int, winch_map: WinchMap) -> tuple[int, int]:
-    """Software limits: positions with the platform anywhere in its workspace, any way turned.
+    """Software limits: positions for any pose of the platform in its workspace.
 
     Raises:
         BadInput: They do not fit the 32-bit position of the drive.
@@ -131,14 +131,14 @@ def position_limits(rig: Rig, drive: int, winch_map: WinchMap) -> tuple[int, int
         raise BadInput(
             f"positions from {low} to {high} counts exceed the drive's 32-bit range",
             where=f"rig {rig.name}: winches[{drive}]",
-            next_step="choose home_counts nearer to 0, or fewer counts per metre of cable; where"
-            " `cdpr home` says this, set the drive's position near 0 with its maker's tool",
+            next_step="choose home_counts closer to 0, or fewer counts per metre of cable; after"
+            " `cdpr home`, set the drive's position near 0 with its manufacturer's tool",
         )
     return low, high
 
 
 def require_within_limits(rig: Rig, positions: Sequence[int]) -> None:
-    """Refuses to enable a drive beyond its position limits: it would run to them.
+    """Refuses to enable a drive beyond its position limits, as it would move to them.
 
     Args:
         rig: The robot.
@@ -155,19 +155,17 @@ def require_within_limits(rig: Rig, positions: Sequence[int]) -> None:
                 f"{names[node]} is at {position} counts, outside its position limits {low} to"
                 f" {high}",
                 where="drive group",
-                why="once enabled it would drive to its limit (607Dh)",
+                why="once enabled it would move to its limit (607Dh)",
                 next_step="configure limits that include this position, or home with"
                 " `cdpr home RIG`; nothing was enabled",
                 values={"node": node},
             )
 
 
-# The sign of a motor's torque: a winch pulls its cable in, whichever way its counts run.
-
-
+# Sign of a motor's torque when winding in.
 def winding_signs(rig: Rig) -> NDArray[np.int64]:
-    """Sign of counts, speed and torque in a drive that winds its cable in, shape (m,).
+    """Sign of counts, speed and torque of a drive when winding in, shape (m,).
 
-    A motor that holds a taut cable has torque of this sign: −1 where positive counts pay out.
+    The torque that holds a taut cable has this sign: −1 if positive counts pay out.
     """
     return np.array([-1 if w.counts_per_metre > 0 else 1 for w in rig.winches], dtype=np.int64)

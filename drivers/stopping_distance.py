@@ -1,4 +1,4 @@
-"""How far the platform goes on when the master is lost: what the clearance of a plan must hold."""
+"""Travel of the platform after the loss of the master, which a plan's clearance must exceed."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from model.rig import Rig
 
 @dataclass(frozen=True, slots=True)
 class LostMaster:
-    """What drives do without their master.
+    """Reaction of the drives to the loss of their master.
 
     Attributes:
-        noticed_by: What stays away: SYNC, the heartbeat, or set-points.
-        notice: Until the last drive begins to stop, [s].
-        ramp: Until it stands then, [s].
-        distance: How far the platform goes meanwhile at the rig's speed along the path, [m].
+        noticed_by: Missing message: SYNC, the heartbeat, or set-points.
+        notice: Time until the last drive begins to stop, [s].
+        ramp: Time of its ramp to rest, [s].
+        distance: Travel of the platform meanwhile at the rig's speed along the path, [m].
     """
 
     noticed_by: str
@@ -28,13 +28,13 @@ class LostMaster:
 
 
 def lost_master(rig: Rig) -> LostMaster:
-    """From the rig file and its drive profile.
+    """The reaction, from the rig file and its drive profile.
 
-    Drives that interpolate may go on at their last speed until they notice, and then slow down
-    evenly, so the distance is speed × (notice + ramp / 2).
+    Drives that interpolate may continue at their last speed until they notice, then decelerate
+    uniformly, so the distance is speed × (notice + ramp / 2).
 
     Raises:
-        BadInput: There is no such profile, or its file is wrong.
+        BadInput: There is no such profile, or its file is invalid.
     """
     cycle = rig.cycle
     drives = rig.document.drives
@@ -47,8 +47,7 @@ def lost_master(rig: Rig) -> LostMaster:
 
 
 def _cia402_times(rig: Rig) -> tuple[str, float, float]:
-    """What CiA 402 drives miss, when the last one notices, and its ramp, [s]."""
-    # Their objects are not loaded for drives of another protocol.
+    """Missing message, time until the last CiA 402 drive notices, and its ramp, [s]."""
     from drivers.cia402.object_dictionary import quick_stop_ramp
     from drivers.cia402.profile import profile_of
 
@@ -62,16 +61,16 @@ def _cia402_times(rig: Rig) -> tuple[str, float, float]:
 
 
 def _watchdog(drives: OdriveDocument) -> float:
-    """Without one nothing is armed."""
+    """Watchdog time, [s]; arming requires one."""
     return (drives.watchdog_ms or 0.0) / 1000.0
 
 
 def require_stopping_room(rig: Rig, clearance: float) -> None:
-    """A platform whose master is lost stands before it touches anything.
+    """Requires that the platform stops before it touches an obstacle after a loss of the master.
 
     Args:
         rig: The robot.
-        clearance: Proved along the whole path, [m]; infinite without obstacles.
+        clearance: Proved for the whole path, [m]; infinite without obstacles.
 
     Raises:
         Refused: The clearance is smaller than the distance to a stop.

@@ -25,7 +25,7 @@ from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from model.scene import Scene
 from planner.check import verify
-from simulation.camera.camera import Film
+from simulation.camera.camera import ImageSequence
 from simulation.factory import make_synthetic_camera
 from tracking.measurement import PoseMeasurement
 from tracking.pose_log import LoggedPicture, write_pose_log
@@ -321,6 +321,6 @@ def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Po
 def _rendered(
     rig: Rig, scene: Scene, camera: Camera, looks: list[tuple[float, Pose]]
 ) -> Iterable[Picture]:
-    film = Film(make_synthetic_camera(rig, scene, camera))
+    film = ImageSequence(make_synthetic_camera(rig, scene, camera))
     for number, (at, pose) in enumerate(looks):
         yield Frame(at, film.picture(at, pose, number), f"rendered {number}")

@@ -1,4 +1,4 @@
-"""A simulated rig behind the interfaces of the real one: drives, platform, cameras, faults."""
+"""A simulated rig with the interfaces of a real one: drives, platform, cameras, faults."""
 
 from __future__ import annotations
 

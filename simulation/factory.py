@@ -1,4 +1,4 @@
-"""The simulated rig for the drives that a rig file names, and its camera."""
+"""Creates the simulated rig for a rig file's drives, and its synthetic cameras."""
 
 from __future__ import annotations
 
@@ -29,21 +29,20 @@ def make_rehearsal(
     behaviour: DriveBehaviour = STRICT,
     eds: Path | None = None,
 ) -> SimulatedRig[Any]:
-    """Simulated drives of a rig's kind.
+    """Simulated drives of the rig's type.
 
     Args:
-        rig: As the next three, for `SimulatedRig`.
+        rig: This and the next three as for `SimulatedRig`.
         bus: The drives' end.
         start_pose: ``world_from_platform``.
-        load: What the platform carries.
-        behaviour: Of CiA 402 drives, where the standards leave a choice.
-        eds: EDS file of CiA 402 drives; left out, that of their profile.
+        load: Payload of the platform.
+        behaviour: Of CiA 402 drives, within the standards.
+        eds: EDS file of CiA 402 drives (default: that of their profile).
 
     Raises:
-        BadInput: The EDS file cannot be used, or the drives are no CiA 402 drives and have none.
+        BadInput: The EDS file cannot be used, or the drives are not CiA 402 drives.
     """
     check_drives(rig, behaviour, eds)
-    # The protocol's library is loaded only for those who need it.
     if rig.document.drives.type == "odrive":
         from simulation.drives.odrive import SimulatedOdriveRig
 
@@ -54,7 +53,7 @@ def make_rehearsal(
 
 
 def check_drives(rig: Rig, behaviour: DriveBehaviour, eds: Path | None) -> None:
-    """Whether a rig's drives can be simulated so; arguments and errors as for `make_rehearsal`."""
+    """Checks the arguments of `make_rehearsal`; errors as there."""
     if rig.document.drives.type != "odrive":
         eds_of(rig, eds)
     elif eds is not None or behaviour != STRICT:
@@ -66,15 +65,15 @@ def check_drives(rig: Rig, behaviour: DriveBehaviour, eds: Path | None) -> None:
 
 
 def make_synthetic_camera(rig: Rig, scene: Scene, camera: Camera) -> SyntheticCamera:
-    """The camera as it truly is, before the rig as it was truly built.
+    """The true camera in front of the rig as built.
 
     Args:
         rig: The robot, with the ``simulation`` section of its file.
-        scene: Its obstacles.
+        scene: Obstacles.
         camera: One of the rig's, as the rig file describes it.
 
     Raises:
-        BadInput: The rig has no tags, or the true lens cannot be.
+        BadInput: The rig has no tags, or the true lens is invalid.
     """
     from simulation.camera.camera import SyntheticCamera
 

@@ -1,7 +1,6 @@
-"""A bus that loses, delays, repeats and spoils frames, by rules; for tests of what depends on it.
+"""A bus for tests that loses, delays, repeats and corrupts frames by rules.
 
-It sits between one end of a bus and that end's user. Nothing in it is random by itself:
-rules that draw take a generator.
+It wraps one end of a bus. It is deterministic: random rules take a generator.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import can
 from drivers.can_load import frame_bits
 
 Arrivals = Iterable[tuple[float, can.Message]]
-"""What becomes of a frame: frames and how much later than it each of them comes, [s]."""
+"""Result of a rule: frames, each with its delay, [s]."""
 
 Rule = Callable[[can.Message], Arrivals]
 
@@ -25,15 +24,15 @@ _Box = list[tuple[float, int, can.Message]]
 BUS_OFF = can.Message(
     arbitration_id=0x040, data=bytes(8), is_error_frame=True, is_extended_id=False
 )
-"""What a controller in bus-off reports to its own host. Source: linux/can/error.h."""
+"""Report of a controller in bus-off to its host. Source: linux/can/error.h."""
 
 
 class FaultBus(can.BusABC):
     """One end of a bus, with rules for each direction.
 
     Attributes:
-        incoming: For frames that come in; each rule sees what the ones before it let through.
-        outgoing: For frames that go out.
+        incoming: For received frames; each rule gets the output of the previous one.
+        outgoing: For sent frames.
     """
 
     def __init__(
@@ -44,15 +43,15 @@ class FaultBus(can.BusABC):
         ahead: float = 0.0,
         bitrate: float | None = None,
     ) -> None:
-        """Takes an open bus, which stays the caller's; without rules nothing happens to frames.
+        """Takes an open bus, owned by the caller; without rules frames pass unchanged.
 
         Args:
-            bus: The end that is used.
-            clock: Seconds; simulated time where the bus is.
-            ahead: Frames that arrive within this time from now have arrived, [s]: in simulated
-                time, in which all of a cycle happens at its beginning, nearly a cycle.
-            bitrate: With it every frame takes its time on the wire, and of those that wait the
-                lowest identifier is next, [bit/s]. Both directions share the wire.
+            bus: The wrapped end.
+            clock: Seconds, real or simulated.
+            ahead: Frames due within this time count as arrived, [s]: in simulated time, where a
+                whole cycle happens at its beginning, nearly a cycle.
+            bitrate: If given, frames take their time on the wire, with arbitration by identifier,
+                [bit/s]. Both directions share the wire.
         """
         super().__init__(channel="")
         self.channel_info = f"{bus.channel_info} with faults"
@@ -67,12 +66,12 @@ class FaultBus(can.BusABC):
         self._goes: _Box = []
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Sends a frame, or what the rules make of it."""
+        """Sends a frame through the rules."""
         self._enter(msg, self.outgoing, self._goes)
         self._pass_on()
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame that came through the rules; None when there is none within the time."""
+        """The next frame from the rules; None if none arrives within the time."""
         self._pass_on()
         wait = timeout
         while not self._has_come():
@@ -85,16 +84,16 @@ class FaultBus(can.BusABC):
             wait = 0.0
         return heapq.heappop(self._came)[2] if self._has_come() else None
 
-    def say(self, message: can.Message) -> None:
-        """Puts a frame on the bus that no rule touches, as another device would."""
+    def inject(self, message: can.Message) -> None:
+        """Sends a frame past the rules, as another device would."""
         self._bus.send(message)
 
     def fileno(self) -> int:
-        """Of the bus underneath."""
+        """Of the wrapped bus."""
         return self._bus.fileno()
 
     def shutdown(self) -> None:
-        """Forgets what is on its way; the bus underneath stays open."""
+        """Discards pending frames; the wrapped bus stays open."""
         self._waiting.clear()
         self._came.clear()
         self._goes.clear()
@@ -121,7 +120,7 @@ class FaultBus(can.BusABC):
                 heapq.heappush(self._waiting, entry)
 
     def _arbitrate(self) -> None:
-        """Gives the wire to the lowest identifier that waits, as long as there is time."""
+        """Transmits waiting frames by priority until now."""
         while self.bitrate is not None and self._waiting:
             begin = max(self._free_at, min(entry[2] for entry in self._waiting))
             if begin > self._now:
@@ -133,14 +132,14 @@ class FaultBus(can.BusABC):
             heapq.heappush(box, (self._free_at, number, message))
 
     def _pass_on(self) -> None:
-        """Sends what has had its time."""
+        """Sends the frames that are due."""
         self._arbitrate()
         while self._goes and self._goes[0][0] <= self._now:
             self._bus.send(heapq.heappop(self._goes)[2])
 
 
 def lose(ids: Container[int], share: float = 1.0, dice: random.Random | None = None) -> Rule:
-    """Loses frames of some identifiers: all of them, or a share by the dice."""
+    """Loses all frames of some identifiers, or a random fraction."""
 
     def rule(message: can.Message) -> Arrivals:
         lost = message.arbitration_id in ids and (dice is None or dice.random() < share)
@@ -150,7 +149,7 @@ def lose(ids: Container[int], share: float = 1.0, dice: random.Random | None = N
 
 
 def lose_next(ids: Container[int], count: int) -> Rule:
-    """Loses the next frames of some identifiers, and then no more."""
+    """Loses the next ``count`` frames of some identifiers."""
     left = count
 
     def rule(message: can.Message) -> Arrivals:
@@ -164,12 +163,12 @@ def lose_next(ids: Container[int], count: int) -> Rule:
 
 
 def delay(ids: Container[int], seconds: float) -> Rule:
-    """Lets frames of some identifiers come later."""
+    """Delays frames of some identifiers."""
     return lambda message: [(seconds if message.arbitration_id in ids else 0.0, message)]
 
 
 def repeat(ids: Container[int], seconds: float = 0.0) -> Rule:
-    """Frames of some identifiers come twice, the second after a delay."""
+    """Repeats frames of some identifiers after a delay."""
 
     def rule(message: can.Message) -> Arrivals:
         again = [(seconds, message)] if message.arbitration_id in ids else []
@@ -179,7 +178,7 @@ def repeat(ids: Container[int], seconds: float = 0.0) -> Rule:
 
 
 def spoil(ids: Container[int], change: Callable[[bytes], bytes], count: int | None = None) -> Rule:
-    """Changes the data of frames of some identifiers: of the next few, or of all."""
+    """Changes the data of the next ``count`` or all frames of some identifiers."""
     left = count
 
     def rule(message: can.Message) -> Arrivals:

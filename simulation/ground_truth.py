@@ -1,6 +1,6 @@
-"""The rig that is simulated, which need not be the one that its file describes.
+"""Ground truth of the simulation, which may differ from the rig file.
 
-Only this package looks into the rig file's ``simulation`` section.
+Only this package reads the rig file's ``simulation`` section.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from model.rig import Camera, Rig, rig_from_document
 from simulation.drives.motion import Motor
 from simulation.plant import Plant
 
-# What the synthetic camera's lens and sensor do to an image.
+# Effects of the synthetic camera's lens and sensor.
 
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """What lens, sensor and lamp do to brightness, and whether cables are in the way.
+    """Effects of lens, sensor, lamp and cables on images.
 
     Attributes:
         noise: Standard deviation, [grey levels of 255].
-        vignetting: Light lost in the corners of the image, share of 1.
+        vignetting: Fraction of light lost in the corners of the image.
         blur: Standard deviation of the lens's and focus's blur, [px].
-        exposure: Time for which the platform's motion is smeared, [s]; 0 for sharp images.
-        light: Share of full light; less leaves less contrast, more overexposes.
-        cables: Cables hide what is behind them.
-        halo: Of a lamp in view: brightness that it adds where it is, share of white.
-        shadow: Share of light that a shadow across the picture takes.
-        sharpening: How much of what a blur takes off is added, as cameras sharpen.
-        enlarged: How many times fewer pixels the sensor has, either way, than the image.
+        exposure: Exposure time, which causes motion blur, [s]; 0 for sharp images.
+        light: Fraction of full light; less reduces contrast, more overexposes.
+        cables: Cables are visible and occlude.
+        halo: Brightness of a lamp's halo at its centre, fraction of white.
+        shadow: Fraction of light that a shadow across the image removes.
+        sharpening: Strength of unsharp masking.
+        enlarged: Ratio of image to sensor resolution, per axis.
         jpeg: Quality of the image's compression; 100 for none.
     """
 
@@ -58,7 +58,7 @@ class Optics:
 
 
 def simulation_of(rig: Rig) -> SimulationDocument:
-    """The imperfections of a rig; a perfect one has none."""
+    """The imperfections of a rig, none by default."""
     return rig.document.simulation or SimulationDocument()
 
 
@@ -66,7 +66,7 @@ def rig_as_built(rig: Rig) -> Rig:
     """The rig with its true geometry: outlets, anchors, drums, pulleys, counts at home.
 
     Raises:
-        BadInput: There is no such rig.
+        BadInput: The true geometry is invalid.
     """
     truth = simulation_of(rig).as_built
     if truth is None:
@@ -90,7 +90,7 @@ def rig_as_built(rig: Rig) -> Rig:
 
 
 def stiffness_as_built(rig: Rig) -> Array | None:
-    """Axial stiffness of each cable, shape (m,), [N]; None where the rig file gives it."""
+    """Axial stiffness of each cable, shape (m,), [N]; None if as in the rig file."""
     truth = simulation_of(rig).as_built
     if truth is None or truth.stiffness_n is None:
         return None
@@ -103,10 +103,10 @@ def winches_as_built(rig: Rig) -> SimulatedWinchesDocument:
 
 
 def camera_as_built(rig: Rig, camera: Camera) -> tuple[Camera, Optics]:
-    """The camera that truly takes the images, and what its lens and sensor do to them.
+    """The true camera, and the effects of its lens and sensor.
 
     Raises:
-        BadInput: The true lens has a number of distortion coefficients that OpenCV does not know.
+        BadInput: The true lens has an unsupported number of distortion coefficients.
     """
     found = [c for c in simulation_of(rig).cameras if c.name == camera.name]
     if not found:
@@ -145,25 +145,23 @@ def _with_lens(camera: Camera, truth: SimulatedCameraDocument) -> Camera:
     return replace(camera, matrix=read_only(matrix), distortion=distortion, lens=lens.lens)
 
 
-def _moved(camera: Camera, place: PoseDocument | None) -> Camera:
-    return camera if place is None else replace(camera, world_from_camera=place.pose())
+def _moved(camera: Camera, pose: PoseDocument | None) -> Camera:
+    return camera if pose is None else replace(camera, world_from_camera=pose.pose())
 
 
-# How a rig stands after its power was gone: drives count from anywhere, cables hang slack.
-
-
-#: Counters start this far from where they were, at most, [turns of the motor].
+# State of a rig after a power loss: arbitrary encoder counts, slack cables.
+#: Largest offset of the counters, [turns of the motor].
 MOST_TURNS = 100.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PowerLoss:
-    """What became of the drums and of their counters.
+    """Effect of a power loss on drums and counters.
 
     Attributes:
-        miscounted: What each drive counts too much from now on, shape (m,), [counts].
-        slack: What each drum has paid out meanwhile, shape (m,), [m].
-        on_a_stand: The platform was caught by a stand; otherwise it hangs on what is taut.
+        miscounted: Offset of each drive's counts, shape (m,), [counts].
+        slack: Length that each drum has paid out, shape (m,), [m].
+        on_a_stand: The platform rests on a support; otherwise it hangs on the taut cables.
     """
 
     miscounted: Array
@@ -172,13 +170,13 @@ class PowerLoss:
 
     @classmethod
     def drawn(cls, rig: Rig, seed: int, most_slack: float, *, on_a_stand: bool) -> PowerLoss:
-        """A random one.
+        """A random power loss.
 
         Args:
             rig: The robot.
-            seed: Of the random numbers.
-            most_slack: The longest slack of a cable, [m].
-            on_a_stand: Whether a stand keeps the platform where it is.
+            seed: Random seed.
+            most_slack: Largest slack of a cable, [m].
+            on_a_stand: Whether a support holds the platform.
         """
         random = np.random.default_rng(seed)
         per_turn = np.array([w.counts_per_rev for w in rig.document.winches], dtype=np.float64)
@@ -187,13 +185,13 @@ class PowerLoss:
         return cls(read_only(np.rint(turns * per_turn)), read_only(slack), on_a_stand)
 
     def apply_to(self, rig: Rig, plant: Plant, motors: Iterable[Motor]) -> None:
-        """Turns the drums and sets their counters; the platform goes where that leaves it.
+        """Rotates the drums and offsets their counters; the platform settles accordingly.
 
         Raises:
             Fault: The platform has no equilibrium there.
         """
         if self.on_a_stand:
-            plant.put_on_a_stand()
+            plant.support()
         plant.miscounted = self.miscounted
         for winch, motor, more, slack in zip(
             rig.winches, motors, self.miscounted, self.slack, strict=True

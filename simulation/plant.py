@@ -1,7 +1,7 @@
-"""The rig behind its drives: a platform that hangs where its drums and cables let it.
+"""The simulated plant: a platform in equilibrium on its cables.
 
-The platform is taken to be in static equilibrium at every moment: at 20 mm/s its inertia is a
-matter of millinewtons. Deterministic: the same lengths from the same start give the same pose.
+The platform is always in static equilibrium, as inertial forces at 20 mm/s are millinewtons.
+Deterministic: the same lengths from the same start give the same pose.
 """
 
 from __future__ import annotations
@@ -22,18 +22,17 @@ from model.winches import WinchMap
 from simulation.equilibrium.hanging import Hanging
 from simulation.equilibrium.newton import hang_still
 
-# A platform on elastic cables that only pull, under gravity: its energy and what follows of it.
+# A platform on elastic cables that only pull, under gravity: energy and its derivatives.
 #
-# Pure. Twists are a translation, then a rotation, both in the world and about the platform's
-# origin.
+# Pure. Twists are translation, then rotation, in the world frame about the platform's origin.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspension:
-    """What the platform hangs on, and what it weighs.
+    """Cables and weight of the platform.
 
-    A cable of axial stiffness EA wound off to the unstrained length L0 pulls with
-    EA · max(0, (l + d) / L0 − 1), l from outlet to anchor and d from drum to outlet.
+    A cable of axial stiffness EA and unstrained length L0 has the tension
+    EA · max(0, (l + d) / L0 − 1), with l from outlet to anchor and d from drum to outlet.
 
     Attributes:
         rig: The robot.
@@ -42,7 +41,7 @@ class Suspension:
         unstrained: L0 of each cable, shape (m,), [m].
         weight: Of platform and payload, [N].
         centre: Their centre of mass, platform frame, shape (3,), [m].
-        hanging: The same for compiled code, without the lengths.
+        hanging: The same for compiled code, except for the lengths.
     """
 
     rig: Rig
@@ -57,24 +56,24 @@ class Suspension:
     def wound(
         cls, rig: Rig, winch_map: WinchMap, unstrained: Array, load: Load | None
     ) -> Suspension:
-        """The rig with its cables wound off to given lengths, shape (m,), [m]."""
+        """The rig with cables of given unstrained lengths, shape (m,), [m]."""
         axial = np.broadcast_to(winch_map.stiffness, rig.cable_count)
         behind, (weight, centre) = winch_map.behind_outlet, _weight(rig, load)
         hanging = _for_kernels(rig, axial, behind, weight, centre)
         return cls(rig, axial, behind, unstrained, weight, centre, hanging)
 
     def with_load(self, load: Load) -> Suspension:
-        """The same with another load on the platform."""
+        """A copy with another load."""
         weight, centre = _weight(self.rig, load)
         hanging = _for_kernels(self.rig, self.axial, self.behind, weight, centre)
         return replace(self, weight=weight, centre=centre, hanging=hanging)
 
     def with_lengths(self, unstrained: Array) -> Suspension:
-        """The same with cables of other unstrained lengths, shape (m,), [m]."""
+        """A copy with other unstrained lengths, shape (m,), [m]."""
         return replace(self, unstrained=unstrained)
 
     def strained(self, pose: Pose) -> tuple[Cables, Array]:
-        """The cables at a pose and how far each is stretched, by its length; negative when slack.
+        """The cables at a pose and their strains, negative if slack.
 
         Raises:
             ValueError: An anchor is inside its pulley.
@@ -95,7 +94,7 @@ class Suspension:
         return float(elastic + self.weight * height)
 
     def gradient(self, pose: Pose, cables: Cables, tensions: Array) -> Array:
-        """Energy by a twist: minus the wrench, shape (6,), [N, N·m]."""
+        """Derivative of the energy by a twist: minus the wrench, shape (6,), [N, N·m]."""
         gradient: Array = -(tensions @ _columns(pose, cables))
         arm_x, arm_y = (pose.rotation @ self.centre)[:2].tolist()
         gradient[2] += self.weight
@@ -104,19 +103,19 @@ class Suspension:
         return gradient
 
     def rates(self, pulling: NDArray[np.bool_]) -> Array:
-        """Tension by length of each cable that pulls, 0 for the others, shape (m,), [N/m]."""
+        """Stiffness of each taut cable, 0 for the others, shape (m,), [N/m]."""
         return np.where(pulling, self.axial / self.unstrained, 0.0)
 
     def stiffness(self, pose: Pose, cables: Cables, rates: Array, tensions: Array) -> Array:
         """Second derivative of the energy by the twist, shape (6, 6).
 
-        Over a pulley the exit moves with the anchor; that part is left out, which costs steps
-        and no accuracy, since the equilibrium is decided by the gradient.
+        The motion of a pulley's exit point is neglected, which costs steps but no accuracy, since
+        the gradient determines the equilibrium.
 
         Args:
             pose: ``world_from_platform``.
             cables: The cables there.
-            rates: Tension by length of each cable, 0 for a slack one, shape (m,), [N/m].
+            rates: Stiffness of each cable, 0 if slack, shape (m,), [N/m].
             tensions: Shape (m,), [N].
         """
         arms = cables.anchors - pose.position
@@ -133,7 +132,7 @@ class Suspension:
         stiffness[3:, :3] += coupling
         spread = (arms.T * swing) @ arms
         stiffness[3:, 3:] += np.trace(spread) * np.eye(3) - spread
-        # Turning also bends the arms of the forces themselves.
+        # Rotation also changes the lever arms of the forces.
         forces = directions * tensions[:, None]
         moment = forces.T @ arms
         moment[2] -= self.weight * (pose.rotation @ self.centre)
@@ -152,7 +151,7 @@ def _weight(rig: Rig, load: Load | None) -> tuple[float, Array]:
 
 
 def _for_kernels(rig: Rig, axial: Array, behind: Array, weight: float, centre: Array) -> Hanging:
-    """Arrays that may be written to and lie in one piece: for others, code is compiled again."""
+    """Writable, contiguous arrays: others would trigger another compilation."""
     return Hanging(
         outlets=np.array(rig.outlets, order="C"),
         feeds=np.array(rig.feed_directions, order="C"),
@@ -166,23 +165,23 @@ def _for_kernels(rig: Rig, axial: Array, behind: Array, weight: float, centre: A
 
 
 def _columns(pose: Pose, cables: Cables) -> Array:
-    """Columns of the structure matrix, one a row, shape (m, 6)."""
+    """Columns of the structure matrix, one per row, shape (m, 6)."""
     arms = cables.anchors - pose.position
     return np.concatenate([cables.directions, _cross(arms, cables.directions)], axis=1)
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Rows' cross products, shape (m, 3); for a few rows faster than `numpy.cross`."""
+    """Cross products of rows, shape (m, 3); for few rows faster than `numpy.cross`."""
     x, y, z = a[:, 0], a[:, 1], a[:, 2]
     u, v, w = b[:, 0], b[:, 1], b[:, 2]
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
 
 
 FORCE_TOLERANCE = 1e-7
-"""Largest force [N] and moment over the platform's reach [N] left at an equilibrium."""
+"""Largest residual force [N] and moment over the platform's reach [N] at an equilibrium."""
 
 QUICK_STEPS = 12
-"""Of Newton's method, from where the platform is; it takes three as a rule, over pulleys more."""
+"""Steps of Newton's method; it usually takes three, with pulleys more."""
 
 MAX_STEPS = 200
 
@@ -193,13 +192,13 @@ class Plant:
     def __init__(
         self, rig: Rig, pose: Pose, load: Load | None = None, stiffness: Array | None = None
     ) -> None:
-        """Puts the platform at a pose under its working tensions.
+        """Sets the platform at a pose under its working tensions.
 
         Args:
             rig: The robot.
             pose: ``world_from_platform``.
-            load: What the platform carries.
-            stiffness: E·A of each cable where they differ, shape (m,), [N].
+            load: Payload of the platform.
+            stiffness: E·A of each cable if different from the rig file, shape (m,), [N].
 
         Raises:
             TensionInfeasible: The cables cannot hold the platform there.
@@ -207,9 +206,9 @@ class Plant:
         self._rig = rig
         self.winch_map = WinchMap(rig, stiffness)
         self._reach = float(np.max(np.linalg.norm(rig.anchors, axis=1)))
-        self._on_a_stand = False
+        self._is_supported = False
         self.miscounted: Array = np.zeros(rig.cable_count)
-        """By how much the drives count more than they would had they been referenced, [counts]."""
+        """Offset of the drives' counts from correctly referenced ones, [counts]."""
         self.pose = pose
         tensions = working_tensions(rig, pose, load).tensions
         unstrained = self.winch_map.unstrained(cables_at(rig, pose).lengths, tensions)
@@ -218,27 +217,27 @@ class Plant:
         self.settle(unstrained)
 
     def carry(self, load: Load) -> None:
-        """Moves the platform to its equilibrium with another load on it.
+        """Moves the platform to its equilibrium with another load.
 
         Raises:
-            Fault: There is none.
+            Fault: There is no equilibrium.
         """
         self._suspension = self._suspension.with_load(load)
         self.settle(self._suspension.unstrained)
 
-    def put_on_a_stand(self) -> None:
-        """A stand keeps the platform where it is, until somebody sees every cable taut.
+    def support(self) -> None:
+        """Supports the platform at its present pose until every cable is taut.
 
-        Then the stand is taken away, and the platform hangs on its cables again.
+        Then the support is removed, and the platform hangs on its cables.
         """
-        self._on_a_stand = True
+        self._is_supported = True
 
     def counts_for(self, pose: Pose, tensions: Array) -> Array:
-        """Drive positions that hold a pose with given tensions, not rounded, shape (m,).
+        """Drive positions for a pose with given tensions, not rounded, shape (m,).
 
         Args:
             pose: ``world_from_platform``.
-            tensions: Shape (m,), [N]; in equilibrium there, or the platform will settle elsewhere.
+            tensions: Shape (m,), [N]; must be in equilibrium, or the platform settles elsewhere.
         """
         lengths = cables_at(self._rig, pose).lengths
         return self.winch_map.counts(self.winch_map.unstrained(lengths, tensions))
@@ -253,21 +252,22 @@ class Plant:
         return self.settling(self.winch_map.unstrained_from_counts(counts - self.miscounted))
 
     def settle(self, unstrained: Array) -> None:
-        """Moves the platform to its equilibrium; the search starts where it is.
+        """Moves the platform to its equilibrium; the search starts at the present pose.
 
         Args:
             unstrained: Unstrained lengths of the whole cables, shape (m,), [m].
 
         Raises:
-            Fault: No equilibrium is found: the platform hangs on nothing, or a length is absurd.
+            Fault: No equilibrium is found: the cables do not hold the platform, or a length is
+                absurd.
         """
         for _ in self.settling(unstrained):
             pass
 
     def settling(self, unstrained: Array) -> Iterator[None]:
-        """`settle` step by step, for who has something else to do meanwhile; argument as there.
+        """`settle` step by step, to allow other work in between; argument as there.
 
-        Pose and tensions are as before until the last step.
+        Pose and tensions change only at the last step.
 
         Raises:
             Fault: See `settle`.
@@ -275,15 +275,15 @@ class Plant:
         if not (np.isfinite(unstrained).all() and (unstrained > 0.0).all()):
             raise self._lost("an unstrained length is not a positive number", unstrained)
         self._suspension = self._suspension.with_lengths(np.array(unstrained))
-        if self._on_a_stand:
+        if self._is_supported:
             self.tensions = read_only(self._pulled(self.pose)[1])
-            self._on_a_stand = bool(self.tensions.min() < self._rig.min_tension)
+            self._is_supported = bool(self.tensions.min() < self._rig.min_tension)
         yield
-        if not (self._on_a_stand or self._settles_quickly()):
-            yield from self._settling_anyhow()
+        if not (self._is_supported or self._settles_quickly()):
+            yield from self._settling_robustly()
 
     def _settles_quickly(self) -> bool:
-        """Newton's method from here; False when it finds nothing. See `newton.hang_still`."""
+        """Newton's method from the present pose; False if it fails. See `newton.hang_still`."""
         hung = self._suspension
         position, rotation = np.array(self.pose.position), np.array(self.pose.rotation, order="C")
         tensions = np.array(self.tensions)
@@ -301,8 +301,8 @@ class Plant:
             self.pose, self.tensions = Pose(position, rotation), read_only(tensions)
         return bool(found)
 
-    def _settling_anyhow(self) -> Iterator[None]:
-        """Down the energy, step by step, with cables that only pull."""
+    def _settling_robustly(self) -> Iterator[None]:
+        """Damped descent of the energy, with cables that only pull."""
         pose = self.pose
         cables, tensions = self._pulled(pose)
         for _ in range(MAX_STEPS):
@@ -321,7 +321,7 @@ class Plant:
         return self._suspension.energy(pose, tensions)
 
     def residual(self, pose: Pose) -> Array:
-        """Wrench left over at a pose, about the platform's origin, shape (6,), [N, N·m]."""
+        """Residual wrench at a pose, about the platform's origin, shape (6,), [N, N·m]."""
         cables, tensions = self._pulled(pose)
         return -self._suspension.gradient(pose, cables, tensions)
 
@@ -357,7 +357,7 @@ class Plant:
     def _descend(
         self, pose: Pose, gradient: Array, step: Array, tensions: Array
     ) -> tuple[Pose, Cables, Array]:
-        """The pose after the step, shortened until the energy does not grow."""
+        """The pose after the step, shortened until the energy decreases."""
         before = self._suspension.energy(pose, tensions)
         slack = 1e-12 * (abs(before) + self._suspension.weight * self._reach)
         slope = float(gradient @ step)
@@ -376,7 +376,7 @@ class Plant:
         return Fault(
             f"the simulation failed: {what}",
             where=f"plant of rig {self._rig.name}",
-            why="cables were paid out or wound in far from any pose of the platform; lengths "
+            why="the cables were paid out or wound in to lengths of no platform pose: "
             + ", ".join(f"{length:.3f}" for length in unstrained)
             + " m",
             next_step="check the commands sent to the drives",
@@ -384,7 +384,7 @@ class Plant:
 
 
 def load_kernels() -> None:
-    """Loads the machine code of the search, or compiles it, so that no drive waits for it."""
+    """Loads or compiles the machine code of the search, so that no drive waits for it."""
     point, one = np.zeros((1, 3)), np.ones(1)
     hanging = Hanging(point, point, 0.0, point, one, one, 1.0, np.zeros(3))
     hang_still(hanging, one, np.zeros(3), np.eye(3), np.ones(1), 1.0, FORCE_TOLERANCE, 0)

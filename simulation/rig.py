@@ -1,4 +1,4 @@
-"""A rig in software, whatever its drives speak: m drives on one bus, and the plant behind them."""
+"""A simulated rig for any drive protocol: m drives on one bus, and the plant."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import can
 import numpy as np
 
-from drivers.can_bus import SentFrame, take, transmit
+from drivers.can_bus import SentFrame, receive_frame, transmit
 from drivers.can_errors import BusDown
 from model.kinematics import cables_at
 from model.pose import Array, Pose
@@ -30,21 +30,21 @@ from simulation.ground_truth import (
 )
 from simulation.plant import Plant
 
-# From the motors to the platform and back: drums turn with them, the drives feel their cables.
+# From the motors to the platform and back: drums follow motors, torques follow tensions.
 
 
-# What lies between a motor's shaft and the cable on its drum: play and steps. Pure.
+# Transmission between motor and drum: backlash and steps. Pure.
 
 
 class Transmission:
-    """Drums that follow their motors with backlash, and stand only at whole steps.
+    """Drums that follow their motors with backlash, in whole steps.
 
-    A drum rests while its motor turns back through the backlash, as in a gear or with cable that
-    rubs in its guides.
+    A drum rests while its motor reverses through the backlash, as with gears or with cable friction
+    in guides.
     """
 
     def __init__(self, backlash: Array, step: float, at: Array) -> None:
-        """Begins with every drum in the middle of its backlash.
+        """Starts with every drum in the middle of its backlash.
 
         Args:
             backlash: Shape (m,), [counts].
@@ -55,7 +55,7 @@ class Transmission:
         self._drums = np.array(at, dtype=np.float64)
 
     def drums(self, motors: Array) -> Array:
-        """Where the drums stand with the motors there, shape (m,), [counts]."""
+        """Positions of the drums for positions of the motors, shape (m,), [counts]."""
         self._drums = np.clip(self._drums, motors - self._half, motors + self._half)
         if self._step == 1.0:
             return self._drums.copy()
@@ -63,11 +63,11 @@ class Transmission:
         return whole
 
 
-# What a simulated rig needs of its drives, whatever they speak.
+# Interface of simulated drives of any protocol.
 
 
 class WinchDrive(Protocol):
-    """What a rig needs of a simulated drive.
+    """Interface of a simulated drive.
 
     Attributes:
         motor: What it moves.
@@ -79,7 +79,7 @@ class WinchDrive(Protocol):
 
     @property
     def state(self) -> Enum:
-        """Its state in the words of its protocol."""
+        """State in terms of its protocol."""
         ...
 
     @property
@@ -88,15 +88,15 @@ class WinchDrive(Protocol):
         ...
 
     def advance(self, elapsed: float) -> None:
-        """Lets time pass, [s]."""
+        """Advances time, [s]."""
         ...
 
 
 class DriveTrain:
-    """Moves the platform to the motors' positions; sets the drives' cable tensions.
+    """Moves the platform to the motors' positions, and sets the drives' torques.
 
-    Feeling goes step by step, for who has something else to do meanwhile: it may take long to find
-    the platform's place.
+    Updates run step by step to allow other work in between, as finding the equilibrium may take
+    long.
 
     Attributes:
         per_newton: Torque by tension, shape (m,), in the unit of the drives' protocol.
@@ -105,14 +105,14 @@ class DriveTrain:
     def __init__(
         self, rig: Rig, plant: Plant, counts: Array, per_newton: Array, friction: float = 0.0
     ) -> None:
-        """Moves the platform to where the drums stand with the motors at given positions.
+        """Moves the platform to the equilibrium for given positions of the motors.
 
         Args:
             rig: The robot, with the ``simulation`` section of its file.
             plant: What the drums move.
             counts: Positions of the motors, shape (m,), [counts].
             per_newton: Torque by tension, shape (m,), in the unit of the drives' protocol.
-            friction: Torque that a motor spends on itself and no cable feels, in that unit.
+            friction: Friction torque of a drive train, in that unit.
 
         Raises:
             Fault: The platform has no equilibrium there.
@@ -126,38 +126,38 @@ class DriveTrain:
         self._tension_noise = winches.tension_noise_n
         self._random = np.random.default_rng([simulation_of(rig).seed, 0x7E45])
         self._friction, self._ahead = friction, np.zeros(len(counts))
-        self._feeling: Iterator[None] | None = None
+        self._update: Iterator[None] | None = None
 
     @property
-    def feeling(self) -> bool:
-        """The drives have begun to feel their cables, and are still about it."""
-        return self._feeling is not None
+    def is_updating(self) -> bool:
+        """Whether an update of the torques is in progress."""
+        return self._update is not None
 
-    def begin_feeling(self, drives: Sequence[WinchDrive]) -> None:
-        """The drives begin to feel the cables as they are now, unless they are still about it."""
-        if self._feeling is None:
-            self._feeling = self._felt(drives)
+    def begin_update(self, drives: Sequence[WinchDrive]) -> None:
+        """Begins an update of the torques, unless one is in progress."""
+        if self._update is None:
+            self._update = self._updating(drives)
 
-    def go_on_feeling(self) -> None:
-        """One step, if there is one to do.
+    def continue_update(self) -> None:
+        """Makes one step of an update in progress.
 
         Raises:
             Fault: The platform has no equilibrium.
         """
-        if self._feeling is None:
+        if self._update is None:
             return
         try:
-            next(self._feeling)
+            next(self._update)
         except StopIteration:
-            self._feeling = None
+            self._update = None
 
-    def finish_feeling(self) -> None:
-        """All steps that are left; errors as for `go_on_feeling`."""
-        while self._feeling is not None:
-            self.go_on_feeling()
+    def finish_update(self) -> None:
+        """Makes all remaining steps; errors as for `continue_update`."""
+        while self._update is not None:
+            self.continue_update()
 
     def settle(self, drives: Sequence[WinchDrive]) -> None:
-        """The platform goes where the drums let it; nothing to do while none has turned.
+        """Moves the platform to its equilibrium, if any drum has moved.
 
         Raises:
             Fault: The platform has no equilibrium.
@@ -167,43 +167,44 @@ class DriveTrain:
             self._plant.settle_counts(self._transmission.drums(counts))
             self._counts = counts
 
-    def _felt(self, drives: Sequence[WinchDrive]) -> Iterator[None]:
-        """The platform goes where the drums let it; then the drives feel its cables."""
+    def _updating(self, drives: Sequence[WinchDrive]) -> Iterator[None]:
+        """Moves the platform to its equilibrium, then sets the torques."""
         counts = _positions(drives)
         if not np.array_equal(counts, self._counts):
             yield from self._plant.settling_counts(self._transmission.drums(counts))
-            if self._friction > 0.0:  # a motor at rest keeps the torque with which it came to rest
-                turned = np.sign(counts - self._counts)
-                self._ahead = np.where(turned == 0.0, self._ahead, turned)
+            if self._friction > 0.0:  # a motor at rest keeps its last friction torque
+                moved = np.sign(counts - self._counts)
+                self._ahead = np.where(moved == 0.0, self._ahead, moved)
             self._counts = counts
-        told = self._plant.tensions
+        tensions = self._plant.tensions
         if self._tension_noise > 0.0:
-            told = told + self._tension_noise * self._random.standard_normal(len(told))
-        torques = told * self.per_newton + self._friction * self._ahead
+            noise = self._random.standard_normal(len(tensions))
+            tensions = tensions + self._tension_noise * noise
+        torques = tensions * self.per_newton + self._friction * self._ahead
         for drive, torque in zip(drives, torques.tolist(), strict=True):
             drive.torque = torque if drive.torque_on else 0.0
 
 
 def _positions(drives: Sequence[WinchDrive]) -> Array:
-    """Of the motors, shape (m,), [counts]."""
+    """Positions of the motors, shape (m,), [counts]."""
     return np.array([drive.motor.position for drive in drives])
 
 
 Frame = bytes | bytearray
 
 TOP_SPEED_RESERVE = 1.5
-"""A simulated motor turns this much faster than its winch's speed limit."""
+"""Top speed of a simulated motor, relative to its winch's speed limit."""
 
 IDLE_WAIT = 0.005
-"""Longest wait for a frame before time-outs of the drives are looked at, [s]."""
+"""Longest wait for a frame before the drives' time-outs are checked, [s]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RehearsalStatus:
-    """What `SimulatedRig.serve` reports while it runs.
+    """Status reported by `SimulatedRig.serve`.
 
     Attributes:
-        cycles: Cycles seen.
+        cycles: Number of cycles.
         states: State of each drive.
         pose: Of the platform, ``world_from_platform``.
         tensions: Shape (m,), [N].
@@ -224,33 +225,33 @@ class SimulatedRig(ABC, Generic[Drive]):
     Attributes:
         drives: In the order of the winches.
         plant: What they move.
-        cycles: Cycles seen.
+        cycles: Number of cycles.
     """
 
     def __init__(
         self, rig: Rig, bus: can.BusABC, start_pose: Pose, load: Load | None = None
     ) -> None:
-        """Switches the drives on where the rig file says that they stand at a pose.
+        """Powers the drives on at the positions of a pose according to the rig file.
 
-        There the platform hangs under working tensions, if the rig is built as its file says; if
-        not, near it.
+        If the rig is built as in its file, the platform hangs there under working tensions,
+        otherwise near it.
 
         Args:
             rig: The robot.
-            bus: An open bus for the drives; the caller's.
+            bus: An open bus for the drives, owned by the caller.
             start_pose: ``world_from_platform``.
-            load: What the platform carries.
+            load: Payload of the platform.
 
         Raises:
             TensionInfeasible: The cables cannot hold the platform there.
-            Fault: The bus did not take the drives' first frames.
+            Fault: The bus did not accept the drives' first frames.
         """
         self._rig, self._bus = rig, bus
         self._cycle = rig.cycle
         self.plant = Plant(rig_as_built(rig), start_pose, load, stiffness_as_built(rig))
         self.cycles = 0
         per_newton = self._torque_per_newton()
-        start = _counts_as_told(rig, start_pose, load)
+        start = _counts_at(rig, start_pose, load)
         self._drive_train = DriveTrain(rig, self.plant, start, per_newton, self._friction())
         self.drives: tuple[Drive, ...] = ()
         self.drives = tuple(
@@ -263,20 +264,20 @@ class SimulatedRig(ABC, Generic[Drive]):
         """Torque by tension, shape (m,), in the unit of the drives' protocol."""
 
     def _friction(self) -> float:
-        """Torque of the drive trains that no cable feels, in the unit of the drives' protocol."""
+        """Friction torque of the drive trains, in the unit of the drives' protocol."""
         return 0.0
 
     @abstractmethod
     def _make_drive(self, number: int, position: float, top_speed: float) -> Drive:
-        """Switches a drive on: its place among the winches, position [counts], speed [counts/s]."""
+        """Creates a drive by index of its winch, position [counts] and top speed [counts/s]."""
 
     @abstractmethod
     def _handle(self, message: can.Message) -> None:
-        """Hands a frame to whom it is for."""
+        """Passes a frame to its drive."""
 
     @abstractmethod
     def pump(self) -> None:
-        """Works off every frame that waits, and answers.
+        """Processes every waiting frame, and answers.
 
         Raises:
             Fault: The bus failed, or the platform has no equilibrium.
@@ -288,31 +289,31 @@ class SimulatedRig(ABC, Generic[Drive]):
 
     @property
     def pose(self) -> Pose:
-        """Where the platform truly is, ``world_from_platform``."""
+        """True pose of the platform, ``world_from_platform``."""
         self._settle()
         return self.plant.pose
 
     @property
     def tensions(self) -> Array:
-        """Of the cables, shape (m,), [N]."""
+        """True cable tensions, shape (m,), [N]."""
         self._settle()
         return self.plant.tensions
 
     def carry(self, load: Load) -> None:
-        """The platform carries something else from now on.
+        """Changes the load of the platform.
 
         Raises:
-            Fault: The platform has no equilibrium with it.
+            Fault: The platform has no equilibrium with this load.
         """
         self._settle()
         self.plant.carry(load)
 
     def advance(self, seconds: float) -> None:
-        """Lets time pass without a frame, in cycles at most: time-outs run, motors move."""
+        """Advances time without frames, in steps of at most a cycle."""
         while seconds > 1e-12:
             step = min(seconds, self._cycle)
             self._advance(step)
-            self._finish_feeling()
+            self._finish_torque_update()
             seconds -= step
 
     def serve(
@@ -325,13 +326,13 @@ class SimulatedRig(ABC, Generic[Drive]):
     ) -> None:
         """Answers in real time until stopped or interrupted from the keyboard.
 
-        Drives answer at once; the platform's place is found while nothing is to be answered, in
-        half of that time at most, and torques wait for it. When this process is held up, the
-        drives' time stands still: they do not blame the master for it. While the interface is down
-        they receive and send nothing, as if unplugged, and continue when it is up again.
+        Drives answer at once; the equilibrium is computed between frames, in at most half of the
+        time, and torques follow it. If this process is delayed, the drives' time stops, so that
+        they do not report a lost master. While the interface is down they neither receive nor send,
+        and continue when it is up again.
 
         Args:
-            stop_requested: Asked every few milliseconds; true ends it.
+            stop_requested: Called every few milliseconds; True ends the simulation.
             on_status: Called every ``status_period`` seconds, between two frames.
             status_period: [s].
             clock: Monotonic seconds.
@@ -340,10 +341,10 @@ class SimulatedRig(ABC, Generic[Drive]):
             Fault: The bus failed, or the platform has no equilibrium.
         """
         try:
-            last = told = clock()
+            last = reported = clock()
             wait = IDLE_WAIT
             while not stop_requested():
-                message = self._heard(wait)
+                message = self._receive(wait)
                 now = clock()
                 self._let_pass(now - last, message)
                 last = now
@@ -352,42 +353,41 @@ class SimulatedRig(ABC, Generic[Drive]):
                     wait = 0.0
                     continue
                 wait = IDLE_WAIT
-                if self._drive_train.feeling:
-                    self._drive_train.go_on_feeling()
-                    wait = clock() - now  # a master on the same processor has its turn, too
-                if on_status is not None and now - told >= status_period:
-                    told = now
+                if self._drive_train.is_updating:
+                    self._drive_train.continue_update()
+                    wait = clock() - now  # leaves half of the processor to a master
+                if on_status is not None and now - reported >= status_period:
+                    reported = now
                     on_status(self.status())
         except KeyboardInterrupt:
             return
 
     def _let_pass(self, waited: float, message: can.Message | None) -> None:
-        """Time that passed until a frame came, or none did; of a longer time only a cycle."""
+        """Advances by the time waited, at most a cycle."""
         self._advance(min(waited, self._cycle))
 
     def status(self) -> RehearsalStatus:
-        """Where everything stands, the platform where the drives felt it last."""
+        """Present state, with the pose of the last torque update."""
         states = tuple(drive.state for drive in self.drives)
         return RehearsalStatus(self.cycles, states, self.plant.pose, self.plant.tensions)
 
-    def _heard(self, wait: float) -> can.Message | None:
-        """The next frame, if one comes within a time [s]; none while the interface is down."""
+    def _receive(self, wait: float) -> can.Message | None:
+        """The next frame within a time [s]; None while the interface is down."""
         try:
-            return take(self._bus, wait)
+            return receive_frame(self._bus, wait)
         except BusDown:
-            time.sleep(IDLE_WAIT)  # the kernel reports it at once, and time must pass all the same
+            time.sleep(IDLE_WAIT)  # the kernel returns at once, but time must pass
             return None
 
     def _advance(self, elapsed: float) -> None:
         for drive in self.drives:
             drive.advance(elapsed)
 
-    def _feel(self) -> None:
-        """The drives begin to feel the cables as they are now, unless they are still about it."""
-        self._drive_train.begin_feeling(self.drives)
+    def _begin_torque_update(self) -> None:
+        self._drive_train.begin_update(self.drives)
 
-    def _finish_feeling(self) -> None:
-        self._drive_train.finish_feeling()
+    def _finish_torque_update(self) -> None:
+        self._drive_train.finish_update()
 
     def _settle(self) -> None:
         self._drive_train.settle(self.drives)
@@ -397,8 +397,8 @@ class SimulatedRig(ABC, Generic[Drive]):
             transmit(self._bus, SentFrame(can_id, data))
 
 
-def _counts_as_told(rig: Rig, pose: Pose, load: Load | None) -> Array:
-    """Whole drive positions that hold a pose, by the rig file, shape (m,), [counts]."""
+def _counts_at(rig: Rig, pose: Pose, load: Load | None) -> Array:
+    """Rounded drive positions for a pose according to the rig file, shape (m,), [counts]."""
     winches = WinchMap(rig)
     tensions = working_tensions(rig, pose, load).tensions
     return np.rint(winches.counts(winches.unstrained(cables_at(rig, pose).lengths, tensions)))

@@ -1,4 +1,4 @@
-"""Prints the lowest version that pyproject.toml declares of every package that cdpr runs on.
+"""Prints the lowest version that pyproject.toml declares for each dependency of cdpr.
 
 python tools/lowest.py > lowest.txt    # constraints for pip
 """
@@ -14,7 +14,7 @@ LOWER_BOUND = re.compile(r"([\w.-]+)(?:\[[\w,]+\])?>=([\w.]+)")
 
 
 def main() -> None:
-    """One line a package."""
+    """Prints one line per package."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     for requirement in [*project["dependencies"], *extras["odrive"]]:

@@ -1,9 +1,9 @@
-"""Makes the recorded session of examples/rig_session: a rig's places at rest, and some images.
+"""Creates the recorded session of examples/rig_session: stationary samples and some images.
 
     python tools/rig_session.py FOLDER [--count 60] [--pictures 6]
 
-The simulated rig of gachon_8_6_rehearsal.yaml is sent to the poses that `cdpr calibrate poses`
-would choose; each is measured by the tracker in one image of the synthetic camera. Deterministic.
+The simulated rig of gachon_8_6_rehearsal.yaml moves to the poses that `cdpr calibrate poses` would
+choose; the tracker measures each in one image of the synthetic camera. Deterministic.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from tracking.tracker import Tracker
 
 RIG = Path(__file__).parents[1] / "configs/gachon_8_6_rehearsal.yaml"
 QUALITY = 90
-"""Of the JPEG files: small, and corners move by less than the noise moves them."""
+"""JPEG quality: small files, with corner errors below the noise."""
 
 
 def free_scene(rig: Rig) -> Scene:
-    """Nothing but the rig."""
+    """A scene without obstacles."""
     home = {"position_mm": (rig.home.position * 1e3).tolist()}
     plain = {
         "schema_version": 1,
@@ -53,14 +53,14 @@ def free_scene(rig: Rig) -> Scene:
 
 
 def poses_to_measure(rig: Rig, scene: Scene, count: int) -> list[Pose]:
-    """As `cdpr calibrate poses` chooses them."""
+    """The poses that `cdpr calibrate poses` chooses."""
     doubts = (0.3e-3,) * 3 + (radians(0.05),) * 3
     requirements = PoseRequirements(count, radians(15.0), radians(15.0), 300, 7.125, 0.1e-3, doubts)
     return choose_poses(rig, scene, requirements, Parameters.of(rig, DEFAULT_DEVIATIONS), seed=0)
 
 
 def header(cables: int) -> list[str]:
-    """Names of the columns; see docs/data-formats.md."""
+    """Column names; see docs/data-formats.md."""
     numbers = range(1, cables + 1)
     return [
         *chain.from_iterable((f"actual_{i}_counts", f"tension_{i}_n") for i in numbers),
@@ -70,7 +70,7 @@ def header(cables: int) -> list[str]:
 
 
 def row(counts: np.ndarray, tensions: np.ndarray, seen: PoseMeasurement) -> list[str]:
-    """The values of one place."""
+    """Values of one sample."""
     pairs = zip(counts, tensions, strict=True)
     turns = np.degrees(seen.rotation_deviation)
     return [
@@ -102,7 +102,7 @@ def main() -> None:
         plant.settle_counts(counts)
         picture = lens.render(plant.pose, number)
         seen = tracker.observe(picture, float(number))
-        tracker.forget()  # the next place is far away
+        tracker.forget()  # the next pose is far away
         if isinstance(seen, PoseMeasurement):
             felt = plant.tensions + noise.normal(0.0, 0.05, rig.cable_count)
             rows.append(row(counts, felt, seen))
@@ -112,7 +112,7 @@ def main() -> None:
             name.write_bytes(data.tobytes())
     text = "\n".join(",".join(values) for values in rows) + "\n"
     (options.folder / "places.csv").write_text(text, encoding="utf-8")
-    print(f"{len(rows) - 1} places, {options.pictures} images in {options.folder}")
+    print(f"{len(rows) - 1} samples, {options.pictures} images in {options.folder}")
 
 
 if __name__ == "__main__":

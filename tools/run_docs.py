@@ -1,24 +1,24 @@
-"""Runs the command blocks of README.md and docs/*.md in order, as a newcomer types them.
+"""Runs the command blocks of README.md and docs/*.md in order, as a newcomer would.
 
     python tools/run_docs.py                      # all pages; a few minutes
     python tools/run_docs.py --fast               # without the blocks marked `run in full`
     python tools/run_docs.py --list               # which blocks are left out, and why
     python tools/run_docs.py docs/odrive.md       # one page
 
-Each page begins in a folder that holds what a clone holds for these commands: `configs`, `examples`
-and `.venv`; README.md and docs/getting-started.md share one. A block is run by `sh -e` with the
-`cdpr` of this Python first on the path, and with sockets, locks and temporary files of its own, so
-that no run of anybody else is reached. Comments on the lines before a fence say more:
+Each page starts in a folder with a clone's `configs`, `examples` and `.venv`; README.md and
+docs/getting-started.md share one. A block is run by `sh -e` with the `cdpr` of this Python first on
+the path, and with separate sockets, locks and temporary files, so that it affects no other runs.
+Comments on the lines before a fence are markers:
 
     <!-- not run: REASON -->                        hardware, root, a camera, the network, hours
     <!-- run in full: REASON -->                    left out by --fast
-    <!-- exit code 3: REASON -->                    what the block must end with, instead of 0
-    <!-- in another terminal, ready at: TEXT -->    goes on beside the next blocks of the page once
-                                                    it has printed TEXT; then it gets Ctrl-C
-    <!-- before: COMMAND -->                        what the page's reader has done already
-    <!-- with options: OPTIONS -->                  what a run needs where nobody can be asked
+    <!-- exit code 3: REASON -->                    required exit code, instead of 0
+    <!-- in another terminal, ready at: TEXT -->    runs beside the page's next blocks once it
+                                                    has printed TEXT; then it gets Ctrl-C
+    <!-- before: COMMAND -->                        what the reader has already done
+    <!-- with options: OPTIONS -->                  options for a run without a terminal
 
-The exit code is 1 when a block fails (page:line and its output are printed), 2 for a bad marker.
+The exit code is 1 if a block fails (page:line and its output are printed), 2 for a bad marker.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-#: A verb of cdpr, after whose name options may follow.
+#: A verb of cdpr, after which options may follow.
 VERB = re.compile(r"^(cdpr (?:calibrate |bench )?\S+)")
 FENCE = re.compile(r"^```(sh|console|bash)\s*$")
 COMMENT = re.compile(r"^<!--\s*(.*?)\s*-->$")
@@ -52,12 +52,12 @@ ENDED_BY_CTRL_C = (0, 130)
 
 
 class BadMarker(Exception):
-    """A comment before a block that says nothing this program knows."""
+    """An unknown comment before a block."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A block of commands and what the comments before it say."""
+    """A block of commands with its markers."""
 
     page: Path
     line: int
@@ -71,13 +71,13 @@ class Block:
 
     @property
     def where(self) -> str:
-        """Page and line of its fence."""
+        """Page and line of the fence."""
         path = self.page.relative_to(ROOT) if self.page.is_relative_to(ROOT) else self.page
         return f"{path}:{self.line}"
 
     @property
     def script(self) -> str:
-        """What the shell runs."""
+        """Script for the shell."""
         commands = self.commands.splitlines()
         if self.options:
             commands = [VERB.sub(rf"\1 {self.options}", command) for command in commands]
@@ -86,7 +86,7 @@ class Block:
         return "\n".join((*self.before, *commands))
 
     def left_out(self, fast: bool) -> str:
-        """Why it is left out; nothing when it is run."""
+        """Reason why it is left out; empty if it is run."""
         return self.not_run or (self.in_full if fast else "")
 
 
@@ -142,17 +142,17 @@ def _markers(page: Path, lines: list[str], fence: int) -> dict[str, object]:
 
 
 def pages_in_order() -> list[list[Path]]:
-    """The pages of each folder: a newcomer's first two share one."""
+    """The pages by shared folder: the first two share one."""
     docs = ROOT / "docs"
     first = [ROOT / "README.md", docs / "getting-started.md"]
     return [first, *([page] for page in sorted(docs.rglob("*.md")) if page not in first)]
 
 
 class Terminal:
-    """Runs blocks in a folder as a clone has it, with everything that a run shares beside it.
+    """Runs blocks in a folder like a clone, with separate state beside it.
 
     Args:
-        base: An empty folder; its path is short, because sockets lie in it.
+        base: An empty folder with a short path, as it contains sockets.
     """
 
     def __init__(self, base: Path) -> None:
@@ -177,7 +177,7 @@ class Terminal:
         """Runs a block.
 
         Returns:
-            What went wrong, with the block's output; nothing when all went well.
+            The problem with the block's output; empty on success.
         """
         if block.ready_at:
             return self._run_beside(block)
@@ -194,7 +194,7 @@ class Terminal:
             return f"exit code {code} instead of {block.exit_code}\n{_content(output)}"
 
     def close(self) -> list[str]:
-        """Presses Ctrl-C where something still runs beside; what went wrong there."""
+        """Sends Ctrl-C to blocks still running; returns their problems."""
         problems = []
         while self._beside:
             process, log = self._beside.pop()
@@ -240,7 +240,7 @@ def _content(output: object) -> str:
 
 
 def run_pages(pages: list[list[Path]], fast: bool) -> int:
-    """Runs the blocks of the pages; how many failed."""
+    """Runs the blocks of the pages; returns the number of failures."""
     failures = 0
     for sharing in pages:
         base = Path(tempfile.mkdtemp(prefix="docs-"))
@@ -277,7 +277,7 @@ def _reported(terminal: Terminal, block: Block) -> bool:
 def main() -> int:
     """Parses the command line."""
     parser = argparse.ArgumentParser(description="run the command blocks of the documentation")
-    parser.add_argument("pages", nargs="*", type=Path, help="pages; all when left out")
+    parser.add_argument("pages", nargs="*", type=Path, help="pages (default: all)")
     parser.add_argument("--fast", action="store_true", help="leave out `run in full`")
     parser.add_argument("--list", action="store_true", help="only list what is left out")
     options = parser.parse_args()

@@ -1,4 +1,4 @@
-"""The JSON schemas of rig, scene, plan and drive profile files, for editors and other programs.
+"""JSON schemas of rig, scene, plan and drive profile files, for editors and other programs.
 
 ``python tools/schemas.py`` writes them into ``docs/schema/`` of the repository (``make schema``).
 """
@@ -24,13 +24,13 @@ DOCUMENTS: dict[str, type[Document]] = {
 
 
 def schema_text(document: type[Document]) -> str:
-    """The JSON schema of a file, as it is committed."""
+    """The JSON schema of a file, as committed."""
     schema = {"$schema": DIALECT, **document.model_json_schema()}
     return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
 
 
 def write_schemas(folder: Path) -> None:
-    """Writes ``rig.schema.json`` and the like, one for each kind of file, into a folder."""
+    """Writes one schema per kind of file, such as ``rig.schema.json``, into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, document in DOCUMENTS.items():
         (folder / f"{name}.schema.json").write_text(schema_text(document), encoding="utf-8")

@@ -1,11 +1,11 @@
-"""Builds the wheel into dist/ and tries it in a clean environment outside the repository.
+"""Builds the wheel into dist/ and tests it in a clean environment outside the repository.
 
     python tools/wheel.py               # needs no network
     python tools/wheel.py --with-index  # installs the dependencies by pip instead of borrowing them
 
-The environment is a new one with the wheel in it. Its dependencies are those of the Python that
-runs this, made visible by a path file; the repository is not, so whatever the wheel lacks is
-missing. Kernels run as plain Python: compiling them in a new folder takes minutes.
+The environment contains only the wheel. Its dependencies are those of the Python that runs this,
+made visible by a path file; the repository is not visible, so files missing from the wheel are
+noticed. Kernels run as plain Python, as compiling them in a new folder takes minutes.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ TRIED = (
 
 
 class Failed(Exception):
-    """Something that a release must have is not so."""
+    """A requirement of a release is not met."""
 
 
 def build() -> Path:
-    """The wheel, in dist/."""
+    """Builds the wheel in dist/."""
     require_tag_of_this_version()
     output = ROOT / "dist"
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(output)]
@@ -53,7 +53,7 @@ def build() -> Path:
 
 
 def require_tag_of_this_version() -> None:
-    """A commit that has a tag of a version is that version."""
+    """Checks that a version tag of this commit matches the version."""
     command = ["git", "tag", "--points-at", "HEAD", "--list", "v*"]
     shown = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if wrong := [tag for tag in shown.stdout.split() if tag != f"v{VERSION}"]:
@@ -61,7 +61,7 @@ def require_tag_of_this_version() -> None:
 
 
 def install(wheel: Path, folder: Path, with_index: bool) -> Path:
-    """A clean environment with the wheel; its folder of programs."""
+    """Creates a clean environment with the wheel; returns its folder of programs."""
     venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"
     borrowed = [] if with_index else ["--no-deps", "--no-index"]
@@ -74,11 +74,11 @@ def install(wheel: Path, folder: Path, with_index: bool) -> Path:
 
 
 def try_out(programs: Path, folder: Path) -> None:
-    """Runs what a newcomer runs first, in an empty folder."""
+    """Runs a newcomer's first commands in an empty folder."""
     where = f"import {', '.join(PACKAGES)}; print({', '.join(f'{p}.__file__' for p in PACKAGES)})"
     found = run([str(programs / "python"), "-c", where], folder).split()
     if outside := [path for path in found if not path.startswith(str(programs.parent))]:
-        raise Failed(f"not of the wheel: {outside[0]}")
+        raise Failed(f"not from the wheel: {outside[0]}")
     for command in TRIED:
         program, *words = command.split()
         answer = run([str(programs / program), *words], folder)
@@ -90,7 +90,7 @@ def try_out(programs: Path, folder: Path) -> None:
 
 
 def run(command: list[str], folder: Path) -> str:
-    """What a command prints.
+    """Output of a command.
 
     Raises:
         Failed: Its exit code is not 0.

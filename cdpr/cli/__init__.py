@@ -1,4 +1,4 @@
-"""The command line. Each verb imports what it needs when it is called."""
+"""The command line; a verb's module is imported when the verb is called."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The `cdpr` command: its verbs, imported only when they are called, and what becomes of errors."""
+"""The `cdpr` command: a table of verbs, imported when called, and error reporting."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class Verb:
     """A verb or a group of verbs.
 
     Attributes:
-        name: As it is typed.
-        target: ``module:function`` below `cdpr.cli`; nothing for a group.
-        verbs: Of a group.
-        about: Help text of a group.
+        name: As typed on the command line.
+        target: ``module:function`` below `cdpr.cli`; empty for a group.
+        verbs: Members of a group.
+        about: A group's help text.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Verb:
 def _verbs(*targets: str) -> tuple[Verb, ...]:
     """Verbs by modules below `cdpr.cli` and their functions, ``module:function,function``.
 
-    A function has an underscore after a word of Python.
+    A function named after a Python keyword or built-in ends in an underscore.
     """
     split = [(module, names) for module, _, names in (one.partition(":") for one in targets)]
     return tuple(
@@ -104,7 +104,7 @@ VERBS = tuple(verb for verbs in PANELS.values() for verb in verbs)
 
 
 class LazyGroup(TyperGroup):
-    """Verbs of a table; the help text and completion of names need no module of theirs."""
+    """A command group over a table; help and completion of names import no verb's module."""
 
     verbs: tuple[Verb, ...] = VERBS
 
@@ -121,7 +121,7 @@ class LazyGroup(TyperGroup):
         return _loaded(next(verb for verb in self.verbs if verb.name == name))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """As Typer does; the verb that is called is imported."""
+        """As in Typer, but imports the verb that is called."""
         name, command, rest = super().resolve_command(ctx, args)
         return name, self.loaded(name) if command is not None and name else command, rest
 
@@ -151,17 +151,17 @@ def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
 
 
 class _VerbCommand(TyperCommand):
-    """A verb whose points are typed as X Y Z everywhere."""
+    """A verb whose points are always typed as X Y Z."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """As Typer does, once points are one word each."""
+        """As in Typer, after joining each point into one word."""
         return super().parse_args(ctx, joined_points(args))
 
 
 def joined_points(arguments: Sequence[str]) -> list[str]:
-    """The arguments with the three words after each ``--via-mm`` as one.
+    """The arguments with the three words after each ``--via-mm`` joined into one.
 
-    Typer knows options of three values and options that may be repeated, not both at once.
+    Typer supports options with three values and repeatable options, but not both at once.
     """
     words = iter(arguments)
     joined: list[str] = []
@@ -173,7 +173,7 @@ def joined_points(arguments: Sequence[str]) -> list[str]:
 
 
 def _guarded(verb: Callable[..., None]) -> Callable[..., None]:
-    """With arguments that can be used; Ctrl-C where no run is going on is the operator's stop."""
+    """Checks the arguments first; Ctrl-C outside a run counts as the operator's stop."""
 
     @functools.wraps(verb)
     def guarded(*args: object, **options: object) -> None:
@@ -229,24 +229,24 @@ def _options(
 
 def main() -> None:
     """Runs the command line; every error ends in one message and its exit code."""
-    # Importing makes some 10^5 objects that stay; looking through them again and again for
-    # rubbish took a tenth of the time of a plan.
+    # Imports create some 10^5 permanent objects; garbage collection over them took a tenth of
+    # the time of a plan.
     gc.set_threshold(100_000, 50, 50)
-    _print_anything()
+    _escape_unprintable()
     try:
         build_app()()
     except SystemExit:
-        _end_of_output()
+        _flush_output()
         raise
     except CdprError as error:
-        _end(error)
+        _exit_with(error)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
     except OSError as error:
-        _end(_of_the_system(error))
+        _exit_with(_from_os_error(error))
     except MemoryError:
-        _end(
+        _exit_with(
             Fault(
                 "not enough memory",
                 next_step="reduce the problem size, or use a computer with more memory",
@@ -256,44 +256,44 @@ def main() -> None:
         _print_defect(error)
         sys.exit(1)
     finally:
-        # Nor is there rubbish to be found in them at the end, which took another fifth.
+        # The final collection took another fifth.
         gc.freeze()
 
 
-def _print_anything() -> None:
-    """A sign that the terminal cannot show, or a file name that is no text, ends no command."""
+def _escape_unprintable() -> None:
+    """Escapes characters that the terminal or its encoding cannot show, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
-def _end(error: CdprError) -> NoReturn:
+def _exit_with(error: CdprError) -> NoReturn:
     with suppress(OSError):  # the cause may be that nothing can be written
         _print_error(error)
     with suppress(OSError):
         sys.stdout.flush()
-    _forget_output()
+    _discard_output()
     sys.exit(error.exit_code)
 
 
-def _end_of_output() -> None:
-    """What was printed is written before the command says that it went well."""
+def _flush_output() -> None:
+    """Flushes the output before the command exits with success."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:  # such as `cdpr … | head`
-        _forget_output()
+        _discard_output()
     except OSError as error:
-        _end(_of_the_system(error))
+        _exit_with(_from_os_error(error))
 
 
-def _forget_output() -> None:
-    """The interpreter would try again to write it at its end, and complain."""
+def _discard_output() -> None:
+    """Discards unwritten output; the interpreter would retry at exit and complain."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _of_the_system(error: OSError) -> CdprError:
-    """The operating system refused a file that a verb did not expect it to, or its output."""
+def _from_os_error(error: OSError) -> CdprError:
+    """An `OSError` that no verb handled, as bad input (a path) or a fault (the output)."""
     why = error.strerror or str(error)
     if error.filename is not None:
         hint = "check the path, its permissions and the free space"
@@ -313,7 +313,7 @@ def _print_error(error: CdprError) -> None:
 
 
 def _print_defect(error: Exception) -> None:
-    """An unexpected error: one line for the user, the trace in a file."""
+    """Reports an unexpected error: one line for the user, the traceback in a file."""
     with tempfile.NamedTemporaryFile(
         "w", prefix="cdpr-error-", suffix=".txt", delete=False, encoding="utf-8"
     ) as file:

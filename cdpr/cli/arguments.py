@@ -1,7 +1,7 @@
-"""What every verb's arguments must be, looked at before the verb opens or writes anything.
+"""Checks of every verb's arguments, before the verb opens or writes anything.
 
-Paths that can be none, outputs that would overwrite an input or each other, and numbers past any
-machine are refused here, once for all verbs.
+Invalid paths, outputs that would overwrite an input or each other, and numbers beyond any machine
+are refused here, for all verbs.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ OUTPUTS = ("output", "mcap", "overlay")
 """The arguments that name what a verb writes; every other path is read."""
 
 MOST, MOST_WHOLE, MOST_SEED = 1e9, 2**31 - 1, 2**63 - 1
-"""Largest sizes of a number, of a whole number, and of a seed of random numbers."""
+"""Largest absolute value of a number, of an integer, and of a random seed."""
 MOST_OF = {"seed": MOST_SEED, "workers": 1024, "columns": 1000, "rows": 1000, "size_px": 16384}
-"""Largest whole number of an argument, where it is another one."""
+"""Largest integer of single arguments, overriding `MOST_WHOLE`."""
 LONGEST_TEXT = 100
-"""Of a name that becomes part of a file's, [bytes]."""
+"""Of a name that becomes part of a file name, [bytes]."""
 NAMES = ("name", "channel", "interface")
 
 
 def check_arguments(arguments: Mapping[str, object]) -> None:
-    """Refuses arguments that no verb can use.
+    """Refuses arguments that are invalid for every verb.
 
     Args:
-        arguments: The verb's, by the name of its parameter.
+        arguments: The verb's arguments, by parameter name.
 
     Raises:
-        BadInput: A path or number can be none, or an output is also an input or another output.
+        BadInput: A path or number is invalid, or an output is also an input or another output.
     """
     given = dict(_single(arguments))
     for name, values in given.items():
@@ -47,7 +47,7 @@ def check_arguments(arguments: Mapping[str, object]) -> None:
 
 
 def _single(arguments: Mapping[str, object]) -> Iterator[tuple[str, list[object]]]:
-    """Each argument's values; of options in a dataclass, its fields."""
+    """Each argument's values; a dataclass of options counts as its fields."""
     for name, value in arguments.items():
         if is_dataclass(value) and not isinstance(value, type):
             yield from _single({field.name: getattr(value, field.name) for field in fields(value)})
@@ -81,12 +81,14 @@ def _check_whole(name: str, value: int) -> None:
 def _check_number(name: str, value: float) -> None:
     if not math.isfinite(value) or abs(value) > MOST:
         what = f"{_option(name)} is {value:g}; it must be a finite number, at most {MOST:g}"
-        raise BadInput(what, where="command line", next_step="give a smaller number, in that unit")
+        raise BadInput(
+            what, where="command line", next_step="give a smaller number, in the option's unit"
+        )
 
 
 def _check_text(name: str, text: str) -> None:
     if "\0" in text or (name in NAMES and len(os.fsencode(text)) > LONGEST_TEXT):
-        what = f"{_option(name)} is a text of {len(text)} characters, not a valid name"
+        what = f"{_option(name)} has {len(text)} characters and is not a valid name"
         hint = f"give a name of {LONGEST_TEXT} bytes at most"
         raise BadInput(what, where=shown(text), next_step=hint)
     if "://" not in text:
@@ -98,13 +100,13 @@ def _option(name: str) -> str:
 
 
 def _paths(name: str, values: Iterable[object]) -> list[Path]:
-    """Of an output; a folder for results may be one that is read, as their names are their own."""
+    """Paths of an output; a folder of results may also be read, as result names are unique."""
     found = [value for value in values if isinstance(value, Path)]
     return [path for path in found if name == "overlay" or not path.is_dir()]
 
 
 def _inputs(values: Iterable[object]) -> Iterator[Path]:
-    """Paths that are read, and texts such as ``front=video.avi`` that turn out to be files."""
+    """Paths that are read, also in texts such as ``front=video.avi``, if the file exists."""
     for value in values:
         if isinstance(value, Path):
             yield value

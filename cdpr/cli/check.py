@@ -1,4 +1,4 @@
-"""`cdpr check`: proves a plan by an independent route."""
+"""`cdpr check`: verifies a plan by an independent method."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def check(
     plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
     rig: Annotated[
         Path | None,
-        typer.Option(help="check against this rig file as it is now"),
+        typer.Option(help="check against this rig file's present content"),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a plan with an independent method: distances at dense poses, with bounds.
+    """Verify a plan independently: distances at dense poses, with bounds in between.
 
-    Exits with 3 when anything is below what the scene asks.
+    Exit code 3 where a value violates the scene's requirements.
 
     [dim]Examples:[/dim]
 

@@ -1,4 +1,4 @@
-"""`cdpr doctor`: looks whether this machine has what a run needs."""
+"""`cdpr doctor`: checks whether this machine has what a run needs."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def doctor(
 ) -> None:
     """Check that this machine can run a rig; with a rig file, also its bus and cameras.
 
-    Each thing that is missing comes with the command that mends it. Nothing is sent on the bus;
-    with --drives only questions are, and no drive is changed.
+    Whatever is missing is listed with the command that fixes it. Nothing is sent on the bus; with
+    --drives only read requests are sent, and no drive is changed.
 
     [dim]Examples:[/dim]
 
@@ -75,7 +75,7 @@ def doctor(
 
 
 def _show_checks(checks: Iterable[MachineCheck]) -> None:
-    """One line for each, and the next step where one is missing."""
+    """One line per check, with the next step where it failed."""
     for check in checks:
         mark = "[green]ok  [/]" if check.good else "[red]miss[/]"
         out.print(f"{mark} {check.name}: {check.text}", soft_wrap=True)
@@ -84,7 +84,7 @@ def _show_checks(checks: Iterable[MachineCheck]) -> None:
 
 
 def _show_table(found: Examined, rig: Rig) -> None:
-    """What needs a change first, then the rest, then the sum."""
+    """Objects that need a change first, then the others, then the total."""
     table = Table("", "object", "needed", "found", "meaning", "change")
     marks = {"ok": "[green]ok[/]", "remark": "[yellow]note[/]", "wrong": "[red]wrong[/]"}
     for verdict in ("wrong", "remark", "ok"):

@@ -1,4 +1,4 @@
-"""`cdpr explain`: what a fault means, its likely cause, and the next step."""
+"""`cdpr explain`: meaning, likely cause and next step of a fault."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def explain(
 ) -> None:
     """Explain a fault that a run reported: meaning, likely cause, state of the machine, next step.
 
-    Without a code, list all of them.
+    Without a code, lists all of them.
 
     [dim]Example:[/dim]
 

@@ -1,4 +1,4 @@
-"""Options that several verbs have, and groups of options that belong together."""
+"""Options shared by several verbs, and groups of related options."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-import calibration  # loads nothing yet: `cdpr stop` must not wait for scientific libraries
+import calibration  # loads names lazily: `cdpr stop` must not wait for scientific libraries
 from cdpr.cli.output import Terminal
 from model.errors import BadInput
 from model.files.documents import millimetres
@@ -28,12 +28,12 @@ Triple = tuple[float, float, float]
 
 
 def level_pose(position_mm: Triple | None) -> Pose | None:
-    """The level pose at a position x y z of an option, ``world_from_platform``."""
+    """The level pose at an option's position x y z, ``world_from_platform``."""
     return None if position_mm is None else Pose.level(millimetres(list(position_mm)))
 
 
 def finite(value: float | None) -> float | None:
-    """The number of an option, as its callback: `inf` and `nan` pass the limits of a type.
+    """Option callback that refuses `inf` and `nan`, which pass min and max.
 
     Raises:
         typer.BadParameter: It is not finite.
@@ -44,9 +44,9 @@ def finite(value: float | None) -> float | None:
 
 
 def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the fields of each dataclass among its parameters as options of their own.
+    """The command with each dataclass parameter expanded into options, one per field.
 
-    Fields are annotated as options are, and have defaults.
+    Fields are annotated like options, and have defaults.
     """
     whole = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {
@@ -76,7 +76,7 @@ def _parameters(group: Any) -> list[inspect.Parameter]:
     ]
 
 
-# Calibration results in place of the rig file's values.
+# Calibration results that replace values of the rig file.
 
 CalibrationOption = Annotated[
     list[Path] | None,
@@ -89,12 +89,12 @@ CalibrationOption = Annotated[
 
 
 def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
-    """The rig with the results of files in place of its file's numbers, in memory only.
+    """The rig with values replaced by calibration results, in memory only.
 
-    The verdict of each result that is not good enough is reported: it may be used all the same.
+    A result that is not good enough is used too, with its verdict as a remark.
 
     Raises:
-        BadInput: A file cannot be used, or is not about this rig.
+        BadInput: A file cannot be used, or belongs to another rig.
     """
     if not files:
         return rig
@@ -106,13 +106,13 @@ def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
     return better
 
 
-# Verbs that reach drives: the rig, its bus, and how its drives are moved.
+# Verbs that reach drives: the rig, its bus, and the motion.
 
 InterfaceOption = Annotated[
     str | None,
     typer.Option("--interface", help="python-can interface, overriding the rig file's"),
 ]
-ChannelOption = Annotated[str | None, typer.Option("--channel", help="its channel")]
+ChannelOption = Annotated[str | None, typer.Option("--channel", help="channel of the interface")]
 FastOption = Annotated[bool, typer.Option("--fast", help="simulated time, as fast as possible")]
 YesOption = Annotated[
     bool, typer.Option("--yes", help="do not ask before moving drives on a real bus")
@@ -127,7 +127,7 @@ SummaryJsonOption = Annotated[bool, typer.Option("--json", help="print the summa
 
 @dataclass(frozen=True, slots=True)
 class BusOptions:
-    """Where the drives of a rig are, and what was calibrated; every field is an option."""
+    """Bus and calibration of a rig; every field is an option."""
 
     interface: InterfaceOption = None
     channel: ChannelOption = None
@@ -138,7 +138,7 @@ class BusOptions:
         return rig_on_bus(path, self.interface, self.channel, self.calibration)
 
 
-RIGS_OWN = BusOptions()
+DEFAULT_BUS = BusOptions()
 
 
 def rig_on_bus(
@@ -147,20 +147,20 @@ def rig_on_bus(
     channel: str | None,
     calibration: list[Path] | None = None,
 ) -> Rig:
-    """The rig of a file, on another bus when one is named, with the results of calibrations."""
+    """The rig of a file, on another bus if one is given, with calibration results."""
     return calibrated_rig(load_rig(path).with_bus(interface, channel), calibration)
 
 
 def require_unused(verb: str, options: Mapping[str, object], why: str) -> None:
-    """Refuses options that would have no effect, as they show a misunderstanding.
+    """Refuses options that would have no effect.
 
     Args:
-        verb: As it is called, ``cdpr jog``.
-        options: Name and value; None and False are not given.
+        verb: The command, such as ``cdpr jog``.
+        options: Value by name; None and False mean not given.
         why: They have no effect.
 
     Raises:
-        BadInput: One was given; with the names of all.
+        BadInput: With the names of all that were given.
     """
     given = [name for name, value in options.items() if value is not None and value is not False]
     if given:

@@ -1,4 +1,4 @@
-"""How the command line talks: results on stdout, progress and remarks on stderr."""
+"""Output of the command line: results on stdout, progress and remarks on stderr."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ out = Console(highlight=False)
 
 
 class _Remarks:
-    """Standard error; a closed pipe must not end a run in motion."""
+    """Standard error that ignores a closed pipe, which must not end a run in motion."""
 
     def write(self, text: str) -> int:
-        """Writes, if anybody is there."""
+        """Writes; errors are ignored."""
         with suppress(OSError):
             sys.stderr.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """Likewise."""
+        """Flushes; errors are ignored."""
         with suppress(OSError):
             sys.stderr.flush()
 
     def __getattr__(self, name: str) -> Any:
-        """All else is as with standard error itself."""
+        """Everything else comes from standard error itself."""
         return getattr(sys.stderr, name)
 
 
@@ -42,20 +42,20 @@ err = Console(file=cast(IO[str], _Remarks()), highlight=False)
 
 
 def show_json(document: Any) -> None:
-    """A result for programs."""
+    """Prints a result for programs."""
     typer.echo(json.dumps(document, indent=1, allow_nan=False))
 
 
 def show_line(text: str, on: Console = out) -> None:
-    """Plain text, of which no terminal wraps a line."""
+    """Prints plain text without wrapping lines."""
     on.print(text, markup=False, soft_wrap=True)
 
 
 def show_facts(title: str, facts: list[tuple[str, str]], on: Console = out) -> None:
-    """A result for people: names on the left, values on the right; a line each in a file.
+    """Prints a result for people: names on the left, values on the right.
 
     Args:
-        title: What they are about.
+        title: Heading.
         facts: Names and values.
         on: `out`, or `err` where standard output is for a program.
     """
@@ -76,7 +76,7 @@ def show_facts(title: str, facts: list[tuple[str, str]], on: Console = out) -> N
 
 @contextmanager
 def progress_bar(text: str, total: float | None, shown: bool) -> Iterator[Advance]:
-    """A bar on stderr where somebody looks; what is given back moves it."""
+    """Shows a progress bar on stderr if that is a terminal; yields the function that moves it."""
     columns = (
         TextColumn("[progress.description]{task.description}"),
         BarColumn(),
@@ -97,7 +97,7 @@ def progress_bar(text: str, total: float | None, shown: bool) -> Iterator[Advanc
 
 @contextmanager
 def spinner(text: str, shown: bool) -> Iterator[None]:
-    """A remark that something takes a moment."""
+    """Shows on a terminal that something takes a moment."""
     if not shown or not err.is_terminal:
         yield
         return
@@ -114,7 +114,7 @@ class Terminal(Listener):
         Args:
             quiet: Standard output is for a program: no notes, no spinner, no bar.
         """
-        self._shown, self._shown_already = not quiet, False
+        self._shown, self._is_busy = not quiet, False
 
     def note(self, text: str) -> None:
         """See `Listener`."""
@@ -132,20 +132,20 @@ class Terminal(Listener):
     @contextmanager
     def waiting(self, text: str) -> Iterator[None]:
         """See `Listener`."""
-        with self._alone() as shown, spinner(text, shown):
+        with self._exclusive() as shown, spinner(text, shown):
             yield
 
     @contextmanager
     def progress(self, text: str, total: float | None) -> Iterator[Advance]:
         """See `Listener`."""
-        with self._alone() as shown, progress_bar(text, total, shown) as advance:
+        with self._exclusive() as shown, progress_bar(text, total, shown) as advance:
             yield advance
 
     @contextmanager
-    def _alone(self) -> Iterator[bool]:
+    def _exclusive(self) -> Iterator[bool]:
         """Whether a spinner or a bar may be shown: a terminal shows one at a time."""
-        before, self._shown_already = self._shown_already, True
+        before, self._is_busy = self._is_busy, True
         try:
             yield self._shown and not before
         finally:
-            self._shown_already = before
+            self._is_busy = before

@@ -40,11 +40,11 @@ _PANEL = "Open readings of the paper's text (docs/paper.md)"
 
 @dataclass(frozen=True, slots=True)
 class SearchOptions:
-    """Which planner searches, and how; every field is an option of `cdpr plan`."""
+    """Planner and its settings; every field is an option of `cdpr plan`."""
 
     planner: Annotated[
         PlannerName,
-        typer.Option(help="optimal (recommended), the paper's, or half of all samples at the goal"),
+        typer.Option(help="optimal (recommended), or the paper's: adaptive, goal-bias"),
     ] = "optimal"
     cost: Annotated[
         Objective | None,
@@ -109,7 +109,7 @@ class SearchOptions:
     ] = False
 
     def with_seed(self, seed: int) -> PlanningOptions:
-        """As the planner's library takes them."""
+        """As options of the planner's library."""
         given: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
         return PlanningOptions(seed=seed, **{k: v for k, v in given.items() if v is not None})
 
@@ -184,7 +184,7 @@ def plan(
         the_scene, done, end = scene_after(the_scene, the_rig, from_run)
         require_room(the_scene, the_rig)
         begun = end.facts(from_run, len(done), len(the_scene.stops))
-    the_scene = _by_way_of(the_scene, via_mm or [])
+    the_scene = _with_via_points(the_scene, via_mm or [])
     require_new_file(output, force)
     settings = settings_from_options(search.with_seed(seed))
     of_legs = search.rounds if search.rounds and len(search.rounds) > 1 else []
@@ -201,13 +201,13 @@ def plan(
     show_facts(f"plan {output}", [*begun, *plan_facts(document), ("next", next_step)])
 
 
-def _by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:
-    """The scene with level way-poses before its own stops, given as ``x y z`` (`joined_points`).
+def _with_via_points(scene: Scene, via_mm: Sequence[str]) -> Scene:
+    """The scene with level poses at ``x y z`` (`joined_points`) before its own stops.
 
     Raises:
-        BadInput: A way-pose cannot be read.
+        BadInput: A position cannot be read.
     """
-    ways = []
+    points = []
     for number, text in enumerate(via_mm, start=1):
         try:
             x, y, z = map(float, text.split())
@@ -219,5 +219,5 @@ def _by_way_of(scene: Scene, via_mm: Sequence[str]) -> Scene:
             raise BadInput(
                 f"--via-mm {text}: finite numbers are required", next_step="write --via-mm 0 40 430"
             )
-        ways.append(StopDocument(name=f"via {number}", position_mm=[x, y, z]))
-    return scene.changed(stops=[*ways, *scene.document.stops]) if ways else scene
+        points.append(StopDocument(name=f"via {number}", position_mm=[x, y, z]))
+    return scene.changed(stops=[*points, *scene.document.stops]) if points else scene

@@ -1,4 +1,4 @@
-"""`cdpr report`: makes the report of a run from its folder."""
+"""`cdpr report`: rewrites the report of a run from its folder."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def report(
     run: Annotated[Path, typer.Argument(help="run folder", metavar="RUNDIR")],
     as_json: Annotated[bool, typer.Option("--json", help="print the run's summary")] = False,
 ) -> None:
-    """Write the report of a run folder again from its files.
+    """Write the report of a run again, from the files of its folder.
 
-    Of a run whose program was killed, or whose disk was full, it writes what is missing from what
-    is there.
+    For a run that was killed, or whose disk was full, missing results are recovered from the files
+    that exist.
 
     [dim]Example:[/dim]
 

@@ -1,4 +1,4 @@
-"""`cdpr sim`: the drives of a rig, simulated in a process of their own."""
+"""`cdpr sim`: simulates the drives of a rig in a separate process."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def sim(
     ] = False,
     plan: Annotated[
         Path | None,
-        typer.Option(help="place the platform at the start of this plan, with its load"),
+        typer.Option(help="start the platform at the start of this plan, with its load"),
     ] = None,
     eds: Annotated[
         Path | None,
@@ -113,7 +113,7 @@ def sim(
         show_line(
             f"{the_rig.cable_count} simulated drives of {the_rig.name} on"
             f" {BusSettings.of(the_rig)}; platform at {x:z.1f}, {y:z.1f}, {z:z.1f} mm;"
-            " Ctrl-C ends it"
+            " Ctrl-C ends the simulation"
         )
         board = LocalRequests()
         with stop_requests(board), real_time() as denied:
@@ -122,21 +122,21 @@ def sim(
             rehearsal.serve(lambda: board.read().stop)
     finally:
         bus.shutdown()
-    out.print("the simulated drives have ended")
+    out.print("simulation ended")
 
 
 def _behaviour(names: list[str]) -> DriveBehaviour:
-    """Of the simulated drives; the name ``list`` prints all names and ends the program."""
+    """Behaviour of the simulated drives; ``list`` prints all names and exits."""
     if "list" in names:
         width = max(len(name) for name, _ in table())
-        for name, says in table():
-            out.print(f"{name:<{width}}  {says}", soft_wrap=True, markup=False, highlight=False)
+        for name, text in table():
+            out.print(f"{name:<{width}}  {text}", soft_wrap=True, markup=False, highlight=False)
         raise typer.Exit
     return behaviour_named(names)
 
 
 def _start(rig: Rig, start_mm: Triple | None, plan: Path | None) -> tuple[Pose, Load | None]:
-    """Where the platform stands, and what it carries."""
+    """The platform's initial pose, and its load."""
     if start_mm is not None and plan is not None:
         raise BadInput(
             "--at-mm and --plan contradict each other", next_step="leave out one of them"

@@ -1,4 +1,4 @@
-"""`cdpr examples` lists and copies ready files; `cdpr new` asks for a rig and writes its file."""
+"""`cdpr examples` lists and copies example files; `cdpr new` asks and writes a rig file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from model.files.rig_template import rig_text
 
 def examples(
     names: Annotated[
-        list[str] | None, typer.Argument(help="examples to copy; without a name, all are listed")
+        list[str] | None, typer.Argument(help="examples to copy; without a name, list all")
     ] = None,
     output: Annotated[
         Path | None,
@@ -32,9 +32,9 @@ def examples(
         typer.Option("--all", help="copy all, into configs/ and examples/ as in the repository"),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="the list as JSON")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the list as JSON")] = False,
 ) -> None:
-    """List the ready rigs, scenes and recorded sessions, or copy some of them.
+    """List the example rigs, scenes and recorded sessions, or copy some of them.
 
     [dim]Examples:[/dim]
 
@@ -67,7 +67,7 @@ def examples(
         show_line(f"copied {path}")
 
 
-# `cdpr new`: asks what a rig file needs to know, and writes it.
+# `cdpr new`: asks for the essentials of a rig, and writes its file.
 
 
 _Point = tuple[float, float, float]
@@ -82,7 +82,9 @@ def new(
             "--from", help="CSV with one line per cable; no questions, defaults for the rest"
         ),
     ] = None,
-    platform_mm: Annotated[_Point | None, typer.Option(metavar="X Y Z", help="its size")] = None,
+    platform_mm: Annotated[
+        _Point | None, typer.Option(metavar="X Y Z", help="platform size")
+    ] = None,
     mass_kg: Annotated[float | None, typer.Option(help="mass of the platform")] = None,
     home_mm: Annotated[_Point | None, typer.Option(metavar="X Y Z", help="home position")] = None,
     lower_mm: Annotated[
@@ -103,16 +105,17 @@ def new(
     encoder: Annotated[str | None, typer.Option(help="absolute or incremental")] = None,
     max_speed_mm_s: Annotated[float | None, typer.Option(help="largest cable speed")] = None,
     torque_constant_n: Annotated[
-        float | None, typer.Option(help="cable tension at rated torque")
+        float | None, typer.Option(help="cable tension at rated motor torque")
     ] = None,
     interface: Annotated[str | None, typer.Option(help="python-can interface of the bus")] = None,
     channel: Annotated[str | None, typer.Option(help="channel of the bus")] = None,
     bitrate: Annotated[int | None, typer.Option(help="bit rate of the bus, bit/s")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
 ) -> None:
-    """Ask for the essentials of a rig, and write a commented rig file.
+    """Ask for the essentials of a rig and write a commented rig file.
 
-    Each question has a unit and a default, which Enter takes; what an option gives is not asked.
+    Each question shows a unit and a default, which Enter accepts; values given as options are not
+    asked for.
 
     [dim]Examples:[/dim]
 
@@ -134,7 +137,7 @@ def new(
 
 
 def _ask(question: RigQuestion, default: str) -> str:
-    """The typed answer; standard error has the question, so that output can go to a file."""
+    """The typed answer; the question goes to standard error, so output can go to a file."""
     unit = f" {question.unit}" if question.unit else ""
     print(f"{question.text} [{default}]{unit}: ", end="", file=sys.stderr, flush=True)
     line = sys.stdin.readline()

@@ -1,4 +1,4 @@
-"""Studies on all cores: `cdpr workspace`, maps of what a rig can do where, and `cdpr bench`."""
+"""Studies on all cores: `cdpr workspace`, maps of a rig's workspace, and `cdpr bench`."""
 
 from __future__ import annotations
 
@@ -81,9 +81,9 @@ def workspace(
     force: Annotated[bool, typer.Option("--force", help="replace the maps in the folder")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
 ) -> None:
-    """Map the workspace: feasibility, wrench closure, capacity margin and dexterity.
+    """Map the workspace: wrench feasibility and closure, capacity margin, dexterity, clearance.
 
-    Wrench closure and feasibility, dexterity, forces and clearances, as one page.
+    The maps are written as arrays and as one HTML page.
 
     [dim]Examples:[/dim]
 
@@ -125,7 +125,7 @@ def _rotation(rotation_wxyz: tuple[float, float, float, float] | None) -> Array 
     return matrix_from_quaternion(np.array(rotation_wxyz) / norm)
 
 
-# `cdpr bench`: measurements of the planner that take a while.
+# `cdpr bench`: long measurements of the planner.
 
 
 ENVIRONMENTS = ("environment_1", "environment_2", "environment_3")
@@ -136,7 +136,7 @@ def paper(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="folder to write", metavar="DIR")
     ] = DEFAULT_FOLDER,
-    seeds: Annotated[int, typer.Option(min=2, help="searches of each planner in each case")] = 100,
+    seeds: Annotated[int, typer.Option(min=2, help="searches per planner and case")] = 100,
     workers: WorkersOption = None,
     dask: DaskOption = None,
     check: Annotated[
@@ -147,10 +147,10 @@ def paper(
 ) -> None:
     """Repeat the paper's evaluation (section 5.3, Fig. 9) and report which claims hold.
 
-    Adaptive sampling against the goal bias, kinematic cost against length, in three environments,
-    with the scene's ends and with random ones, in the rig's workspace box and in larger ones, and
-    for every reading of the text. Writes index.html, images, trials.csv, summary.csv and
-    findings.json. The numbers depend on the seeds alone, the times aside.
+    Compares adaptive sampling with goal bias and kinematic cost with length, in three environments,
+    with the scene's start and goal and with random ones, in the rig's workspace box and in larger
+    ones, and for every reading of the text. Writes index.html, images, trials.csv, summary.csv and
+    findings.json. Apart from times, the numbers depend only on the seeds.
 
     [dim]Example:[/dim]
 
@@ -176,14 +176,14 @@ def paper(
                 out.print(f"{name}: {described[name]}")
         else:
             out.print("paths were not checked; pass --check to check them")
-        out.print(f"larger boxes, every reading, figures: open {output / 'index.html'}")
+        out.print(f"for larger boxes, every reading and figures, open {output / 'index.html'}")
     if described["paths that failed their check"]:
         raise typer.Exit(1)
 
 
 def _table(found: Sequence[Finding]) -> Table:
     table = Table(
-        title="the paper's claims in the rig's own box",
+        title="the paper's claims in the rig's workspace box",
         box=None,
         title_justify="left",
         padding=(0, 2),

@@ -1,4 +1,4 @@
-"""`cdpr track`: measures the platform in images."""
+"""`cdpr track`: measures the platform's pose in images."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def track(
         Path | None, typer.Option(help="also measure the clearance to this scene's obstacles")
     ] = None,
     plan: Annotated[
-        Path | None, typer.Option(help="with 'synthetic': the path of the platform")
+        Path | None, typer.Option(help="with 'synthetic': plan that the platform follows")
     ] = None,
     pictures: Annotated[
         int | None, typer.Option(min=1, help="largest number of images; Ctrl-C also stops")
@@ -114,16 +114,16 @@ def _require_outputs(
     overlay: Path | None,
     force: bool,
 ) -> None:
-    """Refuses outputs that cannot be written, are one another, or are an input."""
+    """Refuses outputs that cannot be written, or that are the same file as another or an input."""
     several = len(sources) > 1
-    logs = {eye.name: own_file(output, eye.name) for eye in sources} if several else {}
+    logs = {c.name: own_file(output, c.name) for c in sources} if several else {}
     for path in [output, *([] if mcap is None else [mcap]), *logs.values()]:
         require_new_file(path, force)
     written: dict[str, Path | None] = {"--output": output, "--mcap": mcap, "--overlay": overlay}
     written |= {f"the log of {name}": path for name, path in logs.items()}
     if overlay is not None and several:
-        written |= {f"the drawing of {e.name}": own_drawing(overlay, e.name) for e in sources}
+        written |= {f"the overlay of {c.name}": own_drawing(overlay, c.name) for c in sources}
     refuse_overwriting(
         {name: path for name, path in written.items() if path is not None},
-        [Path(place) for place in sources.values()],
+        [Path(source) for source in sources.values()],
     )

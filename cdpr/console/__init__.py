@@ -1,7 +1,7 @@
-"""The operator's console: a page that shows the robot live, and with which it is operated.
+"""The operator's console: a web page to monitor and operate the robot.
 
-A client of the command socket and of the public API in a process of its own: what moves is started
-as a verb of the command line, and goes on whatever becomes of the console.
+A client of the command socket and of the public API in a separate process. Motions are started as
+verbs of the command line, and continue when the console ends.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a page may say, one JSON object a message on its socket, and which page may operate."""
+"""Messages from a page, one JSON object each, and which page has control."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Millimetres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Index = Annotated[int, Field(ge=0, le=10_000)]
 
 
-class _Said(BaseModel):
+class _Incoming(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-class _Command(_Said):
+class _Command(_Incoming):
     kind: Literal["command"]
     id: int = 0
 
@@ -57,35 +57,35 @@ class PlainCommand(_Command):
 
 
 class TakeCommand(_Command):
-    """The page wants control; with force from a page that has it."""
+    """Take control; with force, from a page that has it."""
 
     command: Literal["take_control"]
     force: bool = False
 
 
 class SpeedCommand(_Command):
-    """Of the planned speed."""
+    """Set the speed, in per cent of the planned one."""
 
     command: Literal["speed"]
     percent: Annotated[int, Field(ge=SLOWEST, le=FASTEST)]
 
 
 class FileCommand(_Command):
-    """A plan to look at before it is run."""
+    """Load a plan for preview."""
 
     command: Literal["load_plan"]
     file: Text
 
 
 class CompareCommand(_Command):
-    """A plan to look at beside the one that is loaded; none to look at that alone."""
+    """Show a plan beside the loaded one; None ends the comparison."""
 
     command: Literal["compare"]
     file: Text | None
 
 
 class PlanCommand(_Command):
-    """A path to plan: of a scene, or through the taught poses."""
+    """Plan a path for a scene, or through the taught poses."""
 
     command: Literal["plan"]
     scene: Text | None = None
@@ -93,14 +93,14 @@ class PlanCommand(_Command):
 
 
 class NameCommand(_Command):
-    """The pose as it is now is to be kept."""
+    """Teach the present pose."""
 
     command: Literal["teach"]
     name: Text
 
 
 class PickCommand(_Command):
-    """A position of the scene is to be kept, with the orientation of now."""
+    """Teach a position picked in the scene, with the present orientation."""
 
     command: Literal["teach_at"]
     name: Text
@@ -108,7 +108,7 @@ class PickCommand(_Command):
 
 
 class RenameCommand(_Command):
-    """A taught pose gets another name."""
+    """Rename a taught pose."""
 
     command: Literal["rename"]
     pose: Text
@@ -116,7 +116,7 @@ class RenameCommand(_Command):
 
 
 class MoveCommand(_Command):
-    """A taught pose gets another place in the order."""
+    """Move a taught pose within the order."""
 
     command: Literal["move"]
     pose: Text
@@ -124,14 +124,14 @@ class MoveCommand(_Command):
 
 
 class ForgetCommand(_Command):
-    """A taught pose goes."""
+    """Remove a taught pose."""
 
     command: Literal["forget"]
     pose: Text
 
 
-class Held(_Said):
-    """A jog control is held: of the platform, with a direction, or of one cable, with a sense."""
+class Held(_Incoming):
+    """A jog control is held: for the platform with a direction, for a cable with a sense."""
 
     kind: Literal["held"]
     hold: Number
@@ -150,7 +150,7 @@ class Held(_Said):
         return self
 
 
-class LetGo(_Said):
+class LetGo(_Incoming):
     """A jog control is no longer held."""
 
     kind: Literal["let_go"]
@@ -177,14 +177,14 @@ _ANY: TypeAdapter[Message | Held | LetGo] = TypeAdapter(
 
 
 class NotAMessage(ValueError):
-    """What came over the socket is none; the text says why."""
+    """The received text is not a valid message; the error's text says why."""
 
 
 def parse_message(text: str) -> Message | Held | LetGo:
     """The message in a text.
 
     Raises:
-        NotAMessage: It is none.
+        NotAMessage: It is not a valid message.
     """
     if len(text) > LONGEST:
         raise NotAMessage(f"longer than {LONGEST} characters")
@@ -195,7 +195,7 @@ def parse_message(text: str) -> Message | Held | LetGo:
         raise NotAMessage("; ".join(str(problem["msg"]) for problem in problems[:3])) from None
 
 
-# Which page may operate, and which press of a jog control is meant. Pure.
+# Which page has control, and the numbers of its jog presses. Pure.
 
 
 @dataclass(slots=True)
@@ -208,14 +208,14 @@ class _Page:
 
 
 class PageControl:
-    """Everybody may look and stop; one page at a time may operate."""
+    """Every page may watch and stop; one page at a time has control."""
 
     def __init__(self, now_ms: Callable[[], int]) -> None:
-        """No page is open.
+        """Starts with no page open.
 
         Args:
-            now_ms: A clock that all consoles of this computer share, [ms]: presses are numbered by
-                it, so that no console goes on with the press of another, or of one before it.
+            now_ms: A clock shared by all consoles of this computer, [ms]. Press numbers come from
+                it, so no console continues a press of another or of an earlier one.
         """
         self._pages: dict[int, _Page] = {}
         self._now_ms = now_ms
@@ -223,16 +223,16 @@ class PageControl:
         self.holder: int | None = None
         """The page that has control."""
         self.is_service = False
-        """That page is in service mode."""
+        """Whether that page is in service mode."""
 
     def join(self, host: str) -> int:
-        """A page was opened on a computer; its number."""
+        """Registers a page opened on a host; returns its number."""
         number, self._next_page = self._next_page, self._next_page + 1
         self._pages[number] = _Page(f"page {number} on {host}")
         return number
 
     def leave(self, page: int) -> int | None:
-        """A page is gone; the press that it held, if any, and its control end."""
+        """Removes a page and its control; returns the press that it held, if any."""
         held = self.let_go(page)
         del self._pages[page]
         if self.holder == page:
@@ -240,26 +240,26 @@ class PageControl:
         return held
 
     def take(self, page: int, *, moving: bool, force: bool = False) -> str:
-        """Gives a page control; why not, or nothing.
+        """Gives a page control; returns the reason if refused, else an empty text.
 
         Args:
-            page: Which.
-            moving: Something moves.
-            force: Take it from a page that has it; only while nothing moves.
+            page: Number of the page.
+            moving: Whether a motion is in progress.
+            force: Take control from another page; only at rest.
         """
         if self.holder not in (None, page):
             assert self.holder is not None
             if moving or not force:
                 holder = self._pages[self.holder].name
                 when = " while the robot moves" if moving and force else ""
-                return f"{holder} has control; it is not taken away{when}"
+                return f"{holder} has control, and keeps it{when}"
             self.let_go(self.holder)
             self._free()
         self.holder = page
         return ""
 
     def give(self, page: int) -> int | None:
-        """A page gives its control back; the press that it held ends."""
+        """Returns a page's control, and the press that it held, if any."""
         held = self.let_go(page)
         if self.holder == page:
             self._free()
@@ -269,49 +269,49 @@ class PageControl:
         self.holder, self.is_service = None, False
 
     def set_service(self, page: int, on: bool) -> int | None:
-        """The page that has control enters or leaves service mode; the press that it held ends."""
+        """Enters or leaves service mode; returns the press that the page held, if any."""
         held = self.let_go(page)
         if self.holder == page:
             self.is_service = on
         return held
 
     def mode(self, page: int) -> str:
-        """What a page may do: ``observe``, ``operate`` or ``service``."""
+        """A page's mode: ``observe``, ``operate`` or ``service``."""
         if self.holder != page:
             return "observe"
         return "service" if self.is_service else "operate"
 
     def holder_name(self) -> str | None:
-        """Who has control."""
+        """Name of the page that has control."""
         return None if self.holder is None else self._pages[self.holder].name
 
     def hold(self, page: int, hold: int, motion: int) -> int | None:
-        """The press that a page's control is held with; None where it may not, or no longer.
+        """The press number for a held control of a page; None if refused or over.
 
-        A press that is heard of while the page may not operate is over: who gets control later has
-        to press again, and nothing that was said before moves anything.
+        A press reported while the page has no control is over: after gaining control, the operator
+        has to press again, and no earlier message moves anything.
 
         Args:
-            page: Which.
-            hold: The page's own number of the press, rising from 1.
-            motion: Number of the session that it is to move; a press is over with the session in
-                which it began, and at once where there is none (0).
+            page: Number of the page.
+            hold: The page's number of the press, rising from 1.
+            motion: Number of the jog session; a press ends with the session in which it began,
+                and at once without a session (0).
         """
-        mine = self._pages[page]
-        if hold <= mine.over or hold < mine.hold:
+        state = self._pages[page]
+        if hold <= state.over or hold < state.hold:
             return None
-        if self.holder != page or motion == 0 or (hold == mine.hold and motion != mine.motion):
-            mine.over = hold
+        if self.holder != page or motion == 0 or (hold == state.hold and motion != state.motion):
+            state.over = hold
             return None
-        if hold > mine.hold:
+        if hold > state.hold:
             self._last_press = max(self._last_press + 1, self._now_ms())
-            mine.hold, mine.press, mine.motion = hold, self._last_press, motion
-        return mine.press
+            state.hold, state.press, state.motion = hold, self._last_press, motion
+        return state.press
 
     def let_go(self, page: int, hold: int | None = None) -> int | None:
-        """The press that ends: of this number on the page, or the one that is held."""
-        mine = self._pages[page]
+        """Ends a press of a page, by its number or the one held; returns its press number."""
+        state = self._pages[page]
         if hold is None:
-            hold = mine.hold
-        mine.over = max(mine.over, hold)
-        return mine.press if hold >= mine.hold > 0 else None
+            hold = state.hold
+        state.over = max(state.over, hold)
+        return state.press if hold >= state.hold > 0 else None

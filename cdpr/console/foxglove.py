@@ -1,4 +1,4 @@
-"""Streams a run that is under way to Foxglove, in the channels of ``run.mcap``."""
+"""Streams a run to Foxglove, in the channels of ``run.mcap``."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from executor.recording.mcap_channels import (
 from model.clearance import Nearest
 from model.errors import Fault
 
-#: The scene is sent again this often, [s], to programs that connect later.
+#: Period of the scene, [s], for programs that connect later.
 SCENE_EVERY = 1.0
 TOPICS = ("/scene", "/robot", "/tf", "/encoder_pose", "/drives", "/clearance", "/events")
 
 
 class FoxgloveStream:
-    """What programs see that connect to the server."""
+    """Messages to the programs that connect to the server."""
 
     def __init__(self, server: WebSocketServer, context: Context) -> None:
-        """Nothing is sent yet.
+        """Opens the channels.
 
         Args:
-            server: It listens already.
-            context: Its channels.
+            server: Already listening.
+            context: Of the server's channels.
         """
         self.address = f"ws://127.0.0.1:{server.port}"
-        """To be opened in Foxglove."""
+        """Address to open in Foxglove."""
         self._channels = {topic: _channel(topic, context) for topic in TOPICS}
         self._scene_at = float("-inf")
-        self._told: list[dict[str, Any]] = []
+        self._sent_events: list[dict[str, Any]] = []
 
     def take(self, status: dict[str, Any], robot: tuple[RobotView, RobotNow] | None) -> None:
-        """Sends how a run stands now.
+        """Sends the present status of a run.
 
         Args:
             status: See `executor.remote.status`.
-            robot: Where it is by its drives; None before it is known.
+            robot: Pose and clearance from the encoders; None before they are known.
         """
         now = time.time_ns()
         stamp = fox.Timestamp(sec=now // 10**9, nsec=now % 10**9)
@@ -71,13 +71,13 @@ class FoxgloveStream:
 
     def _events(self, status: dict[str, Any], stamp: fox.Timestamp, now: int) -> None:
         for event in status["events"]:
-            if event not in self._told:
+            if event not in self._sent_events:
                 level = fox.LogLevel.Info
                 text, code = event["text"], event["code"]
                 self._send(
                     "/events", fox.Log(timestamp=stamp, level=level, message=text, name=code), now
                 )
-        self._told = status["events"]
+        self._sent_events = status["events"]
 
     def _send(self, topic: str, content: Typed | dict[str, Any], now: int) -> None:
         self._channels[topic].log(encoded(content), log_time=now)
@@ -85,23 +85,23 @@ class FoxgloveStream:
 
 @contextmanager
 def foxglove_stream(port: int) -> Iterator[FoxgloveStream]:
-    """A server on this computer alone, to the end of the block.
+    """A local server until the end of the block.
 
     Args:
-        port: 0 for any that is free.
+        port: 0 for a free one.
 
     Raises:
-        Fault: The port is taken.
+        Fault: The port is in use.
     """
     set_log_level("ERROR")
     context = Context()
     try:
         server = start_server(name="cdpr", host="127.0.0.1", port=port, context=context)
-    except Exception as error:  # the library's own, of several kinds
+    except Exception as error:  # the library raises several types
         raise Fault(
             f"Foxglove cannot be served: {error}",
             where=f"port {port}",
-            next_step="choose another port with --foxglove-port",
+            next_step="choose another port with --foxglove PORT",
         ) from None
     try:
         yield FoxgloveStream(server, context)
@@ -110,7 +110,7 @@ def foxglove_stream(port: int) -> Iterator[FoxgloveStream]:
 
 
 def layout_text() -> str:
-    """A layout for Foxglove: scene, curves of drives and clearance, events."""
+    """A layout for Foxglove: scene, plots of drives and clearance, events."""
 
     def plot(title: str, **series: str) -> layouts.SplitItem:
         paths = [layouts.PlotSeries(value=value, label=name) for name, value in series.items()]

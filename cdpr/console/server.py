@@ -1,4 +1,4 @@
-"""The console's web server: one page, its files, one socket a page. Nothing moves because of it."""
+"""The console's web server: the page, its files, and one WebSocket per page."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from executor.recording.record_files import RUNS
 from executor.recording.verdict import fault_codes, page_text
 from model.errors import BadInput
 
-#: States a second.
+#: States per second.
 RATE = 20.0
-#: A page that does not take its states for so long is let go, [s].
+#: A page that does not receive a state within this time is disconnected, [s].
 PATIENCE = 2.0
-#: Pages that may be open at a time; STOP by `POST /stop` needs none.
+#: Largest number of open pages; STOP by `POST /stop` works without one.
 MOST_PAGES = 64
-#: Commands of a page that may wait for the one before; STOP never does.
+#: Largest number of queued commands per page; STOP is never queued.
 MOST_WAITING = 8
 STOPS_AT_ONCE = 4
 _POLICY = (
@@ -55,19 +55,19 @@ _KINDS = {
 
 
 class ConsoleServer:
-    """The pages that are open, and the state that they are sent.
+    """The open pages, and the state sent to them.
 
     Attributes:
-        token: Who knows it may look, and take control.
+        token: Grants access to the page, and control.
     """
 
     def __init__(self, console: Console, token: str | None = None, host: str = "") -> None:
-        """No page is open.
+        """Starts with no page open.
 
         Args:
-            console: What is shown and done.
-            token: Of the address; without one it is drawn.
-            host: A name of this machine by which pages ask, beside its own.
+            console: The console to serve.
+            token: Of the address (default: random).
+            host: Another name of this machine that requests may use.
         """
         self.token = token or secrets.token_urlsafe(18)
         self._names = {"localhost", socket.gethostname().lower(), host.lower()}
@@ -101,39 +101,38 @@ class ConsoleServer:
 
     @asynccontextmanager
     async def _living(self, _app: Starlette) -> AsyncIterator[None]:
-        looking = asyncio.create_task(self._look())
+        updates = asyncio.create_task(self._update_states())
         try:
             yield
         finally:
-            looking.cancel()
+            updates.cancel()
             with suppress(asyncio.CancelledError):
-                await looking
+                await updates
             self._stops.shutdown()
             await run_in_threadpool(self._console.close)
 
-    async def _look(self) -> None:
-        """The state of all, again and again; where looking fails, pages see old data and say so."""
+    async def _update_states(self) -> None:
+        """Updates the state at `RATE`; if that fails, pages report stale data."""
         loop = asyncio.get_running_loop()
         while True:
             began = loop.time()
-            self._state = await run_in_threadpool(self._console.look)
+            self._state = await run_in_threadpool(self._console.update)
             async with self._news:
                 self._seq += 1
                 self._news.notify_all()
             await asyncio.sleep(max(0.005, began + 1.0 / RATE - loop.time()))
 
-    # Who may.
-
-    async def _guarded(self, request: Request, go_on: Any) -> Response:
-        """No page of another origin gets or does anything; files that say nothing need no token."""
+    # Access.
+    async def _guarded(self, request: Request, call_next: Any) -> Response:
+        """Refuses other origins, and requests without a token except for static files and STOP."""
         path = request.url.path
         is_open = path.startswith("/static/") or path == "/stop"
-        if not self._asks_us(request.headers):
-            return Response("another origin, or another name than this machine's", 403)
+        if not self._is_same_origin(request.headers):
+            return Response("wrong origin, or not a name of this machine", 403)
         if not is_open and not self._knows(request.query_params.get("token")):
-            text = "open the address that `cdpr console` printed: it has the token"
+            text = "open the address printed by `cdpr console`: it contains the token"
             return Response(text, 403)
-        response: Response = await go_on(request)
+        response: Response = await call_next(request)
         response.headers["Content-Security-Policy"] = _POLICY if path == "/" else "sandbox"
         if path.startswith("/runs/"):
             del response.headers["Content-Security-Policy"]  # reports bring their own
@@ -142,10 +141,11 @@ class ConsoleServer:
         response.headers["Cache-Control"] = "no-store"
         return response
 
-    def _asks_us(self, headers: Any) -> bool:
-        """The page that asks, if a browser names one, is ours, and asks by our name or address.
+    def _is_same_origin(self, headers: Any) -> bool:
+        """Whether the request's origin, if given, and its host are this server.
 
-        Other names may be another site's, which lets them point here to be of one origin with us.
+        Other host names are refused: another site could resolve its name to this address (DNS
+        rebinding).
         """
         host, origin = headers.get("host", ""), headers.get("origin")
         if origin is not None and origin.partition("://")[2] != host:
@@ -162,7 +162,7 @@ class ConsoleServer:
     def _knows(self, token: str | None) -> bool:
         return token is not None and secrets.compare_digest(token.encode(), self.token.encode())
 
-    # What there is.
+    # Resources.
 
     async def _page(self, _request: Request) -> Response:
         return HTMLResponse(_resource("index.html"))
@@ -185,27 +185,27 @@ class ConsoleServer:
         return JSONResponse(self._console.compared)
 
     async def _picture(self, request: Request) -> Response:
-        """The newest image of a camera that measures."""
+        """The newest image of a measuring camera."""
         name = request.path_params["name"]
         made = await run_in_threadpool(self._console.pictures.jpeg, name)
         if made is None:
-            return Response(status_code=204)  # the page asks again
+            return Response(status_code=204)  # the page retries
         return Response(made, media_type="image/jpeg")
 
     async def _stop(self, _request: Request) -> Response:
-        """For a page whose socket is lost; anybody may stop."""
-        why_not = await self._at_once(self._console.stop)
+        """STOP without a socket; needs no token."""
+        why_not = await self._run_stop(self._console.stop)
         return JSONResponse({"ok": not why_not, "what": why_not})
 
-    async def _at_once(self, stop: Callable[..., str], *arguments: Any) -> str:
-        """STOP waits for nothing else that pages ask for: it has threads of its own."""
+    async def _run_stop(self, stop: Callable[..., str], *arguments: Any) -> str:
+        """Runs STOP in its own threads, so that it waits for no other request."""
         return await asyncio.get_running_loop().run_in_executor(self._stops, stop, *arguments)
 
     # The socket.
 
     async def _socket(self, page: WebSocket) -> None:
         known = self._knows(page.query_params.get("token"))
-        if not (known and "origin" in page.headers and self._asks_us(page.headers)):
+        if not (known and "origin" in page.headers and self._is_same_origin(page.headers)):
             await page.close(4403)
             return
         if self._pages >= MOST_PAGES:
@@ -213,30 +213,30 @@ class ConsoleServer:
             return
         self._pages += 1
         try:
-            await self._speak(page)
+            await self._serve_page(page)
         finally:
             self._pages -= 1
 
-    async def _speak(self, page: WebSocket) -> None:
+    async def _serve_page(self, page: WebSocket) -> None:
         await page.accept()
         number = self._console.control.join("?" if page.client is None else page.client.host)
         commands: asyncio.Queue[Message] = asyncio.Queue(MOST_WAITING)
         tasks = [
-            asyncio.create_task(self._tell(page, number)),
-            asyncio.create_task(self._obey(page, number, commands)),
+            asyncio.create_task(self._send_states(page, number)),
+            asyncio.create_task(self._execute_commands(page, number, commands)),
         ]
         try:
             while True:
-                await self._hear(page, number, await page.receive_text(), commands)
-        except (WebSocketDisconnect, RuntimeError, KeyError):  # the last for what is no text
+                await self._handle(page, number, await page.receive_text(), commands)
+        except (WebSocketDisconnect, RuntimeError, KeyError):  # KeyError: binary
             pass
         finally:
             for task in tasks:
                 task.cancel()
             await run_in_threadpool(self._console.leave, number)
 
-    async def _tell(self, page: WebSocket, number: int) -> None:
-        seen = 0  # before the first look there is nothing to tell
+    async def _send_states(self, page: WebSocket, number: int) -> None:
+        seen = 0  # no state before the first update
         while True:
             async with self._news:
                 while self._seq == seen:
@@ -256,10 +256,10 @@ class ConsoleServer:
                     await page.close(1013)
                 return
 
-    async def _hear(
+    async def _handle(
         self, page: WebSocket, number: int, text: str, commands: asyncio.Queue[Message]
     ) -> None:
-        """What is held and let go counts at once, STOP too; other commands wait for each other."""
+        """Executes STOP and jog controls at once; queues other commands."""
         try:
             message = parse_message(text)
         except NotAMessage as error:
@@ -271,18 +271,20 @@ class ConsoleServer:
             await run_in_threadpool(self._console.let_go, number, message)
         elif message.command == "stop":
             stopping = asyncio.create_task(self._stop_and_answer(page, number, message))
-            self._stopping.add(stopping)  # it is done even if the page is gone by then
+            self._stopping.add(stopping)  # completes even if the page disconnects
             stopping.add_done_callback(self._stopping.discard)
         elif commands.full():
-            await _answer(page, message, "what this page asked for before is not done yet")
+            await _answer(page, message, "earlier commands of this page are not finished yet")
         else:
             commands.put_nowait(message)
 
     async def _stop_and_answer(self, page: WebSocket, number: int, message: Message) -> None:
-        why_not = await self._at_once(self._console.command, number, message)
+        why_not = await self._run_stop(self._console.command, number, message)
         await _answer(page, message, why_not)
 
-    async def _obey(self, page: WebSocket, number: int, commands: asyncio.Queue[Message]) -> None:
+    async def _execute_commands(
+        self, page: WebSocket, number: int, commands: asyncio.Queue[Message]
+    ) -> None:
         while True:
             message = await commands.get()
             why_not = await run_in_threadpool(self._console.command, number, message)
@@ -291,7 +293,7 @@ class ConsoleServer:
 
 async def _answer(page: WebSocket, message: Message, why_not: str) -> None:
     answer = {"kind": "answer", "to": message.id, "ok": not why_not, "what": why_not}
-    with suppress(RuntimeError, WebSocketDisconnect):  # it is gone
+    with suppress(RuntimeError, WebSocketDisconnect):  # the page is closed
         await page.send_json(answer)
 
 
@@ -300,7 +302,7 @@ def _resource(name: str) -> str:
 
 
 async def _static(request: Request) -> Response:
-    """Files of the page, and those that it shares with reports."""
+    """Files of the page, and those shared with reports."""
     name = request.path_params["name"]
     package = "model.pages" if name in ("base.css", "viewer.js") else "cdpr.console"
     root = files(package) if package == "model.pages" else files(package).joinpath("static")
@@ -314,7 +316,7 @@ async def _static(request: Request) -> Response:
 
 
 async def _run_file(request: Request) -> Response:
-    """A file of a run below the folder of runs."""
+    """A file below the folder of runs."""
     path, root = (RUNS / request.path_params["name"]).resolve(), RUNS.resolve()
     if not (path.is_relative_to(root) and path.is_file()):
         raise HTTPException(404)
@@ -322,7 +324,7 @@ async def _run_file(request: Request) -> Response:
 
 
 async def _help(request: Request) -> Response:
-    """The page of help for an event or fault."""
+    """The help page of an event or fault."""
     code = request.path_params["code"]
     if code not in fault_codes():
         raise HTTPException(404)
@@ -330,31 +332,31 @@ async def _help(request: Request) -> Response:
 
 
 def _plans_and_scenes() -> dict[str, list[str]]:
-    """Files that can be chosen, below the folder that the console runs in."""
+    """Files to choose from, in the console's working folder."""
     here = Path()
     plans = sorted({*here.glob("*.json"), *here.glob("plans/*.json"), *MADE.glob("*.plan.json")})
     folders = (here, here / "scenes", here / "configs")
     scenes = sorted({path for folder in folders for path in folder.glob("*.yaml")})
     return {
-        "plans": [str(path) for path in plans if _says(path, '"kind": "cdpr-plan"')],
-        "scenes": [str(path) for path in scenes if _says(path, "\ngoal:")],
+        "plans": [str(path) for path in plans if _contains(path, '"kind": "cdpr-plan"')],
+        "scenes": [str(path) for path in scenes if _contains(path, "\ngoal:")],
     }
 
 
-def _says(path: Path, word: str) -> bool:
+def _contains(path: Path, text: str) -> bool:
     with suppress(OSError), path.open(encoding="utf-8", errors="replace") as stream:
-        return word in stream.read(100_000)
+        return text in stream.read(100_000)
     return False
 
 
 def run_server(console: Console, host: str, port: int, on_ready: Callable[[str], None]) -> None:
-    """Serves the pages until it is interrupted.
+    """Serves the pages until interrupted.
 
     Args:
-        console: What is shown and done.
+        console: The console to serve.
         host: Address to listen on.
         port: 0 for a free one.
-        on_ready: Called with the address of the page, once it can be opened.
+        on_ready: Called with the page's address once the server listens.
 
     Raises:
         BadInput: The address cannot be used.
@@ -368,7 +370,7 @@ def run_server(console: Console, host: str, port: int, on_ready: Callable[[str],
 
 @contextmanager
 def _listening(host: str, port: int) -> Iterator[socket.socket]:
-    """A socket for the pages.
+    """A listening socket.
 
     Raises:
         BadInput: The address cannot be used.

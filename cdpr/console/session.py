@@ -1,4 +1,4 @@
-"""What the console knows and does for all of its pages; no web server in here."""
+"""State and commands of the console, independent of the web server."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from cdpr.console.commands import (
     TakeCommand,
 )
 from cdpr.console.state import (
-    Kept,
     StartedVerb,
+    StoredState,
     cable_state,
-    file_here,
     jog_state,
-    kept_state,
+    local_file,
     measured_state,
     outcome_state,
     preview,
+    stored_state,
 )
 from cdpr.console.teach import TaughtPoses, scene_text
 from cdpr.console.view import RobotNow, RobotView, nearest_data, pose_data
@@ -58,25 +58,25 @@ from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, empty_scene, load_scene
 
-#: Latch and reference are read this often at most, [s].
-KEPT_EVERY = 0.5
-#: Folder of the plans and scenes that the console makes.
+#: Shortest period of reading the fault latch and the reference, [s].
+STORED_EVERY = 0.5
+#: Folder of the plans and scenes that the console writes.
 MADE = Path("console")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConsoleFiles:
-    """What the console was started with.
+    """Files and options of a console.
 
     Attributes:
-        rig_file: As it is given to verbs.
+        rig_file: Path passed to verbs.
         rig: The robot and its bus.
-        bus_options: Options of the command line for that bus.
-        calibration_options: Those for the results of calibrations that the rig has.
-        cameras: Sources that measure runs, the first one homing, too; empty for none.
-        scene_file: What is around; None where it was not given.
-        without_real_time: Verbs move even where real-time scheduling is denied.
-        read_only: Nothing but STOP.
+        bus_options: Command-line options for that bus.
+        calibration_options: Command-line options for the rig's calibration results.
+        cameras: Sources that measure runs, the first also homing; may be empty.
+        scene_file: Obstacles and payload, if given.
+        without_real_time: Verbs move even if real-time scheduling is denied.
+        read_only: Only STOP is accepted.
     """
 
     rig_file: Path
@@ -90,10 +90,10 @@ class ConsoleFiles:
 
 
 class Console:
-    """One console of one rig; safe to use from several threads."""
+    """The console of one rig; thread-safe."""
 
     def __init__(self, files: ConsoleFiles) -> None:
-        """Nothing is looked at yet.
+        """Loads the scene and the taught poses.
 
         Raises:
             BadInput: The scene, or the file of taught poses, cannot be read.
@@ -116,33 +116,32 @@ class Console:
         self._robot: RobotNow | None = self.view.at_home() if is_simulated(self.rig) else None
         self._at_rest: Future[StatusResult] | None = None
         self._asks = ThreadPoolExecutor(1, "cdpr-drives")
-        self._was_busy = True  # so that the drives are asked at first
-        self._kept_at, self._kept = float("-inf"), Kept(None, False, None)
+        self._was_busy = True  # so that the drives are read at the start
+        self._stored_at, self._stored = float("-inf"), StoredState(None, False, None)
 
-    # What it shows.
-
-    def look(self) -> dict[str, Any]:
-        """The state of all that every page shows alike; call it about 20 times a second."""
-        look = self.watch.look()
-        self._line = self.verbs.look()
-        if look.status is not None:
-            seen = self.view.take(look.status)
+    # State.
+    def update(self) -> dict[str, Any]:
+        """The state that all pages show; to be called about 20 times a second."""
+        report = self.watch.update()
+        self._line = self.verbs.update()
+        if report.status is not None:
+            seen = self.view.take(report.status)
             self._robot = seen or self._robot
-        self.pictures.watch(look.status, self.view.rig)
-        self._ask_at_rest(look.status is not None or self.verbs.verb is not None)
-        self._read_kept()
-        return self._state(look.status, time.monotonic() - look.at)
+        self.pictures.watch(report.status, self.view.rig)
+        self._ask_at_rest(report.status is not None or self.verbs.verb is not None)
+        self._read_stored()
+        return self._state(report.status, time.monotonic() - report.at)
 
     def close(self) -> None:
-        """Lets go of what it watches; what moves goes on."""
+        """Closes all connections; motions continue."""
         self._asks.shutdown()
         self.pictures.close()
         self.watch.close()
 
     def _ask_at_rest(self, busy: bool) -> None:
-        """Reads the drives once whenever nothing moves any more; they may be silent, or not there.
+        """Reads the drives once after each motion; they may be silent or absent.
 
-        No verb is started meanwhile: it would find the drives being read.
+        No verb is started meanwhile, as it would find the drives in use.
         """
         if self._at_rest is not None and self._at_rest.done():
             answer, self._at_rest = self._at_rest, None
@@ -165,7 +164,7 @@ class Console:
             "rig": rig.name,
             "bus": bus_name(rig),
             "simulated": is_simulated(rig),
-            **kept_state(self._kept),
+            **stored_state(self._stored),
             "busy": None if verb is None else {"verb": verb, "text": self._line},
             "outcome": outcome_state(self.verbs.outcome),
             "motion": None if status is None else {**status, "age_s": round(age, 3)},
@@ -179,49 +178,51 @@ class Console:
             "compared": None if self.compared is None else self.compared["name"],
             "jog": jog_state(status),
             "cable": cable_state(status),
-            "poses": self.poses.told(),
+            "poses": self.poses.as_dicts(),
         }
 
-    def _read_kept(self) -> None:
-        """Latch and reference of the bus, from their files."""
+    def _read_stored(self) -> None:
+        """Reads the fault latch and the reference of the bus from their files."""
         now = time.monotonic()
-        if now - self._kept_at < KEPT_EVERY:
+        if now - self._stored_at < STORED_EVERY:
             return
-        self._kept_at = now
+        self._stored_at = now
         if is_simulated(self.rig):
-            self._kept = Kept(None, True, None)
+            self._stored = StoredState(None, True, None)
             return
-        fault, under_way = None, self.watch.last.status is not None
+        fault, is_moving = None, self.watch.last.status is not None
         try:
             fault = FaultLatch(BusSettings.of(self.rig)).read()
             reference = reference_status(MotionInterlock(self.rig))
             why = reference.why_not
         except CdprError as error:
             why = error.what
-        self._kept = Kept(None if fault is None or under_way else fault.cause, not why, why)
+        self._stored = StoredState(
+            None if fault is None or is_moving else fault.cause, not why, why
+        )
 
-    # What it does.
+    # Commands.
 
     def stop(self) -> str:
-        """Stops every run of this user; why not, or nothing."""
-        told = stop_runs()
-        if not (told.stopped or told.silent):
+        """Stops every run of this user; returns why not, or an empty text."""
+        result = stop_runs()
+        if not (result.stopped or result.silent):
             return "nothing moves"
-        return "" if not told.silent else "a run does not answer: press the emergency stop"
+        return "" if not result.silent else "a run does not answer: press the emergency stop"
 
     def command(self, page: int, message: Message) -> str:
-        """Does what a page asks for; why not, or nothing."""
+        """Executes a page's command; returns why not, or an empty text."""
         if message.command == "stop":
             return self.stop()
         if self.files.read_only:
-            return "this console only shows"
+            return "this console is read-only"
         try:
             return self._command(page, message)
         except CdprError as error:
             return str(error)
 
     def load_plan(self, path: Path) -> None:
-        """Shows a plan before it is run.
+        """Loads a plan for preview.
 
         Raises:
             BadInput: It cannot be read, or is for another rig.
@@ -230,7 +231,7 @@ class Console:
         self.preview = preview(path, self.rig)
 
     def compare_plan(self, path: Path | None) -> None:
-        """Shows another plan beside the one that is loaded; None no longer does.
+        """Shows another plan beside the loaded one; None ends the comparison.
 
         Raises:
             BadInput: It cannot be read, or is for another rig.
@@ -255,11 +256,11 @@ class Console:
     def _operate(self, message: Message) -> str:
         match message:
             case SpeedCommand():
-                return self.watch.say("speed", percent=message.percent)
+                return self.watch.send("speed", percent=message.percent)
             case FileCommand():
-                self.load_plan(file_here(message.file))
+                self.load_plan(local_file(message.file))
             case CompareCommand():
-                self.compare_plan(None if message.file is None else file_here(message.file))
+                self.compare_plan(None if message.file is None else local_file(message.file))
             case PlanCommand():
                 self._plan(message)
             case NameCommand():
@@ -279,9 +280,9 @@ class Console:
     def _plain(self, command: str) -> str:
         if command in ("service_begin", "service_end"):
             return self._service(on=command == "service_begin")
-        said = {"hold": "hold", "resume": "resume", "jog_end": "end"}
-        if command in said:
-            return self.watch.say(said[command])
+        requests = {"hold": "hold", "resume": "resume", "jog_end": "end"}
+        if command in requests:
+            return self.watch.send(requests[command])
         verbs: dict[str, Callable[[], str]] = {
             "home": self._home,
             "reset": self._reset,
@@ -304,7 +305,7 @@ class Console:
 
     def _run(self) -> str:
         if self.preview is None or not self.preview["passed"]:
-            return "load a plan that passes first"
+            return "load a plan that passes its check first"
         cameras = [text for source in self.files.cameras for text in ("--camera", source)]
         if not (cameras or is_simulated(self.rig)):
             cameras = ["--no-camera"]
@@ -325,7 +326,7 @@ class Console:
         return self._start("jog", [rig, "--hold-to-run", "--one-cable", *speed])
 
     def _service(self, *, on: bool) -> str:
-        """Enters or leaves service mode; single cables are jogged in it alone."""
+        """Enters or leaves service mode, the only mode that jogs single cables."""
         status = self.watch.last.status
         jogs_cables = status is not None and "cable_jog" in status
         if on and not jogs_cables and (why_not := self.watch.why_busy()):
@@ -334,7 +335,7 @@ class Console:
         with self._control_lock:
             press = None if page is None else self.control.set_service(page, on)
         self._end_press(press)
-        return self.watch.say("end") if jogs_cables and not on else ""
+        return self.watch.send("end") if jogs_cables and not on else ""
 
     def _start(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
         if why_not := self.watch.why_busy():
@@ -345,7 +346,7 @@ class Console:
         return ""
 
     def _plan(self, message: PlanCommand) -> None:
-        scene = self._taught_scene() if message.scene is None else file_here(message.scene)
+        scene = self._taught_scene() if message.scene is None else local_file(message.scene)
         output = MADE / f"{scene.stem}.plan.json"
         cost = [] if message.objective == "shortest" else ["--cost", message.objective]
         if load_scene(scene).rotation_limits is not None:
@@ -364,7 +365,7 @@ class Console:
         return path
 
     def _picked(self, message: PickCommand) -> Pose:
-        """A position of the scene, oriented as the platform is."""
+        """The picked position, with the platform's present orientation."""
         position = millimetres(message.position_mm)
         rig = self.view.rig
         if np.any(position < rig.workspace_lower) or np.any(position > rig.workspace_upper):
@@ -372,18 +373,18 @@ class Console:
                 "this position is outside the workspace",
                 where="console",
                 why="the rig file limits x, y and z of the platform",
-                next_step="pick another one, or another height",
+                next_step="pick another position or height",
             )
         return Pose(position, self._pose_now().rotation)
 
     def _pose_now(self) -> Pose:
         jog = (self.watch.last.status or {}).get("jog")
-        if jog is not None:  # where it was sent, to the last digit: jogs do not turn it
-            place, turn = millimetres(jog["position_mm"]), np.array(jog["quaternion"])
-            return Pose.from_quaternion(place, turn / np.linalg.norm(turn))
+        if jog is not None:  # the commanded pose, exactly: jogs do not rotate the platform
+            position, rotation = millimetres(jog["position_mm"]), np.array(jog["quaternion"])
+            return Pose.from_quaternion(position, rotation / np.linalg.norm(rotation))
         if self._robot is None:
             raise Refused(
-                "where the platform is has not been seen yet",
+                "the platform's pose is not known yet",
                 where="console",
                 next_step="enable the drives for jogging, or run a plan",
             )
@@ -392,7 +393,7 @@ class Console:
     # Jogging.
 
     def held(self, page: int, message: Held) -> None:
-        """A page's jog control is held; what may not move does not."""
+        """Forwards a held jog control, if the page may move what it controls."""
         motion = 0 if self.files.read_only else self.watch.number
         with self._control_lock:
             if message.cable is not None and not self.control.is_service:
@@ -402,34 +403,34 @@ class Console:
             return
         status = self.watch.last.status or {}
         jog = status.get("jog") or status.get("cable_jog")
-        most = 1e3 * self.view.rig.motion.speed if jog is None else float(jog["speed_mm_s"])
-        percent = min(max(round(100.0 * message.speed_mm_s / most), 1), 100)
+        fastest = 1e3 * self.view.rig.motion.speed if jog is None else float(jog["speed_mm_s"])
+        percent = min(max(round(100.0 * message.speed_mm_s / fastest), 1), 100)
         what: dict[str, Any] = {"cable": message.cable, "sense": message.sense}
         if message.direction is not None:
             length = math.hypot(*message.direction)
             direction = [v / length for v in message.direction]
             what = {"direction": direction, "frame": message.frame}
-        self.watch.say("held", press=press, step_mm=message.step_mm, percent=percent, **what)
+        self.watch.send("held", press=press, step_mm=message.step_mm, percent=percent, **what)
 
     def let_go(self, page: int, message: LetGo) -> None:
-        """A page's jog control is no longer held."""
+        """Ends the press of a page's jog control."""
         with self._control_lock:
             press = self.control.let_go(page, message.hold)
         self._end_press(press)
 
     def leave(self, page: int) -> None:
-        """A page is gone, and what it held with it."""
+        """Removes a page, and ends its press."""
         with self._control_lock:
             press = self.control.leave(page)
         self._end_press(press)
 
     def _end_press(self, press: int | None) -> None:
         if press is not None:
-            self.watch.say("let_go", press=press)
+            self.watch.send("let_go", press=press)
 
 
 def _tensions(status: dict[str, Any] | None, robot: RobotNow | None) -> list[float] | None:
-    """Of what moves, also where its cables fit no pose; or as the robot was seen last, [N]."""
+    """Tensions [N] of the run, even where no pose fits; else those last seen."""
     drives = [] if status is None else status["drives"]
     if drives:
         return [drive["tension_n"] for drive in drives]

@@ -1,4 +1,4 @@
-"""What every page is sent: verbs that were started, rig and session, and the preview of a plan."""
+"""Data sent to every page: started verbs, rig and jog session, preview of a plan."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from model.plan import Plan, load_plan, require_same_rig
 from model.pose import Pose
 from model.rig import Rig
 
-#: Of what a verb printed, this much is shown, [characters].
+#: Length of a verb's output that is shown, [characters].
 SHOWN = 4000
 _REPORT = re.compile(r"(\S+/report\.html)")
 _HELP = re.compile(r"docs/faults/(\w+)\.md")
@@ -37,14 +37,14 @@ _HELP = re.compile(r"docs/faults/(\w+)\.md")
 
 @dataclass(frozen=True, slots=True)
 class VerbOutcome:
-    """How a verb ended.
+    """The result of a verb.
 
     Attributes:
-        verb: Its name.
+        verb: Name.
         exit_code: Of the process.
-        text: The end of what it printed.
-        report: The run's report, if it wrote one.
-        fault: Code of the fault whose page it names.
+        text: The end of its output.
+        report: Path of the run's report, if one was written.
+        fault: Code of the fault whose help page the output names.
     """
 
     verb: str
@@ -55,38 +55,38 @@ class VerbOutcome:
 
 
 class StartedVerb:
-    """One verb at a time; it writes to a file, so that no pipe ends with the console."""
+    """Runs one verb at a time, with output to a file: a pipe would break with the console."""
 
     def __init__(self) -> None:
-        """Nothing was started."""
+        """Before any verb."""
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._output = Path()
         self.verb: str | None = None
-        """What is under way."""
+        """Name of the running verb."""
         self.outcome: VerbOutcome | None = None
-        """How the last one ended."""
+        """Result of the last verb."""
 
     def start(self, verb: str, arguments: Sequence[str]) -> None:
         """Starts a verb without a terminal.
 
         Raises:
-            Refused: Another one is under way.
+            Refused: Another verb is running.
         """
         with self._lock:
-            self._look()
+            self._update()
             if self.verb is not None:
                 raise Refused(
-                    f"`cdpr {self.verb}` is still under way",
+                    f"`cdpr {self.verb}` is still running",
                     where="console",
-                    next_step="wait until it has ended, or stop it",
+                    next_step="wait until it ends, or stop it",
                 )
             self._start(verb, arguments)
 
-    def look(self) -> str:
-        """The newest line that the verb printed; notices its end."""
+    def update(self) -> str:
+        """The last line of the verb's output; records its end."""
         with self._lock:
-            return self._look()
+            return self._update()
 
     def _start(self, verb: str, arguments: Sequence[str]) -> None:
         descriptor, name = tempfile.mkstemp(prefix=f"cdpr-{verb}-", suffix=".log")
@@ -104,7 +104,7 @@ class StartedVerb:
             os.close(descriptor)
         self._output, self.verb, self.outcome = Path(name), verb, None
 
-    def _look(self) -> str:
+    def _update(self) -> str:
         if self._process is None or self.verb is None:
             return ""
         text = self._output.read_text(encoding="utf-8", errors="replace")
@@ -128,8 +128,8 @@ def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
     )
 
 
-def file_here(name: str) -> Path:
-    """A file below the folder that the console was started in.
+def local_file(name: str) -> Path:
+    """A file below the console's working folder.
 
     Raises:
         BadInput: It is elsewhere.
@@ -137,21 +137,21 @@ def file_here(name: str) -> Path:
     path = Path(name)
     if not path.resolve().is_relative_to(Path.cwd().resolve()):
         raise BadInput(
-            f"{name} is not below the folder in which the console runs",
+            f"{name} is not below the console's working folder",
             where="console",
-            next_step="copy it there, or start the console elsewhere",
+            next_step="copy it there, or start the console in another folder",
         )
     return path
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
-    """What is on file for a bus.
+class StoredState:
+    """Stored state of a bus.
 
     Attributes:
-        latched: Cause of the latched fault, if one is.
-        referenced: The drives are homed.
-        why_not: Why they are not.
+        latched: Cause of the latched fault, if any.
+        referenced: Whether the drives are homed.
+        why_not: Reason if they are not.
     """
 
     latched: str | None
@@ -159,14 +159,14 @@ class Kept:
     why_not: str | None
 
 
-def kept_state(kept: Kept) -> dict[str, Any]:
+def stored_state(stored: StoredState) -> dict[str, Any]:
     """The fault latch and the homing reference."""
-    reference = {"counts": kept.referenced, "why_not": kept.why_not}
-    return {"latched": kept.latched, "reference": reference}
+    reference = {"counts": stored.referenced, "why_not": stored.why_not}
+    return {"latched": stored.latched, "reference": reference}
 
 
 def outcome_state(ended: VerbOutcome | None) -> dict[str, Any] | None:
-    """How the last verb ended, with addresses of its report and of help."""
+    """The last verb's result, with addresses of its report and help page."""
     if ended is None:
         return None
     return {
@@ -179,7 +179,7 @@ def outcome_state(ended: VerbOutcome | None) -> dict[str, Any] | None:
 
 
 def _address_of(report: Path) -> str | None:
-    """Where the console serves a report; only those below the folder of runs."""
+    """Address of a report on this server; None outside the folder of runs."""
     path, root = report.resolve(), RUNS.resolve()
     return f"/runs/{path.relative_to(root)}" if path.is_relative_to(root) else None
 
@@ -188,25 +188,25 @@ def jog_state(status: dict[str, Any] | None) -> dict[str, Any]:
     """Whether the platform can be jogged, and how far.
 
     Args:
-        status: Of what moves, see `executor.remote.status`; None where nothing does.
+        status: Of the run, see `executor.remote.status`; None at rest.
     """
     why_not = "the drives are not enabled for jogging"
     if status is not None and "cable_jog" in status:
-        why_not = "single cables are jogged: end that first"
+        why_not = "single cables are being jogged: end that first"
     jog = None if status is None else status.get("jog")
     limit = jog and jog["limit"] and f"stops in {jog['room_mm']:.1f} mm: {jog['limit']}"
     return {**_session_state(status, jog, why_not), "limit": limit}
 
 
 def cable_state(status: dict[str, Any] | None) -> dict[str, Any]:
-    """Whether single cables can be jogged, which one was, and how far.
+    """Whether single cables can be jogged, which one moved, and how far.
 
     Args:
         status: As for `jog_state`.
     """
     why_not = "the drives are not enabled for single cables"
     if status is not None and "jog" in status:
-        why_not = "the platform is jogged: end that first"
+        why_not = "the platform is being jogged: end that first"
     jog = None if status is None else status.get("cable_jog")
     names = ("cable", "press_mm", "session_mm", "limit", "limit_n")
     shown = {name: jog[name] if jog else None for name in names}
@@ -216,7 +216,7 @@ def cable_state(status: dict[str, Any] | None) -> dict[str, Any]:
 def _session_state(
     status: dict[str, Any] | None, jog: dict[str, Any] | None, why_not: str
 ) -> dict[str, Any]:
-    """Of a session of jogs, or why there is none."""
+    """State of a jog session, or why there is none."""
     if status is None or jog is None:
         return {"ready": False, "why_not": why_not, "moving": False, "speed_mm_s": 1e3 * FASTEST}
     ready = status["state"] == "moving"
@@ -229,7 +229,7 @@ def _session_state(
 
 
 def measured_state(status: dict[str, Any] | None, age: float) -> dict[str, Any] | None:
-    """The pose by the cameras, while they measure a run.
+    """The pose measured by the cameras of a run.
 
     Args:
         status: As for `jog_state`.
@@ -241,15 +241,13 @@ def measured_state(status: dict[str, Any] | None, age: float) -> dict[str, Any] 
     return measured_data(measured, max(0.0, status["elapsed_s"] - measured["time_s"]) + age)
 
 
-# A plan before it is run: its path, its proof, and how clearance and tensions go along it.
-
-
-#: Poses that are drawn, and at which clearance is computed.
+# Preview of a plan: path, checks, clearance and tensions along it.
+#: Number of poses that are drawn, and at which clearance is computed.
 POSES = 200
 
 
 def preview(path: Path, rig: Rig) -> dict[str, Any]:
-    """What the page shows of a plan; one that does not pass says why.
+    """Preview data of a plan; the verdict says why a plan does not pass.
 
     Raises:
         BadInput: It cannot be read, or is for another rig.
@@ -296,7 +294,7 @@ def preview(path: Path, rig: Rig) -> dict[str, Any]:
 
 
 def _in_mm(distance: float) -> float | None:
-    """A distance [m] as the page takes it; None where nothing is near."""
+    """A distance [m] in mm for the page; None if infinite."""
     return round(distance * 1e3, 1) if np.isfinite(distance) else None
 
 
@@ -308,19 +306,19 @@ def _rows(prepared: PreparedRun) -> list[int]:
 
 def _checks(prepared: PreparedRun) -> list[str]:
     report = prepared.checked.report
-    told = []
+    checks = []
     if np.isfinite(report.proved_obstacle_clearance):
-        told.append(
+        checks.append(
             f"clearance to obstacles at least {report.proved_obstacle_clearance * 1e3:.1f} mm,"
             f" required {report.required_obstacle_clearance * 1e3:.1f} mm"
         )
-    told.append(
-        f"clearance of cables to each other and to the platform at least"
+    checks.append(
+        f"clearance between cables and to the platform at least"
         f" {report.proved_self_clearance * 1e3:.1f} mm,"
         f" required {report.required_self_clearance * 1e3:.1f} mm"
     )
-    told.append(f"tensions {report.min_tension:.1f} to {report.max_tension:.1f} N")
-    return told
+    checks.append(f"tensions {report.min_tension:.1f} to {report.max_tension:.1f} N")
+    return checks
 
 
 def _clearances(rig: Rig, plan: Plan, poses: list[Pose]) -> list[float | None] | None:

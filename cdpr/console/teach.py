@@ -1,4 +1,4 @@
-"""Poses that the operator taught: named, ordered, kept in a file, made into a scene to plan."""
+"""Taught poses: named, ordered, stored in a file, and converted to a scene for planning."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from model.files.validation import problems_of
 from model.pose import Pose, largest_rotations
 from model.scene import Scene
 
-#: Of the poses.
+#: Largest number of poses.
 MOST = 200
-#: Orientations that differ by less are meant to be the same, [deg]: drives do not hold them nearer.
+#: Orientations within this angle count as equal, [deg]: drives do not hold them more accurately.
 ALIKE_DEG = 0.1
-AGAIN = "restore the file, or move it away to begin with no poses"
+AGAIN = "restore the file, or move it away to start without poses"
 
 
 class TaughtPose(PoseDocument):
-    """One pose with its name."""
+    """A named pose."""
 
     name: Name
 
 
 class TaughtDocument(Document):
-    """The file."""
+    """The file of taught poses."""
 
     schema_version: Literal[1] = 1
     poses: list[TaughtPose] = Field(default_factory=list)
 
 
 class TaughtPoses:
-    """Poses in an order, on disk after every change."""
+    """An ordered list of poses, saved after every change."""
 
     def __init__(self, path: Path) -> None:
-        """Those that are in the file; none where there is no file.
+        """Loads the file, if it exists.
 
         Raises:
             BadInput: It cannot be read.
-            InvalidFile: With what is wrong in it.
+            InvalidFile: With its errors.
         """
         self._path = path
         self._poses: list[TaughtPose] = []
@@ -61,11 +61,11 @@ class TaughtPoses:
             self._poses = list(document.poses)
 
     def __len__(self) -> int:
-        """How many."""
+        """Number of poses."""
         return len(self._poses)
 
-    def told(self) -> list[dict[str, Any]]:
-        """As the page takes them."""
+    def as_dicts(self) -> list[dict[str, Any]]:
+        """The poses as data for the page."""
         return [
             {"name": p.name, "position_mm": p.position_mm, "quaternion": p.rotation_wxyz}
             for p in self._poses
@@ -75,7 +75,7 @@ class TaughtPoses:
         """Adds a pose at the end.
 
         Raises:
-            BadInput: There are too many, or the name is taken or none.
+            BadInput: There are too many, or the name is taken or invalid.
         """
         if len(self._poses) >= MOST:
             raise _refusal(f"there are {MOST} poses already", "remove one that is not needed")
@@ -84,10 +84,10 @@ class TaughtPoses:
         self._keep([*self._poses, _named(document, name)])
 
     def rename(self, pose: str, name: str) -> None:
-        """Gives a pose another name.
+        """Renames a pose.
 
         Raises:
-            BadInput: There is no such pose, or the name is taken or none.
+            BadInput: There is no such pose, or the name is taken or invalid.
         """
         index = self._index(pose)
         if name != pose:
@@ -97,14 +97,14 @@ class TaughtPoses:
         self._keep(changed)
 
     def move(self, pose: str, to: int) -> None:
-        """Puts a pose at another place of the order, from 0.
+        """Moves a pose to another position in the order, from 0.
 
         Raises:
-            BadInput: There is no such pose or place.
+            BadInput: There is no such pose or position.
         """
         index = self._index(pose)
         if not 0 <= to < len(self._poses):
-            raise _refusal(f"the order has no place {to + 1}", "look at the list again")
+            raise _refusal(f"the list has no position {to + 1}", "check the list")
         changed = list(self._poses)
         changed.insert(to, changed.pop(index))
         self._keep(changed)
@@ -119,10 +119,10 @@ class TaughtPoses:
         self._keep([*self._poses[:index], *self._poses[index + 1 :]])
 
     def scene(self, around: Scene, name: str) -> SceneDocument:
-        """From the first to the last through all others, among what is around.
+        """A scene from the first pose through all others to the last, with given surroundings.
 
-        Poses that are turned alike within `ALIKE_DEG` are all given the first one's orientation;
-        for others the scene has rotation limits, and is to be planned with free rotation.
+        If all orientations are within `ALIKE_DEG`, every pose gets the first one's orientation;
+        otherwise the scene has rotation limits, and is to be planned with free rotation.
 
         Raises:
             BadInput: There are fewer than two poses.
@@ -145,25 +145,25 @@ class TaughtPoses:
         )
 
     def _rotation_limits(self) -> RotationLimitsDocument:
-        """What all poses and the shortest ways between them keep, and a little more."""
+        """Limits that contain all poses and the shortest rotations between them, plus 1°."""
         quaternions = [one.pose().quaternion for one in self._poses]
-        turned = np.degrees([largest_rotations(a, b) for a, b in pairwise(quaternions)])
-        tilt, turn = (turned.max(axis=0) + 1.0).tolist()
+        largest = np.degrees([largest_rotations(a, b) for a, b in pairwise(quaternions)])
+        tilt, turn = (largest.max(axis=0) + 1.0).tolist()
         return RotationLimitsDocument(tilt_deg=min(90.0, tilt), turn_deg=min(180.0, turn))
 
     def _keep(self, poses: list[TaughtPose]) -> None:
-        """On disk first."""
+        """Saves the poses, then adopts them."""
         document = TaughtDocument(poses=poses)
         self._path.parent.mkdir(exist_ok=True)
         write_atomic(self._path, document.model_dump_json(indent=1) + "\n")
         self._poses = poses
 
     def _index(self, name: str) -> int:
-        """A pose goes by its name: what the operator saw, wherever it is in the order by now."""
+        """Index of a pose by name, as its position may have changed since the operator saw it."""
         for index, pose in enumerate(self._poses):
             if pose.name == name:
                 return index
-        raise _refusal(f"there is no pose '{name}' any more", "look at the list again")
+        raise _refusal(f"there is no pose '{name}'", "check the list")
 
     def _require_free(self, name: str) -> None:
         if any(pose.name == name for pose in self._poses):
@@ -171,7 +171,7 @@ class TaughtPoses:
 
 
 def scene_text(document: SceneDocument) -> str:
-    """A scene file."""
+    """Text of a scene file."""
     data = document.model_dump(mode="json", exclude_defaults=True)
     return yaml.safe_dump(
         {"schema_version": document.schema_version, **data},
@@ -185,7 +185,7 @@ def _named(pose: PoseDocument, name: str) -> TaughtPose:
     try:
         checked = TypeAdapter(Name).validate_python(name.strip())
     except ValidationError:
-        raise _refusal(f"'{name}' is no name", "use 1 to 80 letters or digits") from None
+        raise _refusal(f"'{name}' is not a valid name", "use 1 to 80 letters or digits") from None
     given = {"position_mm": pose.position_mm, "rotation_wxyz": pose.rotation_wxyz}
     return TaughtPose(name=checked, **given)
 

@@ -1,4 +1,4 @@
-"""What the page shows of the robot, from what its drives say: pose, tensions, clearance."""
+"""Pose, tensions and clearance of the robot from its drives, as data for the page."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from model.scene import Scene, empty_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
-#: Clearance is computed this often at most, [s].
+#: Shortest period of computing the clearance, [s].
 CLEARANCE_EVERY = 0.2
-#: Half axes of the ellipsoid that holds 95 % of a normal error in space: in standard deviations.
-SURE_IN_SPACE = 2.7955
+#: Half axes of the 95 % ellipsoid of a normal error in three dimensions, [standard deviations].
+ELLIPSOID_SCALE = 2.7955
 
 
 def scene_figure(rig: Rig, scene: Scene | None, *strokes: Stroke) -> SceneFigure:
-    """The rig among its obstacles, without the platform at any moment."""
+    """The rig and its obstacles, without the platform."""
     surfaces = [frame_surface(rig), *(() if scene is None else obstacle_surfaces(scene))]
     points = [surface.vertices for surface in surfaces]
     points += [stroke.segments.reshape(-1, 3) for stroke in strokes]
@@ -47,14 +47,14 @@ def scene_figure(rig: Rig, scene: Scene | None, *strokes: Stroke) -> SceneFigure
 
 
 def scene_of(rig: Rig, scene: Scene | None) -> dict[str, Any]:
-    """What the page draws at first, as `model.pages.scene.scene_data`, and where goals may be."""
+    """The initial scene as `model.pages.scene.scene_data`, with the workspace for goals."""
     corners = [rig.workspace_lower, rig.workspace_upper]
     workspace = [(1e3 * corner).round(3).tolist() for corner in corners]
     return {**scene_data(scene_figure(rig, scene)), "workspace_mm": workspace}
 
 
 def pose_data(rig: Rig, pose: Pose, source: str) -> dict[str, Any]:
-    """The platform as the page takes it: mm, and where cables leave their pulleys."""
+    """The platform's pose and the cables' exit points, in mm for the page."""
     turn = float(np.degrees(np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])))
     return {
         "position_mm": (np.round(pose.position * 1e3, 2) + 0.0).tolist(),
@@ -67,11 +67,11 @@ def pose_data(rig: Rig, pose: Pose, source: str) -> dict[str, Any]:
 
 
 def nearest_data(nearest: Nearest, required: float) -> dict[str, Any]:
-    """The closest pair as the page takes it: mm, and where on both bodies it is closest.
+    """The closest pair and its two closest points, in mm for the page.
 
     Args:
         nearest: A body of the robot and an obstacle.
-        required: Clearance that the scene asks for, [m].
+        required: Clearance that the scene requires, [m].
     """
     points = np.stack([nearest.first_point, nearest.second_point])
     return {
@@ -83,7 +83,7 @@ def nearest_data(nearest: Nearest, required: float) -> dict[str, Any]:
 
 
 def measured_data(measured: dict[str, Any], age: float) -> dict[str, Any]:
-    """The measured pose of a run's status as the page takes it: mm, and its 95 % ellipsoid.
+    """The measured pose of a run's status and its 95 % ellipsoid, in mm for the page.
 
     Args:
         measured: See `executor.remote.status`.
@@ -91,7 +91,7 @@ def measured_data(measured: dict[str, Any], age: float) -> dict[str, Any]:
     """
     covariance = np.array(measured["covariance_mm2"]).reshape(3, 3)
     variances, axes = np.linalg.eigh((covariance + covariance.T) / 2.0)
-    half = SURE_IN_SPACE * np.sqrt(np.maximum(variances, 0.0))
+    half = ELLIPSOID_SCALE * np.sqrt(np.maximum(variances, 0.0))
     return {
         "position_mm": [round(v, 2) for v in measured["position_mm"]],
         "half_axes_mm": np.round(axes.T * half[:, None], 4).tolist(),
@@ -104,11 +104,11 @@ def measured_data(measured: dict[str, Any], age: float) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotNow:
-    """The robot as its drives have it.
+    """The robot's present state from its drives.
 
     Attributes:
-        pose: ``world_from_platform``; None where their positions fit none.
-        tensions: By their torques, [N].
+        pose: ``world_from_platform``, from the encoders.
+        tensions: From the motor torques, [N].
         nearest: The closest pair of a body of the robot and an obstacle; None without obstacles.
     """
 
@@ -118,14 +118,14 @@ class RobotNow:
 
 
 class RobotView:
-    """Where the robot is, from one status to the next."""
+    """Tracks the robot's pose from one status to the next."""
 
     def __init__(self, rig: Rig, scene: Scene | None) -> None:
-        """Not seen yet.
+        """Starts without a status.
 
         Args:
             rig: The robot and its bus.
-            scene: What is around, unless a run says otherwise.
+            scene: Surroundings, unless a run has its own.
         """
         self._file_rig, self._file_scene = rig, scene
         self._folder: str | None = None
@@ -133,11 +133,11 @@ class RobotView:
         self._nearest: Nearest | None = None
         self._pose = rig.home
         self.waypoints: tuple[Pose, ...] = ()
-        """Of the plan that is run; none otherwise."""
+        """Of the plan being run; empty otherwise."""
         self._set(rig, scene)
 
     def take(self, status: dict[str, Any]) -> RobotNow | None:
-        """The robot by a run's status; None before its first cycle."""
+        """The robot from a run's status; None before the first cycle, or if no pose fits."""
         folder = status["folder"]
         if folder != self._folder:
             self._folder = folder
@@ -152,12 +152,12 @@ class RobotView:
         )
         try:
             self._pose = forward_kinematics(self.rig, lengths, self._pose, tolerance=1e-6).pose
-        except CdprError:  # while cables hang slack, no pose fits
+        except CdprError:  # with slack cables no pose fits
             return None
         return RobotNow(self._pose, tensions.tolist(), self._near(self._pose))
 
     def at_rest(self, status: StatusResult) -> RobotNow | None:
-        """The robot as its drives were read while nothing moves; None where no pose is known."""
+        """The robot from drives read at rest; None if no pose is known."""
         if status.pose is None or status.drives is None:
             return None
         self._pose = status.pose
@@ -166,13 +166,13 @@ class RobotView:
         return RobotNow(status.pose, tensions, self._near(status.pose))
 
     def at_home(self) -> RobotNow:
-        """The robot at its home pose: where drives that a verb simulates begin."""
+        """The robot at its home pose, where simulated drives start."""
         tensions = working_tensions(self.rig, self.rig.home, self.scene.load).tensions
         return RobotNow(self.rig.home, tensions.tolist(), self._near(self.rig.home))
 
     @property
     def required_clearance(self) -> float:
-        """Of the scene, [m]."""
+        """Obstacle clearance required by the scene, [m]."""
         return self.scene.obstacle_clearance
 
     def _near(self, pose: Pose) -> Nearest | None:
@@ -183,17 +183,17 @@ class RobotView:
         return self._nearest
 
     def _set_by(self, folder: Path | None) -> None:
-        """A run's folder says for which rig and scene it is; other motions go by the files."""
+        """Takes rig and scene from a run's folder; other motions use the console's files."""
         rig, scene = self._file_rig, self._file_scene
         self.waypoints = ()
         try:
             if folder is not None and (folder / "plan.json").exists():
-                run = RunFolder(folder)  # it is under way: only what was written first is read
+                run = RunFolder(folder)  # still being written: read only its first files
                 plan = run.plan()
                 rig, scene, self.waypoints = run.rig(), plan.scene, plan.waypoints
             else:
                 rig = MotionInterlock(rig).referenced_rig()
-        except CdprError:  # not homed yet, or the folder is not whole
+        except CdprError:  # not homed yet, or the folder is incomplete
             pass
         self._set(rig, scene)
 

@@ -1,6 +1,6 @@
-"""Follows whatever moves on the rig's bus, over its command socket, and its cameras' images.
+"""Follows the run on the rig's bus over its command socket, and its cameras' images.
 
-It reconnects to the next motion. Images are outlined with what is seen in them.
+It reconnects to the next run. Detections are outlined in the images.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from executor.remote.command_socket import find_runs
 from executor.remote.protocol import make_line
 from model.rig import Rig
 
-#: While nothing moves, a new run is looked for this often, [s].
-LOOK = 0.2
-#: A run that answers later is silent: its last status stays, and grows old, [s].
+#: Period of the search for a run at rest, [s].
+SEARCH_PERIOD = 0.2
+#: Time-out of a status; a silent run's last status is kept, and becomes stale, [s].
 PATIENCE = 0.1
-#: What an operator asks for is answered within this, [s].
+#: Time-out of a command, [s].
 ANSWERED_WITHIN = 0.5
-#: Sent to a silent run as well: obeyed late, they make nothing move.
+#: Commands sent to a silent run too: executed late, they move nothing.
 _ALWAYS = frozenset({"let_go", "hold", "end"})
 _SILENT = "the run does not answer"
 _MOVES = "the robot moves; wait, or stop it"
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """What a run said.
+class RunReport:
+    """Last status of a run.
 
     Attributes:
-        status: See `executor.remote.status`; None when nothing moves.
-        at: When, on the monotonic clock, [s].
+        status: See `executor.remote.status`; None at rest.
+        at: Time of receipt on the monotonic clock, [s].
     """
 
     status: dict[str, Any] | None
@@ -43,34 +43,34 @@ class Look:
 
 
 class RunWatch:
-    """Of the runs on one bus; safe to use from several threads."""
+    """Follows the runs on one bus; thread-safe."""
 
     def __init__(self, bus: str) -> None:
-        """Not connected yet; the bus as a run's status names it."""
+        """Starts unconnected; ``bus`` as in a run's status."""
         self._bus = bus
         self._lock = threading.Lock()
         self._links = ExitStack()
         self._run: RunLink | None = None
         self._looked = float("-inf")
         self._count = 0
-        self.last = Look(None, time.monotonic())
+        self.last = RunReport(None, time.monotonic())
 
     @property
     def number(self) -> int:
-        """Of the motion that is followed, rising with each; 0 while nothing moves."""
+        """Number of the run that is followed, rising with each; 0 at rest."""
         return 0 if self._run is None else self._count
 
-    def look(self) -> Look:
-        """Asks the run that moves; finds one where none did."""
+    def update(self) -> RunReport:
+        """Asks the run for its status, or searches for a run."""
         if not self._lock.acquire(timeout=PATIENCE):
-            return self.last  # somebody waits for an answer
+            return self.last  # another thread waits for an answer
         try:
             now = time.monotonic()
-            if self._run is None and now - self._looked >= LOOK:
+            if self._run is None and now - self._looked >= SEARCH_PERIOD:
                 self._looked = now
                 self._connect()
             if self._run is None:
-                self.last = Look(None, now)
+                self.last = RunReport(None, now)
             elif self._run.owed:
                 self._take(self._run.hear(PATIENCE))
             else:
@@ -80,9 +80,9 @@ class RunWatch:
             self._lock.release()
 
     def why_busy(self) -> str:
-        """Why nothing may be started now, looked up afresh; or nothing.
+        """Why no verb may be started now, or an empty text; searches for runs again.
 
-        A run that does not say which bus it moves may be one on this bus.
+        A silent run may be one on this bus.
         """
         with self._lock:
             silent = self._connect() if self._run is None else []
@@ -93,10 +93,10 @@ class RunWatch:
                 return f"process {numbers} moves a robot and does not answer; wait, or stop it"
             return ""
 
-    def say(self, command: str, **values: Any) -> str:
-        """Sends the run a command; why it was not taken, or nothing.
+    def send(self, command: str, **values: Any) -> str:
+        """Sends the run a command; returns why it was refused, or an empty text.
 
-        A run that is silent is sent nothing that it could obey when it wakes up, long after.
+        A silent run gets only commands of `_ALWAYS`, as it might execute others much later.
         """
         with self._lock:
             if self._run is None:
@@ -114,20 +114,20 @@ class RunWatch:
             return "" if answer.status is not None else _SILENT
 
     def close(self) -> None:
-        """Lets go of the connection."""
+        """Closes the connection."""
         with self._lock:
-            self._let_go()
+            self._disconnect()
 
     def _take(self, answer: Answer) -> None:
-        """An answer counts as new data; silence leaves the old, which then becomes stale."""
+        """Takes a status from an answer; without an answer the last one becomes stale."""
         if answer.status is not None:
-            self.last = Look(answer.status, time.monotonic())
+            self.last = RunReport(answer.status, time.monotonic())
         elif answer.ended:
-            self._let_go()
-            self.last = Look(None, time.monotonic())
+            self._disconnect()
+            self.last = RunReport(None, time.monotonic())
 
     def _connect(self) -> list[int]:
-        """Finds the run on this bus; where there is none, which runs did not say how they stand."""
+        """Connects to the run on this bus; if there is none, returns the silent processes."""
         links, silent = self._links.enter_context(ExitStack()), []
         for run in links.enter_context(find_runs()):
             link = RunLink(run)
@@ -138,46 +138,44 @@ class RunWatch:
                 return []
             if answer.status is None and not answer.ended:
                 silent.append(run.process)
-        self._let_go()
+        self._disconnect()
         return silent
 
-    def _let_go(self) -> None:
+    def _disconnect(self) -> None:
         self._run = None
         self._links.close()
 
 
-# Images of the cameras that measure a run, with outlines of what is seen in them.
-
-
-#: Wider images are made smaller, [px]; and compressed by so much.
+# Images of the cameras that measure a run, with outlines of the detections.
+#: Largest width of an image, [px], and its JPEG quality.
 WIDEST, QUALITY = 640, 70
 
 
 class CameraPictures:
-    """The newest image of each camera; safe to use from several threads.
+    """The newest image of each camera; thread-safe.
 
-    Making one takes a few milliseconds here, and nothing of a run. Who asks while one is made gets
-    the one before: images are left out, none waits.
+    Compression takes a few milliseconds of this process, none of the run's. A request during a
+    compression gets the previous image.
     """
 
     def __init__(self) -> None:
-        """No run is watched."""
+        """Starts without a run."""
         self._busy = threading.Lock()
         self._rig: Rig | None = None
-        self._places: dict[str, tuple[int, int]] = {}
+        self._sources: dict[str, tuple[int, int]] = {}
         self._readers: dict[tuple[int, int], ImageReader] = {}
         self._made: dict[str, bytes] = {}
 
     def watch(self, status: dict[str, Any] | None, rig: Rig) -> None:
-        """Takes in which cameras measure now; it opens and waits for nothing.
+        """Takes the list of measuring cameras from a status; does not block.
 
         Args:
-            status: Of a run; None where nothing moves.
+            status: Of a run; None at rest.
             rig: The robot with its cameras.
         """
         cameras = [] if status is None else status["cameras"]
         self._rig = rig
-        self._places = {
+        self._sources = {
             camera["name"]: (status["process"], camera["live_image"])
             for camera in cameras
             if status is not None and camera["live_image"] is not None
@@ -189,13 +187,13 @@ class CameraPictures:
             return self._made.get(name)
         try:
             self._forget_others()
-            place, rig = self._places.get(name), self._rig
-            if place is None or rig is None:
+            source, rig = self._sources.get(name), self._rig
+            if source is None or rig is None:
                 return None
             with suppress(OSError):
-                if place not in self._readers:
-                    self._readers[place] = ImageReader(*place)
-                newest = self._readers[place].newest()
+                if source not in self._readers:
+                    self._readers[source] = ImageReader(*source)
+                newest = self._readers[source].newest()
                 if newest is not None:
                     self._made[name] = _compressed(newest, rig, name)
             return self._made.get(name)
@@ -203,22 +201,22 @@ class CameraPictures:
             self._busy.release()
 
     def close(self) -> None:
-        """Lets go of the images."""
+        """Closes the image readers."""
         with self._busy:
-            self._places = {}
+            self._sources = {}
             self._forget_others()
 
     def _forget_others(self) -> None:
-        """Of runs that ended nothing is kept."""
-        places = dict(self._places)
-        for place in [one for one in self._readers if one not in places.values()]:
-            self._readers.pop(place).close()
-        for name in [one for one in self._made if one not in places]:
+        """Drops readers and images of runs that ended."""
+        sources = dict(self._sources)
+        for source in [one for one in self._readers if one not in sources.values()]:
+            self._readers.pop(source).close()
+        for name in [one for one in self._made if one not in sources]:
             del self._made[name]
 
 
 def _compressed(newest: LiveImage, rig: Rig, name: str) -> bytes:
-    import cv2  # a console that shows no image does not load it
+    import cv2  # loaded only when an image is shown
 
     from tracking.track import draw_outline
 

@@ -1,4 +1,4 @@
-"""The image files of a folder."""
+"""Image files: reading folders, writing folders and videos."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from model.files.documents import write_bytes_atomic
 from model.files.reading import PICTURE_LIMIT, read_bytes
 from model.rig import Camera
 
-#: Endings of image files, in lower case.
+#: Suffixes of image files, in lower case.
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
 _NO_PICTURE, _CAMERA = "is not a readable image", "the camera has"
 
 
 class ImageFolder:
-    """The images of a folder in the order of their names, numbers counted as numbers.
+    """The images of a folder in natural order of their names.
 
     Args:
-        folder: Where they are.
+        folder: Folder of the images.
         camera: The camera that took them.
-        rate: Images a second; the camera's when left out.
-        on_unused: Called with the name of each unusable file and the reason; the others are used.
+        rate: Images per second (default: the camera's).
+        on_unused: Called with name and reason for each file that is not used.
 
     Attributes:
-        files: All that end like images.
-        unused: Why files were not used, by name.
+        files: All files with an image suffix.
+        unused: Reason by name of each file that is not used.
 
     Raises:
         BadInput: The folder is missing or has no images.
@@ -58,10 +58,10 @@ class ImageFolder:
         return len(self.files)
 
     def __iter__(self) -> Iterator[Frame]:
-        """The images of the camera's size.
+        """Yields the images that have the camera's size.
 
         Raises:
-            BadInput: None can be read, or none is of the camera's size.
+            BadInput: None can be read, or none has the camera's size.
         """
         self.unused.clear()
         wanted = (self._camera.width, self._camera.height)
@@ -83,23 +83,23 @@ class ImageFolder:
 
 
 class OneCamerasPictures:
-    """The images of a folder that are of one size, upright as their files say (EXIF).
+    """The images of a folder with one size, rotated according to their EXIF orientation.
 
-    A camera that was turned by hand stores how; where the images are of one size only as the
-    sensor gave them, they are taken so. Files that cannot be used are named, the others are used.
+    If the images have one size only without this rotation, they are used as stored. Files that
+    cannot be used are listed in `unused`.
 
     Args:
-        folder: Where they are.
-        wanted: Width and height of the camera that took them, [px]; left out, that of most.
+        folder: Folder of the images.
+        wanted: Width and height of the camera that took them, [px] (default: the most frequent).
 
     Attributes:
         size: Width and height, [px].
-        names: Of the images used, in order.
-        unused: Why each of the other files is not used, by name.
-        upright: Whether images are turned as their files say.
+        names: Names of the images used, in order.
+        unused: Reason by name of each file that is not used.
+        upright: Whether the EXIF orientation is applied.
 
     Raises:
-        BadInput: The folder is missing, has no images, or none that can be read or is of the
+        BadInput: The folder is missing, has no images, or none that can be read or has the
             wanted size.
     """
 
@@ -124,15 +124,15 @@ class OneCamerasPictures:
         self.size = wanted or max(counted, key=lambda size: (counted[size], size))
         for path, size in sizes.items():
             if size != self.size:
-                whose = _CAMERA if wanted else "most have"
-                self.unused[path.name] = _other_size(size, whose, self.size)
+                owner = _CAMERA if wanted else "most have"
+                self.unused[path.name] = _other_size(size, owner, self.size)
         if self.size not in counted:
             raise _wrong_sizes(folder, self.unused, self.size)
         self._files = [path for path in sizes if path.name not in self.unused]
         self.names = tuple(path.name for path in self._files)
 
     def __iter__(self) -> Iterator[tuple[str, Image]]:
-        """Name and grey image."""
+        """Yields names and grey images."""
         for path in self._files:
             image = read_picture(path, self.upright)
             if image is not None and _size(image) == self.size:
@@ -140,9 +140,7 @@ class OneCamerasPictures:
 
 
 def picture_files(folder: Path) -> tuple[Path, ...]:
-    """The files of a folder that end like images, in order of their names.
-
-    Numbers in names are counted as numbers.
+    """The files of a folder with an image suffix, in natural order of their names.
 
     Raises:
         BadInput: The folder is missing or has none.
@@ -160,11 +158,11 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
 
 
 def read_picture(path: Path, upright: bool = True) -> Image | None:
-    """A grey image, or None when the file holds none; also for names that OpenCV cannot open.
+    """The grey image of a file, or None if it has none; also for names that OpenCV cannot open.
 
     Args:
         path: The file.
-        upright: Whether it is turned as the file says (EXIF).
+        upright: Whether to apply the EXIF orientation.
     """
     try:
         data = read_bytes(path, PICTURE_LIMIT)
@@ -180,8 +178,8 @@ def read_picture(path: Path, upright: bool = True) -> Image | None:
     return None if picture is None else np.asarray(picture, dtype=np.uint8)
 
 
-def _other_size(size: tuple[int, int], whose: str, wanted: tuple[int, int]) -> str:
-    return f"has {size[0]} x {size[1]} px, {whose} {wanted[0]} x {wanted[1]} px"
+def _other_size(size: tuple[int, int], owner: str, wanted: tuple[int, int]) -> str:
+    return f"has {size[0]} x {size[1]} px, {owner} {wanted[0]} x {wanted[1]} px"
 
 
 def _size(image: Image | None) -> tuple[int, int]:
@@ -206,7 +204,7 @@ def _wrong_sizes(folder: Path, unused: dict[str, str], wanted: tuple[int, int]) 
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sorts ``frame_10`` behind ``frame_9``."""
+    """Sort key that puts ``frame_10`` after ``frame_9``."""
     parts = re.split(r"(\d+)", name.lower())
     return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts]
 
@@ -214,20 +212,20 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
 # Images written to a folder or into a video.
 
 
-#: Endings of videos that are written, and how their images are coded.
+#: Codec of the written videos, by suffix.
 VIDEO_CODES = {".mp4": "mp4v", ".avi": "MJPG"}
 
 
 class PictureOutput:
-    """Writes colour images one after the other, as a context manager.
+    """Context manager that writes colour images to a folder or a video.
 
     Args:
-        path: A folder to make, or a video file by its ending.
-        rate: Images a second of a video.
-        force: Whether something that is there may be replaced (a video) or added to (a folder).
+        path: A folder to create, or a video file, by its suffix.
+        rate: Images per second of a video.
+        force: Whether an existing video may be replaced, or an existing folder added to.
 
     Raises:
-        BadInput: It is there already, or its ending is no known one.
+        BadInput: It exists already, or its suffix is unknown.
     """
 
     def __init__(self, path: Path, rate: float, force: bool = False) -> None:
@@ -271,12 +269,12 @@ class PictureOutput:
             self._unfinished.unlink(missing_ok=True)
 
     def _keep_video(self) -> None:
-        """The video gets its name once it is whole; OpenCV does not say when the disk is full."""
+        """Renames the finished video after counting its images: OpenCV ignores a full disk."""
         reader = cv2.VideoCapture(str(self._unfinished))
         count = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
         reader.release()
         if count < self._count:
-            why = f"it holds only {count} of {self._count} images; the disk may be full"
+            why = f"it contains only {count} of {self._count} images; the disk may be full"
             raise _unwritable(self._path, why)
         try:
             self._unfinished.replace(self._path)
@@ -288,7 +286,7 @@ class PictureOutput:
 
         Args:
             picture: Shape (height, width, 3), blue green red; all of one size.
-            name: Of the image; a folder's file is called after it.
+            name: Of the image; the file in a folder is named after it.
 
         Raises:
             Fault: It cannot be written.
@@ -305,7 +303,7 @@ class PictureOutput:
             raise _unwritable(Path(error.where), error.why) from None
 
     def _file_name(self, name: str) -> str:
-        """Of a picture: ``a.png``; ``a.jpg.png`` where ``a.png`` is another image's."""
+        """File name of an image: ``a.png``, or ``a.jpg.png`` if ``a.png`` is taken."""
         whole = "".join(sign if sign.isalnum() or sign in "-_." else "_" for sign in name)
         short = Path(whole).stem + ".png"
         owner = self._names.setdefault(short, name)
@@ -317,7 +315,7 @@ class PictureOutput:
             size = (picture.shape[1], picture.shape[0])
             self._video = cv2.VideoWriter(str(self._unfinished), code, self._rate, size)
             if not self._video.isOpened():
-                raise _unwritable(self._path, "OpenCV has no encoder for this kind of video here")
+                raise _unwritable(self._path, "OpenCV has no encoder for this video format")
         self._video.write(picture)
         self._count += 1
 

@@ -1,4 +1,4 @@
-"""Images of a video and of a camera."""
+"""Images of a video file and of a live camera."""
 
 from __future__ import annotations
 
@@ -19,39 +19,38 @@ from numpy.typing import NDArray
 from model.errors import BadInput, Fault, HardwareMissing
 from model.rig import Camera
 
-# The newest image of a camera that takes them faster than anybody asks for them.
+# The newest image of a camera that delivers them faster than they are used.
 #
-# A camera's images wait in queues: of the network, of its driver, of the decoder. Who takes
-# one of three falls behind by the other two, and measures an ever older platform. So a thread takes
-# them all, as they come, and keeps the last.
+# Images wait in queues of the network, the driver and the decoder. A reader slower than the camera
+# would measure ever older images, so a thread reads all of them and keeps the last.
 
 
-#: Images a camera may fail to give in a row before it counts as gone.
+#: Consecutive failed reads after which a camera counts as lost.
 LOST_PICTURES = 5
-#: A camera that is being read is waited for no longer than this when it is let go of, [s].
+#: Longest wait for the reading thread when closing, [s].
 END_TIMEOUT = 2.0
 
 
 class Capture(Protocol):
-    """What gives images, such as `cv2.VideoCapture`."""
+    """A source of images, such as `cv2.VideoCapture`."""
 
     def read(self) -> tuple[bool, Any]:
-        """The next image in the queue, waited for; False and nothing where there is none."""
+        """Waits for the next image in the queue; False and None if it fails."""
         ...
 
     def release(self) -> None:
-        """Lets go of the camera."""
+        """Releases the camera."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrived:
-    """An image as it came.
+    """An image as delivered.
 
     Attributes:
-        number: Of the camera's images, from 0; those not requested count.
-        time: When it arrived, on the reader's clock, [s].
-        picture: As the camera gave it.
+        number: Number of the camera's image from 0, including skipped ones.
+        time: Time of arrival on the reader's clock, [s].
+        picture: As the camera delivered it.
     """
 
     number: int
@@ -60,27 +59,27 @@ class Arrived:
 
 
 class PictureReader:
-    """Takes all images of a camera in a thread of its own."""
+    """Reads all images of a camera in a thread."""
 
     def __init__(self, capture: Capture, clock: Callable[[], float]) -> None:
-        """Begins to read.
+        """Starts the thread.
 
         Args:
-            capture: Read and let go of by the thread alone.
+            capture: Read and released only by the thread.
             clock: Monotonic time, [s].
         """
         self._capture, self._clock = capture, clock
         self._changed = threading.Condition()
         self._newest: Arrived | None = None
-        self._ended = self._told_to_end = False
+        self._ended = self._is_closing = False
         self._thread = threading.Thread(target=self._read, name="cdpr-pictures", daemon=True)
         self._thread.start()
 
     def newest(self) -> Arrived | None:
-        """The newest image, each only once; waited for.
+        """Waits for the newest image not returned before.
 
         Returns:
-            None when the camera gives no more.
+            None once the camera delivers no more.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._newest is not None or self._ended)
@@ -88,15 +87,15 @@ class PictureReader:
             return newest
 
     def close(self) -> None:
-        """Ends the reading; a camera that hangs is left to the end of this process."""
-        self._told_to_end = True
+        """Stops the thread; a hanging camera keeps it until this process ends."""
+        self._is_closing = True
         if threading.current_thread() is not self._thread:
             self._thread.join(END_TIMEOUT)
 
     def _read(self) -> None:
         number = failed = 0
         try:
-            while failed < LOST_PICTURES and not self._told_to_end:
+            while failed < LOST_PICTURES and not self._is_closing:
                 good, picture = self._capture.read()
                 now = self._clock()
                 failed = 0 if good else failed + 1
@@ -115,21 +114,21 @@ class PictureReader:
             self._changed.notify_all()
 
 
-# The size that an image file states, read before anything is decoded.
+# Size stated in the header of an image file, read before decoding.
 #
 # Source: PNG specification (W3C), 11.2.1; JPEG, ITU-T T.81, annex B; BMP,
 # Microsoft's BITMAPINFOHEADER.
 
 
 MOST_PIXELS = 2**28
-"""Of an image; more than any camera of this field has, and a quarter of a gigabyte in grey."""
+"""Largest number of pixels of an image, above any camera in use; 256 MB in grey."""
 
 _NO_SIZE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def stated_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of a PNG, JPEG or BMP file, [px]; None of another or a broken one."""
+    """Width and height of a PNG, JPEG or BMP file, [px]; None for other or damaged files."""
     try:
         if data.startswith(b"\x89PNG\r\n\x1a\n"):
             width, height = struct.unpack_from(">II", data, 16)
@@ -145,13 +144,13 @@ def stated_size(data: bytes) -> tuple[int, int] | None:
 
 
 def is_too_large(data: bytes) -> bool:
-    """Whether an image states more pixels than are decoded; other kinds OpenCV limits itself."""
+    """Whether an image states more than `MOST_PIXELS`; OpenCV limits other formats itself."""
     size = stated_size(data)
     return size is not None and size[0] * size[1] > MOST_PIXELS
 
 
 def _jpeg(data: bytes) -> tuple[int, int] | None:
-    """Goes from marker to marker up to the first frame header."""
+    """Size from the first frame header, found by following the markers."""
     at = 2
     while True:
         sign, marker = struct.unpack_from(">BB", data, at)
@@ -169,7 +168,7 @@ def _jpeg(data: bytes) -> tuple[int, int] | None:
 
 Image = NDArray[np.uint8]
 LAST_CAMERA = 255
-"""Index of the last camera that Linux numbers; OpenCV reads larger ones as other drivers' ports."""
+"""Largest camera index on Linux; OpenCV takes larger numbers as ports of other drivers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,7 +176,7 @@ class Frame:
     """One image.
 
     Attributes:
-        time: When it was taken, [s]; since the first image for files.
+        time: Time of capture, [s]; for files, since the first image.
         image: Grey, shape (height, width).
         name: File name, or number in the video or of the camera.
     """
@@ -188,14 +187,14 @@ class Frame:
 
 
 class VideoFile:
-    """The images of a video.
+    """The images of a video file.
 
     Args:
         path: The file.
         camera: The camera that took it.
 
     Raises:
-        BadInput: The file is missing or no video.
+        BadInput: The file is missing, or is not a video.
     """
 
     def __init__(self, path: Path, camera: Camera) -> None:
@@ -225,14 +224,14 @@ class VideoFile:
             )
 
     def __len__(self) -> int:
-        """Number of images as the file states it, for progress."""
+        """Number of images that the file states, for progress."""
         return self._count
 
     def __iter__(self) -> Iterator[Frame]:
-        """Every image.
+        """Yields every image.
 
         Raises:
-            BadInput: They are not of the camera's size, or none can be read.
+            BadInput: They have another size than the camera, or none can be read.
         """
         capture = _opened(str(self._path))
         rate = capture.get(cv2.CAP_PROP_FPS)
@@ -255,16 +254,16 @@ class VideoFile:
 
 
 class LiveCamera:
-    """A camera on this machine or on the network; it answers with its newest image.
+    """A local or network camera that returns its newest image.
 
     Args:
-        source: Its index, such as ``0``, its device file or its address.
-        camera: What the rig file says about it.
+        source: Index, such as ``0``, device file or address.
+        camera: Its description in the rig file.
         clock: Monotonic time, [s].
 
     Raises:
-        HardwareMissing: It does not open or gives no image.
-        BadInput: It gives images of another size.
+        HardwareMissing: It does not open or delivers no image.
+        BadInput: It delivers images of another size.
     """
 
     def __init__(
@@ -292,8 +291,8 @@ class LiveCamera:
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
         self._reader = PictureReader(capture, clock)
-        # A caller that only iterates closes nothing, and the thread must not outlive it.
-        self._let_go = weakref.finalize(self, self._reader.close)
+        # A caller that only iterates does not close it, and the thread must not outlive it.
+        self._finalizer = weakref.finalize(self, self._reader.close)
         try:
             refuse_wrong_size(self.read().image, camera, self.name)
         except BaseException:
@@ -307,22 +306,20 @@ class LiveCamera:
         self.close()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Images without end; those that came while one was looked at are left out.
+        """Yields images endlessly; those that arrive during processing are skipped.
 
         Raises:
-            Fault: The camera stopped giving images.
+            Fault: The camera stopped delivering images.
         """
         while True:
             yield self.read()
 
     def read(self) -> Frame:
-        """The newest image that was not read before, with the time at which it arrived.
-
-        It may have arrived before this was called.
+        """The newest unread image with its time of arrival, which may precede the call.
 
         Raises:
-            HardwareMissing: It never gave an image.
-            Fault: It stopped giving images.
+            HardwareMissing: The camera never delivered an image.
+            Fault: It stopped delivering images.
         """
         arrived = self._reader.newest()
         if arrived is not None:
@@ -330,27 +327,27 @@ class LiveCamera:
             return Frame(arrived.time, _grey(arrived.picture), f"image {arrived.number}")
         kind = Fault if self._seen else HardwareMissing
         raise kind(
-            f"the camera delivered no image {LOST_PICTURES} times in a row",
+            f"the camera failed to deliver an image {LOST_PICTURES} times in a row",
             where=self.name,
-            why="it was unplugged, or its USB bus is too slow for its images",
+            why="it was unplugged, or its USB bus is too slow",
             next_step="check the cable, then start again",
         )
 
     def close(self) -> None:
-        """Lets go of the camera."""
-        self._let_go()
+        """Releases the camera."""
+        self._finalizer()
 
 
 def live_name(camera: str, source: str) -> str:
-    """A camera of the rig file and where its images come from, such as ``side (0)``."""
+    """Name and source of a camera, such as ``side (0)``."""
     return source if camera == source else f"{camera} ({source})"
 
 
 def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
-    """Images of another size than the camera was calibrated for would measure wrongly.
+    """Refuses an image that has not the size for which the camera was calibrated.
 
     Raises:
-        BadInput: The size is another one.
+        BadInput: The size differs.
     """
     height, width = image.shape
     if (width, height) != (camera.width, camera.height):
@@ -358,13 +355,13 @@ def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
             f"the image has {width} x {height} px, camera {camera.name!r} has {camera.width} x"
             f" {camera.height} px",
             where=where,
-            why="it is from another camera, or was cropped or scaled",
+            why="the image is from another camera, or was cropped or scaled",
             next_step="use full-size images of this camera, or calibrate it at this size",
         )
 
 
 def video_size(path: Path) -> tuple[int, int]:
-    """Width and height of a video's images, [px]; nought of a file that is none."""
+    """Width and height of a video's images, [px]; zero if it is not a video."""
     capture = _opened(str(path))
     try:
         width, height = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
@@ -374,7 +371,7 @@ def video_size(path: Path) -> tuple[int, int]:
 
 
 def _opened(source: int | str) -> cv2.VideoCapture:
-    """Opens quietly: what OpenCV and FFmpeg print about it, our own message says better."""
+    """Opens a source without the log output of OpenCV and FFmpeg."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     before = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -2,5 +2,5 @@
 
 import logging
 
-# What canopen says of its own goes where a program that uses it wants it, never to the terminal.
+# Log messages of canopen never go to the terminal by default.
 logging.getLogger("canopen").addHandler(logging.NullHandler())

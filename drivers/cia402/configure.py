@@ -1,4 +1,4 @@
-"""Sets all drives of a rig up and reads every object back; nothing is enabled here."""
+"""Configures all drives of a rig and reads every object back; enables nothing."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import can
 
 from drivers.can_errors import (
     SETTING_UP,
-    all_of_them,
     answers_twice,
+    combined_refusal,
 )
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
@@ -47,31 +47,30 @@ from model.files.drive_profile_file import ProfileDocument
 from model.rig import Rig
 from model.winches import WinchMap
 
-#: What a drive that was just switched on holds another value of, and keeps after an ordered end:
-#: its heartbeat is 0, and a lost connection means nothing. Source: CiA 301, 7.5.2; CiA 402-2.
+#: Objects whose values show a power cycle: volatile, with other defaults (no heartbeat, no reaction
+#: to a lost connection), and kept at the end of a run. Source: CiA 301, 7.5.2; CiA 402-2.
 FORGOTTEN = (0x1017, 0x6007)
 
 MODE_WAIT = 0.5
-"""So long a drive may take to show a mode that was written, [s]."""
+"""Time-out for a drive to show the mode that was written, [s]."""
 
 MODE_ASKED = 10
-"""Times that it is asked meanwhile."""
+"""Number of reads within `MODE_WAIT`."""
 
 READ_ONLY = frozenset({0x06010000, 0x06010002})
-"""Not writable: an object of a fixed value, which counts when it is the wanted one."""
+"""Abort codes of a read-only object, whose fixed value may be the required one."""
 
 PDO_OBJECTS = 0xF9FF
-"""Makes one of a PDO's communication parameters (1400h, 1800h) and its mapping (1600h, 1A00h)."""
+"""Mask that maps a PDO's parameters (1400h, 1800h) and mapping (1600h, 1A00h) to one index."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetUp:
-    """What `configure_drives` did.
+    """Result of `configure_drives`.
 
     Attributes:
-        remarks: What drives cannot do although a run would use it.
-        heartbeats: How many entries of 1016h were written, one number a drive: the master's, then
-            its peers'.
+        remarks: Functions that drives lack although a run would use them.
+        heartbeats: Number of entries of 1016h written in each drive: the master's, then peers'.
     """
 
     remarks: tuple[str, ...]
@@ -93,20 +92,20 @@ def configure_drives(
         rig: The robot; its winches name the nodes.
         bus: An open bus.
         pump: As for `drivers.factory.make_drive_group`.
-        max_tension: From which the torque limit comes, [N]; the rig's own if None.
-        to_reset: Also takes drives in fault, which are going to be reset.
-        on_restarted: Called, before anything is written, with the nodes that do not hold our set-up
-            any more, or never did.
+        max_tension: Tension that sets the torque limit, [N]; the rig's if None.
+        to_reset: Accepts drives in fault too, which will be reset.
+        on_restarted: Called, before anything is written, with the nodes that lost the
+            configuration or never had it.
 
     Returns:
-        What was set up, and what could not be.
+        What was configured, with remarks.
 
     Raises:
         HardwareMissing: Drives do not answer; with all their nodes.
-        Refused: A drive is no CiA 402 drive, is enabled already, refuses an object or does not
-            keep it; two devices have one node id; or another master is at work on this bus.
+        Refused: A drive is not a CiA 402 drive, is already enabled, or refuses or changes an
+            object; two devices have one node id; or another master is active on this bus.
         BadInput: A value of the rig does not fit its object.
-        Fault: The bus does not take frames.
+        Fault: The bus does not accept frames.
     """
     winch_map, profile = WinchMap(rig), profile_of(rig)
     settings = [settings_for(rig, i, winch_map, max_tension) for i in range(rig.cable_count)]
@@ -115,18 +114,18 @@ def configure_drives(
     network.discard_waiting()
     require_answers(network, nodes)
     _refuse_duplicates(network)
-    wrong = WrongObjects()
+    refusals = Refusals()
     entries: list[int] = []
     for drive, node in enumerate(nodes):
         for expected in (*BEFORE, *identifiers(node), *identity(rig), *expected_by(profile)):
-            wrong.note(require_expected, network, node, expected)
-        wrong.note(require_idle, network, node, to_reset)
+            refusals.note(require_expected, network, node, expected)
+        refusals.note(require_idle, network, node, to_reset)
         for setting in settings[drive]:
-            wrong.note(require_there, network, node, setting)
+            refusals.note(require_there, network, node, setting)
         for setting in stated_absent(rig, drive, winch_map, max_tension):
-            wrong.note(require_absent, network, node, setting)
-        wrong.note(count_heartbeats, network, node, profile, entries)
-    wrong.refuse()
+            refusals.note(require_absent, network, node, setting)
+        refusals.note(count_heartbeats, network, node, profile, entries)
+    refusals.raise_any()
     _refuse_duplicates(network)
     on_restarted(
         tuple(n for n, s in zip(nodes, settings, strict=True) if not is_still_set_up(network, n, s))
@@ -134,21 +133,21 @@ def configure_drives(
     absent: dict[str, list[int]] = {}
     for drive, node in enumerate(nodes):
         network.command(NmtCommand.PRE_OPERATIONAL, node)
-        wrong.note(_switch_off_used, network, node, profile)
-        refused: list[str] = []  # before another PDO gets the identifier that this one has
-        wrong.note(_switch_off_unused, network, node, profile, refused)
-        refused += _write_all(network, node, settings[drive], wrong)
-        _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), wrong)
+        refusals.note(_switch_off_used, network, node, profile)
+        refused: list[str] = []  # switched off before another PDO takes its identifier
+        refusals.note(_switch_off_unused, network, node, profile, refused)
+        refused += _write_all(network, node, settings[drive], refusals)
+        _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), refusals)
         for remark in refused:
             absent.setdefault(remark, []).append(node)
-    wrong.refuse()  # a mode that was not taken is not waited for
+    refusals.raise_any()  # before waiting for a mode that was refused
     if not profile.mode_display_when_enabled:
         for node in nodes:
-            wrong.note(_await_mode, network, node)
-    wrong.refuse()
+            refusals.note(_await_mode, network, node)
+    refusals.raise_any()
     for node in nodes:
         network.command(NmtCommand.START, node)
-    network.take_waiting()
+    network.process_waiting()
     for remark in left_out(profile):
         absent.setdefault(remark, []).extend(nodes)
     remarks = (*_absent(absent), *_unwatched_peers(nodes, entries, profile))
@@ -158,36 +157,38 @@ def configure_drives(
     return SetUp(remarks, tuple(watched))
 
 
-class WrongObjects:
-    """Collects what drives refuse, so that one message reports everything."""
+class Refusals:
+    """Collects refusals of drives, so that one message reports all."""
 
     def __init__(self) -> None:
-        """Begins with nothing."""
+        """Starts empty."""
         self._found: list[Refused] = []
 
     def note(self, action: Callable[..., None], *arguments: Any) -> bool:
-        """Does something with a drive; false when the drive refused, which is kept."""
+        """Calls an action; records a refusal of the drive and returns False."""
         try:
             action(*arguments)
         except Refused as error:
-            if "node" not in error.values:  # the bus is another's: nothing more can be said
+            if (
+                "node" not in error.values
+            ):  # another master is active: the other drives do not matter
                 raise
             self._found.append(error)
             return False
         return True
 
-    def refuse(self) -> None:
-        """Does nothing unless something was found.
+    def raise_any(self) -> None:
+        """Raises if a refusal was recorded.
 
         Raises:
-            Refused: With everything that was found.
+            Refused: With all recorded refusals.
         """
         if self._found:
-            raise all_of_them(self._found)
+            raise combined_refusal(self._found)
 
 
 def is_still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> bool:
-    """Whether it holds what only a set-up gives it: a drive that starts again forgets it."""
+    """Whether the drive still holds the volatile settings, which a restart clears."""
     client = network.client(node)
     return all(
         client.read(setting.index, setting.sub, setting.name, setting.size) == setting.data()
@@ -209,7 +210,7 @@ def _absent(absent: dict[str, list[int]]) -> Iterator[str]:
 def _unwatched_peers(
     nodes: Sequence[int], entries: Sequence[int], profile: ProfileDocument
 ) -> Iterator[str]:
-    """One remark for all drives that have the same number of heartbeat entries too few."""
+    """One remark for all drives that lack the same number of heartbeat entries."""
     if not profile.watches_heartbeats:
         reason = (
             "take a lost heartbeat as a fault"
@@ -238,11 +239,11 @@ def _unwatched_peers(
 
 
 def require_answers(network: SetupNetwork, nodes: Sequence[int]) -> None:
-    """First contact with all drives at once; the silent ones are named together.
+    """Contacts all drives at once, and reports all silent ones together.
 
     Raises:
         HardwareMissing: Drives do not answer.
-        Refused: The one that does not answers something else.
+        Refused: The single silent drive gives a wrong answer.
     """
     nothing = network.silent_nodes(nodes)
     if len(nothing) == 1:
@@ -261,7 +262,7 @@ def require_answers(network: SetupNetwork, nodes: Sequence[int]) -> None:
 
 
 def _await_mode(network: SetupNetwork, node: int) -> None:
-    """The mode that was written shows within `MODE_WAIT`; drives need not follow at once."""
+    """Waits up to `MODE_WAIT` until the drive shows the mode that was written."""
     deadline = network.clock() + MODE_WAIT
     for _ in range(MODE_ASKED):
         data = network.client(node).read(MODE_DISPLAY.index, 0, MODE_DISPLAY.name, 1)
@@ -272,16 +273,16 @@ def _await_mode(network: SetupNetwork, node: int) -> None:
 
 
 def _write_all(
-    network: SetupNetwork, node: int, settings: Sequence[Setting], wrong: WrongObjects
+    network: SetupNetwork, node: int, settings: Sequence[Setting], refusals: Refusals
 ) -> list[str]:
-    """Writes and reads back; remarks on what the drive does not have and need not have."""
+    """Writes settings and reads them back; returns remarks on missing optional objects."""
     remarks: list[str] = []
     refused: set[int] = set()
     for setting in settings:
-        # Of a PDO that refuses one object the others fail for the same reason.
+        # If a PDO refuses one object, the others fail for the same reason.
         if setting.index & PDO_OBJECTS in refused:
             continue
-        if not wrong.note(_write, network, node, setting, remarks) and _is_pdo(setting.index):
+        if not refusals.note(_write, network, node, setting, remarks) and _is_pdo(setting.index):
             refused.add(setting.index & PDO_OBJECTS)
     return remarks
 
@@ -291,7 +292,7 @@ def _is_pdo(index: int) -> bool:
 
 
 def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str]) -> None:
-    """Writes one object and reads it back; what an optional one lacks becomes a remark."""
+    """Writes one object and reads it back; a missing optional one becomes a remark."""
     client = network.client(node)
     if setting.per_mille_of is not None:
         index, sub = setting.per_mille_of
@@ -321,7 +322,7 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
 
 
 def _holds(network: SetupNetwork, node: int, setting: Setting) -> bool:
-    """Whether an object that cannot be written holds what it must anyway."""
+    """Whether an object that cannot be written holds the required value."""
     try:
         kept = network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
     except Refused:
@@ -330,7 +331,7 @@ def _holds(network: SetupNetwork, node: int, setting: Setting) -> bool:
 
 
 def _switch_off_used(network: SetupNetwork, node: int, profile: ProfileDocument) -> None:
-    """The identifier of a PDO may change only while it is off. Source: CiA 301, 7.5.2.35."""
+    """Switches the used PDOs off, as identifiers may change only then. CiA 301, 7.5.2.35."""
     for index in used_pdos(profile):
         data = network.client(node).read(index, 1, "PDO identifier")
         value = int.from_bytes(data, "little")
@@ -341,7 +342,7 @@ def _switch_off_used(network: SetupNetwork, node: int, profile: ProfileDocument)
 def _switch_off_unused(
     network: SetupNetwork, node: int, profile: ProfileDocument, remarks: list[str]
 ) -> None:
-    """Process data that is not used fills the bus, or takes frames for others; it may be absent."""
+    """Switches unused PDOs off, which load the bus or react to other frames; may be absent."""
 
     def is_there(index: int) -> bool:
         value = _identifier_if_there(network, node, index, remarks)
@@ -355,7 +356,7 @@ def _switch_off_unused(
 def _identifier_if_there(
     network: SetupNetwork, node: int, index: int, remarks: list[str]
 ) -> int | None:
-    """Identifier of a PDO (sub-index 1); None where it cannot be read, which may be a remark."""
+    """Identifier of a PDO (sub-index 1); None if it cannot be read, perhaps with a remark."""
     try:
         return int.from_bytes(network.client(node).read(index, 1, "PDO identifier"), "little")
     except Refused as error:
@@ -365,7 +366,7 @@ def _identifier_if_there(
         if code not in OBJECT_DOES_NOT_EXIST:
             remarks.append(
                 f"the drive refuses {index:04X}h:01 PDO identifier ({abort_text(int(code))}):"
-                " if it has this PDO, it stays as it is"
+                " if it has this PDO, it stays unchanged"
             )
         return None
 

@@ -1,4 +1,4 @@
-"""What codes of drives mean: EMCY error codes and SDO abort codes, as text."""
+"""Texts of EMCY error codes and SDO abort codes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ EMCY_TEXTS: dict[int, str] = {
     0x8612: "position limit reached",
     0x8700: "SYNC missed or out of time",
     0x9000: "external error",
-    0xFF00: "error of the manufacturer",
+    0xFF00: "manufacturer-specific error",
 }
 """Source: CiA 301 (error code classes) and CiA 402-2 (error codes)."""
 
@@ -62,7 +62,7 @@ _CLASS_TEXTS: dict[int, str] = {
 
 
 def emergency_text(code: int) -> str:
-    """Text of an EMCY error code (also object 603Fh): the code's own, or its class's."""
+    """Text of an EMCY error code (also object 603Fh), or of its class."""
     for mask in _CLASSES:
         text = EMCY_TEXTS.get(code & mask) or _CLASS_TEXTS.get(code & mask)
         if text:

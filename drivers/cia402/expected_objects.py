@@ -1,11 +1,11 @@
-"""Objects that a drive must hold before anything is written to it; none of them is written."""
+"""Objects that a drive must hold before it is configured; they are only read."""
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
 
-from drivers.can_errors import in_fault, keeps_another, moved_by_another
+from drivers.can_errors import in_fault, moved_by_another, wrong_setting
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, Setting
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork
 from drivers.cia402.sdo_jobs import CSP_MODE, OBJECT_DOES_NOT_EXIST
@@ -33,7 +33,7 @@ class Expectation:
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
-#: What a drive must be before anything is written to it.
+#: Requirements of a drive before anything is written to it.
 BEFORE = (
     Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are supported"),
     Expectation(
@@ -44,10 +44,10 @@ BEFORE = (
 
 
 def identifiers(node: int) -> tuple[Expectation, ...]:
-    """On what identifiers a drive hears SYNC and sends its emergencies; CiA 301, 7.5.2."""
+    """Identifiers on which a drive receives SYNC and sends emergencies; CiA 301, 7.5.2."""
     sync, emergency = (
-        "SYNC goes out as 80h, without a counter",
-        "emergencies are heard as 80h + node",
+        "SYNC is sent as 80h, without a counter",
+        "emergencies are received as 80h + node",
     )
     return (
         Expectation(0x1005, 0, 0x7FF, 0x80, "COB-ID SYNC", sync, optional=True),
@@ -57,7 +57,7 @@ def identifiers(node: int) -> tuple[Expectation, ...]:
 
 
 def identity(rig: Rig) -> tuple[Expectation, ...]:
-    """Whose drives they must be, where the rig file says so (1018h)."""
+    """Vendor and product that the rig file requires, if any (1018h)."""
     drives = rig.document.drives
     if not isinstance(drives, Cia402Document):
         return ()
@@ -73,11 +73,11 @@ def identity(rig: Rig) -> tuple[Expectation, ...]:
 MODE_DISPLAY = Expectation(
     0x6061, 0, 0xFF, CSP_MODE, "mode of operation display", "the mode must be active"
 )
-"""What it must show after the set-up, or once enabled (`ProfileDocument`)."""
+"""Required mode after the configuration, or once enabled (`ProfileDocument`)."""
 
 
 def expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
-    """What drives of a profile must hold that the program does not write, such as units."""
+    """Values that the profile requires and the program does not write, such as units."""
     return tuple(
         Expectation(*object_key(each.object), 0xFFFFFFFF, each.value, each.name, each.why)
         for each in profile.expect
@@ -85,7 +85,7 @@ def expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
 
 
 def how_to_set(expected: Expectation) -> str:
-    """The next step where a drive holds another value."""
+    """The next step for a wrong value."""
     if expected.index == 0x6502:
         return (
             "none: a drive without cyclic synchronous position (CSP) cannot be used; Technosoft"
@@ -93,17 +93,17 @@ def how_to_set(expected: Expectation) -> str:
         )
     if expected.index in (0x1000, 0x1018):
         return "check the node id, and vendor_id and product_code of the rig file"
-    return "set it with the maker's tool and store it"
+    return "set it with the manufacturer's tool and store it"
 
 
-# Questions to one drive, each of which refuses it; asked before anything is written.
+# Checks of one drive before anything is written.
 
 
 def require_expected(network: SetupNetwork, node: int, expected: Expectation) -> None:
-    """An object holds what is expected, or is absent where it may be.
+    """Requires that an object holds the expected value, or is optional and absent.
 
     Raises:
-        Refused: It does not.
+        Refused: It holds another value, or is missing.
     """
     try:
         data = network.client(node).read(expected.index, expected.sub, expected.name)
@@ -118,10 +118,10 @@ def require_expected(network: SetupNetwork, node: int, expected: Expectation) ->
 
 
 def require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
-    """Missing objects are all reported before any is written; other errors show then.
+    """Requires that an object exists, so that all missing ones are reported before any write.
 
     Raises:
-        Refused: A drive does not have an object that it needs.
+        Refused: The drive lacks a required object.
     """
     if setting.optional or setting.transient:
         return
@@ -133,10 +133,10 @@ def require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
 
 
 def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
-    """Of an object that its profile calls absent: it is, or holds what it must anyway.
+    """Requires that an object declared absent is absent, or holds the required value.
 
     Raises:
-        Refused: It is there, with another value.
+        Refused: It exists, with another value.
     """
     try:
         data = network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
@@ -147,10 +147,10 @@ def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
     if not setting.is_kept(data):
         found = number_text(data, setting.form)
         raise Refused(
-            f"its profile says that it is absent; the drive has it with {found},"
+            f"the profile declares it absent; the drive has it with {found},"
             f" {setting.value} is required",
             where=f"drive {node}, object {setting}",
-            next_step="take the object out of `absent` in the drive profile",
+            next_step="remove the object from `absent` in the drive profile",
             values={"node": node, "object": str(setting), "found": found},
         )
 
@@ -159,15 +159,15 @@ _STATUS_WORD = "object 6041h:00 status word"
 
 
 def require_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
-    """A drive that is enabled belongs to somebody; one that holds in quick stop may be taken.
+    """Refuses an enabled drive, which another master controls; quick stop is accepted.
 
     Raises:
-        Refused: It is enabled, or in fault and not about to be reset.
+        Refused: It is enabled, or in fault without ``to_reset``.
     """
     data = network.client(node).read(0x6041, 0, "status word", 2)
     state = state_of(int.from_bytes(data, "little"))
     if state in FAULTED and not to_reset:
-        why = "it stopped itself; see its display or maker's tool for the cause"
+        why = "it stopped itself; its display or the manufacturer's tool shows the cause"
         raise in_fault(node, "", _STATUS_WORD, why)
     if state is DriveState.OPERATION_ENABLED:
         raise moved_by_another(node, "enabled already", _STATUS_WORD)
@@ -176,10 +176,10 @@ def require_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
 def count_heartbeats(
     network: SetupNetwork, node: int, profile: ProfileDocument, entries: list[int]
 ) -> None:
-    """Appends how many entries of 1016h the drive has, as far as the profile uses them.
+    """Appends the drive's number of usable entries of 1016h.
 
     Raises:
-        Refused: It has none, and the profile needs one.
+        Refused: It has none, and the profile requires one.
     """
     name, needed = "consumer heartbeat entries", profile.watches_heartbeats
     client = network.client(node)
@@ -192,12 +192,12 @@ def count_heartbeats(
 
 
 def number_text(data: bytes, form: str) -> str:
-    """A value of the type that `struct` names, or what came in its place."""
+    """A value as text by its `struct` format, or the bytes if the length is wrong."""
     if len(data) != struct.calcsize(form):
         return f"{len(data)} bytes ({data.hex()})"
     return str(struct.unpack(form, data)[0])
 
 
-def wrong_value(node: int, place: str, found: str, wanted: str, why: str) -> Refused:
-    """A drive holds another value than the one that is needed."""
-    return keeps_another(node, f"object {place}", found, wanted, why, "the drive's manual")
+def wrong_value(node: int, name: str, found: str, wanted: str, why: str) -> Refused:
+    """An object of a drive holds a wrong value."""
+    return wrong_setting(node, f"object {name}", found, wanted, why, "the drive's manual")

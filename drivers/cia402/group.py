@@ -1,4 +1,4 @@
-"""All CiA 402 drives of a rig as one group: one thread, one bus, one step a cycle."""
+"""All CiA 402 drives of a rig as one group: one thread, one bus, one step per cycle."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from drivers.can_bus import SentFrame
 from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.configure import configure_drives
-from drivers.cia402.inspection import say_simulated
+from drivers.cia402.inspection import are_simulated
 from drivers.cia402.monitor import DriveMonitor
 from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_message
 from drivers.cia402.profile import profile_of
@@ -18,7 +18,7 @@ from drivers.cia402.sdo_jobs import (
     ASKED_AGAIN_AFTER,
     MODE_WAIT,
     REQUESTS_A_CYCLE,
-    STANDING,
+    STATE_REQUESTS,
     AnswerListener,
     ModeCheck,
     SdoJobs,
@@ -52,14 +52,14 @@ from model.errors import HardwareMissing, Refused
 from model.rig import Rig
 
 RESET_CYCLES = 10
-"""Cycles a drive has to leave the state FAULT after a reset."""
+"""Cycles within which a drive must leave the state FAULT after a reset."""
 
 FIRST_READING_ATTEMPTS = 10
 FIRST_READINGS = 2
-"""Of each drive that must agree before its position is believed: one frame may be wrong."""
+"""Consistent readings per drive before its position is accepted: one frame may be wrong."""
 
 FIRST_READING_TIMEOUT = 0.1
-"""A drive that was just started may let the first SYNC pass; [s] for each."""
+"""Time-out per attempt, [s]; a drive just started may miss the first SYNC."""
 
 _WITHOUT_TORQUE = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON)
 
@@ -93,20 +93,20 @@ class Cia402Group(CyclicGroup):
         self._warnings: tuple[DriveWarning, ...] = ()
         self._goal = Goal.IDLE
         self._words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
-        self._told_to_stop = [False] * count
+        self._stop_commanded = [False] * count
         self._targets = [0] * count
         self._demands = [0] * count
         self._faults = []
         self._cycle = 0
         self._cycles_to_goal = 0
-        self._left_stop = False  # commanded "enable operation" since the last release began
+        self._left_stop = False  # "enable operation" was commanded since the last release began
         self._known = False
-        self._unwatching: SdoJobs | None = None
+        self._monitoring_off: SdoJobs | None = None
         self._modes: ModeCheck | None = None
 
     @property
     def capabilities(self) -> Capabilities:
-        """CiA 402 drives as `configure` sets them up."""
+        """Capabilities of CiA 402 drives after `configure`."""
         return Capabilities(
             sync=True,
             holds_on_comm_loss=True,
@@ -123,23 +123,23 @@ class Cia402Group(CyclicGroup):
         )
 
     @property
-    def _heard(self) -> DriveMonitor:
+    def _listener(self) -> DriveMonitor:
         return self._watch
 
     @property
     def restarted(self) -> tuple[int, ...]:
-        """Nodes that `configure` found without this program's set-up."""
+        """Nodes that `configure` found without this program's configuration."""
         return self._restarted
 
     @property
     def targets(self) -> Counts:
-        """Targets last sent, shape (m,), [counts]."""
+        """Last targets sent, shape (m,), [counts]."""
         return np.array(self._targets, dtype=np.int64)
 
     def configure(
         self, *, to_reset: bool = False, on_restarted: OnRestarted | None = None
     ) -> tuple[str, ...]:
-        """Sets every drive up and reads every setting back; see `DriveGroup.configure`."""
+        """Configures every drive and reads every setting back; see `DriveGroup.configure`."""
         self._refuse_enabled()
         self._state = GroupState.OFFLINE
         self._reset_memory()
@@ -158,12 +158,12 @@ class Cia402Group(CyclicGroup):
             on_restarted=take,
         )
         self._heartbeats = done.heartbeats
-        self._simulated = say_simulated(self._bus, self._pump, self._nodes)
+        self._simulated = are_simulated(self._bus, self._pump, self._nodes)
         self._state = GroupState.CONFIGURED
         return done.remarks
 
     def read_positions(self, pace: Pace | None = None) -> CycleStatus:
-        """Sends SYNC until every drive has reported a position; as `DriveGroup.read_positions`."""
+        """Sends SYNC until every drive has reported a position; see `DriveGroup.read_positions`."""
         self._watch.forget_positions()
         agreed = 0
         for _ in range(FIRST_READING_ATTEMPTS):
@@ -192,32 +192,32 @@ class Cia402Group(CyclicGroup):
         """Sends one cycle; see `DriveGroup.send_cycle`."""
         self._online()
         self._discard_stale()
-        if self._goal is not Goal.RESET_FAULT:  # what has come since the last cycle stops this one
-            self._latch(self._news())
+        if self._goal is not Goal.RESET_FAULT:  # faults since the last cycle stop this one
+            self._latch(self._new_messages())
         following = self._state is GroupState.ENABLED
-        words = next_words(self._goal, self._watch.states, self._told_to_stop)
+        words = next_words(self._goal, self._watch.states, self._stop_commanded)
         if self._goal in (Goal.ENABLE, Goal.RELEASE) and self._watch.is_unjudged:
-            words = self._words  # no further step before it is known whether a drive is in fault
+            words = self._words  # no further step until it is known whether a drive is in fault
         if ControlWord.ENABLE_OPERATION in words:
             self._left_stop = True
         self._demands = self._targets if self._known else list(self._watch.positions)
         if following:
             self._targets = [int(target) for target in targets]
         elif ControlWord.ENABLE_OPERATION not in self._words:
-            # Not under power, or held by the drives themselves: the targets follow the drives.
-            # Once enabling has begun they stay, so that a sagging drive is not followed down.
+            # Without power, or held by the drives themselves: the targets follow the positions.
+            # Once enabling has begun they are fixed, so that they do not follow a sagging drive.
             self._targets = list(self._watch.positions)
         self._send(words, may_send)
         self._known = True
         self._cycle += 1
         if self._cycle % self._heartbeat_cycles == 0:
             self._cyclic.send((self._frames.heartbeat,))
-        for jobs in (self._modes, self._unwatching):
+        for jobs in (self._modes, self._monitoring_off):
             if jobs is not None:
                 self._ask(jobs, REQUESTS_A_CYCLE)
 
     def command(self, command: GroupCommand) -> None:
-        """Sets where the group goes; see `DriveGroup.command`."""
+        """Sets the goal of the group; see `DriveGroup.command`."""
         self._online()
         if command is GroupCommand.QUICK_STOP:
             self._stop()
@@ -226,38 +226,38 @@ class Cia402Group(CyclicGroup):
         elif command is GroupCommand.RELEASE:
             self._begin_release()
         elif command is GroupCommand.END_MONITORING:
-            self._begin_unwatching()
+            self._begin_monitoring_off()
         else:
             self._reset_fault()
 
     def quick_stop_now(self) -> None:
         """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
-        self._stop()  # first: whatever the bus does now, no later cycle enables the drives again
+        self._stop()  # first: even if the bus fails now, no later cycle re-enables the drives
         self._send((ControlWord.QUICK_STOP,) * len(self._nodes), lambda _enables: True)
 
     @property
     def ending(self) -> frozenset[int]:
         """Drives whose monitoring is being switched off; see `DriveGroup.ending`."""
-        if self._unwatching is None:
+        if self._monitoring_off is None:
             return frozenset()
-        return frozenset(map(self._nodes.index, self._unwatching.unfinished()))
+        return frozenset(map(self._nodes.index, self._monitoring_off.unfinished()))
 
     @property
     def is_monitored(self) -> bool:
-        """Whether drives still watch this master; see `DriveGroup.is_monitored`."""
-        jobs = self._unwatching
+        """Whether drives still monitor this master; see `DriveGroup.is_monitored`."""
+        jobs = self._monitoring_off
         return jobs is None or bool(jobs.unfinished() | jobs.refused())
 
-    def look(self, pace: Pace) -> CycleStatus:
-        """Asks every drive by SDO how it stands; see `DriveGroup.look`."""
+    def read_state(self, pace: Pace) -> CycleStatus:
+        """Reads the state of every drive by SDO; see `DriveGroup.read_state`."""
         self._online()
-        jobs = SdoJobs(dict.fromkeys(self._nodes, STANDING), self._again_after)
+        jobs = SdoJobs(dict.fromkeys(self._nodes, STATE_REQUESTS), self._again_after)
         silent = {self._nodes[i] for i, heard in enumerate(self._watch.answered) if not heard}
         self._watch.begin_cycle()
         self._watch.on_answer = jobs.take
-        for number in range(round(len(STANDING) * self._answer_time / self._cycle_s)):
+        for number in range(round(len(STATE_REQUESTS) * self._answer_time / self._cycle_s)):
             waited_for = jobs.unfinished()
-            if number * self._cycle_s >= self._answer_time:  # one answer, or it is gone
+            if number * self._cycle_s >= self._answer_time:  # drives without any answer are lost
                 waited_for -= silent - {node for node, _ in jobs.values}
             if not waited_for:
                 break
@@ -267,76 +267,76 @@ class Cia402Group(CyclicGroup):
                 self._pump()
                 left = 0.0
             self._cyclic.take_replies(AnswerListener(self._watch.take, jobs), left)
-        self._watch.take_standing(jobs.values)
+        self._watch.take_states(jobs.values)
         self._look_for_faults()
         return self._status()
 
     def _ask(self, jobs: SdoJobs | ModeCheck, most: int) -> None:
         self._cyclic.send(SentFrame(can_id, data) for can_id, data in jobs.next_requests(most))
 
-    def _begin_unwatching(self) -> None:
-        """Heartbeat first and SYNC last: what is still watched is still sent."""
+    def _begin_monitoring_off(self) -> None:
+        """Switches monitoring off, heartbeat first, SYNC last; both are sent until then."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             raise Refused("enabled drives must monitor this program", where="drive group")
         off = (monitoring_off(count, self._profile.rpdo) for count in self._heartbeats)
-        self._unwatching = SdoJobs(dict(zip(self._nodes, off, strict=True)), self._again_after)
+        self._monitoring_off = SdoJobs(dict(zip(self._nodes, off, strict=True)), self._again_after)
         self._modes = None
-        self._watch.on_answer = self._unwatching.take
+        self._watch.on_answer = self._monitoring_off.take
 
     def _send(self, words: tuple[ControlWord, ...], may_send: Callable[[bool], bool]) -> None:
-        """One cycle's frames; what was asked for is remembered even if the bus fails."""
+        """Sends one cycle's frames; the words are remembered even if the bus fails."""
         self._words = words
-        self._note_told_to_stop()
+        self._note_stop_commanded()
         self._watch.begin_cycle()
         try:
             self._cyclic.send(self._frames.set_points(words, self._targets))
             if not may_send(ControlWord.ENABLE_OPERATION in words):
-                # The drives have these set-points and act on them at SYNC: the last word counts.
+                # The drives act on the set-points at SYNC: the last word counts.
                 self._stop()
                 self._words = (ControlWord.QUICK_STOP,) * len(words)
                 self._cyclic.send(self._frames.set_points(self._words, self._targets))
-        finally:  # a frame that the bus did not take must not keep a stop from the other drives
+        finally:  # a frame that failed must not keep a stop from the other drives
             self._cyclic.send((self._frames.sync,))
 
-    def _note_told_to_stop(self) -> None:
+    def _note_stop_commanded(self) -> None:
         for drive, (state, word) in enumerate(zip(self._watch.states, self._words, strict=True)):
             if state is not DriveState.QUICK_STOP_ACTIVE:
-                self._told_to_stop[drive] = False
+                self._stop_commanded[drive] = False
             elif word is ControlWord.QUICK_STOP:
-                self._told_to_stop[drive] = True
+                self._stop_commanded[drive] = True
 
     def _look_for_faults(self) -> None:
         powered = self._goal in (Goal.ENABLE, Goal.RELEASE)
         warnings = self._watch.warnings()
         self._warnings = warnings if powered else ()
-        found = [*self._news(), *self._stopped_by_themselves()]
-        told = {text for _, text in (*self._faults, *found)}
-        found += self._watch.state_faults(told, powered=powered)
+        found = [*self._new_messages(), *self._autonomous_stops()]
+        known = {text for _, text in (*self._faults, *found)}
+        found += self._watch.state_faults(known, powered=powered)
         if self._goal is not Goal.RESET_FAULT:
             self._latch(found)
 
-    def _news(self) -> list[tuple[int, str]]:
-        """What drives sent since the last call that is a fault whatever they reply."""
+    def _new_messages(self) -> list[tuple[int, str]]:
+        """Messages since the last call that are faults regardless of the replies."""
         found = self._watch.news()
         if self._goal in (Goal.ENABLE, Goal.RELEASE):
             return found
-        # An emergency of a drive that moves nothing becomes its state's reason.
+        # An emergency of a drive at rest only explains its state.
         return [(node, text) for node, text in found if node in self._watch.restarted]
 
-    def _stopped_by_themselves(self) -> list[tuple[int, str]]:
-        """Drives that left a state without being commanded to; not those in fault.
+    def _autonomous_stops(self) -> list[tuple[int, str]]:
+        """Drives that left a state without a command, except those in fault.
 
-        On the way to a release they leave it for SWITCHED ON; one that is back in quick stop after
-        it was enabled must not be enabled again.
+        During a release they change to SWITCHED ON; one that returned to quick stop after it was
+        enabled must not be enabled again.
         """
-        dropped, let_go = self._watch.dropped(), self._watch.let_go()
+        dropped, torque_lost = self._watch.dropped(), self._watch.torque_lost()
         states = dict(zip(self._nodes, self._watch.states, strict=True))
         if self._goal is Goal.ENABLE:
             return [fault for fault in dropped if states[fault[0]] not in FAULTED]
         if self._goal is Goal.RELEASE and self._left_stop:
             back = DriveState.QUICK_STOP_ACTIVE
             return [fault for fault in dropped if states[fault[0]] is back]
-        return let_go if self._goal in (Goal.STOP, Goal.IDLE) else []
+        return torque_lost if self._goal in (Goal.STOP, Goal.IDLE) else []
 
     def _latch(self, found: list[tuple[int, str]]) -> None:
         for fault in found:
@@ -346,7 +346,7 @@ class Cia402Group(CyclicGroup):
             self._goal, self._state = Goal.STOP, GroupState.FAULT
 
     def _advance(self) -> None:
-        """Sees whether the goal is reached, or was not in time."""
+        """Checks whether the goal is reached or overdue."""
         states = self._watch.states
         self._cycles_to_goal += 1
         if self._goal is Goal.RESET_FAULT:
@@ -364,7 +364,7 @@ class Cia402Group(CyclicGroup):
                 self._latch(self._late(_WITHOUT_TORQUE))
 
     def _check_modes(self) -> None:
-        """Set-points are followed once every drive shows CSP; most were asked at set-up."""
+        """Enters ENABLED once every drive shows CSP; most profiles check it when configuring."""
         if not self._profile.mode_display_when_enabled:
             self._state = GroupState.ENABLED
             return
@@ -421,7 +421,7 @@ class Cia402Group(CyclicGroup):
         self._modes = None
 
     def require_releasable(self) -> None:
-        """Whether the drives may be released; see `DriveGroup.require_releasable`."""
+        """Checks whether the drives may be released; see `DriveGroup.require_releasable`."""
         self._refuse_latched("release the drives")
         require_within_limits(self._rig, self._watch.positions)
 
@@ -429,10 +429,10 @@ class Cia402Group(CyclicGroup):
         self.require_releasable()
         self._goal, self._cycles_to_goal, self._left_stop = Goal.RELEASE, 0, False
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
-            self._state = GroupState.QUICK_STOP  # no set-points are followed from here on
+            self._state = GroupState.QUICK_STOP  # set-points are no longer followed
 
     def _reset_fault(self) -> None:
-        """Clears the latch; a drive in fault is reset only when no other holds the platform."""
+        """Clears the faults; resets drives in fault only if no other holds the platform."""
         faulted = self._watch.require_resettable()
         self._cycles_to_goal = 0
         self._faults.clear()

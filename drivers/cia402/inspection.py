@@ -1,4 +1,4 @@
-"""Reads every object that a set-up needs from every drive, all problems at once; writes nothing."""
+"""Reads every object that a configuration needs from every drive; writes nothing."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ Verdict = Literal["ok", "remark", "wrong"]
 
 WRITE_ONLY = 0x06010001
 MOST_VALUES = 3
-"""Of an object that are listed; more are reported as different ones."""
+"""Largest number of distinct values listed per object."""
 
 _WORST: tuple[Verdict, ...] = ("ok", "remark", "wrong")
 
@@ -62,15 +62,15 @@ _PROCESS_DATA = (
 
 @dataclass(slots=True)
 class ObjectRow:
-    """One object of all drives.
+    """One object in all drives.
 
     Attributes:
         object: Index, sub-index and name.
-        needed: What it must hold, or that it must be there.
-        meaning: What it is needed for.
-        verdict: The worst of all drives.
-        change: The next step where it is not good.
-        found: What was found, and in which nodes.
+        needed: Required value or presence.
+        meaning: Purpose.
+        verdict: Worst verdict of all drives.
+        change: Next step if it is not ok.
+        found: Nodes by value found.
     """
 
     object: str
@@ -81,13 +81,13 @@ class ObjectRow:
     found: dict[str, list[int]] = field(default_factory=dict)
 
     def note(self, node: int, text: str, verdict: Verdict = "ok", change: str = "") -> None:
-        """Adds what one drive reported."""
+        """Adds the value of one drive."""
         self.found.setdefault(text, []).append(node)
         if _WORST.index(verdict) > _WORST.index(self.verdict):
             self.verdict, self.change = verdict, change
 
     def found_text(self, nodes: Sequence[int]) -> str:
-        """``all: 8``, or each value with its drives."""
+        """``all: 8``, or every value with its drives."""
         if len(self.found) > MOST_VALUES and self.verdict == "ok":
             return "present; differs between drives"
         if [sorted(nodes)] == [sorted(each) for each in self.found.values()]:
@@ -99,12 +99,12 @@ class ObjectRow:
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """What was found.
+    """Result of an inspection.
 
     Attributes:
         nodes: The drives that answered.
-        silent: Those that did not.
-        rows: One for each object.
+        silent: The drives that did not answer.
+        rows: One per object.
     """
 
     nodes: tuple[int, ...]
@@ -113,7 +113,7 @@ class Examined:
 
     @property
     def good(self) -> bool:
-        """Every drive can be set up, as far as reading shows."""
+        """Whether every drive can be configured, as far as reading shows."""
         return not self.silent and all(row.verdict != "wrong" for row in self.rows)
 
     def as_dict(self) -> dict[str, Any]:
@@ -138,16 +138,16 @@ class Examined:
 
 
 def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
-    """Reads all objects of all drives; sends SDO uploads and nothing else.
+    """Reads all objects of all drives; sends only SDO upload requests.
 
     Args:
-        rig: The robot; its profile says what the drives have.
+        rig: The robot, with its drive profile.
         bus: An open bus.
         pump: As for `drivers.factory.make_drive_group`.
 
     Raises:
         BadInput: The profile or a value of the rig is wrong.
-        HardwareMissing: A drive fell silent meanwhile.
+        HardwareMissing: A drive stopped answering.
         Fault: The bus failed.
     """
     profile, winch_map = profile_of(rig), WinchMap(rig)
@@ -159,42 +159,43 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
     for drive, node in enumerate(all_nodes):
         if node in silent:
             continue
-        look = _Look(network, node, rows)
+        reader = _Reader(network, node, rows)
         for expected in (*BEFORE, *identifiers(node), *identity(rig), *expected_by(profile)):
-            look.at_expected(expected)
-        look.at_state()
+            reader.at_expected(expected)
+        reader.at_state()
         for index, form, name, why in _PROCESS_DATA:
-            look.at_setting(Setting(index, 0, form, 0, name, why), "readable")
-        look.at_scale(rig.document.winches[drive].counts_per_rev)
-        look.at_heartbeats(profile, rig.cable_count)
+            reader.at_setting(Setting(index, 0, form, 0, name, why), "readable")
+        reader.at_scale(rig.document.winches[drive].counts_per_rev)
+        reader.at_heartbeats(profile, rig.cable_count)
         for setting in _last_of_each(settings_for(rig, drive, winch_map, None)):
-            look.at_setting(setting, _needed(setting))
+            reader.at_setting(setting, _needed(setting))
         for setting in stated_absent(rig, drive, winch_map):
-            look.at_absent(setting)
-        for_unused_pdos(profile, look.at_unused)
+            reader.at_absent(setting)
+        for_unused_pdos(profile, reader.at_unused)
     answered = tuple(node for node in all_nodes if node not in silent)
     return Examined(answered, tuple(silent), tuple(rows.values()))
 
 
 def _last_of_each(settings: Iterable[Setting]) -> list[Setting]:
-    """What an object holds in the end, without the steps towards it."""
+    """The final setting of each object, without transient ones."""
     return list({(s.index, s.sub): s for s in settings if not s.transient}.values())
 
 
 def _number(setting: Setting, value: int) -> str:
-    """Objects and identifiers of process data in hexadecimal digits, as manuals print them."""
+    """A value as text; PDO mappings and identifiers in hexadecimal, as in manuals."""
     is_entry = 0x1400 <= setting.index < 0x1C00 and setting.size == 4
     return f"{value:08X}h" if is_entry else str(value)
 
 
 def _needed(setting: Setting) -> str:
     if setting.per_mille_of is None:
-        return f"{_number(setting, setting.value)}, written at set-up"
-    return f"{setting.value} per mille of {object_name(*setting.per_mille_of)}, written at set-up"
+        return f"{_number(setting, setting.value)}, written at configuration"
+    rated = object_name(*setting.per_mille_of)
+    return f"{setting.value} per mille of {rated}, written at configuration"
 
 
-class _Look:
-    """What one drive holds, into the rows of all."""
+class _Reader:
+    """Reads one drive's objects into the rows of all drives."""
 
     def __init__(
         self, network: SetupNetwork, node: int, rows: dict[tuple[int, int], ObjectRow]
@@ -202,7 +203,7 @@ class _Look:
         self._client, self._node, self._rows = network.client(node), node, rows
 
     def at_expected(self, expected: Expectation) -> None:
-        """An object that must hold a value which is not written."""
+        """An object that must hold a value and is not written."""
         row = self._row(expected.index, expected.sub, str(expected), f"{expected.expected:X}h")
         row.meaning = expected.why
         data = self._read(expected.index, expected.sub, row, expected.optional)
@@ -214,7 +215,7 @@ class _Look:
         row.note(self._node, f"{value:X}h", "ok" if good else "wrong", change)
 
     def at_state(self) -> None:
-        """Where the drive is in the state machine."""
+        """State of the drive's state machine."""
         row = self._row(0x6041, 0, "6041h:00 statusword", "not enabled, no fault")
         row.meaning = "only drives at rest are configured"
         data = self._read(0x6041, 0, row, optional=False)
@@ -234,7 +235,7 @@ class _Look:
             row.note(self._node, state.value)
 
     def at_heartbeats(self, profile: ProfileDocument, drives: int) -> None:
-        """How many producers the drive can watch."""
+        """Number of heartbeat producers that the drive can monitor."""
         name, needed = "consumer heartbeat entries", f"1; {drives} to monitor every peer as well"
         used = profile.watches_heartbeats
         row = self._row(
@@ -243,7 +244,7 @@ class _Look:
         row.meaning = (
             "stop when the master or a peer is lost"
             if used
-            else "a lost heartbeat would take the torque off"
+            else "a lost heartbeat would remove the torque"
         )
         data = self._read(HEARTBEAT_CONSUMERS, 0, row, optional=not used, size=1)
         if data is None:
@@ -264,26 +265,26 @@ class _Look:
             row.note(self._node, str(count))
 
     def at_scale(self, counts_per_turn: int) -> None:
-        """Position counts of a motor turn, as far as the drive says; CiA 402-2, factor group."""
+        """Counts per motor turn that the drive reports; CiA 402-2, factor group."""
         row = self._row(0x6092, 1, "feed constant, 6091h gear ratio, 608Fh encoder resolution", "")
-        row.meaning = "position counts of a motor turn: winches[].counts_per_rev"
-        row.needed = row.needed or f"{counts_per_turn} a turn, where the drive has them"
+        row.meaning = "position counts per motor turn: winches[].counts_per_rev"
+        row.needed = row.needed or f"{counts_per_turn} per turn, if the drive has them"
         feed, gear, encoder = (self._quotient(index) for index in (0x6092, 0x6091, 0x608F))
-        said = {"6092h/6091h": feed / (gear or 1.0)} if feed else {}
+        ratios = {"6092h/6091h": feed / (gear or 1.0)} if feed else {}
         if encoder:
-            said["608Fh"] = encoder
-        text = ", ".join(f"{value:.10g} by {name}" for name, value in said.items()) or "absent"
-        if not said or counts_per_turn in said.values():
+            ratios["608Fh"] = encoder
+        text = ", ".join(f"{value:.10g} from {name}" for name, value in ratios.items()) or "absent"
+        if not ratios or counts_per_turn in ratios.values():
             row.note(self._node, text)
         else:
-            row.note(self._node, text, "remark", "compare with 6064h over a motor turn by hand")
+            row.note(self._node, text, "remark", "compare with 6064h over one motor turn")
 
     def at_setting(self, setting: Setting, needed: str) -> None:
-        """An object that is written at set-up: it must be there, and of that length."""
+        """An object written by the configuration, which must exist with the right length."""
         row = self._row(setting.index, setting.sub, str(setting), needed)
         row.meaning = setting.why
         if row.needed != needed:
-            row.needed = "its own value, written at set-up"
+            row.needed = "its own value, written at configuration"
         data = self._read(
             setting.index, setting.sub, row, setting.optional, setting.instead, setting.size
         )
@@ -299,32 +300,32 @@ class _Look:
             found = self._read(*setting.per_mille_of, rated, optional=False)
             if found is not None:
                 value = int.from_bytes(found, "little")
-                change = "" if value else "enter the motor data with the maker's tool"
+                change = "" if value else "enter the motor data with the manufacturer's tool"
                 rated.note(self._node, str(value), "ok" if value else "wrong", change)
 
     def at_absent(self, setting: Setting) -> None:
-        """An object that the profile calls absent; where it is there, its value counts."""
-        needed = f"absent by the profile, or {_number(setting, setting.value)}"
+        """An object that the profile declares absent; if it exists, its value is checked."""
+        needed = f"absent as in the profile, or {_number(setting, setting.value)}"
         row = self._row(setting.index, setting.sub, str(setting), needed)
         row.meaning = setting.why
         data = self._read(setting.index, setting.sub, row, optional=True, size=setting.size)
         if data is not None:
             text = _number(setting, int.from_bytes(data, "little"))
             good = setting.is_kept(data)
-            change = "" if good else "take it out of `absent` in the drive profile"
+            change = "" if good else "remove it from `absent` in the drive profile"
             row.note(self._node, text, "ok" if good else "wrong", change)
 
     def at_unused(self, index: int) -> bool:
-        """A PDO that is switched off at set-up where it is there, which is returned."""
-        row = self._row(index, 1, "PDO identifier", "none required: switched off where it is there")
-        row.meaning = "other process data would only fill the bus"
+        """An unused PDO, which is switched off if it exists; returns whether it exists."""
+        row = self._row(index, 1, "PDO identifier", "none required: switched off if present")
+        row.meaning = "other process data would only load the bus"
         data = self._read(index, 1, row, optional=True)
         if data is not None:
             row.note(self._node, f"{int.from_bytes(data, 'little'):X}h")
         return data is not None
 
     def _quotient(self, index: int) -> float | None:
-        """Sub-index 1 by sub-index 2; None where there is no such object, or no number."""
+        """Sub-index 1 divided by sub-index 2; None if the object is missing or zero."""
         try:
             data = [self._client.read_if_there(index, sub, "position scale") for sub in (1, 2)]
         except Refused as error:
@@ -347,7 +348,7 @@ class _Look:
         instead: str = "",
         size: int = 4,
     ) -> bytes | None:
-        """The object; None where it cannot be read, which is noted."""
+        """Reads an object; None if it cannot be read, which is noted in the row."""
         try:
             return self._client.read(index, sub, row.object, size)
         except Refused as error:
@@ -374,21 +375,21 @@ _BESIDE = {
     "60C2h:01": ", where the drive needs no interpolation time",
     "60C2h:02": ", where the drive needs no interpolation time",
 }
-"""What else a profile says in which an object is absent."""
+"""Further entries of a profile in which an object is absent."""
 
 
 def _how_without(index: int, sub: int) -> str:
-    """Of an object that is needed and not there."""
+    """The next step for a required object that is missing."""
     name = "1016h:01" if index == HEARTBEAT_CONSUMERS else object_name(index, sub)
     if name not in OBJECTS or name in NEEDED:
-        return "use another drive or firmware: no profile makes up for it"
-    own = f"name it as absent in a drive profile of your own{_BESIDE.get(name, '')}"
-    there = [each for each in profile_names() if name in load_profile(each).absent]
-    of_ours = "".join(f"; {load_profile(each).name} have drives.profile: {each}" for each in there)
-    return own + of_ours
+        return "use another drive or firmware: no profile can replace it"
+    own = f"list it as absent in your own drive profile{_BESIDE.get(name, '')}"
+    names = [each for each in profile_names() if name in load_profile(each).absent]
+    known = "".join(f"; for {load_profile(each).name} set drives.profile: {each}" for each in names)
+    return own + known
 
 
-# Looks at CiA 402 drives without changing anything: questions by SDO, and nothing else.
+# Reads the state of CiA 402 drives by SDO without changing anything.
 
 
 def read_states(rig: Rig, bus: can.BusABC, pump: Pump | None) -> DriveSnapshot:
@@ -418,18 +419,16 @@ def read_states(rig: Rig, bus: can.BusABC, pump: Pump | None) -> DriveSnapshot:
     )
 
 
-# Whether drives say by themselves that they are simulated.
-
-
-#: What simulated drives have as 1008h, the manufacturer device name. Source: CiA 301, 7.5.2.8.
+# Whether drives identify themselves as simulated.
+#: Manufacturer device name (1008h) of simulated drives. Source: CiA 301, 7.5.2.8.
 SIMULATED = b"cdpr simulated drive"
 
 
-def say_simulated(bus: can.BusABC, pump: Pump | None, nodes: Sequence[int]) -> bool:
-    """Whether every drive has the name of a simulated one; real ones need not have a name.
+def are_simulated(bus: can.BusABC, pump: Pump | None, nodes: Sequence[int]) -> bool:
+    """Whether every drive has the device name of a simulated one.
 
-    Asks the drives one after another, up to the first that is none. One that does not answer counts
-    as real here: the set-up that follows says what is wrong with it.
+    Reads the drives in turn up to the first real one. A drive that does not answer counts as real;
+    the following configuration reports what is wrong.
 
     Args:
         bus: An open bus.

@@ -1,4 +1,4 @@
-"""What the drives reported, and which of it is a group fault. No bus, no clock."""
+"""State reported by the drives, and the resulting group faults. No bus, no clock."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivers.cia402.pdo import (
     parse_heartbeat,
     parse_reply,
 )
-from drivers.cia402.sdo_jobs import STANDING, SdoRequest
+from drivers.cia402.sdo_jobs import STATE_REQUESTS, SdoRequest
 from drivers.cia402.state_machine import FAULTED, HOLDS, TORQUE_ON, DriveState, state_of
 from drivers.drive_group import DriveWarning
 from drivers.plausibility import ReplyCheck
@@ -28,10 +28,10 @@ def _never(_code: int) -> bool:
 
 
 class DriveMonitor:
-    """The last word of every drive: replies, emergencies, heartbeats.
+    """The last reply, emergency and heartbeat of every drive.
 
     Attributes:
-        on_answer: Takes node and data of answers to SDO requests.
+        on_answer: Called with node and data of SDO answers.
     """
 
     def __init__(
@@ -40,12 +40,12 @@ class DriveMonitor:
         max_steps: Sequence[float],
         is_warning: Callable[[int], bool] = _never,
     ) -> None:
-        """Knows nothing of the drives yet.
+        """Starts without any reply.
 
         Args:
             names: By node id.
-            max_steps: The farthest each drive can turn in a cycle, [counts].
-            is_warning: Whether an EMCY code is a mere warning while the drive stays enabled.
+            max_steps: Largest motion of each drive in a cycle, [counts].
+            is_warning: Whether an EMCY code is only a warning while the drive stays enabled.
         """
         count, nodes = len(names), tuple(names)
         self.nodes = nodes
@@ -62,9 +62,9 @@ class DriveMonitor:
         self._reported: list[DriveWarning] = []  # in this cycle; the drive may be about to stop
         self._to_judge: list[DriveWarning] = []  # the drive's next reply says whether it stopped
         self._warnings: list[DriveWarning] = []
-        self._news: list[tuple[int, str]] = []
+        self._new_messages: list[tuple[int, str]] = []
         self._dropped: list[tuple[int, str]] = []
-        self._let_go: list[tuple[int, str]] = []
+        self._torque_lost: list[tuple[int, str]] = []
         self._emergencies: dict[int, str] = {}
         self._over: set[int] = set()
         self._replies = {TPDO1_BASE + node: i for i, node in enumerate(nodes)}
@@ -74,37 +74,37 @@ class DriveMonitor:
         self.on_answer: Callable[[int, bytes | bytearray], None] = lambda _node, _data: None
 
     def begin_cycle(self) -> None:
-        """From now on replies count for a new cycle."""
+        """Starts a new cycle of replies."""
         self._check.begin_cycle()
         self._to_judge += self._reported
         self._reported = []
         self.answered = [False] * len(self.nodes)
 
     def end_cycle(self) -> None:
-        """Counts the replies that did not come, or could not be believed."""
+        """Counts the replies that were missing or rejected."""
         self._check.end_cycle()
 
     def forget_positions(self) -> None:
-        """The drives may have been moved since: their next positions are believed as they come."""
+        """Accepts any next positions, as the drives may have been moved."""
         self._check.forget_positions()
 
     @property
     def rejected(self) -> int:
-        """Frames thrown away because their length or their content could not be true."""
+        """Number of frames rejected for wrong length or implausible content."""
         return self._check.rejected + self._wrong_lengths
 
     @property
     def complete(self) -> bool:
-        """Every drive has answered in this cycle."""
+        """Whether every drive has answered in this cycle."""
         return all(self.answered)
 
     def take(self, can_id: int, data: bytes | bytearray, *, stale: bool = False) -> None:
-        """Takes in one frame.
+        """Processes one frame.
 
         Args:
-            can_id: Its identifier.
-            data: Its data.
-            stale: A reply in it belongs to a cycle that is over and is thrown away.
+            can_id: Identifier.
+            data: Data bytes.
+            stale: Replies belong to an earlier cycle and are discarded.
         """
         drive = self._replies.get(can_id)
         if drive is None:
@@ -112,13 +112,13 @@ class DriveMonitor:
             if other is not None:
                 other(can_id & 0x7F, data)
             return
-        self._check.hear(drive)
+        self._check.count_reply(drive)
         if stale or self.answered[drive]:
             return
         reply = parse_reply(data)
         if reply is None:
             self._check.reject(drive, f"its reply has {len(data)} bytes instead of 8")
-        elif self._check.believed(drive, reply.position):
+        elif self._check.accept(drive, reply.position):
             self._note(drive, reply)
 
     def _note(self, drive: int, reply: Reply) -> None:
@@ -130,7 +130,7 @@ class DriveMonitor:
         if before is DriveState.OPERATION_ENABLED and state is not before:
             self._dropped.append(self._with_cause(drive, f"stopped on its own: {state.value}"))
         if before in HOLDS and state not in TORQUE_ON and state not in FAULTED:
-            self._let_go.append(self._with_cause(drive, f"lost its torque: {state.value}"))
+            self._torque_lost.append(self._with_cause(drive, f"lost its torque: {state.value}"))
 
     def _with_cause(self, drive: int, what: str) -> tuple[int, str]:
         node = self.nodes[drive]
@@ -139,9 +139,9 @@ class DriveMonitor:
         return node, f"{text}; {cause}" if cause else text
 
     def _judge(self, node: int, state: DriveState) -> None:
-        """What a drive reported before this SYNC is a warning if the drive is still enabled.
+        """An emergency before this SYNC is a warning if the drive is still enabled.
 
-        What its maker lists as a mere warning is one in every state but a fault.
+        A code that the profile lists as a warning is one in every state except fault.
         """
         own = [warning for warning in self._to_judge if warning.node == node]
         self._to_judge = [warning for warning in self._to_judge if warning.node != node]
@@ -150,27 +150,24 @@ class DriveMonitor:
         self._warnings += own
 
     def warnings(self) -> tuple[DriveWarning, ...]:
-        """Emergencies that were no fault of the drive at the SYNC after, since the last call.
+        """Emergencies since the last call that did not stop the drive by the next SYNC.
 
-        An enabled drive follows its set-points on. One that stops for what it reports has left the
-        state by then and is a fault (`dropped`, `state_faults`).
+        An enabled drive keeps following its set-points. One that stops has left the state by then,
+        which is a fault (`dropped`, `state_faults`).
         """
         warnings, self._warnings = tuple(self._warnings), []
         return warnings
 
-    def take_standing(self, values: Mapping[tuple[int, SdoRequest], int]) -> None:
-        """Takes in what drives answered when they were asked how they stand; who did, answered."""
+    def take_states(self, values: Mapping[tuple[int, SdoRequest], int]) -> None:
+        """Takes the answers to `STATE_REQUESTS`; a drive with all of them counts as answered."""
         for drive, node in enumerate(self.nodes):
-            if all((node, job) in values for job in STANDING):
-                word, position, torque = (values[node, job] for job in STANDING)
+            if all((node, job) in values for job in STATE_REQUESTS):
+                word, position, torque = (values[node, job] for job in STATE_REQUESTS)
                 self._note(drive, Reply(word, _signed(position, 32), _signed(torque, 16)))
 
     def news(self) -> list[tuple[int, str]]:
-        """Emergencies of drives that are not enabled, restarts and NMT states since the last call.
-
-        By node.
-        """
-        news, self._news = self._news, []
+        """Emergencies of drives not enabled, restarts and NMT states, since the last call."""
+        news, self._new_messages = self._new_messages, []
         return news
 
     def dropped(self) -> list[tuple[int, str]]:
@@ -178,25 +175,25 @@ class DriveMonitor:
         dropped, self._dropped = self._dropped, []
         return dropped
 
-    def let_go(self) -> list[tuple[int, str]]:
-        """Drives that held and are without torque, but for those in fault; since the last call."""
-        let_go, self._let_go = self._let_go, []
-        return let_go
+    def torque_lost(self) -> list[tuple[int, str]]:
+        """Drives that lost their holding torque without a fault, since the last call."""
+        torque_lost, self._torque_lost = self._torque_lost, []
+        return torque_lost
 
     @property
     def is_unjudged(self) -> bool:
-        """An enabled drive sent an emergency, and its next reply says whether it is a fault."""
+        """Whether an emergency of an enabled drive awaits the reply that shows if it stopped."""
         return any(warning.stops for warning in (*self._reported, *self._to_judge))
 
     def state_faults(self, known: Container[str], *, powered: bool) -> list[tuple[int, str]]:
-        """What is wrong with the drives as they stand, by node.
+        """Present faults of the drives, by node.
 
-        How often a drive may be silent is the executor's to say (`executor.safety.monitor`).
+        The executor judges silence (`executor.safety.monitor`).
 
         Args:
-            known: Faults known already; a drive whose emergency is among them is left out.
-            powered: The group is under power or on its way there; replies that cannot be believed
-                are a fault then.
+            known: Known faults; a drive whose emergency is among them is left out.
+            powered: The group is under power or being enabled, so that rejected replies are a
+                fault.
         """
         found: list[tuple[int, str]] = []
         for node, state in zip(self.nodes, self.states, strict=True):
@@ -210,7 +207,7 @@ class DriveMonitor:
         return found + (self._check.faults() if powered else [])
 
     def require_resettable(self) -> list[int]:
-        """Nodes in fault, which may be reset only when no other drive holds the platform.
+        """Nodes in fault; they may be reset only if no other drive holds the platform.
 
         Raises:
             Refused: Another drive holds it, or a drive restarted.
@@ -234,10 +231,10 @@ class DriveMonitor:
         return faulted
 
     def forget_emergencies(self) -> None:
-        """After a reset by the operator."""
+        """Clears all emergencies after a reset by the operator."""
         self._emergencies.clear()
         self._over.clear()
-        self._news.clear()
+        self._new_messages.clear()
         self._reported, self._to_judge, self._warnings = [], [], []
 
     def _emergency(self, node: int, data: bytes | bytearray) -> None:
@@ -247,20 +244,20 @@ class DriveMonitor:
         elif message.code & 0xFF00:
             text = emergency_text(message.code)
             self._take_emergency(node, message.code, text)
-        elif node in self._emergencies:  # over, and still the best reason there is for a fault
+        elif node in self._emergencies:  # ended, but still the best explanation of a fault
             self._over.add(node)
 
     def _take_emergency(self, node: int, code: int, text: str) -> None:
         self._emergencies[node] = text
         self._over.discard(node)
-        told = f"{self._names[node]}: {text}"
+        message = f"{self._names[node]}: {text}"
         state = self.states[self.nodes.index(node)]
         if self._is_warning(code) and state not in FAULTED:
-            self._reported.append(DriveWarning(node, f"{told}, a warning", stops=False))
+            self._reported.append(DriveWarning(node, f"{message}, a warning", stops=False))
         elif state is not DriveState.OPERATION_ENABLED:
-            self._news.append((node, told))
+            self._new_messages.append((node, message))
         else:
-            self._reported.append(DriveWarning(node, told, stops=True))
+            self._reported.append(DriveWarning(node, message, stops=True))
 
     def _answer(self, node: int, data: bytes | bytearray) -> None:
         self.on_answer(node, data)
@@ -271,11 +268,11 @@ class DriveMonitor:
             self._wrong_lengths += 1
         elif state == NmtState.BOOT_UP:
             self.restarted.add(node)
-            self._news.append(
+            self._new_messages.append(
                 (node, f"{self._names[node]} restarted: its configuration and position are lost")
             )
         elif state != NmtState.OPERATIONAL:
-            self._news.append((node, f"{self._names[node]} left the NMT state operational"))
+            self._new_messages.append((node, f"{self._names[node]} left the NMT state operational"))
 
 
 def _signed(value: int, bits: int) -> int:

@@ -1,4 +1,4 @@
-"""Every object that is written to a drive before it is enabled, with its value and the reason."""
+"""Every object written to a drive before it is enabled, with value and reason."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ PDO_INVALID = 1 << 31
 PDO_NO_RTR = 1 << 30
 
 PDO_IDENTIFIER = 0xA0000000 | 0x7FF
-"""Bits of a COB-ID that are compared: on or off, frame format, identifier. Bit 30 (no RTR) is kept
-or not as the drive likes, the others are reserved. Source: CiA 301, 7.5.2.35."""
+"""Bits of a COB-ID that are compared: valid, frame format, identifier. Drives may change bit 30 (no
+RTR); the others are reserved. Source: CiA 301, 7.5.2.35."""
 
 TORQUE_RESERVE = 1.2
-"""Torque limit above the largest allowed tension: the following-error watch must trip first."""
+"""Torque limit relative to the largest tension: the following-error monitor must trip first."""
 
 _UNSIGNED_MAX = {"<B": 0xFF, "<H": 0xFFFF, "<I": 0xFFFFFFFF}
 
@@ -36,15 +36,15 @@ class Setting:
     Attributes:
         index: Object index.
         sub: Sub-index.
-        form: Type, as `struct` names it.
-        value: What it must hold.
-        name: What the standard calls it.
-        why: The reason for the value.
-        transient: It is written over later in the list, so that only a refusal counts.
-        optional: Drives need not have the object.
-        instead: What does its work in drives that do not have it; nothing where none is missed.
-        mask: Bits that count when it is read back; all where it is 0.
-        per_mille_of: The value is in per mille of this object, as the drive holds it.
+        form: Format of `struct`.
+        value: Value to write.
+        name: Name in the standard.
+        why: Reason for the value.
+        transient: Overwritten later in the list, so that only a refusal counts.
+        optional: The object may be absent.
+        instead: Consequence of its absence; empty if there is none.
+        mask: Bits compared when it is read back; 0 for all.
+        per_mille_of: The value is in per mille of this object's value.
     """
 
     index: int
@@ -60,7 +60,7 @@ class Setting:
     per_mille_of: tuple[int, int] | None = None
 
     def data(self) -> bytes:
-        """The value as the object holds it.
+        """The value as bytes.
 
         Raises:
             BadInput: It does not fit.
@@ -77,17 +77,17 @@ class Setting:
 
     @property
     def size(self) -> int:
-        """Of the value, [bytes]."""
+        """Size of the value, [bytes]."""
         return struct.calcsize(self.form)
 
     def is_kept(self, data: bytes) -> bool:
-        """Whether what the drive holds is what was to be written."""
+        """Whether the drive holds the value."""
         if len(data) != struct.calcsize(self.form) or not self.mask:
             return data == self.data()
         return not (int.from_bytes(data, "little") ^ self.value) & self.mask
 
     def of_rated(self, rated: int) -> Setting:
-        """The setting with its value in the unit of ``per_mille_of``, which holds ``rated``."""
+        """The setting with its value in the unit of ``per_mille_of``, whose value is ``rated``."""
         return replace(self, value=math.ceil(self.value * rated / 1000.0), per_mille_of=None)
 
     def __str__(self) -> str:
@@ -101,13 +101,13 @@ HEARTBEAT_CONSUMERS = 0x1016
 def settings_for(
     rig: Rig, drive: int, winch_map: WinchMap, max_tension: float | None = None
 ) -> tuple[Setting, ...]:
-    """The set-up of one drive, in the order of writing.
+    """The settings of one drive, in the order of writing.
 
     Args:
         rig: The robot.
-        drive: Place of its winch in the rig file, from 0.
+        drive: Index of its winch in the rig file.
         winch_map: The rig's lengths and counts.
-        max_tension: From which the torque limit comes, [N]; the rig's own if None.
+        max_tension: Tension that sets the torque limit, [N]; the rig's if None.
 
     Raises:
         BadInput: A value of the rig does not fit its object.
@@ -120,13 +120,13 @@ def settings_for(
 def stated_absent(
     rig: Rig, drive: int, winch_map: WinchMap, max_tension: float | None = None
 ) -> tuple[Setting, ...]:
-    """What is not written because the drive's profile says that the object is absent.
+    """Settings that are not written because the profile declares the object absent.
 
-    In a drive that has it all the same, another program's value would count.
+    If a drive has it nevertheless, a value of another program could be active.
 
     Args:
         rig: The robot.
-        drive: Place of its winch in the rig file, from 0.
+        drive: Index of its winch in the rig file.
         winch_map: The rig's lengths and counts.
         max_tension: As for `settings_for`.
 
@@ -134,7 +134,9 @@ def stated_absent(
         BadInput: A value of the rig does not fit its object.
     """
     profile = profile_of(rig)
-    watched = Setting(HEARTBEAT_CONSUMERS, 1, "<I", 0, "consumer heartbeat time", "none is watched")
+    watched = Setting(
+        HEARTBEAT_CONSUMERS, 1, "<I", 0, "consumer heartbeat time", "none is monitored"
+    )
     settings = (*_all_settings(rig, drive, winch_map, max_tension, profile), watched)
     return tuple(each for each in settings if not profile.has(each.index, each.sub))
 
@@ -154,7 +156,7 @@ def _all_settings(
 
 
 def left_out(profile: ProfileDocument) -> tuple[str, ...]:
-    """What is missed in drives of a profile, one remark for each optional object without work."""
+    """One remark for each optional object that drives of a profile lack."""
     all_optional = (*_process_data(1, profile), *_supervision(0.01, True, 30), *_options())
     return tuple(
         f"there is no {setting}: {setting.instead}"
@@ -164,14 +166,14 @@ def left_out(profile: ProfileDocument) -> tuple[str, ...]:
 
 
 CLAMPED = (0x6066, 0x6085)
-"""Objects that take the nearest value in range: an earlier trip, and a ramp as steep as it goes."""
+"""Objects clamped to the drive's range: an earlier trip, and the steepest possible ramp."""
 
 
 def _within(setting: Setting, profile: ProfileDocument) -> Setting:
-    """A setting that the drive takes.
+    """The setting within the drive's range.
 
     Raises:
-        BadInput: It takes none that would do.
+        BadInput: No value in the range is suitable.
     """
     allowed = profile.range_of(setting.index, setting.sub)
     if allowed is None or allowed.holds(setting.value):
@@ -179,7 +181,7 @@ def _within(setting: Setting, profile: ProfileDocument) -> Setting:
     if setting.index in CLAMPED and setting.value > allowed.high:
         return replace(setting, value=allowed.high)
     raise BadInput(
-        f"{setting} must hold {setting.value}; {profile.name} takes {allowed.low} to"
+        f"{setting} must hold {setting.value}; {profile.name} accepts {allowed.low} to"
         f" {allowed.high}",
         where="drives.profile",
         why=f"required because: {setting.why}",
@@ -188,17 +190,17 @@ def _within(setting: Setting, profile: ProfileDocument) -> Setting:
 
 
 def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ...]:
-    """Whose heartbeat the drive watches: the master's, then its peers', as far as it has entries.
+    """Heartbeats that the drive monitors: the master's, then its peers', up to its entries.
 
-    None where its loss would take the torque off, whatever a program before this one wrote.
+    All entries are cleared if a loss would remove the torque.
 
     Args:
         rig: The robot.
-        drive: Place of the winch in the rig file, from 0.
-        entries: How many producers the drive can watch (1016h:00).
+        drive: Index of the winch in the rig file.
+        entries: Number of producers that the drive can monitor (1016h:00).
     """
     if not profile_of(rig).watches_heartbeats:
-        name, why = "consumer heartbeat time", "a lost heartbeat would take the torque off"
+        name, why = "consumer heartbeat time", "a lost heartbeat would remove the torque"
         return tuple(
             Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why) for sub in range(1, entries + 1)
         )
@@ -226,8 +228,8 @@ def interpolation_time(
 
     Args:
         cycle: [s].
-        values: That the drive takes in 60C2h:01; 1 to 255 when None.
-        exponents: That it takes in 60C2h:02; -6 to -3 when None.
+        values: Range of 60C2h:01; 1 to 255 if None.
+        exponents: Range of 60C2h:02; -6 to -3 if None.
 
     Raises:
         BadInput: The object cannot hold this cycle.
@@ -241,22 +243,22 @@ def interpolation_time(
     raise BadInput(
         f"the drives cannot interpolate over a cycle of {1000 * cycle:g} ms",
         where="bus.cycle_ms",
-        why=f"object 60C2h holds a whole number up to {most} times a power of ten"
+        why=f"object 60C2h holds an integer up to {most} times a power of ten"
         + ("" if exponents is None else f" from {exponents.low} to {exponents.high}"),
         next_step="use a rounder number, such as 10, 8 or 4",
     )
 
 
 def _process_data(node: int, profile: ProfileDocument) -> tuple[Setting, ...]:
-    """The two PDOs in use, whatever their numbers, on the identifiers of RPDO1 and TPDO1."""
+    """The two PDOs in use, on the identifiers of RPDO1 and TPDO1."""
     received = (0x60400010, 0x607A0020)
     sent = (0x60410010, 0x60640020, 0x60770010)
     rpdo, tpdo = used_pdos(profile)
     taken, replies = f"RPDO{profile.rpdo}", f"TPDO{profile.tpdo}"
     return (
         *_mapped(rpdo, RPDO1_BASE + node, received),
-        # Off: a drive that stops by itself because frames to it alone were lost would be enabled
-        # again by the next one (transition 16 acts by level), before its reply shows that.
+        # Off: a drive that stopped because its frames were lost would be re-enabled by the next
+        # one (transition 16 is level-sensitive) before its reply shows that.
         Setting(
             *(rpdo, 5, "<H", 0, f"{taken} deadline"),
             "the program detects lost set-points and stops",
@@ -276,13 +278,15 @@ def _switched_on(parameters: int, identifier: int, name: str) -> Setting:
 
 
 def _mapped(parameters: int, identifier: int, objects: tuple[int, ...]) -> tuple[Setting, ...]:
-    """Off, no objects, the objects, their number, at each SYNC. Source: CiA 301, 7.5.2.36."""
+    """Mapping procedure: off, clear, objects, count, SYNC. Source: CiA 301, 7.5.2.36."""
     off, mapping = PDO_INVALID | identifier, parameters + 0x200
     return (
-        Setting(parameters, 1, "<I", off, "PDO identifier", "off while it is mapped", True),
-        Setting(mapping, 0, "<B", 0, "PDO mapping", "off while it is mapped", True),
+        Setting(parameters, 1, "<I", off, "PDO identifier", "off while mapping", True),
+        Setting(mapping, 0, "<B", 0, "PDO mapping", "off while mapping", True),
         *(
-            Setting(mapping, sub, "<I", entry, "PDO mapping", "word, position, and torque back")
+            Setting(
+                mapping, sub, "<I", entry, "PDO mapping", "word and position, torque in replies"
+            )
             for sub, entry in enumerate(objects, start=1)
         ),
         Setting(mapping, 0, "<B", len(objects), "PDO mapping", "all objects"),
@@ -292,7 +296,7 @@ def _mapped(parameters: int, identifier: int, objects: tuple[int, ...]) -> tuple
 
 def _supervision(cycle: float, sync: bool, produced_ms: int) -> tuple[Setting, ...]:
     period_us = round(1e6 * cycle) if sync else 0
-    why = "the cycle of the rig" if sync else "a missed SYNC would take the torque off"
+    why = "the cycle of the rig" if sync else "a missed SYNC would remove the torque"
     return (
         Setting(0x1006, 0, "<I", period_us, "communication cycle period", why),
         Setting(
@@ -312,9 +316,9 @@ def _supervision(cycle: float, sync: bool, produced_ms: int) -> tuple[Setting, .
 
 
 def _produced_ms(cycle: float, profile: ProfileDocument) -> int:
-    """Period of a drive's own heartbeat, [ms]: the master's, or the shortest that it takes.
+    """Period of a drive's heartbeat, [ms]: the master's, or the drive's shortest.
 
-    Only other drives wait for it; the master has a reply every cycle.
+    Only other drives monitor it; the master gets a reply every cycle.
     """
     shortest = profile.range_of(0x1017, 0)
     return max(round(1000 * cycle * heartbeat_cycles(cycle)), shortest.low if shortest else 0)
@@ -323,7 +327,7 @@ def _produced_ms(cycle: float, profile: ProfileDocument) -> int:
 def _mode(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
     ranges = profile.range_of(0x60C2, 1), profile.range_of(0x60C2, 2)
     value, exponent = interpolation_time(cycle, *ranges)
-    why = "one set-point a cycle"
+    why = "one set-point per cycle"
     return (
         Setting(0x6060, 0, "<b", CSP_MODE, "modes of operation", "cyclic synchronous position"),
         Setting(0x60C2, 1, "<B", value, "interpolation time period value", why),
@@ -333,8 +337,8 @@ def _mode(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
 
 def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
     winch = rig.winches[drive]
-    # A drive at its top speed stands within one cycle, so that drives at different speeds stop
-    # within a cycle of each other and the tensions stay near what they were.
+    # A drive at top speed stops within one cycle, so that all drives stop within a cycle of each
+    # other and the tensions change little.
     ramp = quick_stop_ramp(rig, drive, cycle, profile)
     window = rig.motion.following_error * abs(winch.counts_per_metre)
     return (
@@ -348,7 +352,7 @@ def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> 
 
 
 def quick_stop_ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> float:
-    """Deceleration by which a drive at its top speed stands within a cycle, in the drive's unit."""
+    """Deceleration that stops a drive from top speed within a cycle, in the drive's unit."""
     winch = rig.winches[drive]
     ramp = winch.max_speed / cycle * abs(winch.counts_per_metre)
     turns = ramp / winch.counts_per_turn
@@ -361,13 +365,13 @@ def _options() -> tuple[Setting, ...]:
         Setting(
             *(0x605C, 0, "<h", 1, "disable operation option code", "ramp down before torque off"),
             optional=True,
-            instead="the reaction to disabling operation is the maker's choice: read the"
+            instead="the reaction to disabling operation is manufacturer-specific: read the"
             " manual before `cdpr release`",
         ),
         Setting(
             *(0x605E, 0, "<h", 2, "fault reaction option code", "ramp down before torque off"),
             optional=True,
-            instead="the reaction to a fault is the maker's choice: read the manual",
+            instead="the reaction to a fault is manufacturer-specific: read the manual",
         ),
     )
 
@@ -382,10 +386,10 @@ def _limits(
             f"max_tension_n is {max_tension / winch.torque_constant:.0f} times the tension at"
             " rated torque",
             where=f"rig {rig.name}: winches[{drive}].torque_constant_n",
-            next_step="set the cable tension at rated motor torque",
+            next_step="enter the cable tension at rated motor torque",
         )
     low, high = position_limits(rig, drive, winch_map)
-    why = "longest and shortest cable of the workspace"
+    why = "longest and shortest cable in the workspace"
     return (
         _torque_limit(torque, profile),
         Setting(0x607D, 1, "<i", low, "min position limit", why),
@@ -394,7 +398,7 @@ def _limits(
 
 
 def _torque_limit(per_mille: int, profile: ProfileDocument) -> Setting:
-    """6072h, or the object of the maker that limits the current; [per mille of rated torque]."""
+    """Setting of 6072h or of the manufacturer's current limit, [per mille of rated torque]."""
     why = "largest allowed tension plus a reserve"
     limit = profile.torque_limit
     if limit is None:
@@ -406,5 +410,5 @@ def _torque_limit(per_mille: int, profile: ProfileDocument) -> Setting:
 
 
 def _capped(index: int, name: str, value: float, why: str) -> Setting:
-    """As large as the object can hold: the largest value still means the same."""
+    """A setting capped at the object's largest value, which has the same effect."""
     return Setting(index, 0, "<I", min(math.ceil(value), _UNSIGNED_MAX["<I"]), name, why)

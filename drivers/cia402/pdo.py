@@ -1,4 +1,4 @@
-"""CANopen frames as bytes: `make_*` builds, `parse_*` reads and checks the length. Pure.
+"""CANopen frames: `make_*` builds bytes, `parse_*` reads them and checks the length. Pure.
 
 Source: CiA 301 (identifiers, SYNC, EMCY, heartbeat, NMT); the process data are those that
 `drivers.cia402.object_dictionary` maps.
@@ -53,7 +53,7 @@ class NmtState(IntEnum):
 
 
 class Reply(NamedTuple):
-    """What a drive answers to a SYNC: status word, position [counts], torque [per mille]."""
+    """A drive's reply to SYNC: status word, position [counts], torque [per mille]."""
 
     status_word: int
     position: int
@@ -78,7 +78,7 @@ def make_set_point(control_word: int, target: int) -> bytes:
 
 
 def parse_set_point(data: bytes | bytearray) -> tuple[int, int] | None:
-    """Control word and target of an RPDO1; None when its length is wrong."""
+    """Control word and target of an RPDO1; None if the length is wrong."""
     return _RPDO1.unpack(data) if len(data) == _RPDO1.size else None
 
 
@@ -92,7 +92,7 @@ def make_reply(status_word: int, position: int, torque: int) -> bytes:
 
 
 def parse_reply(data: bytes | bytearray) -> Reply | None:
-    """A TPDO1; None when its length is wrong."""
+    """A TPDO1; None if the length is wrong."""
     return Reply(*_TPDO1.unpack(data)) if len(data) == _TPDO1.size else None
 
 
@@ -107,7 +107,7 @@ def make_heartbeat(state: NmtState) -> bytes:
 
 
 def parse_heartbeat(data: bytes | bytearray) -> int | None:
-    """The NMT state in a heartbeat (toggle bit dropped); None when its length is wrong."""
+    """The NMT state in a heartbeat (toggle bit dropped); None if the length is wrong."""
     return data[0] & 0x7F if len(data) == 1 else None
 
 
@@ -117,24 +117,24 @@ def make_nmt(command: NmtCommand, node: int) -> bytes:
 
 
 def make_emergency(code: int, register: int, detail: bytes = b"") -> bytes:
-    """EMCY message; ``detail`` is filled up to five bytes."""
+    """EMCY message; ``detail`` is padded to five bytes."""
     return _EMCY.pack(code, register, detail)
 
 
 def parse_emergency(data: bytes | bytearray) -> Emergency | None:
-    """An EMCY message; None when its length is wrong."""
+    """An EMCY message; None if the length is wrong."""
     return Emergency(*_EMCY.unpack(data)) if len(data) == _EMCY.size else None
 
 
-# The frames that a master sends every cycle, built once and filled each time. No bus.
+# The frames that a master sends every cycle, built once and updated. No bus.
 
 
 class CyclicFrames:
-    """One set-point a drive, SYNC, and the master's sign of life.
+    """One set-point per drive, SYNC, and the master's heartbeat.
 
     Attributes:
-        sync: The frame at which set-points begin to count.
-        heartbeat: The master's sign of life.
+        sync: The SYNC frame, which makes the set-points take effect.
+        heartbeat: The master's heartbeat.
     """
 
     def __init__(self, nodes: Sequence[int]) -> None:
@@ -148,7 +148,7 @@ class CyclicFrames:
     def set_points(
         self, words: Sequence[ControlWord], targets: Sequence[int]
     ) -> Sequence[can.Message]:
-        """One set-point a drive.
+        """One set-point frame per drive.
 
         Raises:
             struct.error: A target does not fit 32 bits.
@@ -158,25 +158,25 @@ class CyclicFrames:
         return self._set_points
 
 
-# The identifiers that only a CiA 402 master sends, and what another one does with them.
+# Identifiers that only a CiA 402 master sends, and messages about another master.
 
 
 def commanding_ids(nodes: Iterable[int]) -> frozenset[int]:
-    """Identifiers that only a master that moves these drives sends.
+    """Identifiers sent only by a master that moves these drives.
 
-    A tool that only reads objects may be on the bus; it is not one.
+    A tool that only reads objects is allowed on the bus.
     """
     set_points = {RPDO1_BASE + node for node in nodes}
     return frozenset({NMT_ID, SYNC_ID, HEARTBEAT_BASE + MASTER_NODE} | set_points)
 
 
 def set_up_ids(nodes: Sequence[int]) -> frozenset[int]:
-    """The same while drives are set up: no other master may access their objects then."""
+    """As `commanding_ids`, plus SDO requests: none from elsewhere during configuration."""
     return commanding_ids(nodes) | {SDO_REQUEST_BASE + node for node in nodes}
 
 
 def foreign_master_message(can_id: int) -> str:
-    """What another program does when it sends a frame of one of these identifiers."""
+    """Message about another program that sends a frame with one of these identifiers."""
     node = can_id & 0x7F
     if can_id == SYNC_ID:
         return "another program sends SYNC on this bus"

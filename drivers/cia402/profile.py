@@ -1,7 +1,7 @@
-"""Drive profiles: those that cdpr brings along, the lab's own, and which one a rig file names.
+"""Drive profiles: those shipped with cdpr, your own, and the one of a rig file.
 
-A profile is a YAML file (`model.files.drive_profile_file`), one of ours in
-``drivers/cia402/profiles`` or the lab's own; ``drives.profile`` of the rig file names it.
+A profile is a YAML file (`model.files.drive_profile_file`) in ``drivers/cia402/profiles`` or
+elsewhere; ``drives.profile`` of the rig file names it.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from model.rig import Rig
 FOLDER = Path(__file__).parent / "profiles"
 
 MOST_PDOS = 512
-"""Of each kind. Source: CiA 301, 7.5.2.35 to 7.5.2.38."""
+"""Largest number of RPDOs, and of TPDOs. Source: CiA 301, 7.5.2.35 to 7.5.2.38."""
 
 STANDARD_PDOS = 4
-"""Of each kind, each of which a drive may have without the one before."""
+"""RPDOs and TPDOs of which a drive may have any subset."""
 
 
 def profile_names() -> tuple[str, ...]:
-    """The profiles that cdpr brings along."""
+    """The profiles shipped with cdpr."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))
 
 
 def load_profile(name: str) -> ProfileDocument:
-    """One of cdpr's profiles by its name, or the file of that path.
+    """A shipped profile by name, or a profile file by path.
 
     Raises:
         BadInput: There is no such profile, or the file cannot be read.
-        InvalidFile: With everything that is wrong with the file.
+        InvalidFile: With all errors of the file.
     """
     return _loaded(name)
 
@@ -54,22 +54,22 @@ def _loaded(name: str) -> ProfileDocument:
 
 
 def profile_of(rig: Rig) -> ProfileDocument:
-    """The profile that a rig file names.
+    """The profile named by a rig file.
 
     Raises:
-        BadInput: There is none of that name, or its file is wrong.
+        BadInput: There is no such profile, or its file is invalid.
     """
     drives = rig.document.drives
     return load_profile(drives.profile if isinstance(drives, Cia402Document) else "cia402")
 
 
 def rpdo_parameters(number: int) -> int:
-    """Index of the communication parameters of an RPDO, by its number from 1. CiA 301, 7.5.2.35."""
+    """Index of an RPDO's communication parameters, by its number from 1. CiA 301, 7.5.2.35."""
     return 0x1400 + number - 1
 
 
 def tpdo_parameters(number: int) -> int:
-    """The same of a TPDO. Source: CiA 301, 7.5.2.37."""
+    """Index of a TPDO's communication parameters. Source: CiA 301, 7.5.2.37."""
     return 0x1800 + number - 1
 
 
@@ -77,12 +77,12 @@ _FIRST_PDOS = rpdo_parameters(1), tpdo_parameters(1)
 
 
 def used_pdos(profile: ProfileDocument) -> tuple[int, int]:
-    """Communication parameters of the process data that are used: of the RPDO, of the TPDO."""
+    """Communication parameters of the RPDO and of the TPDO in use."""
     return rpdo_parameters(profile.rpdo), tpdo_parameters(profile.tpdo)
 
 
 def unused_pdos(profile: ProfileDocument) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Those that are switched off where they exist: RPDOs, and TPDOs."""
+    """Communication parameters of unused RPDOs and TPDOs, which are switched off."""
     kinds = zip(_FIRST_PDOS, used_pdos(profile), strict=True)
     received, sent = (
         tuple(i for i in range(at, at + MOST_PDOS) if i != used) for at, used in kinds
@@ -91,14 +91,14 @@ def unused_pdos(profile: ProfileDocument) -> tuple[tuple[int, ...], tuple[int, .
 
 
 def for_unused_pdos(profile: ProfileDocument, is_there: Callable[[int], bool]) -> None:
-    """Goes through the unused PDOs of a drive as far as it may have them.
+    """Visits the unused PDOs that a drive may have.
 
-    All of 1 to 4. Beyond these a drive numbers its PDOs without a gap, so that the first one that
-    is absent ends the search.
+    All of 1 to 4; beyond these PDOs are numbered without a gap, so that the first absent one ends
+    the search.
 
     Args:
         profile: Of the drive.
-        is_there: Called with the communication parameters of each; whether the drive has it.
+        is_there: Called with the communication parameters of each; returns whether it exists.
     """
     for indices, first in zip(unused_pdos(profile), _FIRST_PDOS, strict=True):
         for index in indices:

@@ -1,9 +1,8 @@
-"""Reading and writing objects of drives by SDO, without a thread and without canopen's client.
+"""Reads and writes objects of drives by SDO, without a thread and without canopen's client.
 
-An answer counts for a request only when it names the same object and is of the same kind, so that
-one that comes late, twice or for another object is never taken for this one's. The caller of a
-request takes the frames off the bus itself: a receiving thread would share the bus with the cyclic
-loop, and dies for good when the interface goes down.
+An answer is matched to a request by object and kind, so that late, duplicate or foreign answers are
+ignored. The caller of a request receives the frames itself: a receiving thread would share the bus
+with the cyclic loop, and would end when the interface goes down.
 
 Source: CiA 301, 7.2.4 (SDO protocols).
 """
@@ -18,7 +17,7 @@ from math import ceil
 
 import can
 
-from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, take, transmit
+from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, receive_frame, transmit
 from drivers.can_errors import SETTING_UP, ForeignMaster, error_frame_fault
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import (
@@ -35,19 +34,19 @@ from drivers.drive_group import Pump
 from model.errors import CdprError, Fault, HardwareMissing, Refused
 
 RESPONSE_TIMEOUT = 2.0
-"""For the answer to one request unless the drive's profile says otherwise, [s]."""
+"""Time-out of a request unless the drive's profile states another, [s]."""
 
 ATTEMPTS = 2
-"""A request or its answer may be lost while a drive starts up."""
+"""Attempts per transfer: a request or its answer may be lost while a drive starts up."""
 
 CONTACT_REPEAT = 0.5
-"""So often a drive that has not answered at first contact is asked again, [s]."""
+"""Period of repeated requests at first contact, [s]."""
 
 ECHO_WAIT = 0.05
-"""A second device with the same node id answers within this time of the first, [s]."""
+"""Time within which a second device with the same node id answers, [s]."""
 
 NOT_NOW = frozenset({0x08000020, 0x08000021, 0x08000022})
-"""The drive has the object, and does not transfer it in its present state."""
+"""Abort codes of an object that exists but cannot be transferred in the present state."""
 
 Key = tuple[int, int, int]
 """Kind of an answer, index and sub-index."""
@@ -60,7 +59,7 @@ _HEAD = struct.Struct("<BHB")
 
 
 class _Aborted(Exception):
-    """The drive said no, with an abort code."""
+    """The drive aborted the transfer."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"{code:08X}h")
@@ -68,11 +67,11 @@ class _Aborted(Exception):
 
 
 class _NoAnswer(Exception):
-    """Nothing came in time."""
+    """No answer within the time-out."""
 
 
 class SetupNetwork:
-    """The bus during set-up: sends NMT and SDO frames and takes the replies."""
+    """The bus during configuration: sends NMT and SDO frames and receives the replies."""
 
     def __init__(
         self,
@@ -89,7 +88,7 @@ class SetupNetwork:
             bus: The bus.
             pump: As for `drivers.factory.make_drive_group`.
             nodes: The drives.
-            timeout: For the answer to one request, [s].
+            timeout: Of one request, [s].
             clock: Monotonic, [s].
         """
         self._bus, self._pump = bus, pump
@@ -108,19 +107,19 @@ class SetupNetwork:
         self.send(NMT_ID, make_nmt(command, node))
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Sends a frame; it is not another master's when it comes back."""
+        """Sends a frame, and expects its echo."""
         self._own.sent(can_id)
         transmit(self._bus, can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
     def silent_nodes(self, nodes: Iterable[int]) -> list[int]:
-        """Asks all nodes for their device type (1000h) at once; those that do not answer.
+        """Requests the device type (1000h) from all nodes at once; returns those without an answer.
 
-        They are asked again and again, as a drive hears nothing before it has booted. A silent
-        drive costs one time-out, however many of them there are.
+        Requests are repeated, as a booting drive receives nothing. All silent drives together cost
+        one time-out.
         """
         waiting = [self.client(node) for node in nodes]
         begin, times = self.clock(), ATTEMPTS
-        if self._pump is None:  # drives of this process let their own time pass as they are asked
+        if self._pump is None:  # for simulated drives time advances with each request
             times = max(times, ceil(self.timeout / CONTACT_REPEAT))
         for number in range(1, times + 1):
             for client in waiting:
@@ -132,40 +131,40 @@ class SetupNetwork:
         return [client.node for client in waiting]
 
     def _await(self, clients: Sequence[Client], deadline: float) -> None:
-        """Takes answers until all have come, or it is that late."""
+        """Receives answers until all have arrived or the deadline has passed."""
         while any(client.waits for client in clients):
             left = deadline - self.clock()
-            if left <= 0.0 or (not self.hand_over(left) and self._pump is not None):
+            if left <= 0.0 or (not self.process_frame(left) and self._pump is not None):
                 return
 
     def nodes_answering_twice(self) -> list[int]:
-        """Nodes from which more answers have come than requests went to them."""
+        """Nodes that sent more answers than they got requests."""
         deadline = self.clock() + ECHO_WAIT
-        while (left := deadline - self.clock()) > 0.0 and self.hand_over(left):
+        while (left := deadline - self.clock()) > 0.0 and self.process_frame(left):
             pass
         return [node for node, client in self._clients.items() if client.has_surplus]
 
-    def take_waiting(self) -> None:
-        """Hands over all that has come in up to now."""
-        while self.hand_over(0.0):
+    def process_waiting(self) -> None:
+        """Processes all frames received so far."""
+        while self.process_frame(0.0):
             pass
 
     def discard_waiting(self) -> None:
-        """Forgets frames that came in before; they say nothing about now."""
-        while take(self._bus, 0.0) is not None:
+        """Discards frames received earlier."""
+        while receive_frame(self._bus, 0.0) is not None:
             pass
 
-    def hand_over(self, timeout: float) -> bool:
-        """Hands one frame over; false when none came within the time [s].
+    def process_frame(self, timeout: float) -> bool:
+        """Processes one frame; False if none arrives within the time [s].
 
         Raises:
-            Refused: It is another master's.
+            Refused: The frame is another master's.
             BusFault: The bus failed.
         """
         if self._pump is not None:
             self._pump()
-            timeout = 0.0  # drives of this process have answered by now, or never will
-        message = take(self._bus, timeout)
+            timeout = 0.0  # simulated drives have answered by now, or never will
+        message = receive_frame(self._bus, timeout)
         if message is None:
             return False
         if message.is_error_frame:
@@ -178,10 +177,10 @@ class SetupNetwork:
         return True
 
     def wait(self, seconds: float) -> None:
-        """Lets time pass and takes what comes meanwhile; returns at once with drives of here."""
+        """Processes frames for some time; returns at once with simulated drives."""
         deadline = self.clock() + seconds
         while (left := deadline - self.clock()) > 0.0:
-            if not self.hand_over(left) and self._pump is not None:
+            if not self.process_frame(left) and self._pump is not None:
                 return
 
     def _judge_error(self, message: can.Message) -> None:
@@ -201,84 +200,84 @@ class SetupNetwork:
 
 
 class Client:
-    """Asks one drive, one request at a time."""
+    """SDO client of one drive, with one request at a time."""
 
     def __init__(self, node: int, network: SetupNetwork) -> None:
-        """Takes the node and the bus that it is on."""
+        """Takes the node and its network."""
         self.node = node
         self._network = network
         self._wanted: Key | None = None
         self._answer: bytes | None = None
         self._asked: Counter[Key] = Counter()
         self._answered: Counter[Key] = Counter()
-        self._strange = 0  # answers that no request ever asked for
+        self._unexpected = 0  # answers without a request
 
     @property
     def waits(self) -> bool:
-        """A request is out and its answer has not come."""
+        """Whether a request awaits its answer."""
         return self._wanted is not None and self._answer is None
 
     @property
     def has_surplus(self) -> bool:
-        """A request was answered more often than it was sent: two devices have this node id."""
+        """Whether a request was answered more often than sent: two devices have this node id."""
         return any(self._answered[key] > times for key, times in self._asked.items())
 
     def no_answer(self, where: str) -> CdprError:
-        """Why a request stays without its answer: silence, or answers to other questions."""
-        if not self._strange:
+        """The error for a missing answer: silence, or answers to other requests."""
+        if not self._unexpected:
             return silent(self.node, where)
         return Refused(
             f"drive {self.node} answered a different request",
             where=where,
-            why="two devices have this node id, or another program talks to the drive",
+            why="two devices have this node id, or another program accesses the drive",
             next_step="give each device on the bus a unique node id; end other programs",
             values={"node": self.node},
         )
 
     def take(self, data: bytes) -> None:
-        """Takes in a frame of the drive; one that answers no open request is thrown away."""
+        """Processes a frame of the drive; it is ignored if it answers no open request."""
         if len(data) != 8:
             return
         command, index, sub = _HEAD.unpack_from(data)
         known = [key for key in self._asked if _answers(key, command, index, sub)]
         segments = [key for key in known if key[0] in _SEGMENTS]
-        # A segment names no object: it counts for the one that is asked for, or for any of them.
+        # A segment names no object: it counts for the open request, or else for any.
         own = [key for key in segments if key == self._wanted]
         self._answered.update((own or segments)[:1] or known)
-        self._strange += not known
+        self._unexpected += not known
         if self.waits and self._wanted is not None and _answers(self._wanted, command, index, sub):
             self._answer = data
 
     def ask_device_type(self) -> None:
-        """Sends the request of first contact; `waits` says whether it was answered."""
+        """Sends the request of first contact; see `waits`."""
         self._ask(_upload(0x1000, 0), (_UPLOAD, 0x1000, 0))
 
     def give_up(self) -> None:
-        """The answer to the open request is not waited for any longer; it may still come."""
+        """Stops waiting for the answer to the open request."""
         self._wanted = None
 
     def read(self, index: int, sub: int, name: str, size: int = 4) -> bytes:
         """Reads an object.
 
         Args:
-            index: Its index.
-            sub: Its sub-index.
+            index: Index.
+            sub: Sub-index.
             name: For messages.
-            size: Of its value, [bytes]; counts where the drive's answer does not state it.
+            size: Size of the value if the answer does not state it, [bytes].
 
         Raises:
             HardwareMissing: The drive does not answer.
-            Refused: It will not read the object.
+            Refused: It aborts the transfer.
         """
-        place = f"{index:04X}h:{sub:02X} {name}"
-        return self._attempt(lambda: self._read(index, sub, size), place)
+        target = f"{index:04X}h:{sub:02X} {name}"
+        return self._attempt(lambda: self._read(index, sub, size), target)
 
     def read_if_there(self, index: int, sub: int, name: str, size: int = 4) -> bytes | None:
-        """Reads an object that not every drive has; None where it has not; as `read`.
+        """Reads an optional object as `read`; None if it does not exist.
 
         Raises:
             HardwareMissing: The drive does not answer.
-            Refused: It has the object and will not read it.
+            Refused: It has the object, and aborts the transfer.
         """
         try:
             return self.read(index, sub, name, size)
@@ -292,11 +291,11 @@ class Client:
 
         Raises:
             HardwareMissing: The drive does not answer.
-            Refused: It will not take the value.
+            Refused: It aborts the transfer.
         """
-        place = f"{index:04X}h:{sub:02X} {name}"
+        target = f"{index:04X}h:{sub:02X} {name}"
         request = _HEAD.pack(0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0")
-        self._attempt(lambda: self._exchange(request, (_DOWNLOAD, index, sub)), place)
+        self._attempt(lambda: self._exchange(request, (_DOWNLOAD, index, sub)), target)
 
     def _read(self, index: int, sub: int, size: int) -> bytes:
         reply = self._exchange(_upload(index, sub), (_UPLOAD, index, sub))
@@ -307,7 +306,7 @@ class Client:
         return self._read_segments(index, sub)
 
     def _read_segments(self, index: int, sub: int) -> bytes:
-        """The other legal answer: the data follow in segments of up to seven bytes."""
+        """Reads the data of a segmented transfer, in segments of up to seven bytes."""
         data, toggle = b"", 0
         while True:
             request = bytes((0x60 | toggle,)) + bytes(7)
@@ -326,14 +325,14 @@ class Client:
         """Sends one request and returns its answer.
 
         Raises:
-            _Aborted: The drive said no.
+            _Aborted: The drive aborted the transfer.
             _NoAnswer: It did not answer in time.
         """
         self._ask(request, wanted)
         deadline = self._network.clock() + self._network.timeout
         while self._answer is None:
             left = deadline - self._network.clock()
-            if left <= 0.0 or not self._network.hand_over(left):
+            if left <= 0.0 or not self._network.process_frame(left):
                 self.give_up()
                 raise _NoAnswer
         answer, self._wanted, self._answer = self._answer, None, None
@@ -341,9 +340,9 @@ class Client:
             raise _Aborted(int.from_bytes(answer[4:], "little"))
         return answer
 
-    def _attempt(self, transfer: Callable[[], bytes], place: str) -> bytes:
-        """Runs a transfer; errors name node and object."""
-        where = f"drive {self.node}, object {place}"
+    def _attempt(self, transfer: Callable[[], bytes], target: str) -> bytes:
+        """Runs a transfer with repetitions; errors name node and object."""
+        where = f"drive {self.node}, object {target}"
         for attempt in range(1, ATTEMPTS + 1):
             try:
                 return transfer()
@@ -353,7 +352,7 @@ class Client:
                     where=where,
                     next_step="compare the object with the drive's manual and its EDS file;"
                     " `cdpr doctor RIG --drives` lists all objects of all drives",
-                    values={"node": self.node, "object": place, "abort_code": error.code},
+                    values={"node": self.node, "object": target, "abort_code": error.code},
                 ) from None
             except _NoAnswer:
                 if attempt == ATTEMPTS:
@@ -372,9 +371,9 @@ def _upload(index: int, sub: int) -> bytes:
 
 
 def _answers(wanted: Key, command: int, index: int, sub: int) -> bool:
-    """Whether a frame is an answer of the kind and to the object that are waited for.
+    """Whether a frame answers the wanted kind and object.
 
-    A segment names no object; its toggle bit distinguishes it from the one before.
+    A segment names no object; its toggle bit distinguishes it from the previous one.
     """
     kind, wanted_index, wanted_sub = wanted
     if command == _ABORT:

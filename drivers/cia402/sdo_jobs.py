@@ -1,7 +1,7 @@
-"""SDO requests to many drives at once, beside the cycle: one at a time for each. No bus, no clock.
+"""SDO requests to many drives during cyclic operation, one per drive at a time. No bus, no clock.
 
-`drivers.cia402.sdo` waits for every answer, which a loop that keeps SYNC going cannot do. Values of
-up to four bytes only; source: CiA 301, 7.2.4.
+`drivers.cia402.sdo` waits for every answer, which a loop that sends SYNC cannot do. Values of up to
+four bytes only; source: CiA 301, 7.2.4.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from drivers.cia402.pdo import SDO_REQUEST_BASE
 from drivers.cia402.profile import rpdo_parameters
 
 REQUESTS_A_CYCLE = 1
-"""SDO requests beside a cycle: as much as fits on a bus that others fill to nine tenths."""
+"""SDO requests per cycle: as many as fit on a bus with 90 % load."""
 
 ASKED_AGAIN_AFTER = 0.5
-"""Without an answer to an SDO request, [s]; slower drives answer twice, which does no harm."""
+"""Time without an answer after which a request is repeated, [s]; double answers are harmless."""
 
 MODE_WAIT = 0.5
-"""So long an enabled drive may take to show its mode, beside the time of its SDO answer, [s]."""
+"""Time for an enabled drive to show its mode, in addition to the SDO answer, [s]."""
 
 CSP_MODE = 8
 """Cyclic synchronous position."""
@@ -34,19 +34,19 @@ _SEGMENTS_FOLLOW = frozenset({0x40, 0x41})
 _ASK_FOR_SEGMENT = bytes((0x60, *bytes(7)))
 _LENGTH = 8
 
-#: Abort codes: there is no such object; there is no such sub-index.
+#: Abort codes: object does not exist; sub-index does not exist.
 OBJECT_DOES_NOT_EXIST = frozenset({0x06020000, 0x06090011})
 
 
 @dataclass(frozen=True, slots=True)
 class SdoRequest:
-    """One object to write, or to read where there is no data.
+    """One object to write, or to read if there is no data.
 
     Attributes:
         index: Object index.
         sub: Sub-index.
-        data: To write, 1, 2 or 4 bytes; empty to read.
-        size: Of what is read, [bytes]; counts where the drive's answer does not state it.
+        data: 1, 2 or 4 bytes to write; empty to read.
+        size: Size of a read value if the answer does not state it, [bytes].
     """
 
     index: int
@@ -55,36 +55,40 @@ class SdoRequest:
     size: int = 4
 
     def frame(self) -> bytes:
-        """The request."""
+        """Data of the request frame."""
         command = _DOWNLOAD[len(self.data)] if self.data else _UPLOAD
         head = bytes((command, self.index & 0xFF, self.index >> 8, self.sub))
         return head + self.data.ljust(4, b"\0")
 
 
-#: What a drive says of itself: status word, position [counts] and torque [per mille].
-STANDING = (SdoRequest(0x6041, 0, size=2), SdoRequest(0x6064, 0), SdoRequest(0x6077, 0, size=2))
+#: State of a drive: status word, position [counts] and torque [per mille].
+STATE_REQUESTS = (
+    SdoRequest(0x6041, 0, size=2),
+    SdoRequest(0x6064, 0),
+    SdoRequest(0x6077, 0, size=2),
+)
 
 
 def time_to_end(heartbeats: Iterable[int], cycle: float, answer: float) -> float:
-    """Longest time that the end of all monitoring takes, [s].
+    """Longest time to end all monitoring, [s].
 
     Args:
-        heartbeats: As for `monitoring_off`, one number a drive.
+        heartbeats: As for `monitoring_off`, one number per drive.
         cycle: [s].
-        answer: For one SDO answer, [s].
+        answer: Time of one SDO answer, [s].
     """
     jobs = [len(monitoring_off(count)) for count in heartbeats]
     return sum(jobs) * cycle / REQUESTS_A_CYCLE + max(jobs) * answer
 
 
 def monitoring_off(heartbeats: int, rpdo: int = 1) -> tuple[SdoRequest, ...]:
-    """What ends all monitoring by a drive: heartbeats, set-points, and SYNC last.
+    """Requests that end all monitoring by a drive: heartbeats, set-points, and SYNC last.
 
-    Those of its peers, too: one that fell silent after the end would take the torque off all.
+    Peers' heartbeats too: a peer that became silent later would remove the torque of all.
 
     Args:
-        heartbeats: Entries of 1016h that set-up wrote, the master's first.
-        rpdo: Number of the RPDO that takes the set-points.
+        heartbeats: Number of entries of 1016h written at configuration, the master's first.
+        rpdo: Number of the RPDO for the set-points.
     """
     return (
         *(SdoRequest(0x1016, sub, bytes(4)) for sub in range(1, heartbeats + 1)),
@@ -97,20 +101,20 @@ MODE_DISPLAY = SdoRequest(0x6061, 0, size=1)
 
 
 class SdoJobs:
-    """Requests that wait, the one under way for each drive, and what was answered.
+    """Queued requests, the open one of each drive, and the answers.
 
     Attributes:
-        values: What was read, by node and job.
-        failed: What a drive refused to write or read, by node and job, with its abort code.
+        values: Values read, by node and job.
+        failed: Abort codes, by node and job.
     """
 
     def __init__(self, jobs: Mapping[int, Iterable[SdoRequest]], again_after: int) -> None:
-        """Nothing is asked yet.
+        """Sends nothing yet.
 
         Args:
-            jobs: Of each node, in the order of sending.
-            again_after: Turns without an answer after which a request is sent again: requests and
-                answers get lost.
+            jobs: Requests of each node, in the order of sending.
+            again_after: Turns without an answer after which a request is repeated, as frames may
+                be lost.
         """
         self._again_after = again_after
         self._turns: dict[int, int] = {}
@@ -122,27 +126,27 @@ class SdoJobs:
         self.failed: dict[tuple[int, SdoRequest], int] = {}
 
     def unfinished(self) -> set[int]:
-        """Nodes that have not answered everything."""
+        """Nodes with open or queued requests."""
         return {node for node, waiting in self._waiting.items() if waiting} | set(self._asked)
 
     def refused(self) -> set[int]:
-        """Nodes that refused a request, other than for an object that is absent."""
+        """Nodes that refused a request, except for absent objects."""
         return {
             node for (node, _), code in self.failed.items() if code not in OBJECT_DOES_NOT_EXIST
         }
 
     @property
     def is_asking(self) -> bool:
-        """An answer is awaited."""
+        """Whether an answer is awaited."""
         return bool(self._asked)
 
     def next_requests(self, most: int) -> list[tuple[int, bytes]]:
-        """Identifier and data of requests to send in this turn, one a drive at most.
+        """Identifier and data of the requests to send in this turn, at most one per drive.
 
-        All drives get their first request before one of them gets its second.
+        All drives get their first request before any gets its second.
 
         Args:
-            most: How many.
+            most: Largest number of requests.
         """
         for node in self._asked:
             self._turns[node] += 1
@@ -162,19 +166,19 @@ class SdoJobs:
         return requests
 
     def take(self, node: int, data: bytes | bytearray) -> None:
-        """Takes in an answer; one to another question, or a late one, counts for nothing."""
+        """Processes an answer; late answers and those to other requests are ignored."""
         job = self._asked.get(node)
         if job is None or len(data) != _LENGTH:
             return
         if self._frames[node] == _ASK_FOR_SEGMENT and not data[0] & 0xF0:
-            # A segment has up to seven bytes, so the first one is the last.
+            # A segment holds up to seven bytes, so the first one is the last.
             self.values[node, job] = int.from_bytes(data[1 : 8 - (data[0] >> 1 & 7)], "little")
             del self._asked[node]
         elif int.from_bytes(data[1:3], "little") == job.index and data[3] == job.sub:
             self._take_answer(node, job, data)
 
     def _take_answer(self, node: int, job: SdoRequest, data: bytes | bytearray) -> None:
-        """Of a frame that names the object."""
+        """Processes an answer that names the object."""
         if data[0] == _ABORTED:
             self.failed[node, job] = int.from_bytes(data[4:8], "little")
         elif job.data and data[0] == _DOWNLOADED:
@@ -191,38 +195,38 @@ class SdoJobs:
 
 
 class AnswerListener:
-    """Hears drives until every request under way is answered; a `drivers.cyclic_group.Listener`."""
+    """A `drivers.cyclic_group.ReplyListener` until every open request is answered."""
 
     def __init__(self, take: Callable[..., None], jobs: SdoJobs) -> None:
-        """Frames are handed to ``take``, which knows the jobs."""
+        """Passes frames to ``take``."""
         self._jobs, self.take = jobs, take
 
     @property
     def complete(self) -> bool:
-        """No answer is awaited."""
+        """Whether no answer is awaited."""
         return not self._jobs.is_asking
 
 
 def mode_text(name: str, mode: int | None) -> str:
-    """What is wrong with the mode that an enabled drive shows; None where it shows none."""
+    """Message about the wrong mode of an enabled drive; None for no answer."""
     if mode is None:
         return f"{name} does not report its mode once enabled (6061h)"
     return f"{name} is in mode {mode} (6061h) once enabled, not in 8 (CSP)"
 
 
 class ModeCheck:
-    """Asks enabled drives for their mode until all are in CSP, or one never was in time.
+    """Reads the mode of enabled drives until all are in CSP or time is up.
 
-    For drives that show a mode only once they are enabled; until it is known they stay on the
-    targets that they were enabled on.
+    For drives that show the mode only once enabled; until then they hold the targets at which they
+    were enabled.
     """
 
     def __init__(self, nodes: Iterable[int], cycles: int, again_after: int) -> None:
-        """Nothing is asked yet.
+        """Sends nothing yet.
 
         Args:
             nodes: Of all drives.
-            cycles: That it may take.
+            cycles: Largest number of cycles.
             again_after: As for `SdoJobs`.
         """
         self._modes: dict[int, int | None] = dict.fromkeys(nodes)
@@ -230,7 +234,7 @@ class ModeCheck:
         self._jobs = SdoJobs({}, again_after)
 
     def next_requests(self, most: int) -> list[tuple[int, bytes]]:
-        """Of one cycle; see `SdoJobs.next_requests`."""
+        """Requests of one cycle; see `SdoJobs.next_requests`."""
         self._left -= 1
         self._note_answers()
         if not self._jobs.unfinished():
@@ -239,7 +243,7 @@ class ModeCheck:
         return self._jobs.next_requests(most)
 
     def take(self, node: int, data: bytes | bytearray) -> None:
-        """Takes in an answer; see `SdoJobs.take`."""
+        """Processes an answer; see `SdoJobs.take`."""
         self._jobs.take(node, data)
         self._note_answers()
 
@@ -253,5 +257,5 @@ class ModeCheck:
 
     @property
     def is_overdue(self) -> bool:
-        """No time is left."""
+        """Whether time is up."""
         return self._left <= 0

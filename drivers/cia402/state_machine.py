@@ -1,7 +1,7 @@
-"""Which control word each drive gets next, so that all go the same way in the same cycle.
+"""Next control word of each drive, so that all change state in the same cycle.
 
-Pure: goal and states go in, the next words come out. Every word has bit 1 set, so that none is
-"disable voltage"; enabling is all or none.
+Pure: from goal and states to words. Every word has bit 1 set, so that none is "disable voltage";
+all drives are enabled together or none.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from enum import Enum, IntEnum, auto
 
-# The CiA 402 state machine as tables: status word to state, and the control words sent.
+# The CiA 402 state machine as tables: states by status word, and the control words in use.
 #
 # Source: CiA 402-2 / IEC 61800-7-201, tables "state coding" and "command coding".
 
@@ -28,9 +28,9 @@ class DriveState(Enum):
 
 
 class ControlWord(IntEnum):
-    """The control words this program sends.
+    """Control words in use.
 
-    Bit 1 is set in each of them: a word without it is "disable voltage", which frees the cable.
+    Bit 1 is set in all of them: a word without it is "disable voltage", which releases the cable.
     """
 
     SHUTDOWN = 0x06
@@ -39,10 +39,10 @@ class ControlWord(IntEnum):
     ENABLE_OPERATION = 0x0F
     QUICK_STOP = 0x02
     RESET_FAULT = 0x86
-    """Rising edge of bit 7, with "shutdown" beside it."""
+    """Rising edge of bit 7, combined with "shutdown"."""
 
 
-#: Mask, value and state of a status word. The short mask leaves bit 5 open.
+#: Mask, value and state of a status word. The shorter mask ignores bit 5.
 STATE_CODES: tuple[tuple[int, int, DriveState], ...] = (
     (0x4F, 0x00, DriveState.NOT_READY),
     (0x4F, 0x40, DriveState.SWITCH_ON_DISABLED),
@@ -73,7 +73,7 @@ def _decoded(status_word: int) -> DriveState:
     for mask, value, state in STATE_CODES:
         if status_word & mask == value:
             return state
-    # No state of the standard has this code: nothing may be assumed about the drive.
+    # Not a code of the standard: nothing may be assumed about the drive.
     return DriveState.NOT_READY
 
 
@@ -81,7 +81,7 @@ _STATES = tuple(_decoded(low_bits) for low_bits in range(0x80))
 
 
 def state_of(status_word: int) -> DriveState:
-    """The state a status word (6041h) reports; a code the standard has not is NOT_READY."""
+    """The state in a status word (6041h); NOT_READY for codes outside the standard."""
     return _STATES[status_word & 0x7F]
 
 
@@ -91,10 +91,10 @@ VOLTAGE_ENABLED, REMOTE = 1 << 4, 1 << 9
 _NO_VOLTAGE = (
     "its bit 4 (voltage enabled) is 0: mains power is off, or safe torque off (STO) is active"
 )
-_LOCAL = "its bit 9 (remote) is 0: its maker's tool, panel or enable input has control"
-_INTERLOCKED = "check mains power, safe torque off (STO) and its enable input"
+_LOCAL = "its bit 9 (remote) is 0: its commissioning tool, panel or enable input has control"
+_INTERLOCKED = "check mains power, safe torque off (STO) and the enable input"
 _STAYS_STOPPED = (
-    "it does not take 0Fh there (transition 16), so that only a loss of power ends its quick stop:"
+    "it does not accept 0Fh there (transition 16), so only a power cycle ends its quick stop:"
     " support the platform first"
 )
 
@@ -105,24 +105,24 @@ def late_drives(
     wanted: Sequence[DriveState],
     seconds: float,
 ) -> list[tuple[int, str]]:
-    """Drives that did not come to a state in time, by node, and why they may not have.
+    """Drives that did not reach a state in time, by node, with the likely reason.
 
     Args:
         names: By node id.
         status_words: Of each of them, as last reported.
-        wanted: States that count; the last one is where they were sent.
-        seconds: That they had, [s].
+        wanted: Accepted states; the last one was commanded.
+        seconds: Time that they had, [s].
     """
-    way = f"on the way to {wanted[-1].value} after {seconds:g} s (enable_timeout_ms of its profile)"
+    late = f"instead of {wanted[-1].value} after {seconds:g} s (enable_timeout_ms of its profile)"
     return [
-        (node, f"{name} is in {state_of(word).value} {way}{_obstacle(word)}")
+        (node, f"{name} is in {state_of(word).value} {late}{_reason_for(word)}")
         for (node, name), word in zip(names.items(), status_words, strict=True)
         if state_of(word) not in wanted
     ]
 
 
-def _obstacle(status_word: int) -> str:
-    """What in its status word says why a drive stays where it is."""
+def _reason_for(status_word: int) -> str:
+    """Why a drive stays in its state, as far as its status word shows."""
     state = state_of(status_word)
     if state is DriveState.QUICK_STOP_ACTIVE:
         return f"; {_STAYS_STOPPED}"
@@ -132,13 +132,13 @@ def _obstacle(status_word: int) -> str:
 
 
 def without_power(status_word: int) -> list[str]:
-    """What in its status word keeps a drive at rest from being enabled; nothing if it may be."""
+    """Reasons in its status word why a drive at rest cannot be enabled."""
     shown = [_LOCAL] if not status_word & REMOTE else []
     return shown + ([_NO_VOLTAGE] if not status_word & VOLTAGE_ENABLED else [])
 
 
 class Goal(Enum):
-    """Where the group is going."""
+    """Goal of the group."""
 
     IDLE = auto()
     """No power; a drive found under torque is commanded to stop and hold."""
@@ -149,7 +149,7 @@ class Goal(Enum):
 
 
 _MAY_HOLD = TORQUE_ON | {DriveState.NOT_READY}
-"""States in which a drive may hold a cable; NOT_READY stands for a drive not heard yet too."""
+"""States in which a drive may hold a cable; NOT_READY includes drives without any reply."""
 
 _RANKS = {
     DriveState.NOT_READY: 0,
@@ -159,7 +159,7 @@ _RANKS = {
     DriveState.QUICK_STOP_ACTIVE: 2,
     DriveState.OPERATION_ENABLED: 3,
 }
-"""How far a drive is on its way; a drive that holds in quick stop waits for the others."""
+"""Progress towards OPERATION ENABLED; a drive in quick stop waits for the others."""
 
 _NEXT_WORD = (
     ControlWord.SHUTDOWN,
@@ -170,22 +170,22 @@ _NEXT_WORD = (
 
 
 def next_words(
-    goal: Goal, states: Sequence[DriveState], told_to_stop: Sequence[bool]
+    goal: Goal, states: Sequence[DriveState], stop_commanded: Sequence[bool]
 ) -> tuple[ControlWord, ...]:
-    """The control words of the next cycle, one a drive.
+    """The control words of the next cycle, one per drive.
 
     Args:
-        goal: Where the group is going.
+        goal: Of the group.
         states: As last reported.
-        told_to_stop: True for drives that were sent a quick stop since they reported QUICK STOP
+        stop_commanded: True for drives that were sent a quick stop since they reported QUICK STOP
             ACTIVE.
     """
     if goal is Goal.STOP:
         return (ControlWord.QUICK_STOP,) * len(states)
     if goal is Goal.ENABLE:
-        return _enable(states, told_to_stop)
+        return _enable(states, stop_commanded)
     if goal is Goal.RELEASE:
-        return _release(states, told_to_stop)
+        return _release(states, stop_commanded)
     if goal is Goal.RESET_FAULT:
         return tuple(
             ControlWord.RESET_FAULT if state is DriveState.FAULT else _idle(state)
@@ -198,33 +198,36 @@ def _idle(state: DriveState) -> ControlWord:
     return ControlWord.QUICK_STOP if state in _MAY_HOLD else ControlWord.SHUTDOWN
 
 
-def _enable(states: Sequence[DriveState], told_to_stop: Sequence[bool]) -> tuple[ControlWord, ...]:
-    """One step towards OPERATION ENABLED; the last step is one step of all drives."""
+def _enable(
+    states: Sequence[DriveState], stop_commanded: Sequence[bool]
+) -> tuple[ControlWord, ...]:
+    """One step towards OPERATION ENABLED; all drives take the last step together."""
     if any(state in FAULTED for state in states):
         return (ControlWord.QUICK_STOP,) * len(states)
     lowest = min(_RANKS[state] for state in states)
-    # Out of quick stop only by a fresh edge: a drive that stopped by itself while commanded to
-    # run must first be commanded to stop.
-    fresh = all(
-        state is not DriveState.QUICK_STOP_ACTIVE or told
-        for state, told in zip(states, told_to_stop, strict=True)
+    # A drive that stopped itself must first be commanded to stop before it is enabled again.
+    may_restart = all(
+        state is not DriveState.QUICK_STOP_ACTIVE or commanded
+        for state, commanded in zip(states, stop_commanded, strict=True)
     )
-    if lowest >= 2 and fresh:
+    if lowest >= 2 and may_restart:
         return (ControlWord.ENABLE_OPERATION,) * len(states)
     word = _NEXT_WORD[min(lowest, 1)]
     return tuple(ControlWord.QUICK_STOP if s in _MAY_HOLD else word for s in states)
 
 
-def _release(states: Sequence[DriveState], told_to_stop: Sequence[bool]) -> tuple[ControlWord, ...]:
-    """Operation disabled on all, which closes brakes; shut down once none is under torque.
+def _release(
+    states: Sequence[DriveState], stop_commanded: Sequence[bool]
+) -> tuple[ControlWord, ...]:
+    """Disables operation of all drives, which closes brakes, then shuts them down.
 
-    The only way out of QUICK STOP ACTIVE without "disable voltage" leads through OPERATION
-    ENABLED, for all drives together and with targets on the actual positions.
+    Without "disable voltage", QUICK STOP ACTIVE can only be left through OPERATION ENABLED, by
+    all drives together and with targets at the actual positions.
     """
     if any(state in FAULTED for state in states):
         return (ControlWord.QUICK_STOP,) * len(states)
     if DriveState.QUICK_STOP_ACTIVE in states:
-        return _enable(states, told_to_stop)
+        return _enable(states, stop_commanded)
     if DriveState.OPERATION_ENABLED in states:
         return (ControlWord.SWITCH_ON,) * len(states)
     return (ControlWord.SHUTDOWN,) * len(states)

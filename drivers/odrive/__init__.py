@@ -1,1 +1,1 @@
-"""ODrives that speak CANSimple, as one group: no SYNC, a watchdog, a brake on every winch."""
+"""A group of ODrives with CANSimple: no SYNC, a watchdog, a brake on every winch."""

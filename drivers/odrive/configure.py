@@ -1,4 +1,4 @@
-"""Sets every ODrive up, and reads back what can be read back, before any of them is enabled."""
+"""Configures all ODrives and reads back what can be read, before any is enabled."""
 
 from __future__ import annotations
 
@@ -9,15 +9,22 @@ from pathlib import Path
 
 import can
 
-from drivers.can_bus import EchoFilter, SentFrame, bus_name, echoes_own_frames, take, transmit
+from drivers.can_bus import (
+    EchoFilter,
+    SentFrame,
+    bus_name,
+    echoes_own_frames,
+    receive_frame,
+    transmit,
+)
 from drivers.can_errors import (
     SETTING_UP,
     ForeignMaster,
     answers_twice,
     error_frame_fault,
     in_fault,
-    keeps_another,
     moved_by_another,
+    wrong_setting,
 )
 from drivers.can_load import HEARTBEATS_WAITED
 from drivers.drive_group import Pump
@@ -39,34 +46,34 @@ from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 from model.winches import WinchMap
 
-# Questions to ODrives and their answers while they are set up. One thread.
+# Requests to ODrives and their answers during configuration. One thread.
 
 
 RESPONSE_TIMEOUT = 0.5
-"""For the answer to a question, [s]."""
+"""Time-out of a request, [s]."""
 
 ECHO_WAIT = 0.05
-"""A second device with the same node id answers within this time of the first, [s]."""
+"""Time within which a second device with the same node id answers, [s]."""
 
 OPCODE_READ, OPCODE_WRITE = 0, 1
 
 PUMPED = 0.01
-"""Time that is counted for each pump of simulated drives, [s]."""
+"""Time counted for each step of simulated drives, [s]."""
 
 
 def commanding_ids(layouts: Layouts, nodes: Sequence[int]) -> frozenset[int]:
-    """Identifiers that only a master that moves these drives sends."""
+    """Identifiers sent only by a master that moves these drives."""
     moving = (layouts.set_input_pos, layouts.set_axis_state, layouts.clear_errors, layouts.estop)
     return frozenset(can_id(node, layout.command) for node in nodes for layout in moving)
 
 
 def foreign_master_message(identifier: int) -> str:
-    """What another program does when it sends a frame of one of these identifiers."""
+    """Message about another program that sends a frame with one of these identifiers."""
     return f"another program commands drive {node_and_command(identifier)[0]}"
 
 
 class SetupLink:
-    """The bus while drives are set up."""
+    """The bus during configuration."""
 
     def __init__(
         self, bus: can.BusABC, pump: Pump | None, layouts: Layouts, nodes: Sequence[int]
@@ -77,26 +84,26 @@ class SetupLink:
             commanding_ids(layouts, nodes), echoes_own_frames=echoes_own_frames(bus)
         )
 
-    def tell(self, node: int, layout: Layout, *values: float) -> None:
+    def send(self, node: int, layout: Layout, *values: float) -> None:
         """Sends a message to one drive."""
         self._send(node, layout.command, layout.pack(*values))
 
     def ask(self, node: int, layout: Layout) -> None:
-        """Asks one drive for a message; without data it is a question."""
+        """Requests a message from one drive, by the same message without data."""
         self._send(node, layout.command, b"")
 
     def read(self, node: int, endpoint: int) -> None:
-        """Asks for the value of an endpoint."""
+        """Requests the value of an endpoint."""
         data = self._layouts.rxsdo.pack(OPCODE_READ, endpoint, 0)
         self._send(node, self._layouts.rxsdo.command, data[:4])
 
     def write(self, node: int, endpoint: int, raw: int, size: int) -> None:
-        """Sets the value of an endpoint, of ``size`` bytes."""
+        """Writes the value of an endpoint, of ``size`` bytes."""
         data = self._layouts.rxsdo.pack(OPCODE_WRITE, endpoint, raw)
         self._send(node, self._layouts.rxsdo.command, data[: 4 + size])
 
     def answers(self, layout: Layout, timeout: float) -> Iterator[tuple[int, tuple[float, ...]]]:
-        """Node and values of every message of a kind that comes within a time [s].
+        """Yields node and values of every message of a kind within a time [s].
 
         Raises:
             BusFault: The bus failed, or another program commands a drive.
@@ -119,7 +126,7 @@ class SetupLink:
 
     def _frames(self, timeout: float) -> Iterator[can.Message]:
         for left in self._waits(timeout):
-            while (message := take(self._bus, left)) is not None:
+            while (message := receive_frame(self._bus, left)) is not None:
                 if message.is_error_frame:
                     fault = error_frame_fault(
                         message.arbitration_id, message.data, bus_name(self._bus)
@@ -135,7 +142,7 @@ class SetupLink:
                     break
 
     def _waits(self, timeout: float) -> Iterator[float]:
-        """How long to wait for the next frame; with simulated drives a cycle passes each time."""
+        """Yields times to wait for the next frame; steps simulated drives instead."""
         if self._pump is not None:
             for _ in range(math.ceil(timeout / PUMPED)):
                 self._pump()
@@ -148,20 +155,20 @@ class SetupLink:
 
 SPEED_RESERVE = 1.5
 TORQUE_RESERVE = 1.2
-"""Limits above what a run may need: the watch over following error and tension must trip first."""
+"""Limits relative to a run's needs: the monitors of following error and tension must trip first."""
 
 WHOLE_IN_FLOAT = 2**24
-"""Whole numbers up to this are exact in the 32-bit float of a set-point."""
+"""Integers up to this are exact in the 32-bit float of a set-point."""
 
 OLDEST_FIRMWARE = (0, 6)
 NO_SUPPLY = 1.0
-"""Below this voltage a drive has no supply, [V]."""
+"""Voltage below which the motor supply is off, [V]."""
 
 CONFIRMATION_WAIT = 0.01
-"""For the confirmation of a write, [s]."""
+"""Time for the confirmation of a write, [s]."""
 
 
-Told = dict[int, tuple[float, ...]]
+Answers = dict[int, tuple[float, ...]]
 
 
 def configure_drives(
@@ -174,12 +181,12 @@ def configure_drives(
     max_tension: float,
     to_reset: bool,
 ) -> tuple[str, ...]:
-    """Sets every drive up; arguments and errors as for `drivers.drive_group.DriveGroup.configure`.
+    """Configures every drive; arguments and errors as for `DriveGroup.configure`.
 
-    The torque limit comes from ``max_tension``, [N].
+    ``max_tension`` sets the torque limit, [N].
 
-    A watchdog that expired while nothing was enabled only shows that a master was lost; it is
-    cleared, on drives that all hold by their brakes.
+    A watchdog that expired while no drive was enabled only shows that a master was lost; it is
+    cleared if all brakes are closed.
     """
     nodes = tuple(winch.node_id for winch in rig.winches)
     check_resolution(rig)
@@ -196,9 +203,9 @@ def configure_drives(
         turns = SPEED_RESERVE * winch.max_speed * abs(winch.counts_per_metre)
         torque = TORQUE_RESERVE * max_tension / winch.torque_constant * winch.rated_torque
         limits = turns / winch.counts_per_turn, torque / document.motor_torque_constant_nm_a
-        link.tell(winch.node_id, layouts.set_limits, *limits)
+        link.send(winch.node_id, layouts.set_limits, *limits)
         mode = ControlMode.POSITION, InputMode.PASSTHROUGH
-        link.tell(winch.node_id, layouts.set_controller_mode, *mode)
+        link.send(winch.node_id, layouts.set_controller_mode, *mode)
     if known is not None:
         return ()
     return (
@@ -208,10 +215,10 @@ def configure_drives(
 
 
 def check_resolution(rig: Rig) -> None:
-    """A set-point is a 32-bit float of turns: it must resolve every count of the travel.
+    """Requires that set-points, 32-bit floats in turns, resolve every count of the travel.
 
     Raises:
-        BadInput: It does not.
+        BadInput: They do not.
     """
     winch_map = WinchMap(rig)
     for drive in range(rig.cable_count):
@@ -220,29 +227,29 @@ def check_resolution(rig: Rig) -> None:
             raise BadInput(
                 f"an ODrive's set-point does not resolve positions up to {farthest} counts",
                 where=f"rig {rig.name}: winches[{drive}]",
-                next_step="choose a smaller counts_per_rev (for ODrives this unit is your own"
-                " choice), or home_counts nearer to 0",
+                next_step="choose a smaller counts_per_rev (an arbitrary unit for ODrives), or"
+                " home_counts closer to 0",
             )
 
 
 def _answers(
     link: SetupLink, layout: Layout, nodes: Sequence[int], timeout: float, *, asked: bool
-) -> Told:
-    """One message of every drive.
+) -> Answers:
+    """One message from every drive.
 
     Raises:
-        HardwareMissing: From one none came.
-        Refused: A question was answered twice.
+        HardwareMissing: A drive sent none.
+        Refused: A request was answered twice.
     """
-    told: Told = {}
+    received: Answers = {}
     for node, values in link.answers(layout, timeout):
-        if node in told and asked:
+        if node in received and asked:
             raise answers_twice(node)
         if node in nodes:
-            told[node] = values
-        if len(told) == len(nodes):
-            return told
-    silent = ", ".join(str(node) for node in nodes if node not in told)
+            received[node] = values
+        if len(received) == len(nodes):
+            return received
+    silent = ", ".join(str(node) for node in nodes if node not in received)
     raise HardwareMissing(
         f"drive{'s' if ',' in silent else ''} {silent}: no {layout.name}",
         where=SETTING_UP,
@@ -256,21 +263,21 @@ def _answers(
 def _check_versions(
     link: SetupLink, layouts: Layouts, nodes: Sequence[int], known: Endpoints | None
 ) -> None:
-    """Every drive answers and is one, with a firmware that speaks these messages."""
+    """Checks that every drive answers once, with a supported firmware."""
     for node in nodes:
         link.ask(node, layouts.get_version)
-    told = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True)
+    versions = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True)
     for node, _ in link.answers(layouts.get_version, ECHO_WAIT):
         if node in nodes:
             raise answers_twice(node)
-    for node, (_, *version) in told.items():
+    for node, (_, *version) in versions.items():
         firmware = tuple(int(part) for part in version)
         text = ".".join(map(str, firmware))
         if firmware[:2] < OLDEST_FIRMWARE:
             raise Refused(
                 f"its firmware {text} is too old",
                 where=f"drive {node}",
-                why="CANSimple of firmware 0.6 has other messages",
+                why="CANSimple has other messages since firmware 0.6",
                 next_step="update it with odrivetool",
                 values={"node": node, "firmware": text},
             )
@@ -288,30 +295,30 @@ def _check_versions(
 def _check_idle(
     link: SetupLink, layouts: Layouts, nodes: Sequence[int], document: OdriveDocument, reset: bool
 ) -> None:
-    """No drive is enabled or busy; one that is enabled belongs to somebody."""
+    """Checks that no drive is enabled or busy; another program controls an enabled one."""
     wait = HEARTBEATS_WAITED * document.heartbeat_ms / 1000.0
-    told = _answers(link, layouts.heartbeat, nodes, wait, asked=False)
-    for node, (_, state, _) in told.items():
+    heartbeats = _answers(link, layouts.heartbeat, nodes, wait, asked=False)
+    for node, (_, state, _) in heartbeats.items():
         if state != AxisState.IDLE:
             enabled = state == AxisState.CLOSED_LOOP_CONTROL
             what = "already enabled" if enabled else f"in axis state {state}"
             raise moved_by_another(node, what, "Heartbeat")
-    for node, (errors, _, _) in told.items():
+    for node, (errors, _, _) in heartbeats.items():
         if int(errors) & ~AxisError.WATCHDOG_TIMER_EXPIRED and not reset:
             why = "it disarmed itself; its brake holds the cable"
             raise in_fault(node, f": {error_text(int(errors))}", "Heartbeat", why)
-    if any(errors == AxisError.WATCHDOG_TIMER_EXPIRED for errors, _, _ in told.values()):
+    if any(errors == AxisError.WATCHDOG_TIMER_EXPIRED for errors, _, _ in heartbeats.values()):
         for node in nodes:
-            link.tell(node, layouts.clear_errors, 0)
+            link.send(node, layouts.clear_errors, 0)
 
 
 def _check_supply(link: SetupLink, layouts: Layouts, nodes: Sequence[int]) -> None:
     for node in nodes:
         link.ask(node, layouts.get_bus_voltage_current)
     layout = layouts.get_bus_voltage_current
-    told = _answers(link, layout, nodes, RESPONSE_TIMEOUT, asked=True)
-    for node, (voltage, _) in told.items():
-        if not voltage > NO_SUPPLY:  # also when it is no number
+    supplies = _answers(link, layout, nodes, RESPONSE_TIMEOUT, asked=True)
+    for node, (voltage, _) in supplies.items():
+        if not voltage > NO_SUPPLY:  # also for NaN
             raise Refused(
                 f"drive {node} has no motor supply: {voltage:.1f} V",
                 where=f"drive {node}, Get_Bus_Voltage_Current",
@@ -325,23 +332,23 @@ def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wante
 
     Raises:
         HardwareMissing: The drive does not report it.
-        Refused: It does not keep it.
+        Refused: It reports another value.
     """
     raw = endpoint.to_raw(wanted.value)
     link.write(node, endpoint.number, raw, endpoint.size)
-    # From firmware 0.6.11 on the write is confirmed; the confirmation is not the answer.
+    # Since firmware 0.6.11 writes are confirmed; the confirmation must not be taken for the answer.
     for _ in link.answers(layouts.txsdo, CONFIRMATION_WAIT):
         pass
     link.read(node, endpoint.number)
-    for answering, (number, told) in link.answers(layouts.txsdo, RESPONSE_TIMEOUT):
+    for answering, (number, reported) in link.answers(layouts.txsdo, RESPONSE_TIMEOUT):
         if answering != node or number != endpoint.number:
             continue
-        if int(told) == raw:
+        if int(reported) == raw:
             return
-        raise keeps_another(
+        raise wrong_setting(
             node,
             f"endpoint {endpoint.name}",
-            f"{endpoint.from_raw(int(told)):g}",
+            f"{endpoint.from_raw(int(reported)):g}",
             f"{wanted.value:g}",
             wanted.why,
             "ODrive's API reference",

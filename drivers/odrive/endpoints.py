@@ -1,7 +1,7 @@
-"""The settings of an ODrive by name: the flat endpoints of its firmware, and what cdpr wants there.
+"""Settings of an ODrive by name: the endpoints of its firmware, and the values that cdpr requires.
 
-ODrive publishes a `flat_endpoints.json` for each firmware and board; it gives the number and the
-type behind each name of the API reference.
+ODrive publishes a `flat_endpoints.json` for each firmware and board, with number and type of each
+name in the API reference.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _OTHER_FILE = (
 
 
 class _EndpointEntry(BaseModel):
-    """One entry of the file; only those that are needed are read."""
+    """One entry of the file."""
 
     model_config = ConfigDict(strict=True)
 
@@ -44,7 +44,7 @@ class _EndpointEntry(BaseModel):
 
 
 class _EndpointsFile(BaseModel):
-    """What of ODrive's file is read; the rest of it is ODrive's own."""
+    """The parts of ODrive's file that are used."""
 
     model_config = ConfigDict(strict=True)
 
@@ -59,7 +59,7 @@ class Endpoint:
     Attributes:
         name: Such as ``axis0.config.enable_watchdog``.
         number: On the bus.
-        form: Its type, as `struct` names it.
+        form: Type as a `struct` format.
     """
 
     name: str
@@ -68,11 +68,11 @@ class Endpoint:
 
     @property
     def size(self) -> int:
-        """Of a value, [bytes]."""
+        """Size of a value, [bytes]."""
         return struct.calcsize(self.form)
 
     def to_raw(self, value: float) -> int:
-        """The four bytes of a value, as the number that the message holds."""
+        """The four bytes of a value, as the integer in the message."""
         return int.from_bytes(struct.pack(self.form, value).ljust(4, b"\0"), "little")
 
     def from_raw(self, raw: int) -> float:
@@ -83,12 +83,12 @@ class Endpoint:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A setting, what it must hold, and why.
+    """A setting with its required value.
 
     Attributes:
         name: Of the endpoint.
-        value: What it must hold.
-        why: The reason for the value.
+        value: Required value.
+        why: Reason for the value.
     """
 
     name: str
@@ -102,7 +102,7 @@ class Endpoints:
 
     Attributes:
         firmware: Major, minor, revision.
-        by_name: Those that cdpr uses.
+        by_name: The endpoints that cdpr uses.
     """
 
     firmware: tuple[int, int, int]
@@ -110,7 +110,7 @@ class Endpoints:
 
 
 def wanted_settings(document: OdriveDocument) -> tuple[Wanted, ...]:
-    """What every drive of a rig must hold; the limits are set by messages of their own."""
+    """Required settings of every drive of a rig; limits are set by separate messages."""
     can, config = "axis0.config.can", "axis0.config"
     watchdog = (document.watchdog_ms or 0.0) / 1000.0
     return (
@@ -131,8 +131,7 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
     """The endpoints in a `flat_endpoints.json`.
 
     Raises:
-        BadInput: The file cannot be read, is no such file, or has no endpoint of a name that is
-            needed.
+        BadInput: The file cannot be read, has another format, or lacks a required endpoint.
     """
     content = read_json(path, _OTHER_FILE)
     try:

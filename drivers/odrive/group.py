@@ -1,9 +1,9 @@
-"""All ODrives of a rig as one group: no SYNC, brakes that close when an axis is disarmed.
+"""All ODrives of a rig as one group: no SYNC, and brakes that close when an axis is disarmed.
 
-Every cycle sends all set-points back to back. A stop, wanted or not, keeps every target where it is
-(at top speed a drive then stands within a cycle), holds under torque until the platform is at rest,
-and disarms all drives back to back, which closes their brakes. Without a master the drives' own
-watchdogs disarm them: they were fed by the same batch of frames and run out together.
+Every cycle sends all set-points back to back. Any stop freezes all targets (at top speed a
+drive then stops within a cycle), holds under torque until the platform is at rest, and disarms all
+drives back to back, which closes their brakes. Without a master the drives' watchdogs disarm them:
+they are fed by the same batch of frames, so they expire together.
 """
 
 from __future__ import annotations
@@ -38,26 +38,26 @@ from drivers.odrive.messages import (
     read_layouts,
     state_text,
 )
-from drivers.odrive.monitor import OdriveWatch
+from drivers.odrive.monitor import OdriveMonitor
 from drivers.plausibility import largest_steps, winding_signs
 from model.errors import HardwareMissing, Refused
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 
 STEP_TIMEOUT = 1.0
-"""For enabling and for disarming, [s]: a brake takes a few tenths, and heartbeats are slow."""
+"""Time-out of enabling and disarming, [s]: brakes take a few tenths, and heartbeats are slow."""
 
 SETTLING = 0.1
-"""Held under torque before the brakes close, [s]."""
+"""Time under torque before the brakes close, [s]."""
 
 FIRST_READING_ATTEMPTS = 20
 FIRST_READINGS = 2
 FIRST_READING_TIMEOUT = 0.1
-"""For the messages of all drives, [s]."""
+"""Time-out for the messages of all drives, [s]."""
 
 
 class _Stop(Enum):
-    """How far a stop is."""
+    """Progress of a stop."""
 
     NONE = auto()
     HOLDING = auto()
@@ -89,18 +89,18 @@ class OdriveGroup(CyclicGroup):
     def _reset_memory(self) -> None:
         ids = commanding_ids(self._layouts, self._nodes)
         self._cyclic = CyclicBus(self._bus, ids, foreign_master_message)
-        self._watch = OdriveWatch(self._rig, self._document, self._layouts, self._max_steps)
+        self._watch = OdriveMonitor(self._rig, self._document, self._layouts, self._max_steps)
         self._recent: deque[list[int]] = deque(maxlen=self._watch.window)
         self._stop = _Stop.NONE
         self._waited = 0
         self._releasing = False
-        self._all_hold = False  # the stop under way found all drives enabled
+        self._all_hold = False  # all drives were enabled when the stop began
         self._resetting = 0
         self._faults = []
 
     @property
     def capabilities(self) -> Capabilities:
-        """What the rig file declares, and what no ODrive does."""
+        """Capabilities of ODrives, with the brakes and the watchdog of the rig file."""
         return Capabilities(
             sync=False,
             holds_on_comm_loss=False,
@@ -113,28 +113,28 @@ class OdriveGroup(CyclicGroup):
         )
 
     @property
-    def _heard(self) -> OdriveWatch:
+    def _listener(self) -> OdriveMonitor:
         return self._watch
 
     @property
     def restarted(self) -> tuple[int, ...]:
-        """All whose encoder is not absolute: an ODrive keeps its settings without power."""
+        """All nodes without an absolute encoder, as ODrive settings are non-volatile."""
         return tuple(winch.node_id for winch in self._rig.winches if not winch.absolute)
 
     @property
     def stopping(self) -> bool:
-        """Drives hold under torque that are still to be handed over to their brakes."""
+        """Whether drives under torque still have to be handed over to their brakes."""
         return self._stop in (_Stop.HOLDING, _Stop.DISARMING)
 
     @property
     def targets(self) -> Counts:
-        """Targets last sent, shape (m,), [counts]."""
+        """Last targets sent, shape (m,), [counts]."""
         return np.array(self._last(), dtype=np.int64)
 
     def configure(
         self, *, to_reset: bool = False, on_restarted: OnRestarted | None = None
     ) -> tuple[str, ...]:
-        """Sets every drive up; see `DriveGroup.configure`."""
+        """Configures every drive; see `DriveGroup.configure`."""
         self._refuse_enabled()
         self._state = GroupState.OFFLINE
         self._reset_memory()
@@ -153,9 +153,9 @@ class OdriveGroup(CyclicGroup):
         return remarks
 
     def read_positions(self, pace: Pace | None = None) -> CycleStatus:
-        """Listens until every drive has reported position and state; see `DriveGroup`.
+        """Waits until every drive has reported position and state; see `DriveGroup`.
 
-        Its drives report by themselves, so that nothing is sent and no pace is kept.
+        ODrives report on their own, so nothing is sent and ``pace`` is not used.
         """
         self._online()
         self._cyclic.forget_waiting()
@@ -174,8 +174,8 @@ class OdriveGroup(CyclicGroup):
         raise HardwareMissing(
             f"no {'position' if silent else 'heartbeat'} from drives {names}",
             where="reading the drives' positions",
-            why="a drive lost power or the bus, or sends its messages less often than the rig file"
-            " says",
+            why="a drive lost power or the bus, or its message periods are longer than in the rig"
+            " file",
             next_step="check power, wiring and the message periods, then start again",
             values={"nodes": names},
         )
@@ -185,7 +185,7 @@ class OdriveGroup(CyclicGroup):
     ) -> None:
         """Sends one cycle; see `DriveGroup.send_cycle`.
 
-        A set-point arms no axis that disarmed itself, so that `may_send` decides nothing here.
+        A set-point does not arm an axis that disarmed itself, so `may_send` has no effect.
         """
         may_send(False)
         self._online()
@@ -195,7 +195,7 @@ class OdriveGroup(CyclicGroup):
         if self._state is GroupState.ENABLED:
             now = [int(target) for target in targets]
         elif self._state is GroupState.ENABLING or self.stopping:
-            now = before  # a sagging drive is not followed down
+            now = before  # do not follow a sagging drive
         else:
             now = list(self._watch.positions)
             before = now
@@ -209,7 +209,7 @@ class OdriveGroup(CyclicGroup):
             self._cyclic.send(self._frames.axis_states(AxisState.CLOSED_LOOP_CONTROL))
 
     def command(self, command: GroupCommand) -> None:
-        """Sets where the group goes; see `DriveGroup.command`."""
+        """Sets the goal of the group; see `DriveGroup.command`."""
         self._online()
         if command is GroupCommand.ENABLE:
             self._begin_enabling()
@@ -223,7 +223,7 @@ class OdriveGroup(CyclicGroup):
             self._releasing = command is GroupCommand.RELEASE
 
     def require_releasable(self) -> None:
-        """Unless a fault is latched; see `DriveGroup.require_releasable`."""
+        """Refuses while a fault is latched; see `DriveGroup.require_releasable`."""
         self._refuse_latched("release the drives")
 
     def quick_stop_now(self) -> None:
@@ -234,16 +234,16 @@ class OdriveGroup(CyclicGroup):
 
     @property
     def ending(self) -> frozenset[int]:
-        """None at rest: only an armed axis has a watchdog; see `DriveGroup.ending`."""
+        """Empty, as only an armed axis has a watchdog; see `DriveGroup.ending`."""
         return frozenset()
 
     @property
     def is_monitored(self) -> bool:
-        """Never at rest; see `DriveGroup.is_monitored`."""
+        """False, as axes at rest monitor nothing; see `DriveGroup.is_monitored`."""
         return False
 
-    def look(self, pace: Pace) -> CycleStatus:
-        """Listens once more; see `DriveGroup.look`."""
+    def read_state(self, pace: Pace) -> CycleStatus:
+        """Reads positions and states again; see `DriveGroup.read_state`."""
         return self.read_positions(pace)
 
     def _last(self) -> list[int]:
@@ -264,7 +264,7 @@ class OdriveGroup(CyclicGroup):
             self._begin_stop(GroupState.FAULT)
 
     def _begin_stop(self, state: GroupState) -> None:
-        """Targets stay where they are; a stop that has begun is not restarted."""
+        """Freezes the targets; does not restart a stop in progress."""
         powered = self._state in (GroupState.ENABLING, GroupState.ENABLED)
         self._all_hold = self._all_hold or self._state is GroupState.ENABLED
         if self._state is not GroupState.FAULT:
@@ -299,16 +299,16 @@ class OdriveGroup(CyclicGroup):
             if state != AxisState.CLOSED_LOOP_CONTROL:
                 why = RESULT_TEXTS.get(result, f"procedure result {result}")
                 name = self._rig.drive_names[node]
-                text = f"{name} stays {state_text(state)} on the way to closed loop control"
+                text = f"{name} stays {state_text(state)} instead of closed loop control"
                 found.append((node, f"{text}: {why}"))
         return found
 
     def _status(self) -> CycleStatus:
         watch = self._watch
         positions = np.array(watch.positions, dtype=np.int64)
-        told = np.array(self._recent or [watch.positions], dtype=np.int64)
-        # A drive reports its position at its own time: somewhere between the last set-points.
-        demands = np.clip(positions, told.min(axis=0), told.max(axis=0))
+        targets = np.array(self._recent or [watch.positions], dtype=np.int64)
+        # A drive reports its position asynchronously, between the last set-points.
+        demands = np.clip(positions, targets.min(axis=0), targets.max(axis=0))
         torques = np.rint(np.array(watch.torques) * self._per_mille).astype(np.int64)
         words = np.array(watch.status_words, dtype=np.int64)
         missing = np.array(watch.missing)
@@ -341,7 +341,7 @@ class OdriveGroup(CyclicGroup):
         self._recent.clear()
 
     def _reset_fault(self) -> None:
-        """Takes the errors off all drives, when none holds the platform by its torque."""
+        """Clears the errors of all drives if none holds the platform under torque."""
         if self._watch.any_enabled() or self._stop is _Stop.HOLDING:
             raise Refused(
                 "drives cannot be reset while some hold the platform under torque",
@@ -354,10 +354,10 @@ class OdriveGroup(CyclicGroup):
         self._cyclic.send(self._frames.clear_errors())
         self._state, self._stop = GroupState.CONFIGURED, _Stop.NONE
         heartbeat = self._document.heartbeat_ms / self._rig.document.bus.cycle_ms
-        self._resetting = int(heartbeat) + 2  # until what they say is newer than this
+        self._resetting = int(heartbeat) + 2  # until all heartbeats are newer than the reset
 
 
-# Reads the state of ODrives without changing anything, from their cyclic messages.
+# Reads the state of ODrives from their cyclic messages without changing anything.
 
 
 ATTEMPTS, TIMEOUT = 20, 0.1
@@ -370,7 +370,7 @@ def read_axes(
     layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
     nodes = [winch.node_id for winch in rig.winches]
     cyclic = CyclicBus(bus, commanding_ids(layouts, nodes), foreign_master_message)
-    watch = OdriveWatch(rig, document, layouts, largest_steps(rig, rig.cycle))
+    watch = OdriveMonitor(rig, document, layouts, largest_steps(rig, rig.cycle))
     cyclic.forget_waiting()
     for _ in range(ATTEMPTS):
         watch.begin_cycle()
@@ -387,8 +387,8 @@ def read_axes(
             f"no {'position' if silent else 'heartbeat'} from drives"
             f" {', '.join(map(str, silent or nodes))}",
             where="listening to the drives",
-            why="a drive has no power, is not on the bus, or sends its messages less often"
-            " than the rig file says",
+            why="a drive has no power, is not on the bus, or its message periods are longer"
+            " than in the rig file",
             next_step="check power, wiring and the message periods",
         )
     per_mille = winding_signs(rig) * 1000.0 / [winch.rated_torque for winch in rig.winches]
@@ -396,6 +396,6 @@ def read_axes(
         positions=np.array(watch.positions, dtype=np.int64),
         torques=np.rint(np.array(watch.torques) * per_mille).astype(np.int64),
         status_words=np.array(watch.status_words, dtype=np.int64),
-        # Their settings outlive their power, so a loss of power leaves no trace.
+        # Their settings are non-volatile, so a loss of power leaves no trace.
         restarted=tuple(winch.node_id for winch in rig.winches if not winch.absolute),
     )

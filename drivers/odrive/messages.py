@@ -1,4 +1,4 @@
-"""The messages of CANSimple: their layouts from a DBC file, and what their numbers mean. No bus.
+"""CANSimple messages: layouts from a DBC file, and meaning of the numbers. No bus.
 
 Source: ODrive documentation, "CAN Protocol" and "API Reference" of firmware 0.6.
 """
@@ -19,18 +19,18 @@ from model.errors import BadInput
 from model.files.reading import MEGABYTE, read_bytes
 from model.rig import Rig
 
-# The layout of every message, taken from a DBC file with cantools; packed by `struct` afterwards.
+# Layout of every message, read from a DBC file with cantools and packed by `struct`.
 #
-# cantools takes tens of microseconds a message, and a cycle has dozens of them; so the signals of
-# a message become one `struct.Struct` when the file is read.
+# cantools takes tens of microseconds per message, and a cycle has dozens; so the signals of a
+# message become one `struct.Struct` when the file is read.
 
 
 OWN_DBC = Path(__file__).with_name("cansimple.dbc")
 
 DBC_LIMIT = 2 * MEGABYTE
-"""Of a file, [bytes]; ODrive's own has a twentieth of it."""
+"""Largest size of a file, [bytes]; ODrive's has a twentieth of it."""
 
-#: What is needed of each message, in the order of its bytes.
+#: Required signals of each message, in the order of its bytes.
 NEEDED: dict[str, tuple[str, ...]] = {
     "Get_Version": (
         "Protocol_Version",
@@ -57,13 +57,13 @@ _INTEGERS = {(8, False): "B", (16, False): "H", (32, False): "I", (16, True): "h
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How the signals of one message lie in its bytes.
+    """Layout of the signals in a message.
 
     Attributes:
         name: As in the DBC file, without the axis.
-        command: Its number.
-        form: The signals.
-        scales: Value of one step of each signal; None where it is not scaled.
+        command: Number of the message.
+        form: Format of the signals.
+        scales: Value of one step of each signal; None if not scaled.
     """
 
     name: str
@@ -72,11 +72,11 @@ class Layout:
     scales: tuple[float | None, ...]
 
     def pack(self, *values: float) -> bytes:
-        """The bytes of a message; a scaled signal that does not fit is as large as it may be."""
+        """The bytes of a message, with scaled signals limited to their range."""
         return self.form.pack(*map(_steps, values, self.scales))
 
     def unpack(self, data: bytes | bytearray) -> tuple[float, ...] | None:
-        """The values in a message; None when its length is wrong."""
+        """The values in a message; None if its length is wrong."""
         if len(data) != self.form.size:
             return None
         raw = self.form.unpack(data)
@@ -91,7 +91,7 @@ def _steps(value: float, scale: float | None) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Layouts:
-    """All messages that are used."""
+    """All messages in use."""
 
     get_version: Layout
     heartbeat: Layout
@@ -109,11 +109,11 @@ class Layouts:
 
 
 def read_layouts(path: Path = OWN_DBC) -> Layouts:
-    """The layouts in a DBC file: ODrive's own, or the one beside this module.
+    """The layouts in a DBC file, by default the one beside this module.
 
     Raises:
-        BadInput: cantools is not installed; the file cannot be read; a message or signal is not in
-            it, or lies where no byte begins.
+        BadInput: cantools is not installed, the file cannot be read, or a message or signal is
+            missing or not aligned to bytes.
     """
     database = _database(path)
     found = {name.lower(): _layout(database, name, path) for name in NEEDED}
@@ -129,14 +129,14 @@ def _database(path: Path) -> Any:
             where="drives.type: odrive",
             next_step="pip install 'cdpr[odrive]'",
         ) from error
-    # As cantools itself reads it: DBC files are of code page 1252.
+    # DBC files use code page 1252, as in cantools.
     text = read_bytes(path, DBC_LIMIT).decode("cp1252", errors="replace")
     try:
-        # Not strict: in ODrive's own file some signals have more bits than the message.
+        # Not strict: in ODrive's file some signals have more bits than the message.
         return cantools.database.load_string(text, database_format="dbc", strict=False)
     except RecursionError as error:
         raise _unfit(path, "it is nested too deeply") from error
-    # What of a damaged file cantools does not foresee comes as it stumbles over it.
+    # Errors of cantools in damaged files that it does not check.
     except (
         cantools.database.errors.Error,
         ArithmeticError,
@@ -179,7 +179,7 @@ def _layout(database: Any, name: str, path: Path) -> Layout:
 
 
 def _scale(given: float, name: str, path: Path) -> float | None:
-    """Value of one step of a signal; None where it is not scaled."""
+    """Value of one step of a signal; None if not scaled."""
     if not 1e-9 <= abs(given) <= 1e9:
         raise _unfit(path, f"{name} has a scale of {str(given)[:40]}")
     return None if given == 1 else float(given)
@@ -197,7 +197,7 @@ COMMAND_BITS = 5
 
 
 class AxisState(IntEnum):
-    """States of an axis that matter here; in the others it calibrates or searches."""
+    """Axis states in use; in the others the axis calibrates or searches."""
 
     IDLE = 1
     CLOSED_LOOP_CONTROL = 8
@@ -210,13 +210,13 @@ class ControlMode(IntEnum):
 
 
 class InputMode(IntEnum):
-    """What becomes of a set-point on its way to the controller."""
+    """Processing of a set-point before the controller."""
 
     PASSTHROUGH = 1
 
 
 class AxisError(IntEnum):
-    """Errors with a meaning of their own here."""
+    """Errors that are handled specially."""
 
     WATCHDOG_TIMER_EXPIRED = 0x0100_0000
     ESTOP_REQUESTED = 0x0200_0000
@@ -257,7 +257,7 @@ RESULT_TEXTS: dict[int, str] = {
     13: "not possible in this state",
     14: "not calibrated",
 }
-"""Why an axis did not reach a state that was requested."""
+"""Reason why an axis did not reach a requested state."""
 
 
 def can_id(node: int, command: int) -> int:
@@ -271,13 +271,13 @@ def node_and_command(identifier: int) -> tuple[int, int]:
 
 
 def error_text(errors: int) -> str:
-    """What the bits of an axis error say."""
+    """Text of an axis error."""
     known = [text for bit, text in ERROR_TEXTS.items() if errors & bit]
     return f"{', '.join(known) or 'unknown error'} (error {errors:08X}h)"
 
 
 def state_text(word: int) -> str:
-    """What a `status_word` says."""
+    """Text of a `status_word`."""
     state, error = word & 0xFF, word & ERROR_FLAG
     names = {AxisState.IDLE: "idle", AxisState.CLOSED_LOOP_CONTROL: "closed loop control"}
     text = names.get(AxisState(state)) if state in names else f"axis state {state}"
@@ -288,15 +288,15 @@ ERROR_FLAG = 0x100
 
 
 def status_word(state: int, errors: int) -> int:
-    """An axis's state as one number: the state, and a flag for errors."""
+    """State of an axis as one number, with a flag for errors."""
     return state | (ERROR_FLAG if errors else 0)
 
 
-# The frames that a master of ODrives sends, built from the layouts of the DBC file. No bus.
+# The frames that a master of ODrives sends. No bus.
 
 
 class OdriveFrames:
-    """One frame a drive, to be sent back to back: no SYNC makes them count together."""
+    """Builds one frame per drive, to be sent back to back as there is no SYNC."""
 
     def __init__(self, rig: Rig, layouts: Layouts) -> None:
         """Takes nodes, counts and cycle from the rig."""
@@ -306,11 +306,11 @@ class OdriveFrames:
         self._layouts = layouts
 
     def set_points(self, targets: Sequence[int], before: Sequence[int]) -> list[can.Message]:
-        """Positions, with their speed as feed-forward; they feed the watchdogs.
+        """Positions with speed feed-forward; they also feed the watchdogs.
 
         Args:
             targets: Shape (m,), [counts].
-            before: Of the cycle before, shape (m,), [counts].
+            before: Targets of the previous cycle, shape (m,), [counts].
         """
         layout = self._layouts.set_input_pos
         return [
@@ -327,7 +327,7 @@ class OdriveFrames:
         return [self._frame(node, self._layouts.set_axis_state, state) for node in self._nodes]
 
     def clear_errors(self) -> list[can.Message]:
-        """Takes the errors off every drive."""
+        """Clears the errors of every drive."""
         return [self._frame(node, self._layouts.clear_errors, 0) for node in self._nodes]
 
     def _frame(self, node: int, layout: Layout, *values: float) -> can.Message:

@@ -1,4 +1,4 @@
-"""What ODrives reported, how long ago, and which of it is a group fault. No bus, no clock."""
+"""State reported by ODrives with its age, and the resulting group faults. No bus, no clock."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 
 SPARE_CYCLES = 1
-"""Drives keep their own time: a message may come a cycle later than its period says."""
+"""Cycles that a message may be late, as the drives' clocks are not synchronized."""
 
 MISSED_TORQUES = 3
-"""Cycles beyond that without a torque; how long positions may stay away is the executor's to say
-(`executor.safety.monitor`)."""
+"""Further cycles without a torque that are a fault; `executor.safety.monitor` judges missing
+positions."""
 
 NEVER = 10**6
 
 
-class OdriveWatch:
-    """The last word of every drive: heartbeats, estimates, torques.
+class OdriveMonitor:
+    """The last heartbeat, estimate and torque of every drive.
 
     Attributes:
         states: Axis states.
@@ -35,7 +35,7 @@ class OdriveWatch:
     def __init__(
         self, rig: Rig, document: OdriveDocument, layouts: Layouts, max_steps: Sequence[float]
     ) -> None:
-        """Takes the farthest each drive can turn in a cycle, [counts]."""
+        """Takes the largest motion of each drive in a cycle, [counts]."""
         count, cycle_ms = rig.cable_count, rig.document.bus.cycle_ms
         self.nodes = tuple(winch.node_id for winch in rig.winches)
         self.states, self.errors, self.results = [0] * count, [0] * count, [0] * count
@@ -45,7 +45,7 @@ class OdriveWatch:
         self._check = ReplyCheck(rig.drive_names, max_steps)
         self._fresh = [False] * count
         self._layouts = layouts
-        # Cycles since each kind of message came, and how many there may be.
+        # Cycles since the last message of each kind, and their limits.
         self._ages = {kind: [NEVER] * count for kind in ("heartbeat", "position", "torque")}
         self._most = {
             "heartbeat": math.ceil(HEARTBEATS_WAITED * document.heartbeat_ms / cycle_ms),
@@ -63,63 +63,63 @@ class OdriveWatch:
 
     @property
     def window(self) -> int:
-        """Cycles back to the oldest set-point that the newest position may belong to."""
+        """Number of last set-points to which the newest position may belong."""
         return self._most["position"] + 1
 
     @property
     def rejected(self) -> int:
-        """Frames thrown away because their length or their content could not be true."""
+        """Number of frames rejected for wrong length or implausible content."""
         return self._check.rejected
 
     @property
     def complete(self) -> bool:
-        """Every drive has reported a position in this cycle."""
+        """Whether every drive has reported a position in this cycle."""
         return all(self._fresh)
 
     @property
     def missing(self) -> list[bool]:
-        """Drives whose last position is older than it may be."""
+        """True for drives whose last position is too old."""
         return [age > self._most["position"] for age in self._ages["position"]]
 
     @property
     def status_words(self) -> list[int]:
-        """The state of each axis as one number."""
+        """The state of each axis as one number (`status_word`)."""
         return [status_word(s, e) for s, e in zip(self.states, self.errors, strict=True)]
 
     def begin_cycle(self) -> None:
-        """From now on messages count for a new cycle."""
+        """Starts a new cycle of messages."""
         self._check.begin_cycle()
         self._fresh = [False] * len(self.nodes)
 
     def end_cycle(self) -> None:
-        """A cycle is over: everything is one cycle older."""
+        """Ends a cycle: ages all messages by one cycle."""
         self._check.end_cycle()
         for ages in self._ages.values():
             ages[:] = [age + 1 for age in ages]
 
     def forget_positions(self) -> None:
-        """The drives may have been moved since: their next positions are believed as they come."""
+        """Accepts any next positions, as the drives may have been moved."""
         self._check.forget_positions()
         self._ages["position"] = [NEVER] * len(self.nodes)
 
     def forget_heartbeats(self) -> None:
-        """What drives say of their state counts only from now on."""
+        """Ignores the states reported so far."""
         self._ages["heartbeat"] = [NEVER] * len(self.nodes)
 
     @property
     def states_known(self) -> bool:
-        """Every drive has sent a heartbeat since they were forgotten, and none is overdue."""
+        """Whether every drive has sent a heartbeat since `forget_heartbeats`, none overdue."""
         return all(age <= self._most["heartbeat"] for age in self._ages["heartbeat"])
 
     def take(self, can_id: int, data: bytes | bytearray, *, stale: bool = False) -> None:
-        """Takes in one frame; drives send when it is their time, so the newest always counts."""
+        """Processes one frame; drives send asynchronously, so the newest always counts."""
         route = self._routes.get(can_id)
         if route is None:
             return
         drive, layout, note = route
         values = layout.unpack(data)
         if values is None:
-            if data:  # without data it is a question of another program
+            if data:  # without data it is a request of another program
                 self._check.reject(drive, f"its {layout.name} has {len(data)} bytes instead of 8")
         else:
             note(drive, values)
@@ -129,15 +129,15 @@ class OdriveWatch:
         return all(known == state for known in self.states)
 
     def any_enabled(self) -> bool:
-        """Whether an axis follows set-points, or may do so."""
+        """Whether an axis follows set-points."""
         return AxisState.CLOSED_LOOP_CONTROL in self.states
 
     def faults(self, *, powered: bool, enabled: bool) -> list[tuple[int, str]]:
-        """What is wrong with the drives as they stand, by node.
+        """Present faults of the drives, by node.
 
         Args:
-            powered: The group is under power or on its way there; silence is a fault then.
-            enabled: Every axis was enabled and must be so.
+            powered: The group is under power or being enabled, so that silence is a fault.
+            enabled: Every axis must be enabled.
         """
         found = [
             (node, f"{self._names[node]}: {error_text(errors)}")
@@ -177,7 +177,7 @@ class OdriveWatch:
             self._check.reject(drive, "its position is not a number")
             return
         position = round(turns * self._per_turn[drive])
-        if self._check.believed(drive, position):
+        if self._check.accept(drive, position):
             self.positions[drive] = position
             self._ages["position"][drive] = 0
             self._fresh[drive] = True

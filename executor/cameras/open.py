@@ -32,7 +32,7 @@ from model.scene import Scene, empty_scene, scene_from_document
 from tracking.measurement import Observation
 
 if TYPE_CHECKING:  # a real camera loads no simulator
-    from simulation.camera.camera import Film
+    from simulation.camera.camera import ImageSequence
 
 #: Approximate number of a run's images kept for its report.
 KEPT_PICTURES = 12
@@ -142,17 +142,17 @@ def make_observer(
 
 def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
     if name == SYNTHETIC:  # a real camera loads no simulator
-        from simulation.camera.camera import Film
+        from simulation.camera.camera import ImageSequence
         from simulation.factory import make_synthetic_camera
 
-        return RenderedPictures(Film(make_synthetic_camera(rig, scene, camera)))
+        return RenderedPictures(ImageSequence(make_synthetic_camera(rig, scene, camera)))
     return LivePictures(LiveCamera(name, camera))
 
 
 class RenderedPictures:
     """The synthetic camera as the run's source of images."""
 
-    def __init__(self, film: Film) -> None:
+    def __init__(self, film: ImageSequence) -> None:
         self._film = film
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:

@@ -223,7 +223,7 @@ class SyncMaster:
         return self.look()
 
     def look(self) -> CycleStatus:
-        """Asks every drive how it stands, without SYNC; see `DriveGroup.look`.
+        """Asks every drive how it stands, without SYNC; see `DriveGroup.read_state`.
 
         Raises:
             Fault: The bus failed.
@@ -234,7 +234,7 @@ class SyncMaster:
             self.clock.next_cycle()
             return self.clock.time_left()
 
-        self.status = self.group.look(pace)
+        self.status = self.group.read_state(pace)
         return self.status
 
     def leave_unmoved(self) -> None:

@@ -1,1 +1,1 @@
-"""A synthetic camera: renders what a camera would see of the simulated rig."""
+"""A synthetic camera, which renders images of the simulated rig."""

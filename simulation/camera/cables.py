@@ -1,4 +1,4 @@
-"""Cables in the synthetic camera's image: thin lines, hidden by what stands before them."""
+"""Cables in the synthetic camera's image: thin lines, with occlusion."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from model.rig import Camera
 from simulation.camera.rendering import Image8, Image32
 from tracking.camera_model import pixels_of
 
-#: Points along a cable, and how far a point must lie behind a surface to be hidden, [m].
+#: Points along a cable, and distance behind a surface from which a point is hidden, [m].
 POINTS, HIDDEN = 96, 3e-3
-#: Where a cable is hidden or leaves the image is found to this part of the way between points.
+#: Bisections of the interval between points to find the end of a visible part.
 HALVINGS = 8
-#: Cables without a radius in the rig file are drawn with this one, [m].
+#: Drawn radius of cables without one in the rig file, [m].
 DRAWN_RADIUS = 0.75e-3
-#: Brightness of a cable, and binary digits of a pixel that OpenCV draws with.
+#: Brightness of a cable, and fractional bits of OpenCV's pixel coordinates.
 CABLE, SHIFT = 34.0, 4
-#: Nearest distance that is drawn, [m], and how far beyond the image's edges: a thick line is cut
-#: off square at its end, [px].
+#: Nearest distance that is drawn, [m], and margin beyond the image border, [px]: thick lines have
+#: square ends.
 NEAR, BEYOND = 0.05, 40.0
-#: Points that are drawn in one width.
+#: Number of points drawn with the same width.
 _OF_ONE_WIDTH = 16
 
 
@@ -41,11 +41,11 @@ def draw_cables(
 
     Args:
         picture: Shape (height, width), changed in place.
-        depth: Distance along the camera's z axis of what each pixel shows, same shape, [m].
+        depth: Depth of each pixel along the camera's z axis, same shape, [m].
         camera: The camera.
-        cables: Where the cables run, world frame.
+        cables: Of the rig, world frame.
         camera_from_world: Pose.
-        radius: Of the cables, [m]; 0 for the drawn default.
+        radius: Of the cables, [m]; 0 for the default.
     """
     starts, ends = camera_from_world.apply(cables.exits), camera_from_world.apply(cables.anchors)
     lines = _Lines.before_lens(camera, depth, starts, ends)
@@ -60,33 +60,33 @@ def draw_cables(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Straight lines before a camera, each from its start at share 0 to its end at share 1.
+    """Straight lines in front of a camera, parametrised from 0 at the start to 1 at the end.
 
     Attributes:
         camera: The camera.
-        depth: Of what each pixel shows, shape (height, width), [m].
+        depth: Of each pixel, shape (height, width), [m].
         starts: Camera frame, shape (m, 3), [m].
-        ways: To the ends, shape (m, 3), [m].
+        spans: From start to end, shape (m, 3), [m].
     """
 
     camera: Camera
     depth: Image32
     starts: Array
-    ways: Array
+    spans: Array
 
     @classmethod
     def before_lens(cls, camera: Camera, depth: Image32, starts: Array, ends: Array) -> _Lines:
-        """The parts of lines that are not nearer than `NEAR`."""
-        ways = ends - starts
-        rising = np.where(ways[:, 2] == 0.0, 1e-12, ways[:, 2])
+        """The parts of lines farther than `NEAR`."""
+        spans = ends - starts
+        rising = np.where(spans[:, 2] == 0.0, 1e-12, spans[:, 2])
         crossing = np.clip((NEAR - starts[:, 2]) / rising, 0.0, 1.0)
         begin = np.where(starts[:, 2] < NEAR, crossing, 0.0)[:, None]
         end = np.where(ends[:, 2] < NEAR, crossing, 1.0)[:, None]
         before = np.maximum(starts[:, 2], ends[:, 2]) > NEAR
-        return cls(camera, depth, (starts + begin * ways)[before], ((end - begin) * ways)[before])
+        return cls(camera, depth, (starts + begin * spans)[before], ((end - begin) * spans)[before])
 
     def visible(self) -> list[Array]:
-        """Points along each unbroken part that is to be seen, shape (k, 3) each, [m]."""
+        """Points along each continuous visible part, shape (k, 3) each, [m]."""
         grid = np.linspace(0.0, 1.0, POINTS)
         count = len(self.starts)
         shown = self._seen(np.repeat(np.arange(count), POINTS), np.tile(grid, count))
@@ -105,7 +105,7 @@ class _Lines:
         ]
 
     def _border(self, line: NDArray[np.int64], seen: Array, unseen: Array) -> Array:
-        """Where lines cease to be seen between two shares, shape (k,); still seen there."""
+        """Last visible parameter between a visible and a hidden one, shape (k,)."""
         for _ in range(HALVINGS):
             middle = (seen + unseen) / 2.0
             there = self._seen(line, middle)
@@ -113,7 +113,7 @@ class _Lines:
         return seen
 
     def _seen(self, line: NDArray[np.int64], share: Array) -> NDArray[np.bool_]:
-        """Whether points are in the image or just beyond it, and not behind a surface."""
+        """Whether points are in the image or its margin, and not behind a surface."""
         points = self._points(line, share)
         if not len(points):
             return np.zeros(0, dtype=bool)
@@ -125,7 +125,7 @@ class _Lines:
         return np.asarray(inside & (points[:, 2] < self.depth[row, column] + HIDDEN))
 
     def _points(self, line: NDArray[np.int64], share: Array) -> Array:
-        points: Array = self.starts[line] + share[:, None] * self.ways[line]
+        points: Array = self.starts[line] + share[:, None] * self.spans[line]
         return points
 
 

@@ -1,7 +1,7 @@
 """The synthetic camera: images of the rig with an exactly known pose.
 
-Tags, platform and obstacles are met by the undistorted ray of every sample, 2 × 2 samples a pixel.
-What stands still is drawn once; an image redraws the platform's surroundings and the cables.
+Tags, platform and obstacles are intersected with the undistorted ray of every sample, 2 × 2 samples
+per pixel. The background is drawn once; each image redraws the platform's region and the cables.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ from tracking.camera_model import pixels_of, rays_of
 if TYPE_CHECKING:
     from simulation.camera.rendering import Image8
 
-# What lamps, shadows and a camera's own processing do to images.
+# Effects of lamps, shadows and the camera's image processing.
 #
-# A lamp's halo and a shadow are light: they come before the sensor's noise. Sharpening, enlarging
-# and JPEG are done by cameras and drivers to what the sensor gave, noise included.
+# A lamp's halo and a shadow are light, so they precede the sensor's noise. Sharpening, enlarging
+# and JPEG compression follow it, as in cameras and drivers.
 
 
 LAMP = (0.42, 0.36)
-"""Where the lamp's image is, shares of width and height."""
+"""Position of the lamp's image, fractions of width and height."""
 HALO_REACH = 0.12
-"""How far its halo falls to a third, share of the width."""
+"""Distance at which its halo falls to 1/e, fraction of the width."""
 SHADOW_ANGLE, PENUMBRA = 0.5, 2.5
-"""Of the shadow's edge against the rows [rad], and how wide it is [px]."""
+"""Angle of the shadow's edge to the rows [rad], and its width [px]."""
 SHARP_RADIUS = 1.2
-"""Of the blur that sharpening takes off, [px]."""
+"""Standard deviation of the blur in unsharp masking, [px]."""
 
 
 def veil_of(camera: Camera, optics: Optics) -> Image32:
@@ -66,7 +66,7 @@ def veil_of(camera: Camera, optics: Optics) -> Image32:
 
 
 def light_of(camera: Camera, optics: Optics) -> Image32:
-    """Share of light that reaches each pixel: lamp, vignetting, and a shadow across the middle."""
+    """Fraction of light at each pixel: lamp, vignetting, and a shadow across the middle."""
     x = (np.arange(camera.width) - (camera.width - 1) / 2.0) / (camera.width / 2.0)
     y = (np.arange(camera.height) - (camera.height - 1) / 2.0) / (camera.width / 2.0)
     radius = x[None, :] ** 2 + y[:, None] ** 2
@@ -79,7 +79,7 @@ def light_of(camera: Camera, optics: Optics) -> Image32:
 
 
 def before_the_sensor(picture: Image8, optics: Optics) -> Image8:
-    """The picture on a sensor of as many times fewer pixels as it is enlarged later."""
+    """The image reduced to the sensor's pixels, before it is enlarged again."""
     if optics.enlarged == 1:
         return picture
     height, width = picture.shape
@@ -88,12 +88,12 @@ def before_the_sensor(picture: Image8, optics: Optics) -> Image8:
 
 
 def processed(picture: Image8, size: tuple[int, int], optics: Optics) -> Image8:
-    """What the camera makes of what its sensor gave.
+    """The image after the camera's processing.
 
     Args:
-        picture: Noise included.
-        size: Width and height that it gives, [px].
-        optics: How.
+        picture: From the sensor, with noise.
+        size: Output width and height, [px].
+        optics: Settings.
     """
     if optics.enlarged > 1:
         picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -107,19 +107,17 @@ def processed(picture: Image8, size: tuple[int, int], optics: Optics) -> Image8:
     return picture
 
 
-# The ray behind every sample of the sensor.
-
-
-#: Samples from one ray that is undistorted to the next: a lens is smooth, and there are millions.
+# Viewing ray of every sample of the sensor.
+#: Samples between exactly undistorted rays; the others are interpolated, as a lens is smooth.
 RAY_STEP = 8
-#: Every so many rays one is checked; the others are at most about so far off, [rad].
+#: Every how many rays one is checked, and largest accepted error, [rad].
 RAYS_CHECKED, RAY_TOLERANCE = 97, 1e-7
 
 
 def sample_rays(camera: Camera) -> Image32:
     """Viewing ray (x, y, 1) of every sample, camera frame; shape (2 height, 2 width, 2).
 
-    Cameras with the same lens and size share them: the array is read-only.
+    Cameras with the same lens and size share the array, which is read-only.
     """
     matrix, distortion = (tuple(a.ravel().tolist()) for a in (camera.matrix, camera.distortion))
     return _rays(camera.width, camera.height, camera.lens, matrix, distortion)
@@ -129,7 +127,7 @@ def sample_rays(camera: Camera) -> Image32:
 def _rays(
     width: int, height: int, lens: str, matrix: tuple[float, ...], distortion: tuple[float, ...]
 ) -> Image32:
-    """Rays of a coarse grid, and cubics between them; where these are too far off, rays of all."""
+    """Rays by cubic interpolation of a coarse grid, or exact ones if that is inaccurate."""
 
     def exact(points: Array) -> Array:
         return rays_of(lens, np.array(matrix).reshape(3, 3), np.array(distortion), points)
@@ -150,10 +148,10 @@ def _rays(
 
 
 def _between(count: int) -> tuple[Array, Array]:
-    """Where every `RAY_STEP`-th sample is, [px], and its weight in each of ``count`` samples.
+    """Position of every `RAY_STEP`-th sample, [px], and its weight in each of ``count`` samples.
 
     Returns:
-        Pixels, shape (k,), reaching beyond both ends, and weights, shape (count, k).
+        Pixels, shape (k,), extending beyond both ends, and weights, shape (count, k).
     """
     whole, u = np.divmod(np.arange(count) / RAY_STEP, 1.0)
     first = whole.astype(int)
@@ -171,17 +169,17 @@ def _between(count: int) -> tuple[Array, Array]:
     return nodes, weights
 
 
-# Images one after the other.
+# Image sequences.
 
 
-class Film:
-    """Images of one camera, each smeared by the platform's motion since the one before.
+class ImageSequence:
+    """Images of one camera, each with motion blur from the motion since the previous one.
 
-    The first is sharp. Between images the platform is taken to have moved steadily.
+    The first is sharp. Between images the platform moves uniformly.
     """
 
     def __init__(self, camera: SyntheticCamera) -> None:
-        """Takes the camera; nothing is rendered yet."""
+        """Takes the camera; renders nothing yet."""
         self._camera = camera
         self._before: tuple[float, Pose] | None = None
 
@@ -191,7 +189,7 @@ class Film:
         Args:
             time: At the middle of its exposure, [s].
             pose: Of the platform there, ``world_from_platform``.
-            frame: Number of the image; it picks the noise.
+            frame: Number of the image, which selects the noise.
 
         Returns:
             Grey image, shape (height, width).
@@ -205,26 +203,26 @@ class Film:
 
 #: Brightness of the platform's faces in full light.
 PLATFORM = 168.0
-#: A platform that is nearer to the lens is not drawn, or not smeared, [m].
+#: Distance to the lens below which the platform is not drawn or not blurred, [m].
 NEAREST = 0.02
-#: Motion blur is drawn as poses this far apart, [px], but no more of them than:
+#: Distance of the poses that make up motion blur, [px], and their largest number.
 SMEAR_STEP, MOST_POSES = 0.5, 64
-#: Moments of an exposure over which a row of a rolling shutter is averaged.
+#: Times within an exposure over which a row of a rolling shutter is averaged.
 _SUB_TIMES = 8
-#: A shorter smear is not to be seen, [px].
+#: Shorter motion blur is invisible, [px].
 LEAST_SMEAR = 0.02
-#: Slack of the precomputed noise, in which each image takes another place, [px].
+#: Margin of the precomputed noise, from which each image takes a different part, [px].
 NOISE_SLACK = 96
 
 
 class SyntheticCamera:
-    """Takes images of a simulated rig.
+    """Renders images of a simulated rig.
 
     Args:
-        rig: Its platform, tags and cables.
-        scene: Its obstacles.
+        rig: Platform, tags and cables.
+        scene: Obstacles.
         camera: One of the rig's cameras, or another.
-        seed: Of the noise: the same seed, pose and frame give the same image.
+        seed: Of the noise; the same seed, pose and frame give the same image.
         optics: Imperfections of lens and sensor.
 
     Raises:
@@ -254,9 +252,9 @@ class SyntheticCamera:
         """The image with the platform at ``pose`` (``world_from_platform``).
 
         Args:
-            pose: Exact truth of the image, in the middle of its exposure.
-            frame: Number of the image; it picks the noise.
-            motion: Of the platform meanwhile; left out, it stands still.
+            pose: True pose in the middle of the exposure.
+            frame: Number of the image, which selects the noise.
+            motion: Of the platform during the exposure (default: at rest).
 
         Returns:
             Grey image, shape (height, width).
@@ -271,14 +269,14 @@ class SyntheticCamera:
             for one in poses:
                 light += self._at(one)
             light /= len(poses)
-        # Rounded up as often as the mean lies near: the mean of two is a tie half the time, and a
-        # rule for ties would make edges brighter or darker.
+        # Stochastic rounding: the mean of two values is a tie half the time, and any rule for ties
+        # would make edges brighter or darker.
         chance = np.random.default_rng([self.seed, frame, 0x5EA2]).random(light.shape, np.float32)
         mean = np.floor(light + chance)
         return self._taken(np.asarray(np.minimum(mean, 255.0), dtype=np.uint8), frame)
 
     def _while_exposed(self, pose: Pose, motion: PlatformMotion | None) -> list[Pose]:
-        """Poses in the middles of equal parts of the exposure, close enough for even blur."""
+        """Poses at the midpoints of equal parts of the exposure, close enough for smooth blur."""
         time = self.optics.exposure
         if motion is None or time <= 0.0:
             return [pose]
@@ -287,7 +285,7 @@ class SyntheticCamera:
         return [motion.moved(pose, ((k + 0.5) / count - 0.5) * time) for k in range(count)]
 
     def _smear(self, pose: Pose, motion: PlatformMotion, times: tuple[float, float]) -> float:
-        """How far the platform's corners go meanwhile at most, [px]; 0 too near to the lens."""
+        """Largest displacement of the platform's corners, [px]; 0 too close to the lens."""
         ends = (motion.moved(pose, time) for time in times)
         seen = [self._camera_from_world.apply(p.apply(self.rig.platform_corners)) for p in ends]
         if min(float(corners[:, 2].min()) for corners in seen) < NEAREST:
@@ -296,10 +294,10 @@ class SyntheticCamera:
         return float(np.linalg.norm(last - first, axis=1).max())
 
     def _row_by_row(self, pose: Pose, motion: PlatformMotion) -> Image32:
-        """Light of a platform whose rows are exposed one after the other, shape of the image.
+        """Light of a platform with rows exposed one after the other, in the image's shape.
 
-        Each row blends the images of the poses before and after: less than `SMEAR_STEP` apart, its
-        edges are where they would be.
+        Each row blends the images of the poses before and after; as these are closer than
+        `SMEAR_STEP`, edges are in the right position.
         """
         rows = np.zeros((self.camera.height, 2))
         rows[:, 1] = np.arange(self.camera.height)
@@ -308,7 +306,7 @@ class SyntheticCamera:
         first, last = float(of_rows.min()), float(of_rows.max())
         regions = [self._platform_region(motion.moved(pose, time)) for time in (first, last)]
         seen = [region for region in regions if not region.empty]
-        if seen:  # only rows that show it need poses
+        if seen:  # only rows that show the platform need poses
             top = max(0, min(region.slices()[0].start for region in seen) - 1)
             bottom = min(len(rows), max(region.slices()[0].stop for region in seen) + 1)
             first, last = sorted((float(of_rows[top]), float(of_rows[bottom - 1])))
@@ -317,15 +315,15 @@ class SyntheticCamera:
         times = np.linspace(*ends, count)
         within = (np.arange(_SUB_TIMES) + 0.5) / _SUB_TIMES - 0.5 if half > 0.0 else np.zeros(1)
         exposed = np.clip(of_rows[:, None] + 2.0 * half * within, *ends)
-        place = (exposed - ends[0]) / (ends[1] - ends[0]) * (count - 1)
+        index = (exposed - ends[0]) / (ends[1] - ends[0]) * (count - 1)
         light = np.zeros(self._still.shape, np.float32)
         for k, time in enumerate(times):
-            share = np.maximum(0.0, 1.0 - np.abs(place - k)).mean(axis=1)
+            share = np.maximum(0.0, 1.0 - np.abs(index - k)).mean(axis=1)
             light += share[:, None].astype(np.float32) * self._at(motion.moved(pose, float(time)))
         return light
 
     def _at(self, pose: Pose) -> Image8:
-        """The image of a platform that stands still, without noise."""
+        """The image of a platform at rest, without noise."""
         picture, depth = self._still.copy(), self._depth
         region = self._platform_region(pose)
         if not region.empty:
@@ -365,7 +363,7 @@ class SyntheticCamera:
         return np.asarray(np.clip(pixels * light + veil + 0.5, 0, 255), dtype=np.uint8)
 
     def _taken(self, picture: Image8, frame: int) -> Image8:
-        """The image that the sensor, and what processes its output, make of light."""
+        """The image after sensor noise and processing."""
         size = (self.camera.width, self.camera.height)
         noisy = self._with_noise(before_the_sensor(picture, self.optics), frame)
         return processed(noisy, size, self.optics)
@@ -377,7 +375,7 @@ class SyntheticCamera:
         height, width = picture.shape
         noise = np.ascontiguousarray(self._noise[down : down + height, right : right + width])
         noisy = np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), dtype=np.uint8)
-        np.copyto(noisy, 255, where=picture == 255)  # a full sensor gives white, whatever the noise
+        np.copyto(noisy, 255, where=picture == 255)  # a saturated pixel stays white
         return noisy
 
 
@@ -396,7 +394,7 @@ def _faces(rig: Rig) -> list[tuple[Pose, tuple[float, float]]]:
 
 
 def _noise(camera: Camera, deviation: float, seed: int) -> NDArray[np.int16]:
-    """Noise somewhat larger than an image."""
+    """Noise larger than an image by `NOISE_SLACK`."""
     shape = (camera.height + NOISE_SLACK, camera.width + NOISE_SLACK)
     values = np.random.default_rng([seed, 0xCA3E]).standard_normal(shape, dtype=np.float32)
     return np.round(values * np.float32(deviation)).astype(np.int16)

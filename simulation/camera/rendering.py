@@ -1,8 +1,8 @@
-"""What the synthetic camera draws on: brightness and depth behind every sample of the sensor.
+"""Rendering of the synthetic camera: brightness and depth of every sample of the sensor.
 
-Each pixel is sampled 2 × 2 times (drawing once a pixel moves tag corners by 0.09 px); the samples
-are averaged at the end. Every sample has its undistorted viewing ray, so that planes and triangles
-are met exactly, lens distortion included.
+Each pixel has 2 × 2 samples (one would move tag corners by 0.09 px), which are averaged at the end.
+Every sample has its undistorted viewing ray, so that planes and triangles are intersected exactly,
+including lens distortion.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from model.shapes import (
 )
 from tracking.camera_model import pixels_of
 
-#: Samples a pixel along x and along y.
+#: Samples per pixel along x and along y.
 SAMPLES = 2
-#: Surfaces nearer to each other than this count as touching: the later drawn one is seen, [m].
+#: Distance within which surfaces count as touching, so that the one drawn later is visible, [m].
 TOUCHING = 5e-4
 
 Image32 = NDArray[np.float32]
@@ -52,17 +52,17 @@ class CanvasRegion:
 
     @property
     def empty(self) -> bool:
-        """Whether it holds no pixel."""
+        """Whether it contains no pixel."""
         return self.right <= self.left or self.bottom <= self.top
 
     def slices(self, scale: int = 1) -> tuple[slice, slice]:
-        """Rows and columns, in samples when ``scale`` is `SAMPLES`."""
+        """Rows and columns, in samples if ``scale`` is `SAMPLES`."""
         rows = slice(self.top * scale, self.bottom * scale)
         return rows, slice(self.left * scale, self.right * scale)
 
 
 def region_of(camera: Camera, points_in_camera: Array, margin: int = 2) -> CanvasRegion:
-    """Pixels that the hull of points, shape (n, 3), [m], can cover; all if it is partly behind."""
+    """Pixels that the hull of points, shape (n, 3), [m], may cover; all if partly behind."""
     if np.any(points_in_camera[:, 2] < 0.02):
         return CanvasRegion(0, 0, camera.width, camera.height)
     pixels = pixels_of(camera, points_in_camera)
@@ -74,11 +74,11 @@ def region_of(camera: Camera, points_in_camera: Array, margin: int = 2) -> Canva
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Canvas:
-    """Brightness (0..255) and depth along the camera's z axis [m] of the samples of a region.
+    """Brightness (0..255) and depth along the camera's z axis [m] of a region's samples.
 
     Attributes:
-        camera: Whose samples they are.
-        region: The pixels it covers.
+        camera: Owner of the samples.
+        region: The pixels covered.
         rays: Shape (2 h, 2 w, 2).
         brightness: Shape (2 h, 2 w).
         depth: Shape (2 h, 2 w), [m].
@@ -92,14 +92,14 @@ class Canvas:
 
     @classmethod
     def blank(cls, camera: Camera, rays: Image32, brightness: float = 0.0) -> Canvas:
-        """A whole image with nothing in it."""
+        """An empty canvas of a whole image."""
         shape = rays.shape[:2]
         whole = CanvasRegion(0, 0, camera.width, camera.height)
         light = np.full(shape, brightness, dtype=np.float32)
         return cls(camera, whole, rays, light, np.full(shape, np.inf, dtype=np.float32))
 
     def part(self, region: CanvasRegion) -> Canvas:
-        """The same canvas within a region of it: a view, not a copy."""
+        """A view of a region of this canvas."""
         rows, columns = region.slices(SAMPLES)
         above, left = self.region.top * SAMPLES, self.region.left * SAMPLES
         where = (
@@ -110,31 +110,31 @@ class Canvas:
         return Canvas(self.camera, region, *views)
 
     def copy(self) -> Canvas:
-        """A canvas that can be drawn on without changing this one."""
+        """An independent copy."""
         light, depth = self.brightness.copy(), self.depth.copy()
         return Canvas(self.camera, self.region, self.rays, light, depth)
 
     def pixels(self) -> Image32:
-        """Brightness of the pixels: the mean of their samples; shape (h, w)."""
+        """Brightness of the pixels, as means of their samples, shape (h, w)."""
         size = (self.region.right - self.region.left, self.region.bottom - self.region.top)
         return np.asarray(
             cv2.resize(self.brightness, size, interpolation=cv2.INTER_AREA), dtype=np.float32
         )
 
     def within(self, points_in_camera: Array) -> Canvas | None:
-        """The part that the hull of points can cover, or None."""
+        """The part that the hull of points may cover, or None."""
         inner = region_of(self.camera, points_in_camera)
-        mine = self.region
+        own = self.region
         common = CanvasRegion(
-            max(inner.left, mine.left),
-            max(inner.top, mine.top),
-            min(inner.right, mine.right),
-            min(inner.bottom, mine.bottom),
+            max(inner.left, own.left),
+            max(inner.top, own.top),
+            min(inner.right, own.right),
+            min(inner.bottom, own.bottom),
         )
         return None if common.empty else self.part(common)
 
     def paint(self, depth: Image32, brightness: Image32, mask: NDArray[np.bool_]) -> None:
-        """Puts a surface on the canvas where it is in front of what is there."""
+        """Draws a surface where it is in front of the present content."""
         seen = mask & (depth < self.depth + np.float32(TOUCHING))
         np.copyto(self.brightness, brightness, where=seen)
         np.copyto(self.depth, depth, where=seen)
@@ -143,11 +143,11 @@ class Canvas:
 def draw_quad(
     canvas: Canvas, camera_from_quad: Pose, half_size: tuple[float, float], texture: Image32
 ) -> None:
-    """Draws a flat image, seen from its front (+z) only.
+    """Draws a flat image, visible only from its front (+z).
 
     Args:
-        canvas: What to draw on.
-        camera_from_quad: x to the right of the image, y up, z out of it.
+        canvas: Target.
+        camera_from_quad: Pose with x to the right of the image, y up, z out of it.
         half_size: Half width and half height, [m].
         texture: Brightness 0..255, shape (rows, columns).
     """
@@ -176,10 +176,10 @@ def draw_quad(
 
 
 def draw_triangles(canvas: Canvas, vertices: Array, brightness: Array) -> None:
-    """Draws triangles, both sides seen, brightness blended between their corners.
+    """Draws triangles visible from both sides, with interpolated brightness.
 
     Args:
-        canvas: What to draw on.
+        canvas: Target.
         vertices: Camera frame, shape (n, 3, 3), [m].
         brightness: Of each corner, 0..255, shape (n, 3).
     """
@@ -221,7 +221,7 @@ class Surface:
 
 
 def surface_of(shape: Shape) -> Surface:
-    """The surface of any obstacle shape; round ones within 0.4 % of their radius."""
+    """The surface of an obstacle shape; round ones are accurate to 0.4 % of their radius."""
     match shape:
         case Box():
             hull = convex_hull(shape_points(shape))
@@ -231,20 +231,20 @@ def surface_of(shape: Shape) -> Surface:
         case TriangleMesh(vertices=vertices, triangles=triangles):
             return _faceted(vertices[triangles])
         case Sphere(radius=radius):
-            return _turned(*_arc(radius, 0.0, -np.pi / 2, np.pi / 2))
+            return _revolved(*_arc(radius, 0.0, -np.pi / 2, np.pi / 2))
         case Capsule(radius=radius, length=length):
             low = _arc(radius, -length / 2, -np.pi / 2, 0.0)
             high = _arc(radius, length / 2, 0.0, np.pi / 2)
-            return _turned(np.vstack([low[0], high[0]]), np.vstack([low[1], high[1]]))
+            return _revolved(np.vstack([low[0], high[0]]), np.vstack([low[1], high[1]]))
         case Cylinder(radius=radius, length=length):
             h = length / 2
             outline = [(0, -h), (radius, -h), (radius, -h), (radius, h), (radius, h), (0, h)]
             normals = [(0, -1), (0, -1), (1, 0), (1, 0), (0, 1), (0, 1)]
-            return _turned(np.array(outline, dtype=float), np.array(normals, dtype=float))
+            return _revolved(np.array(outline, dtype=float), np.array(normals, dtype=float))
 
 
 def _faceted(vertices: Array) -> Surface:
-    """Flat triangles: one normal for all three corners."""
+    """Flat triangles, with one normal for all three corners."""
     normal = np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = normal / np.maximum(length, 1e-15)
@@ -258,8 +258,8 @@ def _arc(radius: float, height: float, start: float, end: float) -> tuple[Array,
     return radius * normals + np.array([0.0, height]), normals
 
 
-def _turned(outline: Array, normals: Array) -> Surface:
-    """Surface of revolution about z of an outline in the (r, z) plane, shapes (k, 2)."""
+def _revolved(outline: Array, normals: Array) -> Surface:
+    """Surface of revolution about z of an outline in the (r, z) plane, shape (k, 2)."""
     angles = np.linspace(0.0, 2 * np.pi, AROUND + 1)
     turn = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
@@ -278,7 +278,7 @@ def _strips(grid: Array) -> Array:
     return np.concatenate([first.reshape(-1, 3, 3), second.reshape(-1, 3, 3)])
 
 
-# Printed tags for the synthetic camera: the official images, white border included.
+# Printed tags for the synthetic camera: official images with their white border.
 
 
 #: Brightness of ink and paper in full light.
@@ -296,7 +296,7 @@ def modules_across(family: str) -> int:
 
 @lru_cache(maxsize=256)
 def tag_print(family: str, number: int, across: int, down: int) -> Image32:
-    """A tag with one module of white around it, upright as its own project draws it.
+    """A tag with one white module around it, upright as in its own project.
 
     Args:
         family: Such as ``tag36h11``.
@@ -312,10 +312,8 @@ def tag_print(family: str, number: int, across: int, down: int) -> Image32:
     return print_.repeat(down, axis=0).repeat(across, axis=1)
 
 
-# What stands still before the synthetic camera: floor with shadows, frame tags, obstacles.
-
-
-#: Direction to the lamp, world frame, and how much light the side away from it gets.
+# Background of the synthetic camera: floor with shadows, frame tags, obstacles.
+#: Direction to the lamp, world frame, and fraction of light on surfaces facing away.
 LAMP = np.array([0.35, 0.55, 0.76]) / np.linalg.norm([0.35, 0.55, 0.76])
 AMBIENT = 0.62
 ROOM, FLOOR, JOINT, EDGE = 96.0, 150.0, 122.0, 90.0
@@ -326,13 +324,13 @@ OBSTACLE_PAINT = (198.0, 172.0, 184.0, 160.0)
 
 
 def shade(normals: Array) -> Array:
-    """Share of full light on surfaces with unit normals, world frame, shape (..., 3)."""
+    """Fraction of full light on surfaces with unit normals, world frame, shape (..., 3)."""
     facing = np.clip(normals @ LAMP, 0.0, 1.0)
     return np.asarray(AMBIENT + (1.0 - AMBIENT) * facing)
 
 
 def draw_background(canvas: Canvas, rig: Rig, scene: Scene, camera_from_world: Pose) -> None:
-    """Draws all that does not move."""
+    """Draws everything that does not move."""
     surfaces = [surface_of(obstacle.shape) for obstacle in scene.obstacles]
     in_world = [_placed(s, o) for s, o in zip(surfaces, scene.obstacles, strict=True)]
     _draw_floor(canvas, rig, in_world, camera_from_world)
@@ -359,10 +357,10 @@ def draw_tag(
 
 
 def _texels(camera: Camera, camera_from_tag: Pose, module: float) -> tuple[int, int]:
-    """Texels for a module's width and height, as wide as samples where the tag is seen.
+    """Texels per module width and height, about one per sample at the tag's distance.
 
-    Interpolation between them then blurs an edge over one sample, and 2 x 2 samples show its place
-    without a bias that would hang on where it lies between the samples.
+    Interpolation then blurs an edge over one sample, so that 2 x 2 samples show its position
+    without a bias that depends on its position between the samples.
     """
     centre, rotation = camera_from_tag.position, camera_from_tag.rotation
     depth = max(0.05, float(centre[2]))
@@ -410,7 +408,7 @@ def _floor_texture(low: Array, high: Array) -> Image32:
 def _shadow(
     shape: tuple[int, ...], low: Array, high: Array, obstacles: list[Surface]
 ) -> NDArray[np.float32]:
-    """Share of the lamp's light that obstacles take from each texel of the floor."""
+    """Fraction of the lamp's light that obstacles block at each texel of the floor."""
     covered = np.zeros(shape, dtype=np.uint8)
     for surface in obstacles:
         points = surface.vertices

@@ -1,7 +1,7 @@
-"""What simulated CiA 402 drives do that standards allow and makers' drives do, each by a name.
+"""Named behaviours of simulated CiA 402 drives that the standards allow and real drives show.
 
-`STRICT` is the default: it holds a master to CiA 301 and CiA 402 literally. There is no kinder
-preset; every other behaviour makes life harder.
+`STRICT` is the default, which enforces CiA 301 and CiA 402 literally. There is no more lenient
+preset; other behaviours add difficulties.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ def _nothing() -> Mapping[Any, Any]:
 
 @dataclass(frozen=True, slots=True)
 class DriveBehaviour:
-    """Where the standards leave a choice, and what makers' drives are known to do.
+    """Choices within the standards, and known deviations of real drives.
 
     Attributes:
-        sync_periods: SYNC is overdue after this many periods of 1006h.
-        heartbeat_loss_is_fault: A lost heartbeat is a fault, whatever 6007h says.
-        maps_when_operational: A PDO that is off can be mapped in NMT operational, too.
-        sdo_delay: Every SDO answer takes this long, [s].
-        sdo_late: Every seventh SDO answer takes this much longer, [s].
-        sdo_twice: Every SDO answer comes again this much later, [s]; None: once.
-        sdo_lost: Every SDO answer of this number is lost; 0: none.
-        absent: Abort code by index and sub-index (None: all) of objects that the drive has not got.
-        ranges: Smallest and largest value by object, in place of the EDS file's.
-        mode_delay: The mode (6061h) follows 6060h so late, [s].
-        mode_when_enabled: And it does so only while the drive is enabled.
-        warning: EMCY code of a warning that comes and goes while the drive stays enabled; 0: none.
+        sync_periods: SYNC is overdue after this number of periods of 1006h.
+        heartbeat_loss_is_fault: A lost heartbeat is a fault, regardless of 6007h.
+        maps_when_operational: A disabled PDO can be mapped in NMT operational too.
+        sdo_delay: Delay of every SDO answer, [s].
+        sdo_late: Additional delay of every seventh SDO answer, [s].
+        sdo_twice: Delay after which every SDO answer is repeated, [s]; None: never.
+        sdo_lost: Every N-th SDO answer is lost; 0: none.
+        absent: Abort code by index and sub-index (None: all) of missing objects.
+        ranges: Smallest and largest value by object, replacing the EDS file's.
+        mode_delay: Delay of the mode (6061h) after 6060h, [s].
+        mode_when_enabled: The mode follows only while the drive is enabled.
+        warning: EMCY code of a warning that comes and goes while enabled; 0: none.
         flicker: Bits 4, 7 and 8 to 15 of the status word change at every SYNC.
-        boot_delay: Time from switching on or a reset to the boot-up message, [s].
+        boot_delay: Time from power-on or reset to the boot-up message, [s].
         position_noise: Standard deviation of 6064h, [counts].
         torque_noise: Standard deviation of 6077h, [per mille].
-        friction: Torque that turns the drive train and no cable feels, [per mille].
-        stick: The motor stands until its following error is so large, then jumps, [counts].
+        friction: Friction torque of the drive train, [per mille].
+        stick: Following error at which a resting motor jumps, [counts].
     """
 
     sync_periods: float = 3.0
@@ -67,7 +67,7 @@ class DriveBehaviour:
 
     @property
     def answers_late(self) -> bool:
-        """Something that a master asks for comes only after time has passed."""
+        """Whether some answers to a master are delayed."""
         late = (self.sdo_delay, self.sdo_late, self.sdo_twice, self.boot_delay, self.mode_delay)
         return any(late)
 
@@ -77,20 +77,20 @@ STRICT = DriveBehaviour()
 
 @dataclass(frozen=True, slots=True)
 class NamedBehaviour:
-    """One line of the table.
+    """One entry of the table of behaviours.
 
     Attributes:
-        name: What the command line calls it.
-        value: What its value means; empty where it takes none.
-        example: The value in the text of ``list``, and the default; empty: a value is needed.
-        says: What the drive does, in one line.
-        put: A behaviour with it, from one without it and the value.
+        name: Name on the command line.
+        value: Meaning of its value; empty if it takes none.
+        example: Default value, shown by ``list``; empty if a value is required.
+        text: Description in one line.
+        put: Returns a behaviour with this one added, given the value.
     """
 
     name: str
     value: str
     example: str
-    says: str
+    text: str
     put: Callable[[DriveBehaviour, str], DriveBehaviour]
 
 
@@ -274,20 +274,20 @@ _BY_NAME = {behaviour.name: behaviour for behaviour in BEHAVIOURS}
 
 
 def behaviour_named(names: Iterable[str], base: DriveBehaviour = STRICT) -> DriveBehaviour:
-    """The behaviour with all of these names, each ``NAME`` or ``NAME=VALUE``.
+    """The behaviour with the given names, each ``NAME`` or ``NAME=VALUE``.
 
     Raises:
-        BadInput: A name is unknown, or its value has no meaning.
+        BadInput: A name is unknown, or its value is invalid.
     """
     for text in names:
         name, equals, value = text.partition("=")
         named = _BY_NAME.get(name)
         if named is None:
             raise BadInput(
-                f"there is no behaviour {name!r} of a simulated drive",
+                f"there is no behaviour {name!r} of simulated drives",
                 where="--drive-behaviour",
-                why="there are: " + ", ".join(_BY_NAME),
-                next_step="`cdpr sim RIG --drive-behaviour list` explains them",
+                why="known behaviours: " + ", ".join(_BY_NAME),
+                next_step="list them with `cdpr sim RIG --drive-behaviour list`",
             )
         if equals and not named.value:
             raise BadInput(f"{name} takes no value", where="--drive-behaviour")
@@ -297,12 +297,12 @@ def behaviour_named(names: Iterable[str], base: DriveBehaviour = STRICT) -> Driv
             raise BadInput(
                 f"{text!r} is not valid",
                 where="--drive-behaviour",
-                why=f"{name} needs a value: {name}={named.value}; {named.says}",
-                next_step="`cdpr sim RIG --drive-behaviour list` explains it",
+                why=f"{name} needs a value: {name}={named.value}; {named.text}",
+                next_step="see `cdpr sim RIG --drive-behaviour list`",
             ) from None
     return base
 
 
 def table() -> list[tuple[str, str]]:
-    """Name with its value, and what it does, of each behaviour."""
-    return [(b.name + (f"={b.value}" if b.value else ""), b.says) for b in BEHAVIOURS]
+    """Name with value, and description, of each behaviour."""
+    return [(b.name + (f"={b.value}" if b.value else ""), b.text) for b in BEHAVIOURS]

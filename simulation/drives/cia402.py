@@ -1,9 +1,9 @@
-"""A simulated CiA 402 drive on a CANopen bus; it knows the standards, not the master.
+"""A simulated CiA 402 drive on a CANopen bus, based on the standards, independent of the master.
 
-It is built from an EDS file and does what CiA 301 and CiA 402 allow, to the letter; what they
-leave to the maker is a `DriveBehaviour`. Set-points are taken and replies sent at SYNC; a reply
-shows what was so at that SYNC, before the new set-point acts. Time goes on only by `advance`. The
-drive has a brake that is closed whenever there is no torque, so that its drum stays where it is.
+It is built from an EDS file and follows CiA 301 and CiA 402 literally; manufacturer-specific
+choices are a `DriveBehaviour`. Set-points take effect and replies are sent at SYNC; a reply shows
+the state at that SYNC, before the new set-point. Time advances only by `advance`. The drive has a
+brake that is closed whenever there is no torque, so that its drum holds its position.
 
 Source: CiA 301 (4.2), CiA 402-2.
 """
@@ -74,8 +74,8 @@ _SYNC, _BOOT = "sync", "boot"
 _FLICKERING = 0xFF90
 
 _REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x8: 0x10, 0xF: 0x80}
-"""Of 1001h by the first digit of an error code: current, voltage, temperature, communication,
-the maker's; each beside bit 0, generic error."""
+"""Bits of 1001h by the first digit of an error code: current, voltage, temperature, communication,
+manufacturer-specific; each in addition to bit 0, generic error."""
 
 
 class SimulatedDrive(PowerStage):
@@ -88,7 +88,7 @@ class SimulatedDrive(PowerStage):
         motor: What it moves.
         nmt: NMT state.
         torque: Actual torque, set by the plant, [per mille of rated torque].
-        silent: It hears and says nothing, as with its bus cable pulled (set from outside).
+        silent: It neither receives nor sends, as with its bus cable unplugged (set from outside).
     """
 
     def __init__(
@@ -102,16 +102,16 @@ class SimulatedDrive(PowerStage):
         behaviour: DriveBehaviour = STRICT,
         counts_per_turn: float = 4096.0,
     ) -> None:
-        """Switches a drive on: it announces itself and waits in PRE-OPERATIONAL.
+        """Powers the drive on: it sends boot-up and waits in PRE-OPERATIONAL.
 
         Args:
             node: CANopen node id.
             position: Of the motor, [counts].
             top_speed: Of the motor, [counts/s].
-            send: Puts a frame (identifier, data) on the bus.
-            eds: Its objects; left out, those of the profile ``cia402``.
-            behaviour: What it does where the standards leave a choice.
-            counts_per_turn: Of the motor shaft, for a drive that counts speed in revolutions.
+            send: Sends a frame (identifier, data).
+            eds: Its objects (default: those of the profile ``cia402``).
+            behaviour: Choices within the standards.
+            counts_per_turn: Of the motor shaft, for drives with speed in revolutions.
         """
         motor = Motor(position, position, top_speed, stick=behaviour.stick)
         super().__init__(motor, behaviour, counts_per_turn, seed=node)
@@ -122,7 +122,7 @@ class SimulatedDrive(PowerStage):
         self.power_on()
 
     def power_on(self) -> None:
-        """Starts, or starts again: everything set up is lost, the motor stays where it is."""
+        """Starts or restarts: the configuration is lost, the motor keeps its position."""
         self.objects = DriveObjects(self._eds, self.node, self.behaviour)
         for (index, sub), read in (
             (STATUS_WORD, self._status_shown),
@@ -139,7 +139,7 @@ class SimulatedDrive(PowerStage):
         self._boot()
 
     def _boot(self) -> None:
-        """After switching on, or a reset of the communication."""
+        """Boots after power-on or a reset of the communication."""
         self.nmt = NmtState.BOOT_UP
         self._server = SdoServer(self.objects, self.behaviour, self._answer)
         self._deadlines = Deadlines()
@@ -160,10 +160,10 @@ class SimulatedDrive(PowerStage):
         self._send(HEARTBEAT_BASE + self.node, make_heartbeat(NmtState.BOOT_UP))
 
     def until_answer(self, with_mode: bool = False) -> float:
-        """Time until something that was asked for is there, [s]; infinity where nothing will be.
+        """Time until the next answer, [s]; infinity if none is due.
 
         Args:
-            with_mode: The mode, which comes late, is asked for, too.
+            with_mode: Also wait for a delayed mode.
         """
         if self.nmt is BOOT_UP or (with_mode and MODE_FOLLOWS in self._deadlines):
             due = min(self._deadlines.earliest, self._server.next_due)
@@ -173,11 +173,11 @@ class SimulatedDrive(PowerStage):
 
     @property
     def pdo_ids(self) -> list[int]:
-        """Identifiers of the RPDOs that it takes."""
+        """Identifiers of the valid RPDOs."""
         return list(self._pdos.received)
 
     def advance(self, elapsed: float) -> None:
-        """Lets time pass, [s]: the motor moves, time-outs run, what is late goes out."""
+        """Advances time, [s]: the motor moves, time-outs run, delayed frames are sent."""
         if elapsed <= 0.0:
             return
         now = self._now = self._now + elapsed
@@ -194,14 +194,14 @@ class SimulatedDrive(PowerStage):
             self._server.deliver(now)
 
     def on_sync(self) -> None:
-        """SYNC: reply with what is, then act on the set-points that were waiting."""
+        """SYNC: sends replies with the present state, then applies the waiting set-points."""
         if self.silent or self.nmt is not OPERATIONAL:
             return
         self._window_ends = self._now + self._sync_window if self._sync_window else inf
         if self._sync_timeout:
             self._deadlines.expect(_SYNC, self._now + self._sync_timeout)
             if self._errors:
-                self._recovered(_SYNC)
+                self._clear_error(_SYNC)
         if self.behaviour.flicker:
             self._flicker = self._random.getrandbits(16) & _FLICKERING
         for pdo in self._pdos.sent:
@@ -213,31 +213,31 @@ class SimulatedDrive(PowerStage):
                 self._take(received, values)
 
     def on_set_point(self, data: Frame) -> None:
-        """RPDO1 with its usual identifier."""
+        """RPDO1 with its default identifier."""
         self.on_pdo(RPDO1_BASE + self.node, data)
 
     def on_pdo(self, can_id: int, data: Frame) -> None:
-        """An RPDO: parsed by the current mapping, kept until the next SYNC if it is synchronous."""
+        """An RPDO: unpacked by the current mapping, kept until the next SYNC if synchronous."""
         if self.silent or self.nmt is not OPERATIONAL:
             return
         pdo = self._pdos.received.get(can_id)
         if pdo is None:
             return
         if len(data) != pdo.form.size:
-            self._comes_amiss((PDO_LENGTH, pdo.number), PDO_LENGTH)
+            self._raise_error((PDO_LENGTH, pdo.number), PDO_LENGTH)
             return
         if pdo.deadline:
             self._deadlines.expect(pdo.number, self._now + pdo.deadline)
         if self._errors:
-            self._recovered((PDO_LENGTH, pdo.number))
-            self._recovered(pdo.number)
+            self._clear_error((PDO_LENGTH, pdo.number))
+            self._clear_error(pdo.number)
         values = pdo.form.unpack(data)
         if pdo.synchronous:
             if self._now > self._window_ends + TOLERANCE:
-                self._comes_amiss((PDO_LATE, pdo.number), PDO_LATE)
+                self._raise_error((PDO_LATE, pdo.number), PDO_LATE)
                 return
             if self._errors:
-                self._recovered((PDO_LATE, pdo.number))
+                self._clear_error((PDO_LATE, pdo.number))
             self._waiting[pdo.number] = pdo, values
         else:
             self._take(pdo, values)
@@ -269,16 +269,16 @@ class SimulatedDrive(PowerStage):
             self._boot()
 
     def on_heartbeat(self, node: int, data: Frame) -> None:
-        """The heartbeat of another node; watched from the first one on."""
+        """The heartbeat of another node; monitored from the first one."""
         if node not in self._watched or self.silent or self.nmt is BOOT_UP:
             return
         if len(data) == 1:
             self._deadlines.expect((LIFE_GUARD, node), self._now + self._watched[node])
             if self._errors:
-                self._recovered((LIFE_GUARD, node))
+                self._clear_error((LIFE_GUARD, node))
 
     def _judge(self, key: Key, value: int) -> int:
-        """Abort code of a write by SDO that the drive does not take now."""
+        """Abort code of an SDO write in the present state; 0 to accept it."""
         index, sub = key
         if index in RPDO or index in TPDO or index in RPDO_MAP or index in TPDO_MAP:
             pre_operational = self.nmt is NmtState.PRE_OPERATIONAL
@@ -299,7 +299,7 @@ class SimulatedDrive(PowerStage):
         return bool(value & 0xFFFF) and any(e >> 16 & 0x7F == node and e & 0xFFFF for e in others)
 
     def _on_changed(self, key: Key, value: int) -> None:
-        """An object has another value."""
+        """Reacts to a changed object."""
         index = key[0]
         if index in RPDO or index in TPDO or index in RPDO_MAP or index in TPDO_MAP:
             if index in TPDO:
@@ -323,17 +323,17 @@ class SimulatedDrive(PowerStage):
             self._read_settings()
 
     def _drop_remote_bit(self, key: Key, value: int) -> None:
-        """Bit 30 of a TPDO's COB-ID: it answers no remote request, and keeps no bit for it."""
+        """Clears bit 30 of a TPDO's COB-ID, as remote requests are not supported."""
         if key[1] == 1:
             self.objects.note(key, value & ~(1 << 30))
 
     def _read_settings(self) -> None:
-        """What time-outs need, so that `advance` need not look objects up."""
+        """Caches settings of time-outs, so that `advance` reads no objects."""
         self._read_motion_settings()
         get = self.objects.get
         self._heartbeat_period = get((0x1017, 0), 0) / 1000.0
         self._sync_timeout = self.behaviour.sync_periods * get((0x1006, 0), 0) / 1e6
-        #: Of synchronous RPDOs after SYNC, [s]; 0: without end.
+        #: Of synchronous RPDOs after SYNC, [s]; 0: unlimited.
         self._sync_window = get((0x1007, 0), 0) / 1e6
         if not self._sync_timeout:
             self._deadlines.forget(_SYNC)
@@ -346,7 +346,7 @@ class SimulatedDrive(PowerStage):
         return {e >> 16 & 0x7F: (e & 0xFFFF) / 1000.0 for e in taken if e & 0xFFFF}
 
     def _on_deadlines(self) -> None:
-        """Something has not come in time, or happens by itself at a time."""
+        """Handles passed deadlines: missing messages, and timed events."""
         for what in self._deadlines.passed(self._now):
             if what == _BOOT:
                 self._booted()
@@ -355,17 +355,17 @@ class SimulatedDrive(PowerStage):
             elif what == WARNING_CHANGES:
                 self._warn()
             elif what == _SYNC:
-                self._comes_amiss(_SYNC, SYNC_OVERDUE)
+                self._raise_error(_SYNC, SYNC_OVERDUE)
                 self._connection_lost(SYNC_OVERDUE)
             elif isinstance(what, int):
-                self._comes_amiss(what, SET_POINT_OVERDUE)
+                self._raise_error(what, SET_POINT_OVERDUE)
                 self._connection_lost(SET_POINT_OVERDUE)
             else:
-                self._comes_amiss(what, LIFE_GUARD)
+                self._raise_error(what, LIFE_GUARD)
                 self._lose_heartbeat()
 
     def _lose_heartbeat(self) -> None:
-        """A node that is watched by 1016h is silent: 6007h, and 1029h:01 for the NMT state."""
+        """Loss of a heartbeat in 1016h: reaction by 6007h, and by 1029h:01 for the NMT state."""
         if self.behaviour.heartbeat_loss_is_fault:
             self._fault_code = LIFE_GUARD
             self._react_to_fault()
@@ -378,7 +378,7 @@ class SimulatedDrive(PowerStage):
             self._leave_operational(NmtState.PRE_OPERATIONAL)
 
     def _leave_operational(self, nmt: NmtState) -> None:
-        """Process data, and the watch over them, stop."""
+        """Stops process data and their monitoring."""
         self.nmt = nmt
         self._waiting.clear()
         for what in self._deadlines.kept():
@@ -398,25 +398,25 @@ class SimulatedDrive(PowerStage):
         elif option == 3:
             self._command_quick_stop()
 
-    def _comes_amiss(self, what: object, code: int) -> None:
-        """An error of the communication: reported once, until it is over."""
+    def _raise_error(self, what: object, code: int) -> None:
+        """A communication error: reported once until it is cleared."""
         if what not in self._errors:
             self._errors[what] = code
             self._emergency(code)
 
-    def _recovered(self, what: object) -> None:
-        """It is over: EMCY 0000h, with what is left in the error register."""
+    def _clear_error(self, what: object) -> None:
+        """The error is over: EMCY 0000h, with the remaining error register."""
         if self._errors.pop(what, None) is not None:
             self._emergency(0)
 
     def _take(self, pdo: ReceivePdo, values: tuple[int, ...]) -> None:
-        """The data of an RPDO act; the control word last, so that a target is there before it."""
+        """Applies the data of an RPDO, the control word last, after the target."""
         self.objects.keep(pdo.keys, values)
         for at, key in pdo.acting:
             self._write(key, values[at])
 
     def _write(self, key: Key, value: int) -> None:
-        """An object that acts at once, by RPDO or SDO."""
+        """Writes an object that takes effect at once, by RPDO or SDO."""
         if key == TARGET:
             self._take_target(value)
         elif key == CONTROL_WORD:
@@ -425,7 +425,7 @@ class SimulatedDrive(PowerStage):
             self._take_mode(value)
 
     def _emergency(self, code: int) -> None:
-        """EMCY: an error has come (code), or one has gone (0)."""
+        """Sends EMCY: an error occurred (code), or one is over (0)."""
         active = [*self._errors.values(), self._fault_code, code]
         register = 0
         for one in active:

@@ -10,7 +10,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from drivers.can_bus import take
+from drivers.can_bus import receive_frame
 from drivers.cia402.pdo import (
     HEARTBEAT_BASE,
     MASTER_NODE,
@@ -32,22 +32,22 @@ from simulation.drives.pdo import TOLERANCE
 from simulation.rig import Frame, SimulatedRig
 
 PDO_IDS = range(TPDO1_BASE, SDO_REPLY_BASE)
-"""Identifiers that process data may have."""
+"""Identifiers of process data."""
 
 PATIENCE = 2.0
-"""Simulated time that a request from this thread waits for its answer, at most, [s]."""
+"""Longest simulated time that passes while a request awaits its answer, [s]."""
 
 FINEST = 0.001
-"""Shorter times are added up before the drives are stepped, [s], which costs less."""
+"""Smallest time step of the drives, [s]; shorter times are accumulated."""
 
 
 class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
-    """CiA 402 drives and their platform; as in real drives, their time is locked to SYNC.
+    """CiA 402 drives and their platform, with time locked to SYNC as in real drives.
 
-    One cycle passes from one SYNC to the next, however they jitter, and more only while none comes.
-    Positions that a SYNC asks for are those at that SYNC. Torques are those that the drives felt
-    when all stood as at the SYNC before, as in a drive that filters them: one cycle old, or more
-    where `serve` took longer to find the platform's place.
+    Exactly one cycle passes between two SYNCs regardless of jitter, and more only while none
+    arrives. Replies contain the positions at their SYNC. Torques belong to the positions at the
+    previous SYNC, as in a drive that filters them, or are older if `serve` took longer to find the
+    platform's equilibrium.
     """
 
     def __init__(
@@ -60,15 +60,15 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
         behaviour: DriveBehaviour = STRICT,
         eds: Path | None = None,
     ) -> None:
-        """Switches the drives on; the first arguments and errors as for `SimulatedRig`.
+        """Powers the drives on; the first arguments and errors as for `SimulatedRig`.
 
         Args:
             rig: The robot.
-            bus: An open bus for the drives; the caller's.
+            bus: An open bus for the drives, owned by the caller.
             start_pose: ``world_from_platform``.
-            load: What the platform carries.
-            behaviour: What the drives do where the standards leave a choice.
-            eds: Their EDS file; left out, that of the rig file's drive profile.
+            load: Payload of the platform.
+            behaviour: Choices within the standards.
+            eds: EDS file (default: that of the rig file's drive profile).
 
         Raises:
             BadInput: The EDS file cannot be used.
@@ -80,11 +80,11 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
         self._pdo_handlers: dict[int, Callable[[int, Frame], None]] | None = None
         self._cyclic = {SYNC_ID, *(RPDO1_BASE + drive.node for drive in self.drives)}
         self._begun = False
-        self._passed = 0.0  # of the drives' time since the last SYNC
-        self._waited = 0.0  # and what is too short for a step
+        self._passed = 0.0  # the drives' time since the last SYNC
+        self._waited = 0.0  # accumulated time too short for a step
 
     def _torque_per_newton(self) -> Array:
-        """In per mille of rated torque."""
+        """Torque per newton, [per mille of rated torque]."""
         one_newton = np.ones(self._rig.cable_count)
         per_mille: Array = winding_signs(self._rig) * self._rig.torques_by(one_newton)
         return per_mille
@@ -106,15 +106,15 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
         return self.behaviour.friction
 
     def pump(self) -> None:
-        """Works off every frame that waits, and answers; each cycle of the master lets one pass.
+        """Processes every waiting frame; time advances by one cycle per cycle of the master.
 
-        A cycle begins with the first of its set-points, or with its SYNC where none came.
+        A cycle begins with its first set-point, or with its SYNC if there is none.
 
         Raises:
             Fault: The bus failed, or the platform has no equilibrium.
         """
         idle, synced = True, False
-        while (message := take(self._bus, 0.0)) is not None:
+        while (message := receive_frame(self._bus, 0.0)) is not None:
             idle = False
             if message.arbitration_id in self._cyclic and not self._begun:
                 self._advance(self._cycle)
@@ -122,15 +122,15 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
             is_sync = message.arbitration_id == SYNC_ID
             self._begun, synced = self._begun and not is_sync, synced or is_sync
             self._handle(message)
-            self._finish_feeling()
+            self._finish_torque_update()
         if self.behaviour.answers_late and not self._begun and not synced:
             self._wait_for_answers(idle)
 
     def _wait_for_answers(self, idle: bool) -> None:
-        """A master that asked something waits for the answer: time passes until the next is out.
+        """Advances time until the next answer, for which the master waits.
 
-        One that sends SYNC meanwhile does not wait: its cycles let the time pass. When it says
-        nothing it waits for the mode that it chose, if that comes late.
+        With SYNC, the master's cycles advance the time instead. An idle master waits for a delayed
+        mode.
         """
         wait = min(drive.until_answer(idle) for drive in self.drives)
         if wait < inf:
@@ -141,14 +141,14 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
         if message is not None and message.arbitration_id == SYNC_ID:
             self._advance(self._cycle - self._passed)
             self._passed = self._waited = 0.0
-        elif self._waited >= FINEST:  # time passes whatever else is said on the bus
+        elif self._waited >= FINEST:  # time passes regardless of other frames
             step = min(self._waited, self._cycle)
             self._advance(step)
             self._passed += step
             self._waited = 0.0
 
     def _routes(self) -> dict[int, Callable[[Frame], None]]:
-        """What to do with each identifier."""
+        """Handler of each identifier."""
         routes: dict[int, Callable[[Frame], None]] = {
             NMT_ID: self._on_nmt,
             SYNC_ID: self._on_sync,
@@ -159,7 +159,7 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
         return routes
 
     def _routes_of_pdos(self) -> dict[int, Callable[[int, Frame], None]]:
-        """What to do with the identifiers of RPDOs, which the drives' objects say."""
+        """Handler of each RPDO identifier, from the drives' objects."""
         return {can_id: drive.on_pdo for drive in self.drives for can_id in drive.pdo_ids}
 
     def _handle(self, message: can.Message) -> None:
@@ -178,15 +178,15 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
             handler(message.data)
 
     def _on_sdo(self, drive: SimulatedDrive, data: Frame) -> None:
-        self._pdo_handlers = None  # it may set process data up
+        self._pdo_handlers = None  # the request may change process data
         drive.on_sdo(data)
 
     def _on_sync(self, data: Frame) -> None:
-        """The drives answer before the platform's place is looked for, which may take long."""
+        """The drives reply before the search for the platform's equilibrium, which may be slow."""
         self.cycles += 1
         for drive in self.drives:
             drive.on_sync()
-        self._feel()
+        self._begin_torque_update()
 
     def _on_nmt(self, data: Frame) -> None:
         if len(data) == 2:
@@ -200,7 +200,7 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
                 drive.on_heartbeat(node, data)
 
     def _send(self, can_id: int, data: Frame) -> None:
-        """On the bus, and to the other drives, which sit on the same end of it."""
+        """Sends to the bus and to the other drives, which share this end of it."""
         super()._send(can_id, data)
         if can_id > HEARTBEAT_BASE:
             self._on_heartbeat(can_id - HEARTBEAT_BASE, data)

@@ -1,7 +1,7 @@
-"""EDS files: which objects a drive has, who may read and write them, their ranges and defaults.
+"""EDS files: a drive's objects with access, ranges and defaults.
 
-Source: CiA 306. Makers' files deviate in small ways, which are read as they are meant: hexadecimal
-limits of signed types, `$NODEID` before or after the sum, other encodings than ASCII.
+Source: CiA 306. Common deviations of manufacturers' files are accepted: hexadecimal limits of
+signed types, `$NODEID` before or after the sum, other encodings than ASCII.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Key = tuple[int, int]
 
 EDS_FOLDER = Path(__file__).parent / "eds"
 EDS_LIMIT = 4 * MEGABYTE
-"""Of a file, [bytes]; makers' files have a tenth of it."""
+"""Largest size of a file, [bytes]; manufacturers' files have a tenth of it."""
 
 _SECTION = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
 _RECORD, _ARRAY = 0x8, 0x9
 _REALS = {0x08: "<f", 0x11: "<d"}
 _SIGNED = {0x02: 1, 0x03: 2, 0x04: 4, 0x10: 3, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8}
 _UNSIGNED = {0x01: 1, 0x05: 1, 0x06: 2, 0x07: 4, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8}
-_UNSIGNED |= {0x08: 4, 0x11: 8}  # reals travel as their bits
+_UNSIGNED |= {0x08: 4, 0x11: 8}  # reals as their bits
 _UNSIGNED_8 = 0x05
 
 
@@ -38,17 +38,17 @@ class ObjectDescription:
     """One object of a drive.
 
     Attributes:
-        name: As the file says.
-        length: In bytes; 0 for a text or a domain, which may have any.
+        name: As in the file.
+        length: In bytes; 0 for a text or a domain of any length.
         signed: The value is a signed integer.
         readable: By SDO.
         writable: By SDO.
         to_rpdo: It can be mapped to an RPDO.
         to_tpdo: It can be mapped to a TPDO.
-        default: After switching on; an integer, or the bytes of a text.
+        default: Value after power-on: an integer, or the bytes of a text.
         of_node: The node id is added to the default.
-        low: Smallest value, if the file names one.
-        high: Largest value, if the file names one.
+        low: Smallest value, if stated.
+        high: Largest value, if stated.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Eds:
     Attributes:
         path: Of the file.
         objects: By index and sub-index.
-        dummies: Data types that may fill gaps in an RPDO, by the file's ``DummyUsage``.
+        dummies: Data types that may fill gaps in an RPDO (``DummyUsage``).
     """
 
     path: Path
@@ -83,7 +83,7 @@ def profile_path(profile: str) -> Path:
     """The EDS file of a drive profile.
 
     Raises:
-        BadInput: There is none of that name.
+        BadInput: There is none for this profile.
     """
     path = EDS_FOLDER / f"{profile}.eds"
     if not path.is_file():
@@ -91,14 +91,14 @@ def profile_path(profile: str) -> Path:
         raise BadInput(
             f"the simulation has no EDS file for the drive profile {profile!r}",
             where="drives.profile",
-            why=f"it has: {known}",
-            next_step="choose one of them, or pass the maker's file with --eds",
+            why=f"known profiles: {known}",
+            next_step="choose one of them, or pass the manufacturer's file with --eds",
         )
     return path
 
 
 def eds_of(rig: Rig, path: Path | None = None) -> Eds:
-    """The objects of a rig's simulated drives: a file's, or those of its drive profile.
+    """The objects of a rig's simulated drives, from a file or for its drive profile.
 
     Raises:
         BadInput: There is no such file, or it cannot be used.
@@ -111,7 +111,7 @@ def read_eds(path: Path) -> Eds:
     """Reads an EDS file.
 
     Raises:
-        BadInput: The file cannot be read, has no objects, or a line in it has no meaning.
+        BadInput: The file cannot be read, has no objects, or contains an invalid line.
     """
     parser = configparser.ConfigParser(
         interpolation=None, strict=False, delimiters=("=",), comment_prefixes=(";",)
@@ -157,7 +157,7 @@ def _text(path: Path) -> str:
 def _described(
     index: int, sub: int, section: Mapping[str, str], where: str
 ) -> dict[Key, ObjectDescription]:
-    """What one section describes: a variable, or an array in its compact form."""
+    """Objects of one section: a variable, or a compact array."""
     kind = _number(section.get("objecttype", ""), where)[0] or 0x7
     compact = _number(section.get("compactsubobj", ""), where)[0] or 0
     if not 0 <= compact <= 254:
@@ -215,14 +215,14 @@ def _limit(text: str, length: int, signed: bool, where: str) -> int | None:
     try:
         value = _number(text, where)[0]
     except BadInput:
-        if "." in text:  # of a real
+        if "." in text:  # a real number
             return None
         raise
     return None if value is None else _wrapped(value, length, signed)
 
 
 def _number(text: str, where: str) -> tuple[int | None, bool]:
-    """The value, None where there is none; and whether the node id is to be added."""
+    """The value, None if empty; and whether the node id is added."""
     plain = text.strip().upper().replace(" ", "")
     of_node = "$NODEID" in plain
     plain = plain.replace("$NODEID", "").strip("+")
@@ -235,6 +235,6 @@ def _number(text: str, where: str) -> tuple[int | None, bool]:
 
 
 def _wrapped(value: int, length: int, signed: bool) -> int:
-    """0xFF of a signed byte is −1."""
+    """Value as a signed integer; 0xFF of a signed byte is −1."""
     bits = 8 * length
     return value - (1 << bits) if signed and value >= 1 << (bits - 1) else value

@@ -1,4 +1,4 @@
-"""How the motor of a simulated drive moves: following set-points, ramping down, holding. Pure."""
+"""Motion of a simulated drive's motor: following set-points, ramping down, holding. Pure."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass
 
 @dataclass(slots=True)
 class Motor:
-    """Position of a motor shaft and what it is made to do.
+    """Position of a motor shaft, and its demand.
 
     Attributes:
         position: Actual position, [counts].
-        demand: Position the controller wants now, [counts].
+        demand: Position demanded by the controller, [counts].
         speed: Of the demand, [counts/s].
-        top_speed: The motor cannot turn faster, [counts/s].
-        jammed: The shaft does not turn at all (set from outside).
-        stick: It stands until it lags so far behind, then jumps, [counts]; 0 where it runs freely.
+        top_speed: Largest speed of the motor, [counts/s].
+        jammed: The shaft does not move (set from outside).
+        stick: Following error at which a resting motor jumps, [counts]; 0 without stick-slip.
     """
 
     position: float
@@ -28,17 +28,17 @@ class Motor:
 
     @property
     def following_error(self) -> float:
-        """Demand less actual position, [counts]."""
+        """Demand minus actual position, [counts]."""
         return self.demand - self.position
 
     def follow(self, target: float, time_left: float, elapsed: float, load: int) -> None:
-        """Interpolates towards a target that is to be reached after ``time_left`` [s].
+        """Interpolates towards a target due after ``time_left`` [s].
 
         Args:
             target: [counts].
             time_left: Until the target is due, before this step, [s].
             elapsed: Length of this step, [s].
-            load: Sign of the direction in which the torque limit lets the motor not move; or 0.
+            load: Sign of the direction blocked by the torque limit, or 0.
         """
         if time_left <= elapsed:
             moved = target - self.demand
@@ -51,25 +51,25 @@ class Motor:
     def ramp_down(self, deceleration: float, elapsed: float, load: int) -> None:
         """Slows down at a rate [counts/s²] and then holds; ``load`` as for `follow`."""
         stopping = min(elapsed, abs(self.speed) / deceleration)
-        slowed = 0.0  # in full: what rounding leaves of a speed may be too little ever to pass
+        slowed = 0.0  # exactly: a rounding remainder of the speed might never decay
         if stopping == elapsed:
             slowed = self.speed - math.copysign(deceleration * stopping, self.speed)
         self.demand += 0.5 * (self.speed + slowed) * stopping
         self.speed = slowed
         self._turn(elapsed, load)
 
-    def yield_to(self, load: int, way: float) -> None:
-        """A motor at its torque limit: the load turns it back, or it comes back against the load.
+    def yield_to(self, load: int, distance: float) -> None:
+        """Moves a motor at its torque limit, back with the load or forward against it.
 
         Args:
             load: Sign of the direction in which the motor pulls.
-            way: That way, at most to where the controller wants it, [counts]; negative against it.
+            distance: Motion in that direction, [counts], up to the demand; negative with the load.
         """
         if not self.jammed:
-            self.position += load * min(way, max(0.0, self.following_error * load))
+            self.position += load * min(distance, max(0.0, self.following_error * load))
 
     def release(self) -> None:
-        """Torque off, brake closed: the shaft stays, the demand goes to it."""
+        """Torque off, brake closed: the shaft stays, and the demand is set to it."""
         self.demand, self.speed = self.position, 0.0
 
     def _turn(self, elapsed: float, load: int) -> None:
@@ -98,7 +98,7 @@ _SECONDS = {0x00: 1.0, 0x03: 1.0, 0x47: 60.0, 0x56: 1.0, 0x57: 1.0}
 
 
 def counts_in(unit: int, counts_per_turn: float) -> float | None:
-    """Counts, counts/s or counts/s² in one of a unit; None for a unit that is not known here.
+    """Counts, counts/s or counts/s² in one unit; None for an unknown unit.
 
     Args:
         unit: Value of 60A8h, 60A9h or 60AAh; 0 for counts.

@@ -1,4 +1,4 @@
-"""The object dictionary of a simulated drive: what it has, what it starts with, what it refuses."""
+"""The object dictionary of a simulated drive: objects, defaults, refusals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SIMULATED = {
     (0x1009, 0): b"none",
     (0x100A, 0): b"simulation",
 }
-"""Whatever the EDS file says: a simulated drive must not pass for the maker's."""
+"""Override the EDS file: a simulated drive must not be mistaken for a real one."""
 
 
 class Abort(Exception):
@@ -42,17 +42,17 @@ class Abort(Exception):
 
 
 class DriveObjects:
-    """Values of a drive's objects, as its EDS file describes them.
+    """Values of a drive's objects, as described by its EDS file.
 
     Attributes:
-        refusals: Abort code by object, for drives that refuse something (tests set it).
-        stuck: Objects that take a value and do not keep it (tests set it).
-        judge: Abort code of a write that the drive does not take now; 0 where it does.
-        changed: Called after an object has another value.
+        refusals: Abort code by object that the drive refuses (set by tests).
+        stuck: Objects that accept a value without storing it (set by tests).
+        judge: Returns the abort code of a write in the present state; 0 to accept it.
+        changed: Called after an object has changed.
     """
 
     def __init__(self, eds: Eds, node: int, behaviour: DriveBehaviour = STRICT) -> None:
-        """Starts with the values a drive has when it is switched on."""
+        """Starts with the values after power-on."""
         self.refusals: dict[Key, int] = {}
         self.stuck: set[Key] = set()
         self.judge: Callable[[Key, int], int] = lambda _key, _value: 0
@@ -67,17 +67,17 @@ class DriveObjects:
         self._restore(range(0x10000))
 
     def restore_communication(self) -> None:
-        """The communication profile area (1000h to 1FFFh) as after switching on."""
+        """Resets the communication profile area (1000h to 1FFFh) to its power-on values."""
         self._restore(range(0x1000, 0x2000))
 
     def __getitem__(self, key: Key) -> int:
-        """The value of an object that is a number."""
+        """The value of a numeric object."""
         value = self._values[key]
         assert isinstance(value, int)
         return value
 
     def __setitem__(self, key: Key, value: int) -> None:
-        """Sets a value from inside the drive; no check."""
+        """Sets a value from inside the drive, without checks."""
         if key not in self._described:
             raise KeyError(f"{key[0]:04X}h:{key[1]:02X}")
         self._values[key] = value
@@ -88,32 +88,32 @@ class DriveObjects:
         return key in self._described
 
     def get(self, key: Key, without: int) -> int:
-        """The value of an object, or another where the drive has not got it."""
+        """The value of an object, or a default if the drive lacks it."""
         return self[key] if key in self._described else without
 
     def keep(self, keys: Iterable[Key], values: Iterable[int]) -> None:
-        """Values that came in process data."""
+        """Stores values received in process data."""
         self._values.update(zip(keys, values, strict=True))
 
     def indices(self) -> list[int]:
-        """Of all objects that the drive has, in the order of the EDS file."""
+        """Indices of all objects of the drive, in the order of the EDS file."""
         return list(dict.fromkeys(index for index, _ in self._described))
 
     def note(self, key: Key, value: int) -> None:
-        """Keeps what the drive itself reports, if it has the object."""
+        """Stores a value that the drive reports, if it has the object."""
         if key in self._described:
             self._values[key] = value
 
     def values(self) -> dict[Key, int | bytes]:
-        """All values as they are kept now."""
+        """All stored values."""
         return dict(self._values)
 
     def subs(self, index: int) -> list[int]:
-        """Sub-indices of an object that the drive has."""
+        """Sub-indices of an object."""
         return [sub for i, sub in self._described if i == index]
 
     def described(self, key: Key) -> ObjectDescription | None:
-        """What the EDS file says about an object; None where the drive has not got it."""
+        """Description of an object in the EDS file; None if the drive lacks it."""
         return self._described.get(key)
 
     def is_dummy(self, index: int) -> bool:
@@ -121,16 +121,16 @@ class DriveObjects:
         return index in self._eds.dummies
 
     def measured(self, index: int, sub: int, read: Callable[[], int]) -> None:
-        """Makes an object show a value of the moment."""
+        """Makes an object return a live value."""
         self._readers[index, sub] = read
         self.changed((index, sub), 0)
 
     def reader(self, key: Key) -> Callable[[], int]:
-        """What reads an object that is a number."""
+        """Reader of a numeric object."""
         return self._readers.get(key) or (lambda: self[key])
 
     def get_data(self, index: int, sub: int) -> bytes:
-        """What an SDO upload gives.
+        """Data of an SDO upload.
 
         Raises:
             Abort: There is no such object, or it cannot be read.
@@ -149,11 +149,11 @@ class DriveObjects:
         return value.to_bytes(described.length, "little")
 
     def set_data(self, index: int, sub: int, data: bytes) -> None:
-        """Takes an SDO download.
+        """Stores the data of an SDO download.
 
         Raises:
-            Abort: The object is not there, is read-only, has another length, or may not have this
-                value now.
+            Abort: The object is missing, read-only or of another length, or may not have this value
+                now.
         """
         key = index, sub
         described = self._find(key)
@@ -197,15 +197,15 @@ class DriveObjects:
 
 
 def _absence(key: Key, behaviour: DriveBehaviour) -> int:
-    """Abort code of an object that the drive has not got; 0 where nothing is said about it."""
+    """Abort code of an object declared absent by the behaviour; 0 for others."""
     index, sub = key
     return behaviour.absent.get((index, sub)) or behaviour.absent.get((index, None), 0)
 
 
-# The SDO server of a simulated drive; its answers may come late, twice or never.
+# SDO server of a simulated drive, whose answers may be late, repeated or lost.
 #
-# Source: CiA 301 (4.2), 7.2.4: expedited and segmented transfers, abort codes. It knows no block
-# transfers, which a server need not.
+# Source: CiA 301 (4.2), 7.2.4: expedited and segmented transfers, abort codes. Block transfers,
+# which are optional, are not supported.
 
 
 TOGGLE_NOT_ALTERNATED = 0x05030000
@@ -222,13 +222,13 @@ class SdoServer:
     """Answers requests of 8 bytes.
 
     Attributes:
-        next_due: When the next answer goes out, [s]; infinity while none waits.
+        next_due: Time of the next answer, [s]; infinity without any.
     """
 
     def __init__(
         self, objects: DriveObjects, behaviour: DriveBehaviour, send: Callable[[bytes], None]
     ) -> None:
-        """Serves a drive's objects; ``send`` puts an answer on the bus."""
+        """Serves a drive's objects; ``send`` sends an answer."""
         self._objects, self._behaviour, self._send = objects, behaviour, send
         self._key = 0, 0
         self._upload: bytes | None = None
@@ -246,7 +246,7 @@ class SdoServer:
         self.next_due = self._queue[0][0] if self._queue else inf
 
     def on_request(self, data: bytes, now: float) -> None:
-        """Works off one request; its answer goes out at once or by `deliver`."""
+        """Processes one request; its answer is sent at once or by `deliver`."""
         try:
             answer = self._answer(data)
         except Abort as abort:
@@ -256,7 +256,7 @@ class SdoServer:
             self._reply(answer.ljust(8, b"\0"), now)
 
     def _reply(self, answer: bytes, now: float) -> None:
-        """Late, twice or not at all, as the behaviour says."""
+        """Sends an answer late, twice or never, according to the behaviour."""
         behaviour = self._behaviour
         self._answers += 1
         if behaviour.sdo_lost and self._answers % behaviour.sdo_lost == 0:
@@ -281,7 +281,7 @@ class SdoServer:
             return self._begin_download(command, data)
         if kind == 2:
             return self._begin_upload()
-        if kind == 4:  # the client gave up
+        if kind == 4:  # abort by the client
             return None
         raise Abort(UNKNOWN_COMMAND)
 

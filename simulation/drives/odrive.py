@@ -1,10 +1,11 @@
-"""A simulated ODrive; it knows CANSimple, not the master.
+"""A simulated ODrive, based on CANSimple, independent of the master.
 
-It sends heartbeats, estimates and torques at its own periods. A set-point acts when it comes. When
-the axis is disarmed, by the master, its watchdog or an error, the torque goes and the brake closes.
+It sends heartbeats, estimates and torques periodically. A set-point takes effect on arrival. When
+the axis is disarmed, by the master, its watchdog or an error, the torque is removed and the brake
+closes.
 
-Source: ODrive documentation, "CAN Protocol" (firmware 0.6). Where it leaves something open: the
-watchdog runs while the axis is enabled; errors keep an axis from being enabled.
+Source: ODrive documentation, "CAN Protocol" (firmware 0.6). Assumptions where it is not specific:
+the watchdog runs while the axis is enabled; errors prevent enabling.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from drivers.can_bus import take
+from drivers.can_bus import receive_frame
 from drivers.odrive.endpoints import read_endpoints
 from drivers.odrive.messages import (
     OWN_DBC,
@@ -50,7 +51,7 @@ SUPPLY = 48.0
 
 @dataclass(slots=True)
 class OdriveSettings:
-    """What a lab has written into a drive with odrivetool; as on the drive, it outlives power.
+    """Non-volatile settings of a drive, as written with odrivetool.
 
     Attributes:
         watchdog: Time without a set-point after which the axis is disarmed, [s]; None when off.
@@ -58,8 +59,8 @@ class OdriveSettings:
         estimates: Period, [s].
         torques: Period, [s].
         firmware: Major, minor, revision.
-        values: Other endpoints by number: four bytes as the bus has them.
-        stuck: Endpoints that do not keep what is written (tests set it).
+        values: Other endpoints by number, as four raw bytes.
+        stuck: Endpoints that ignore writes (set by tests).
     """
 
     watchdog: float | None
@@ -80,12 +81,12 @@ class SimulatedOdrive:
         motor: What it moves.
         state: Axis state.
         errors: Active errors of the axis.
-        calibrated: Without a calibration the axis cannot be enabled (set from outside).
+        calibrated: Required for enabling the axis (set from outside).
         torque: Actual torque, set by the rig, [N·m].
-        supply: Of the motors, [V] (set from outside).
+        supply: Motor supply, [V] (set from outside).
         silent: Messages that it does not send: ``heartbeat``, ``estimates``, ``torques`` (set from
             outside).
-        deaf: It hears and says nothing, as with its bus cable pulled (set from outside).
+        deaf: It neither receives nor sends, as with its bus cable unplugged (set from outside).
     """
 
     def __init__(
@@ -99,17 +100,17 @@ class SimulatedOdrive:
         top_speed: float,
         send: Send,
     ) -> None:
-        """Switches a drive on: idle, its brake closed.
+        """Powers the drive on: idle, with its brake closed.
 
         Args:
             node: Node id.
             settings: Written with odrivetool.
             layouts: Of the messages.
-            counts_per_turn: The motor's position is in counts, the drive's in turns.
+            counts_per_turn: Counts of the motor per turn of the drive.
             torque_constant: Of the motor, [N·m/A].
             position: Of the motor, [counts].
             top_speed: Of the motor, [counts/s].
-            send: Puts a frame (identifier, data) on the bus.
+            send: Sends a frame (identifier, data).
         """
         self.node, self.settings = node, settings
         self._layouts, self._send_frame = layouts, send
@@ -134,7 +135,7 @@ class SimulatedOdrive:
         self.power_on()
 
     def power_on(self) -> None:
-        """Starts, or starts again: errors and limits are gone, the motor stays where it is."""
+        """Starts or restarts: errors and limits are cleared, the motor keeps its position."""
         self.state, self.errors, self.result = AxisState.IDLE, 0, SUCCESS
         self._mode: tuple[int, int] = (0, 0)
         self._target = self.motor.position
@@ -149,7 +150,7 @@ class SimulatedOdrive:
         return self.state is AxisState.CLOSED_LOOP_CONTROL
 
     def advance(self, elapsed: float) -> None:
-        """Lets time pass, [s]: the motor moves, the watchdog runs, messages are due."""
+        """Advances time, [s]: the motor moves, the watchdog runs, messages are sent."""
         if elapsed <= 0.0:
             return
         if self.torque_on:
@@ -162,10 +163,10 @@ class SimulatedOdrive:
             self._due[kind] -= elapsed
             if self._due[kind] <= 1e-9:
                 self._due[kind] += getattr(self.settings, kind)
-                self._tell(kind)
+                self._send_periodic(kind)
 
-    def hear(self, command: int, data: Frame) -> None:
-        """A frame for this drive."""
+    def receive(self, command: int, data: Frame) -> None:
+        """Processes a frame for this drive."""
         if self.deaf:
             return
         if not data:
@@ -179,7 +180,7 @@ class SimulatedOdrive:
                 act(*values)
 
     def fail(self, error: int) -> None:
-        """An error: the axis is disarmed, its brake closes."""
+        """Raises an error: the axis is disarmed, its brake closes."""
         self.errors |= error
         self._disarm(DISARMED)
 
@@ -188,7 +189,7 @@ class SimulatedOdrive:
         self.motor.release()
 
     def _limited_direction(self) -> int:
-        """At its current limit the motor cannot pull further the way it is pulling."""
+        """Sign of the direction blocked by the current limit, or 0."""
         if abs(self.torque) < self._largest_torque:
             return 0
         return 1 if self.torque > 0 else -1
@@ -223,8 +224,8 @@ class SimulatedOdrive:
         self.fail(AxisError.ESTOP_REQUESTED)
 
     def _answer(self, command: int) -> None:
-        """A question: a message without data."""
-        if command == self._layouts.estop.command:  # the only command that has none
+        """Answers a request, which is a message without data."""
+        if command == self._layouts.estop.command:  # the only command without data
             self._estop()
         elif command == self._layouts.get_version.command:
             self._send(self._layouts.get_version, 2, *self.settings.firmware)
@@ -232,7 +233,7 @@ class SimulatedOdrive:
             self._send(self._layouts.get_bus_voltage_current, self.supply, 0.0)
 
     def _on_sdo(self, data: bytes) -> None:
-        """Reads or writes an endpoint; a write is confirmed as from firmware 0.6.11 on."""
+        """Reads or writes an endpoint; a write is confirmed, as since firmware 0.6.11."""
         opcode, endpoint, raw = (
             int(v) for v in self._layouts.rxsdo.unpack(data.ljust(8, b"\0")) or (0, 0, 0)
         )
@@ -240,7 +241,7 @@ class SimulatedOdrive:
             self.settings.values[endpoint] = raw
         self._send(self._layouts.txsdo, endpoint, self.settings.values.get(endpoint, 0))
 
-    def _tell(self, kind: str) -> None:
+    def _send_periodic(self, kind: str) -> None:
         if kind in self.silent:
             return
         if kind == "heartbeat":
@@ -262,21 +263,22 @@ class SimulatedOdrive:
 
 
 class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
-    """ODrives and their platform; nothing on the bus gives them a common time.
+    """ODrives and their platform, without a common clock on the bus.
 
-    In one process a cycle passes with each `pump`; in real time, `serve` follows the clock.
+    In one process time advances by a cycle with each `pump`; in real time `serve` follows the
+    clock.
     """
 
     def __init__(
         self, rig: Rig, bus: can.BusABC, start_pose: Pose, load: Load | None = None
     ) -> None:
-        """Arguments and errors as for `SimulatedRig`; the drives hold what the rig file says."""
+        """Arguments and errors as for `SimulatedRig`; settings come from the rig file."""
         document = rig.document.drives
         if not isinstance(document, OdriveDocument):
             raise TypeError("the rig has no ODrives")
         self._document = document
         self._layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
-        self._since_felt = 0.0
+        self._since_update = 0.0
         super().__init__(rig, bus, start_pose, load)
         self._by_node = {drive.node: drive for drive in self.drives}
 
@@ -301,20 +303,20 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         )
 
     def pump(self) -> None:
-        """Works off every frame that waits, then lets a cycle pass; see `SimulatedRig.pump`."""
-        while (message := take(self._bus, 0.0)) is not None:
+        """Processes every waiting frame, then advances a cycle; see `SimulatedRig.pump`."""
+        while (message := receive_frame(self._bus, 0.0)) is not None:
             self._handle(message)
         self._advance(self._cycle)
-        self._finish_feeling()
+        self._finish_torque_update()
 
     def _advance(self, elapsed: float) -> None:
-        """The drives feel their cables once a cycle: finding the platform's place takes longest."""
+        """Updates the torques only once per cycle, as finding the equilibrium is slow."""
         super()._advance(elapsed)
-        self._since_felt += elapsed
-        if self._since_felt >= self._cycle - 1e-9:
-            self._since_felt = 0.0
+        self._since_update += elapsed
+        if self._since_update >= self._cycle - 1e-9:
+            self._since_update = 0.0
             self.cycles += 1
-            self._feel()
+            self._begin_torque_update()
 
     def _handle(self, message: can.Message) -> None:
         if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
@@ -322,11 +324,11 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         node, command = node_and_command(message.arbitration_id)
         drive = self._by_node.get(node)
         if drive is not None:
-            drive.hear(command, message.data)
+            drive.receive(command, message.data)
 
 
 def _settings(document: OdriveDocument) -> OdriveSettings:
-    """As if a lab had written the rig file's values with odrivetool."""
+    """Settings as if the rig file's values had been written with odrivetool."""
     watchdog = document.watchdog_ms
     settings = OdriveSettings(
         watchdog=watchdog / 1000.0 if watchdog is not None else None,

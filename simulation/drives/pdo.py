@@ -1,4 +1,4 @@
-"""Process data of a simulated drive: what may be set up when, and frames by the current mapping.
+"""Process data of a simulated drive: checks of parameter writes, and frames by current mapping.
 
 Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38: PDO communication and mapping parameters.
 """
@@ -46,10 +46,10 @@ class ReceivePdo:
 
     Attributes:
         number: From 0.
-        synchronous: Its data act at the next SYNC.
-        keys: Where they go, in order.
-        acting: Those that do something at once, by their order here: the control word last.
-        form: How they are packed.
+        synchronous: Its data take effect at the next SYNC.
+        keys: Mapped objects, in order.
+        acting: Index and key of objects that take effect at once, the control word last.
+        form: Packing of the values.
         deadline: 1400h:05, [s]; 0 for none.
     """
 
@@ -67,10 +67,10 @@ class TransmitPdo:
 
     Attributes:
         can_id: Of its frame.
-        every: SYNCs from one frame to the next.
+        every: Number of SYNCs per frame.
         readers: Of its objects, in order.
-        form: How they are packed.
-        seen: SYNCs since it was sent.
+        form: Packing of the values.
+        seen: SYNCs since the last frame.
     """
 
     can_id: int
@@ -105,18 +105,18 @@ class ProcessData:
         self.rebuild()
 
     def rebuild(self) -> None:
-        """After a parameter has changed."""
+        """Rebuilds the PDOs after a change of parameters."""
         received = (self._receive_pdo(index) for index in self._rpdos)
         self.received: dict[int, ReceivePdo] = {i: pdo for found in received for i, pdo in found}
         self.sent = [pdo for index in self._tpdos for pdo in self._transmit_pdo(index)]
 
     def refused(self, key: Key, value: int, *, may_map: bool) -> int:
-        """Abort code of a write to a parameter; 0 where it is taken.
+        """Abort code of a write to a parameter; 0 to accept it.
 
         Args:
             key: The object.
             value: To be written.
-            may_map: The drive is in an NMT state in which it can be mapped.
+            may_map: The NMT state allows mapping.
         """
         index, sub = key
         if index in RPDO or index in TPDO:
@@ -140,7 +140,7 @@ class ProcessData:
             )
             return OUT_OF_RANGE if bad_id or (stays_valid and changed) else 0
         if sub == 2 and LAST_SYNC_TYPE < value < 254:
-            return OUT_OF_RANGE  # reserved, or on remote request, which the drive does not know
+            return OUT_OF_RANGE  # reserved, or on remote request, which is not supported
         if sub in (3, 6) and valid and index in TPDO:
             return OUT_OF_RANGE  # inhibit time, SYNC start value
         return 0
@@ -154,7 +154,7 @@ class ProcessData:
         return 0 if all(self._fits(index, entry) for entry in entries) else NOT_MAPPABLE
 
     def _fits(self, index: int, entry: int) -> bool:
-        """Whether an object can be mapped, with the length that it has."""
+        """Whether an object can be mapped with the stated length."""
         key, bits = (entry >> 16, entry >> 8 & 0xFF), entry & 0xFF
         if index in RPDO_MAP and key[1] == 0 and self._objects.is_dummy(key[0]):
             return bits in (8, 16, 32)
@@ -197,56 +197,56 @@ class ProcessData:
             described = self._objects.described(key)
             letter = _LETTERS.get((entry & 0xFF) // 8)
             if letter is None or not (described or self._objects.is_dummy(key[0])):
-                continue  # a default of the EDS file that the drive cannot keep
+                continue  # an invalid default of the EDS file
             keys.append(key)
             letters += letter if described and described.signed else letter.upper()
         return tuple(keys), struct.Struct("<" + letters)
 
 
 def _is_restricted(can_id: int) -> bool:
-    """Identifiers that CiA 301 keeps for other services (table "restricted CAN-IDs")."""
+    """Whether CiA 301 reserves an identifier (table "restricted CAN-IDs")."""
     return any(low <= can_id <= high for low, high in _RESTRICTED)
 
 
-# What a simulated drive waits for, and when it has to come at the latest.
+# Deadlines of a simulated drive.
 
 
 TOLERANCE = 1e-9
 
 
 class Deadlines:
-    """Times [s] by what is due then; looking costs nothing while none can have passed."""
+    """Times [s] by event; checking is cheap as long as none has passed."""
 
     def __init__(self) -> None:
-        """Nothing is due."""
+        """Starts without deadlines."""
         self._due: dict[Hashable, float] = {}
         self.earliest = inf
 
     def __contains__(self, what: object) -> bool:
-        """Whether something is waited for."""
+        """Whether an event has a deadline."""
         return what in self._due
 
     def expect(self, what: Hashable, due: float) -> None:
-        """It is due then, and no longer when it was due before."""
+        """Sets or replaces the deadline of an event."""
         self._due[what] = due
         if due < self.earliest:
             self.earliest = due
 
     def forget(self, what: Hashable) -> None:
-        """It is not waited for any more."""
+        """Removes a deadline."""
         self._due.pop(what, None)
 
     def clear(self) -> None:
-        """Nothing is due any more."""
+        """Removes all deadlines."""
         self._due.clear()
         self.earliest = inf
 
     def kept(self) -> list[Hashable]:
-        """All that is waited for."""
+        """All events with a deadline."""
         return list(self._due)
 
     def passed(self, now: float) -> list[Hashable]:
-        """What was due before now; it is waited for no longer."""
+        """Removes and returns the events that are overdue."""
         gone = [what for what, due in self._due.items() if now > due + TOLERANCE]
         for what in gone:
             del self._due[what]

@@ -1,7 +1,7 @@
 """The drive function of a simulated CiA 402 drive: state machine, modes, motor and faults.
 
-It knows no bus: commands come as control words, and what it has to say as EMCY codes. Commands act
-by their level; only the reset of a fault needs a rising edge.
+It is independent of the bus: commands are control words, reports are EMCY codes. Commands are
+level-sensitive; only a fault reset needs a rising edge.
 
 Source: CiA 402-2.
 """
@@ -18,16 +18,16 @@ from simulation.drives.object_dictionary import DriveObjects
 from simulation.drives.pdo import Deadlines
 
 SLIP_SHARE = 0.005
-"""A motor that is loaded with twice the torque that it can hold slips at this share of its top
-speed, and comes back at no more."""
+"""Slip speed of a motor loaded with twice its torque limit, as a fraction of its top speed; also
+the limit of the return speed."""
 
 WARNING_LASTS = 0.5
-"""A warning comes and goes after this time, [s]."""
+"""Time for which a warning is present or absent, [s]."""
 
 CYCLIC_POSITION = 8
 FOLLOWING_ERROR = 0x8611
 NO_WINDOW = 0xFFFFFFFF
-"""6065h for no watch over the following error."""
+"""Value of 6065h that disables following-error monitoring."""
 
 MODE_FOLLOWS, WARNING_CHANGES = "mode", "warning"
 
@@ -51,7 +51,7 @@ class PowerStage(ABC):
     """State machine and motor of one drive.
 
     Attributes:
-        behaviour: What it does where the standards leave a choice.
+        behaviour: Choices within the standards.
         objects: Its object dictionary.
         motor: What it moves.
         torque: Actual torque, set by the plant, [per mille of rated torque].
@@ -63,11 +63,11 @@ class PowerStage(ABC):
     def __init__(
         self, motor: Motor, behaviour: DriveBehaviour, counts_per_turn: float, seed: int
     ) -> None:
-        """Takes the motor; `_switch_on` has to follow.
+        """Takes the motor; `_switch_on` must be called next.
 
         Args:
             motor: What it moves.
-            behaviour: What it does where the standards leave a choice.
+            behaviour: Choices within the standards.
             counts_per_turn: Of the motor shaft.
             seed: Of all noise.
         """
@@ -78,10 +78,10 @@ class PowerStage(ABC):
 
     @abstractmethod
     def _emergency(self, code: int) -> None:
-        """Reports an error, or with 0 that one is over."""
+        """Reports an error, or with 0 the end of one."""
 
     def _switch_on(self) -> None:
-        """The state after switching on; the motor stays where it is."""
+        """Sets the power-on state; the motor keeps its position."""
         self.state, self.torque = DriveState.NOT_READY, 0.0
         self.motor.release()
         self._control_word = 0
@@ -93,7 +93,7 @@ class PowerStage(ABC):
         self._fault_code = self._flicker = 0
 
     def _read_motion_settings(self) -> None:
-        """What `_move` needs, so that it need not look objects up."""
+        """Caches settings of the motion, so that `_move` reads no objects."""
         get = self.objects.get
         unit = get((ACCELERATION_UNIT, 0), 0)
         acceleration = counts_in(unit, self._counts_per_turn) or 1.0
@@ -119,7 +119,7 @@ class PowerStage(ABC):
 
     @property
     def status_word(self) -> int:
-        """6041h as it is now."""
+        """Present value of 6041h."""
         return self._status_shown()
 
     def _status_shown(self) -> int:
@@ -138,7 +138,7 @@ class PowerStage(ABC):
         return self._torque_on
 
     def fail(self, code: int) -> None:
-        """A fault inside the drive: fault reaction, then FAULT."""
+        """Raises a drive fault: fault reaction, then FAULT."""
         if self.state in FAULTED:
             return
         self._fault_code = code
@@ -146,7 +146,7 @@ class PowerStage(ABC):
         self._react_to_fault()
 
     def _react_to_fault(self) -> None:
-        """605Eh: 0 takes the torque off at once, the others brake before."""
+        """605Eh: 0 removes the torque at once, others after a ramp."""
         if self.state in FAULTED:
             return
         if self.torque_on and self.objects.get((0x605E, 0), 2) != 0:
@@ -155,7 +155,7 @@ class PowerStage(ABC):
             self._power_off(DriveState.FAULT)
 
     def _has_mode(self, mode: int) -> bool:
-        """By 6502h: bit 0 is mode 1; mode 0 is none."""
+        """Whether 6502h lists a mode; bit 0 is mode 1, mode 0 means none."""
         modes = self.objects.get((0x6502, 0), 0xFFFFFFFF)
         return mode <= 0 or (mode <= 32 and bool(modes >> (mode - 1) & 1))
 
@@ -191,9 +191,10 @@ class PowerStage(ABC):
             self.motor.yield_to(load, speed * elapsed)
 
     def _limited_direction(self) -> int:
-        """At its torque limit the motor cannot pull further the way it is pulling.
+        """Sign of the direction blocked by the torque limit, or 0.
 
-        A load above it turns the motor back; it is at its limit until it is where it is to be.
+        A load above the limit moves the motor back; it stays at the limit until it reaches its
+        demand.
         """
         limited = abs(self.torque) >= self._max_torque
         if not (limited or self._at_limit):
@@ -213,7 +214,7 @@ class PowerStage(ABC):
             self._error_time = 0.0
 
     def _take_mode(self, mode: int) -> None:
-        """6060h: at once, late, or only while the drive is enabled, as its behaviour says."""
+        """6060h: at once, late, or only while enabled, according to the behaviour."""
         if not self._has_mode(mode):
             return
         self._wanted_mode = mode
@@ -228,7 +229,7 @@ class PowerStage(ABC):
             self._mode = self._wanted_mode
 
     def _take_target(self, target: int) -> None:
-        """A target outside the software limits (607Dh) is not approached further than they are."""
+        """Takes a target, limited to the software limits (607Dh)."""
         if self._mode != CYCLIC_POSITION:
             return
         low, high = self._limits
@@ -236,7 +237,7 @@ class PowerStage(ABC):
         self._time_to_target = self._interpolation
 
     def _take_control_word(self, word: int) -> None:
-        """Commands act by their level, whatever the word was before; only a reset needs an edge."""
+        """Executes a command; level-sensitive, except for the rising edge of a reset."""
         rising = word & 0x80 and not self._control_word & 0x80
         self._control_word = word
         if self._enabled and word & 0x8F == 0x0F:
@@ -279,7 +280,7 @@ class PowerStage(ABC):
             self._power_off(DriveState.SWITCHED_ON)
 
     def _command_enable(self) -> None:
-        """Transitions 4 and 16, and 3 followed by 4 at once; 16 only where 605Ah lets it hold."""
+        """Transitions 4 and 16, and 3 with 4; 16 only if 605Ah holds after a quick stop."""
         stopped = self.state is DriveState.QUICK_STOP_ACTIVE
         if (stopped and self._stop_option >= 5) or self.state in (
             DriveState.READY_TO_SWITCH_ON,
@@ -294,7 +295,7 @@ class PowerStage(ABC):
                 self._deadlines.expect(WARNING_CHANGES, self._now + WARNING_LASTS)
 
     def _warn(self) -> None:
-        """A warning comes, or goes; the drive does what it did before."""
+        """Raises or clears a warning, without other effects."""
         enabled, was = self.state is DriveState.OPERATION_ENABLED, self._warned
         self._warned = enabled and not was
         if self._warned != was:
@@ -303,7 +304,7 @@ class PowerStage(ABC):
             self._deadlines.expect(WARNING_CHANGES, self._now + WARNING_LASTS)
 
     def _quick_stop(self) -> None:
-        """605Ah: 5 to 8 hold after the ramp, 1 to 4 take the torque off then, 0 at once."""
+        """605Ah: 5 to 8 hold after the ramp, 1 to 4 then remove the torque, 0 at once."""
         self.state = DriveState.QUICK_STOP_ACTIVE
         if self._stop_option == 0:
             self._power_off(DriveState.SWITCH_ON_DISABLED)

@@ -1,1 +1,1 @@
-"""Compiled search for the pose at which a platform on elastic cables hangs still."""
+"""Compiled search for the equilibrium of a platform on elastic cables."""

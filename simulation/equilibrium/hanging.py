@@ -1,6 +1,6 @@
-"""Cables, forces and stiffness of a hanging platform, compiled; `simulation.plant` explains.
+"""Cables, forces and stiffness of a suspended platform, compiled; see `simulation.plant`.
 
-The same formulas as there, a cable at a time, into arrays that the caller keeps. Tests compare.
+The same formulas, one cable at a time, into arrays of the caller. Tests compare both.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from model.pose import Array
 
 
 class Hanging(NamedTuple):
-    """What does not change while the drums turn.
+    """Constants of the equilibrium search.
 
     Attributes:
         outlets: World frame, shape (m, 3), [m].
-        feeds: Travel of each cable where it enters its pulley, world frame, shape (m, 3).
+        feeds: Direction of each cable where it enters its pulley, world frame, shape (m, 3).
         radius: Of the pulleys, 0 without, [m].
         anchors: Platform frame, shape (m, 3), [m].
         axial: EA of each cable, shape (m,), [N].
@@ -41,9 +41,9 @@ class Strained(NamedTuple):
 
     Attributes:
         arms: From the platform's origin to each anchor, world axes, shape (m, 3), [m].
-        columns: Of the structure matrix, one a row, shape (m, 6).
+        columns: Of the structure matrix, one per row, shape (m, 6).
         straight: From exit to anchor, shape (m,), [m].
-        strains: How far each cable is stretched, by its length; negative when slack, shape (m,).
+        strains: Strain of each cable, negative if slack, shape (m,).
     """
 
     arms: Array
@@ -70,8 +70,8 @@ def run_cable(
     """The cable to an anchor, as `model.kinematics.cables_to`.
 
     Returns:
-        Unit vector from anchor to exit, straight part [m], length [m]; straight part 0 where no
-        cable can run.
+        Unit vector from anchor to exit, straight part [m], length [m]; straight part 0 if no
+        cable path exists.
     """
     x, y, z = anchor[0] - outlet[0], anchor[1] - outlet[1], anchor[2] - outlet[2]
     if radius == 0.0:
@@ -104,7 +104,7 @@ def run_cable(
 def strain(
     hanging: Hanging, unstrained: Array, position: Array, rotation: Array, seen: Strained
 ) -> bool:
-    """Fills ``seen`` for a pose; False where a cable cannot run."""
+    """Fills ``seen`` for a pose; False if a cable has no path."""
     for k in range(len(unstrained)):
         a, b, c = rotate(rotation, hanging.anchors[k])
         anchor = (a + position[0], b + position[1], c + position[2])
@@ -148,7 +148,7 @@ def bend(
     """Fills the energy's second derivative by the twist, shape (6, 6); `Suspension.stiffness`."""
     stiffness[:, :] = 0.0
     x, y, z = rotate(rotation, hanging.centre)
-    moment = stiffness[3:, 3:]  # first the sum of force times arm and the spread of the arms
+    moment = stiffness[3:, 3:]  # first the sum of force times arm, and the arms' second moment
     moment[2, 0] -= hanging.weight * x
     moment[2, 1] -= hanging.weight * y
     moment[2, 2] -= hanging.weight * z

@@ -1,4 +1,4 @@
-"""Newton's method for the pose at which a platform hangs still, compiled."""
+"""Newton's method for the equilibrium of a suspended platform, compiled."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ def hang_still(
     tolerance: float,
     steps: int,
 ) -> bool:
-    """From the cables that pulled before to those that pull in the end.
+    """Finds the equilibrium, starting from the present set of taut cables.
 
-    The cables that pull may push as well, and the others do neither: during the search a step of
-    the drums may press some of them together. Where it comes to rest with one that pushes, or with
-    a slack one that is stretched, it continues with those that pull there.
+    During the search taut cables may also push, as a step of the drums may compress some, and slack
+    ones have no force. If it converges with a pushing cable or a stretched slack one, it continues
+    with the set of cables that are stretched there.
 
     Args:
         hanging: Rig and weight.
         unstrained: Lengths of the whole cables, shape (m,), [m].
-        position: Of the platform, shape (3,), [m]; replaced by what is found.
-        rotation: Matrix, shape (3, 3); replaced by what is found.
-        tensions: Shape (m,), [N]; 0 for a slack cable; replaced by what is found.
+        position: Of the platform, shape (3,), [m]; overwritten by the result.
+        rotation: Matrix, shape (3, 3); overwritten by the result.
+        tensions: Shape (m,), [N]; 0 for a slack cable; overwritten by the result.
         reach: Of the platform, [m].
-        tolerance: Largest force [N], and moment over the reach [N], that is left.
-        steps: At most.
+        tolerance: Largest residual force [N], and moment over the reach [N].
+        steps: Largest number of steps.
 
     Returns:
-        False when it does not end, or ends where the platform would fall or tip.
+        False if it does not converge, or converges to an unstable equilibrium.
     """
     count = len(unstrained)
     pulls = tensions > 0.0
@@ -71,7 +71,7 @@ def hang_still(
 
 @compiled
 def is_small(gradient: Array, reach: float, tolerance: float) -> bool:
-    """Whether forces and moments are in balance; not where one is not a number."""
+    """Whether forces and moments are balanced; False for NaN."""
     for i in range(3):
         force, moment = abs(gradient[i]), abs(gradient[3 + i]) / reach
         if not (force < tolerance and moment < tolerance):
@@ -81,7 +81,7 @@ def is_small(gradient: Array, reach: float, tolerance: float) -> bool:
 
 @compiled
 def renew(pulls: NDArray[np.bool_], strains: Array) -> bool:
-    """Notes which cables are stretched, in place; whether they are others than before."""
+    """Updates the set of stretched cables in place; returns whether it changed."""
     changed = False
     for k in range(len(pulls)):
         stretched = strains[k] > 0.0
@@ -92,7 +92,7 @@ def renew(pulls: NDArray[np.bool_], strains: Array) -> bool:
 
 @compiled
 def turn(rotation: Array, x: float, y: float, z: float) -> None:
-    """Turns in place by a rotation vector in the world, [rad]; `matrix_from_rotation_vector`."""
+    """Rotates in place by a rotation vector in the world, [rad]; `matrix_from_rotation_vector`."""
     angle = math.sqrt(x * x + y * y + z * z)
     first, second = 1.0, 0.5
     if angle >= 1e-6:

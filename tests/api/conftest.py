@@ -1,4 +1,4 @@
-"""Runs of a test are its own: nobody else's stop reaches them, and its stops reach nobody else."""
+"""Separate run folders for each test, so that stops do not affect other tests' runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 def own_run_folders(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
-    """Where runs are announced."""
+    """Folder in which runs are advertised."""
     folder = tmp_path_factory.mktemp("tmp")
     monkeypatch.setenv("TMPDIR", str(folder))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))

@@ -1,4 +1,4 @@
-"""Examples, notebooks and the README's code run as they are: no hardware, no Jupyter."""
+"""Examples, notebooks and the README's code run unchanged: no hardware, no Jupyter."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOTEBOOKS = sorted((EXAMPLES / "notebooks").glob("*.ipynb"))
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder of its own with the ready rigs and scenes; figures are drawn into memory."""
+    """A separate folder with the example rigs and scenes; figures are drawn into memory."""
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
@@ -34,7 +34,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
 
 
 def ran(name: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
-    """Runs an example as from a shell."""
+    """Runs an example as a shell does."""
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     with suppress(SystemExit):
         runpy.run_path(str(EXAMPLES / name), run_name="__main__")

@@ -1,4 +1,4 @@
-"""Images, calibrations and workspace maps by one call each, with paths as texts."""
+"""Images, calibrations and workspace maps with one call each, and paths as strings."""
 
 from __future__ import annotations
 

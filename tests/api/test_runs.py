@@ -1,4 +1,4 @@
-"""Runs as results: verdict, columns, figures, and the same again from the folder."""
+"""Run results: verdict, columns, figures, and the same loaded from the folder."""
 
 from __future__ import annotations
 

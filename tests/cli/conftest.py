@@ -1,4 +1,4 @@
-"""One plan and one run for all tests of the command line."""
+"""A plan and a run shared by all tests of the command line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def plain_terminal(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
     """No colour forced from outside, own folders for announcements and error files, and nothing
-    told of machine code that this machine has not made yet."""
+    shown about machine code that is not compiled yet."""
     for name in ("FORCE_COLOR", "PY_COLORS", "GITHUB_ACTIONS", "TTY_COMPATIBLE", "COLUMNS"):
         monkeypatch.delenv(name, raising=False)
     temporary = tmp_path_factory.mktemp("tmp")

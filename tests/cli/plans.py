@@ -1,4 +1,4 @@
-"""Plans made by hand, so that tests of what comes after need no search."""
+"""Hand-made plans, so that tests of later steps need no search."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ START_MM, GOAL_MM = (0.0, 0.0, 445.0), (0.0, 30.0, 495.0)
 
 
 def rig_with_two_pictures_a_second(folder: Path) -> Path:
-    """The paper's rig for long runs: drawing its images takes longer than all the rest."""
+    """The paper's rig for long runs, with few images, as rendering takes most of the time."""
     rig = folder / "rig.yaml"
     text = RIG.read_text()
     assert "rate_hz: 10" in text
@@ -30,7 +30,7 @@ def rig_with_two_pictures_a_second(folder: Path) -> Path:
 
 
 def rig_with_long_cycles(folder: Path, cycle_ms: int = 100) -> Path:
-    """The paper's rig for runs in real time: a busy host is late by a part of 100 ms, not by it."""
+    """The paper's rig for runs in real time, with cycles longer than the delays of a busy host."""
     rig = folder / "rig.yaml"
     text = RIG.read_text()
     assert "cycle_ms: 10\n" in text
@@ -39,7 +39,7 @@ def rig_with_long_cycles(folder: Path, cycle_ms: int = 100) -> Path:
 
 
 def free_scene(start_mm: Sequence[float], goal_mm: Sequence[float]) -> Scene:
-    """A room with one far block, so that there is a clearance to measure."""
+    """A room with one distant block, so that there is a clearance to measure."""
     data = {
         "schema_version": 1,
         "name": "far block",
@@ -58,7 +58,7 @@ def free_scene(start_mm: Sequence[float], goal_mm: Sequence[float]) -> Scene:
 
 
 def straight_plan(rig: Rig, scene: Scene, corners_mm: Sequence[Sequence[float]]) -> PlanDocument:
-    """A sealed plan along straight lines; whether it is a good one is for the check to say."""
+    """A sealed plan along straight lines, not checked."""
     waypoints = [PoseDocument(position_mm=list(map(float, corner))) for corner in corners_mm]
     report = check_path(rig, scene, [Pose.level(millimetres(list(c))) for c in corners_mm])
     near, own = report.obstacle_clearance, report.self_clearance
@@ -102,7 +102,7 @@ def straight_plan(rig: Rig, scene: Scene, corners_mm: Sequence[Sequence[float]])
 
 
 def write_short_plan(path: Path, rig_file: Path = RIG) -> Path:
-    """A straight path of 58 mm of the paper's rig, about 3 s long."""
+    """Writes a straight path of 58 mm for the paper's rig, about 3 s long."""
     scene = free_scene(START_MM, GOAL_MM)
     save_plan(straight_plan(load_rig(rig_file), scene, [START_MM, GOAL_MM]), path)
     return path

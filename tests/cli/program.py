@@ -1,4 +1,4 @@
-"""Calls the real command line in this process: `main` with arguments, as the console script."""
+"""Calls the real command line in this process: `main` with arguments, like the console script."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cdpr.cli import main
 
 @dataclass(frozen=True)
 class Answer:
-    """What a call left: its exit code and what it said."""
+    """Result of a call: exit code and output."""
 
     code: int
     out: str
@@ -24,12 +24,12 @@ class Answer:
 
     @property
     def said(self) -> str:
-        """Everything it said, without line breaks, so that no wrapping hides a sentence."""
+        """The whole output without line breaks, so that wrapping hides no sentence."""
         return " ".join((self.out + " " + self.err).split())
 
 
 def call(*arguments: str | Path, answers: str = "") -> Answer:
-    """Runs ``cdpr ARGUMENTS``; ``answers`` is what its standard input holds."""
+    """Runs ``cdpr ARGUMENTS`` with ``answers`` as standard input."""
     out, err = io.StringIO(), io.StringIO()
     argv = ["cdpr", *map(str, arguments)]
     with (
@@ -60,7 +60,7 @@ def content(folder: Path) -> dict[str, bytes | None]:
 
 @contextmanager
 def nothing_written(folder: Path) -> Iterator[None]:
-    """Whatever happens inside leaves the folder as it was."""
+    """Requires that the block leaves the folder unchanged."""
     before = content(folder)
     yield
     after = content(folder)
@@ -69,7 +69,7 @@ def nothing_written(folder: Path) -> Iterator[None]:
 
 
 def one_message(answer: Answer, code: int, *parts: str) -> None:
-    """The answer is one clear error: exit code, a message with a next step, and nothing else."""
+    """Requires one clear error: exit code, a message with a next step, and nothing else."""
     assert answer.code == code, answer
     assert "Traceback" not in answer.said
     assert "defect of cdpr" not in answer.said

@@ -1,4 +1,4 @@
-"""What no verb can use is refused before anything is opened: overwriting, odd paths and numbers."""
+"""Invalid arguments of any verb are refused first: overwriting, odd paths and numbers."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def _program(*arguments: str | Path, **how: object) -> subprocess.CompletedProce
     )
 
 
-def test_a_full_disk_behind_standard_output_is_told() -> None:
+def test_a_full_disk_behind_standard_output_is_reported() -> None:
     with open("/dev/full", "w") as full:
         done = _program("--version", stdout=full)
     assert done.returncode == 1

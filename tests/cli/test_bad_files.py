@@ -1,4 +1,4 @@
-"""Rig and scene files that cannot be used: every problem with its place, and nothing is written."""
+"""Unusable rig and scene files: every problem with its location, and nothing is written."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RIG_MISTAKES = {
     "not a number": ("mass_kg: 0.4", "mass_kg: .nan", ["platform.mass_kg"]),
     "a word for a number": ("mass_kg: 0.4", "mass_kg: heavy", ["platform.mass_kg"]),
     "seven anchors": ("  - [65, -65, 65]\n", "", ["anchors_mm", "7", "8"]),
-    "tensions the wrong way round": (
+    "tensions in the wrong order": (
         "max_tension_n: 100",
         "max_tension_n: 4",
         ["max_tension_n", "min_tension_n"],
@@ -32,7 +32,7 @@ RIG_MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", RIG_MISTAKES)
-def test_a_mistake_in_a_rig_file_is_told_with_its_line(tmp_path: Path, mistake: str) -> None:
+def test_a_mistake_in_a_rig_file_is_reported_with_its_line(tmp_path: Path, mistake: str) -> None:
     old, new, parts = RIG_MISTAKES[mistake]
     text = RIG.read_text()
     assert old in text
@@ -60,9 +60,9 @@ def test_all_problems_of_a_file_come_at_once_in_the_order_of_their_lines(tmp_pat
     rig.write_text(text)
     answer = call("plan", rig, SCENE, "-o", tmp_path / "plan.json")
     one_message(answer, 2, "platform.mass_kg", "cables.radius", "bus.cycle_ms")
-    places = [int(part.split(":")[0]) for part in answer.err.split(f"{rig}:")[1:]]
-    assert places == sorted(places)
-    assert len(places) >= 3
+    lines = [int(part.split(":")[0]) for part in answer.err.split(f"{rig}:")[1:]]
+    assert lines == sorted(lines)
+    assert len(lines) >= 3
 
 
 SCENE_MISTAKES = {
@@ -75,7 +75,7 @@ SCENE_MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", SCENE_MISTAKES)
-def test_a_mistake_in_a_scene_file_is_told_with_its_line(tmp_path: Path, mistake: str) -> None:
+def test_a_mistake_in_a_scene_file_is_reported_with_its_line(tmp_path: Path, mistake: str) -> None:
     old, new, parts = SCENE_MISTAKES[mistake]
     text = SCENE.read_text()
     assert old in text
@@ -112,7 +112,7 @@ def test_a_file_that_is_no_rig_file_is_named(tmp_path: Path, verb: str, kind: st
 
 
 def test_files_in_another_order_are_named_for_what_they_are(tmp_path: Path) -> None:
-    """Not as a dozen keys to mend in a file that is whole."""
+    """Not as a dozen wrong keys in a valid file."""
     plan = tmp_path / "plan.json"
     with nothing_written(tmp_path):
         one_message(call("plan", SCENE, RIG, "-o", plan), 2, "a scene file, not a rig file")
@@ -120,7 +120,7 @@ def test_files_in_another_order_are_named_for_what_they_are(tmp_path: Path) -> N
         one_message(call("check", RIG), 2, "a file of another kind", "pass another file")
 
 
-def test_a_missing_folder_and_a_read_only_one_are_told_apart(tmp_path: Path) -> None:
+def test_a_missing_folder_and_a_read_only_one_are_distinguished(tmp_path: Path) -> None:
     missing = tmp_path / "not there"
     one_message(call("plan", RIG, SCENE, "-o", missing / "p.json"), 2, f"no folder {missing}")
     (tmp_path / "file").touch()

@@ -1,4 +1,4 @@
-"""Plan files that cannot be used, for `cdpr check` and `cdpr run` alike."""
+"""Unusable plan files, for `cdpr check` and `cdpr run`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.cli.program import Answer, call, nothing_written, one_message
 
 
 def use(verb: str, plan: Path, folder: Path, rig: Path = RIG) -> Answer:
-    """`cdpr check` or `cdpr run` of a plan, which must leave the folder as it is."""
+    """`cdpr check` or `cdpr run` of a plan, which must leave the folder unchanged."""
     rest = ["-o", folder / "run", "--fast", "--no-camera"] if verb == "run" else []
     with nothing_written(folder):
         return call(verb, plan, "--rig", rig, *rest)
@@ -52,7 +52,7 @@ def test_an_edited_plan_is_not_used(short_plan: Path, tmp_path: Path, verb: str)
         ("incomplete", '{"kind": "cdpr-plan", "schema_version": 1}', "waypoints"),
     ],
 )
-def test_a_file_that_is_no_plan_is_told_so(
+def test_a_file_that_is_not_a_plan_is_reported_as_such(
     tmp_path: Path, verb: str, name: str, text: str | None, part: str
 ) -> None:
     plan = tmp_path / f"{name}.json"
@@ -87,7 +87,7 @@ def test_a_plan_of_the_rig_before_it_was_changed_names_the_part(
 
 
 def colliding_plan(path: Path) -> Path:
-    """A plan whose file is whole, straight through the obstacle of environment 1."""
+    """A valid plan file, straight through the obstacle of environment 1."""
     scene = load_scene(CONFIGS / "environment_1.yaml")
     corners = [(180.0, 180.0, 300.0), (-180.0, -180.0, 400.0)]
     save_plan(straight_plan(load_rig(RIG), scene, corners), path)
@@ -100,14 +100,14 @@ def test_a_whole_plan_that_collides_is_refused_before_anything_moves(tmp_path: P
     one_message(answer, 3, "the plan fails its check", "obstacle_1", "limit 10 mm")
 
 
-def test_check_tells_every_violation_with_its_place_and_exits_3(tmp_path: Path) -> None:
+def test_check_reports_every_violation_with_its_position_and_exits_3(tmp_path: Path) -> None:
     plan = colliding_plan(tmp_path / "plan.json")
     answer = use("check", plan, tmp_path)
     assert answer.code == 3
     assert "violated" in answer.out
     assert "obstacle_1" in answer.out
     assert "not passed" in answer.out
-    told = call("check", plan, "--json")
-    assert told.code == 3
-    assert json.loads(told.out)["passed"] is False
-    assert json.loads(told.out)["violations"]
+    checked = call("check", plan, "--json")
+    assert checked.code == 3
+    assert json.loads(checked.out)["passed"] is False
+    assert json.loads(checked.out)["violations"]

@@ -1,4 +1,4 @@
-"""Files are good, but the world is not: places, drives, cameras and folders that cannot be used."""
+"""Valid files, but unusable positions, drives, cameras and folders."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def folder(tmp_path: Path, short_plan: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("option", "place", "parts"),
+    ("option", "position", "parts"),
     [
         ("--start-mm", "-150 0 300", ["start", "obstacle_1", "mm"]),
         ("--goal-mm", "-150 -100 300", ["goal", "obstacle_1", "mm"]),
@@ -65,15 +65,15 @@ def folder(tmp_path: Path, short_plan: Path) -> Path:
         ("--start-mm", "0 0 100", ["start", "workspace", "150"]),
     ],
 )
-def test_a_start_or_goal_that_cannot_be_used_is_told_with_what_and_how_much(
-    tmp_path: Path, option: str, place: str, parts: list[str]
+def test_an_unusable_start_or_goal_is_reported_with_reason_and_amount(
+    tmp_path: Path, option: str, position: str, parts: list[str]
 ) -> None:
     with nothing_written(tmp_path):
-        answer = call("plan", RIG, SCENE, "-o", tmp_path / "plan.json", option, *place.split())
+        answer = call("plan", RIG, SCENE, "-o", tmp_path / "plan.json", option, *position.split())
     one_message(answer, 2, *parts)
 
 
-def test_a_goal_that_is_not_reached_tells_how_near_the_search_came(tmp_path: Path) -> None:
+def test_a_goal_that_is_not_reached_reports_the_closest_distance(tmp_path: Path) -> None:
     hard = CONFIGS / "environment_3.yaml"
     with nothing_written(tmp_path):
         options = ("--planner", "adaptive", "--max-iterations", "5")
@@ -109,19 +109,17 @@ def test_a_demo_does_not_write_into_an_existing_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("verb", ["plan", "track"])
-def test_a_result_in_a_folder_that_is_not_there_is_told_before_the_work(
-    folder: Path, verb: str
-) -> None:
-    place = folder / "no such folder" / "result"
+def test_a_result_in_a_missing_folder_is_reported_before_the_work(folder: Path, verb: str) -> None:
+    missing = folder / "no such folder" / "result"
     rest = {
         "plan": [RIG, SCENE],
         "track": [RIG, "synthetic", "--plan", folder / "plan.json"],
     }[verb]
     with nothing_written(folder):
-        one_message(call(verb, *rest, "-o", place), 2, str(place))
+        one_message(call(verb, *rest, "-o", missing), 2, str(missing))
 
 
-def test_a_run_folder_below_a_file_is_told_before_the_work(folder: Path) -> None:
+def test_a_run_folder_below_a_file_is_reported_before_the_work(folder: Path) -> None:
     (folder / "file").touch()
     rest = ("--rig", RIG, "--fast", "--no-camera", "-o", folder / "file" / "above" / "run")
     with nothing_written(folder):
@@ -129,7 +127,7 @@ def test_a_run_folder_below_a_file_is_told_before_the_work(folder: Path) -> None
 
 
 def test_without_a_rig_file_no_bus_is_moved(folder: Path) -> None:
-    """A plan is a file from anywhere; which drives move is for the rig file of this machine."""
+    """A plan may come from anywhere; only this machine's rig file decides which drives move."""
     refused(folder, 2, "--rig", interface="udp_multicast", no_camera=True, yes=True)
     refused(folder, 2, "--rig", channel="can0", no_camera=True, yes=True)
 
@@ -137,18 +135,18 @@ def test_without_a_rig_file_no_bus_is_moved(folder: Path) -> None:
 @pytest.fixture
 def read_only(short_plan: Path) -> Iterator[Path]:
     """A folder that its user may read and not write, with a plan in it; removed afterwards."""
-    place = Path(tempfile.mkdtemp(dir="/tmp", prefix="read only "))
-    shutil.copy(short_plan, place / "plan.json")
-    (place / "plan.json").chmod(0o644)
-    place.chmod(stat.S_IRUSR | stat.S_IXUSR | stat.S_IROTH | stat.S_IXOTH)
-    yield place
-    place.chmod(0o700)
-    shutil.rmtree(place)
+    read_only_folder = Path(tempfile.mkdtemp(dir="/tmp", prefix="read only "))
+    shutil.copy(short_plan, read_only_folder / "plan.json")
+    (read_only_folder / "plan.json").chmod(0o644)
+    read_only_folder.chmod(stat.S_IRUSR | stat.S_IXUSR | stat.S_IROTH | stat.S_IXOTH)
+    yield read_only_folder
+    read_only_folder.chmod(0o700)
+    shutil.rmtree(read_only_folder)
 
 
 @pytest.mark.parametrize("verb", ["plan", "run", "demo"])
-def test_a_read_only_folder_is_told_before_the_work(read_only: Path, verb: str) -> None:
-    """In a process of its own, without the right of root to write anywhere."""
+def test_a_read_only_folder_is_reported_before_the_work(read_only: Path, verb: str) -> None:
+    """In a separate process, without root's permission to write anywhere."""
     rest = {
         "plan": [RIG, SCENE, "-o", "new.json"],
         "run": ["plan.json", "--rig", RIG, "-o", "run", "--fast", "--no-camera"],
@@ -195,7 +193,7 @@ def test_a_kernel_bus_that_is_not_there_names_the_command_that_brings_it_up(fold
     )
 
 
-def test_a_platform_that_stands_elsewhere_is_not_moved(folder: Path) -> None:
+def test_a_platform_at_another_pose_is_not_moved(folder: Path) -> None:
     refused(
         folder,
         3,
@@ -224,7 +222,7 @@ def test_a_drive_that_does_not_answer_is_named(
     refused(folder, 4, "drive 5", "answer", "check power", rig=RIG, fast=True, no_camera=True)
 
 
-def test_a_bus_without_drives_is_told_before_anything_is_enabled(
+def test_a_bus_without_drives_is_reported_before_anything_is_enabled(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sdo, "RESPONSE_TIMEOUT", 0.01)
@@ -260,14 +258,14 @@ def test_a_real_bus_moves_only_after_a_yes(folder: Path, answers: str) -> None:
 # The camera.
 
 
-def test_a_camera_that_is_not_there_is_told_before_anything_moves(folder: Path) -> None:
+def test_a_missing_camera_is_reported_before_anything_moves(folder: Path) -> None:
     refused(folder, 4, "camera front (77)", "/dev/video", rig=RIG, camera=77)
 
 
 def test_ctrl_c_is_heard_while_a_camera_that_hangs_is_opened(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its server takes the connection and says nothing more."""
+    """Its server accepts the connection and sends nothing."""
     is_ready, asked = CameraProcess.is_ready, []
 
     def stop_at_first(process: CameraProcess, within: float) -> bool:
@@ -316,7 +314,7 @@ def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:
         ),
     ],
 )
-def test_wishes_that_contradict_each_other_are_told(
+def test_contradictory_options_are_reported(
     folder: Path, options: dict[str, object], parts: list[str]
 ) -> None:
     refused(folder, 2, *parts, rig=RIG, **options)
@@ -337,9 +335,9 @@ def test_a_source_that_shows_nothing_leaves_no_pose_log(
 ) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.mp4").write_text("no video")
-    place = source if source.isdigit() or source == "synthetic" else tmp_path / source
+    opened = source if source.isdigit() or source == "synthetic" else tmp_path / source
     with nothing_written(tmp_path):
-        answer = call("track", RIG, place, "-o", tmp_path / "poses.csv")
+        answer = call("track", RIG, opened, "-o", tmp_path / "poses.csv")
     one_message(answer, code, part)
 
 
@@ -362,7 +360,7 @@ def test_a_report_needs_a_whole_run_folder(tmp_path: Path, finished_run: Path) -
 
 
 @pytest.mark.parametrize("name", ["cycles.csv", "clearance.csv", "poses.csv", "summary.json"])
-def test_a_damaged_run_folder_is_told_by_file(
+def test_a_damaged_run_folder_is_reported_by_file(
     tmp_path: Path, finished_run: Path, name: str
 ) -> None:
     broken = tmp_path / "broken"

@@ -1,4 +1,4 @@
-"""`cdpr calibrate camera` on folders as people have them."""
+"""`cdpr calibrate camera` on typical folders."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def save(path: Path, image: np.ndarray) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Fourteen good images in several formats, and files that are of no use."""
+    """Fourteen good images in several formats, and unusable files."""
     folder = tmp_path_factory.mktemp("my images")
     for k, image in enumerate(pictures(14, 0.09)):
         if k == 0:
@@ -87,7 +87,7 @@ def test_people_read_the_verdict_first(folder) -> None:
     assert "small.png has 320 x 240 px, most have 640 x 480 px" in answer.out
 
 
-def test_squares_told_too_small_do_not_make_a_result_good(tmp_path) -> None:
+def test_a_stated_square_size_that_is_too_small_does_not_make_a_result_good(tmp_path) -> None:
     """All millimetres shrink with the squares, pixels do not."""
     rng = np.random.default_rng(3)
     for k, image in enumerate(pictures(12, 0.09)):
@@ -126,7 +126,7 @@ def test_one_picture_many_times_is_never_good_enough(tmp_path) -> None:
     assert "tilt" in answer.said
 
 
-def test_a_board_of_another_number_of_corners_is_told(tmp_path) -> None:
+def test_a_board_with_another_number_of_corners_is_reported(tmp_path) -> None:
     save(tmp_path / "a.png", pictures(1, 0.0)[0])
     options = ("--columns", "11", "--rows", "7", "--square-mm", "25")
     answer = call("calibrate", "camera", tmp_path, *options)
@@ -134,7 +134,7 @@ def test_a_board_of_another_number_of_corners_is_told(tmp_path) -> None:
 
 
 def test_a_wrong_size_of_squares_shows_in_the_distance_of_the_boards(folder) -> None:
-    """Images alone cannot tell it: the camera is the same, everything lies ten times as far."""
+    """Images alone do not show it: the camera is the same, everything is ten times as far."""
     answer = call("calibrate", "camera", folder, *BOARD[:-1], "250", "--wanted-mm", "10")
     (line,) = (row for row in answer.out.splitlines() if row.split()[:2] == ["boards", "were"])
     near, far = line.split()[2], line.split()[4]

@@ -1,4 +1,4 @@
-"""`cdpr calibrate extrinsics`: cameras that stand elsewhere than the rig file says."""
+"""`cdpr calibrate extrinsics`: cameras at another pose than in the rig file."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ TURNS = ((0.2, 0, 0), (0, 0.25, 0), (0, 0, 0.3), (-0.2, 0.1, 0), (0.1, -0.2, -0.
 
 
 def poses() -> list[Pose]:
-    """Of the platform, far apart and turned."""
-    places = [(0, 0, 0.45), (0.15, 0, 0.5), (-0.1, 0.1, 0.4), (0, -0.15, 0.55), (0.1, 0.1, 0.35)]
+    """Of the platform, far apart and rotated."""
+    positions = [(0, 0, 0.45), (0.15, 0, 0.5), (-0.1, 0.1, 0.4), (0, -0.15, 0.55), (0.1, 0.1, 0.35)]
     return [
-        Pose(places[k % 5] + np.array([0, 0, 0.01 * k]), matrix_from_rotation_vector(TURNS[k % 6]))
+        Pose(
+            positions[k % 5] + np.array([0, 0, 0.01 * k]), matrix_from_rotation_vector(TURNS[k % 6])
+        )
         for k in range(10)
     ]
 
@@ -40,7 +42,7 @@ def truth() -> Pose:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, truth: Pose) -> Path:
-    """Ten images, a file of the platform's poses, and files that are of no use."""
+    """Ten images, a file of the platform's poses, and unusable files."""
     folder = tmp_path_factory.mktemp("rig images")
     rig = load_rig(RIG)
     scene = replace(load_scene(CONFIGS / "environment_1.yaml"), obstacles=())
@@ -48,8 +50,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, truth: Pose) -> Path:
     rows = ["picture,x_mm,y_mm,z_mm,qw,qx,qy,qz"]
     for k, pose in enumerate(poses()):
         cv2.imwrite(str(folder / f"{k}.png"), camera.render(pose, k))
-        place = ",".join(f"{1e3 * x:.6f}" for x in pose.position)
-        rows.append(f"{k}.png,{place}," + ",".join(f"{q:.9f}" for q in pose.quaternion))
+        coordinates = ",".join(f"{1e3 * x:.6f}" for x in pose.position)
+        rows.append(f"{k}.png,{coordinates}," + ",".join(f"{q:.9f}" for q in pose.quaternion))
     (folder / "poses.csv").write_text("\n".join(rows) + "\n")
     cv2.imwrite(str(folder / "wall.png"), np.full((720, 1280), 128, np.uint8))
     cv2.imwrite(str(folder / "small.png"), np.full((240, 320), 128, np.uint8))
@@ -58,7 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, truth: Pose) -> Path:
 
 
 def far(found: dict, truth: Pose) -> float:
-    """How far off the found place is, [mm]."""
+    """Error of the position found, [mm]."""
     pose = PoseDocument.model_validate(found["world_from_camera"]).pose()
     return pose.distance_to(truth) * 1e3
 
@@ -84,7 +86,7 @@ def test_a_camera_is_found_by_frame_tags_and_the_result_used(folder, truth, tmp_
     (tmp_path / "one" / "0.png").write_bytes((folder / "0.png").read_bytes())
     log = tmp_path / "poses.csv"
     wrong = call("track", RIG, tmp_path / "one", "-o", log)
-    assert wrong.code == 1  # the camera does not stand where the rig file says
+    assert wrong.code == 1  # the camera is not at the rig file's pose
     answer = call("track", RIG, tmp_path / "one", "-o", log, "--calibration", saved)
     assert answer.code == 0, answer
     x, y, z = (float(v) for v in log.read_text().splitlines()[1].split(",")[3:6])
@@ -108,15 +110,15 @@ def run(short_plan: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_run_tells_its_poses_by_the_drives(run: Path) -> None:
+def test_a_run_gives_its_poses_from_the_encoders(run: Path) -> None:
     answer = call("calibrate", "extrinsics", RIG, run / "pictures", "--poses", run, "--json")
-    assert answer.code == 3, answer  # a short straight path does not tell much
+    assert answer.code == 3, answer  # a short straight path gives little information
     found = json.loads(answer.out)
     assert found["pictures"] >= 8
     named = load_rig(RIG).cameras[0].world_from_camera
-    for axis, place in zip("xyz", named.position * 1e3, strict=True):
+    for axis, coordinates in zip("xyz", named.position * 1e3, strict=True):
         low, high = found["intervals"][f"{axis}_mm"]
-        assert low <= place <= high
+        assert low <= coordinates <= high
 
 
 def test_the_pictures_of_another_camera_are_refused(run: Path, tmp_path: Path) -> None:
@@ -172,7 +174,7 @@ def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: st
     one_message(answer, 2, named)
 
 
-def test_folders_that_cannot_be_used_are_told(folder, tmp_path) -> None:
+def test_unusable_folders_are_reported(folder, tmp_path) -> None:
     out = tmp_path / "out"
     answer = call("calibrate", "extrinsics", RIG, tmp_path / "nowhere", "-o", out)
     one_message(answer, 2, "not a folder of images")

@@ -1,4 +1,4 @@
-"""`cdpr calibrate camera --live`, with a video in place of a camera."""
+"""`cdpr calibrate camera --live`, with a video instead of a camera."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ TURNS = ([0.5, 0, 0], [-0.5, 0, 0], [0, 0.5, 0], [0, -0.5, 0], [0.3, 0.3, 0.2])
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A board that is held at nine places, two images each, and tilted every way."""
-    places = [(x, y) for x in (-0.11, 0.0, 0.11) for y in (-0.08, 0.0, 0.08)]
-    held = [(*place, [0.0, 0.0, 0.0]) for place in places] + [(0.0, 0.0, turn) for turn in TURNS]
+    """A board held at nine positions, two images each, and tilted in every direction."""
+    positions = [(x, y) for x in (-0.11, 0.0, 0.11) for y in (-0.08, 0.0, 0.08)]
+    held = [(*position, [0.0, 0.0, 0.0]) for position in positions] + [
+        (0.0, 0.0, turn) for turn in TURNS
+    ]
     path = tmp_path_factory.mktemp("live") / "board.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, SIZE)
     for x, y, turn in held:
@@ -51,8 +53,8 @@ def test_pictures_are_taken_with_advice_and_then_used(video: Path, tmp_path: Pat
     assert "# # #" in answer.err
 
 
-def test_a_video_in_place_of_a_folder_is_used(video: Path) -> None:
-    """Of every view one picture is used, as nothing moved to the next."""
+def test_a_video_is_used_instead_of_a_folder(video: Path) -> None:
+    """One image of every view is used, as nothing moved to the next."""
     answer = call("calibrate", "camera", video, *BOARD, "--json")
     assert answer.code in (0, 3), answer
     found = json.loads(answer.out)
@@ -60,7 +62,7 @@ def test_a_video_in_place_of_a_folder_is_used(video: Path) -> None:
     assert all("nothing moved" in why for why in found["unused"].values())
 
 
-def test_a_board_that_is_never_seen_is_told(video: Path, tmp_path: Path) -> None:
+def test_a_board_that_is_never_detected_is_reported(video: Path, tmp_path: Path) -> None:
     other = ("--board", "charuco", "--columns", "5", "--rows", "4", "--square-mm", "25")
     other += ("--marker-mm", "20")
     answer = call("calibrate", "camera", tmp_path / "taken", "--live", video, *other)
@@ -75,7 +77,7 @@ def test_a_board_that_is_never_seen_is_told(video: Path, tmp_path: Path) -> None
         (("--pictures", "12"), 2, "are for capturing images"),
     ],
 )
-def test_cameras_that_are_none_are_told(tmp_path: Path, options, code: int, named: str) -> None:
+def test_invalid_cameras_are_reported(tmp_path: Path, options, code: int, named: str) -> None:
     answer = call("calibrate", "camera", tmp_path / "taken", *options, *BOARD)
     one_message(answer, code, named)
 

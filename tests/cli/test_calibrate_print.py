@@ -1,4 +1,4 @@
-"""`cdpr calibrate print`: a file in exact size, or one clear message."""
+"""`cdpr calibrate print`: a file at exact scale, or one clear message."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ BOARD = ("--columns", "9", "--rows", "6", "--square-mm", "25")
 def test_a_board_is_printed(tmp_path: Path) -> None:
     answer = call("calibrate", "print", tmp_path / "board.pdf", *BOARD, "--json")
     assert answer.code == 0, answer
-    told = json.loads(answer.out)
-    assert (told["pages"], told["width_mm"], told["height_mm"]) == (1, 297.0, 210.0)
-    assert "measure the ruler" in told["next_steps"][0]
+    document = json.loads(answer.out)
+    assert (document["pages"], document["width_mm"], document["height_mm"]) == (1, 297.0, 210.0)
+    assert "measure the ruler" in document["next_steps"][0]
     ((size, _, _),) = pages_in((tmp_path / "board.pdf").read_bytes())
     assert size.round(2).tolist() == [297.0, 210.0]
 

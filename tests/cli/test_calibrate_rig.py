@@ -1,4 +1,4 @@
-"""`cdpr calibrate rig` on files as people have them."""
+"""`cdpr calibrate rig` on typical files."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def test_a_result_and_its_report_are_written_and_applied(file: Path, tmp_path: P
     folder = tmp_path / "calibration"
     done = call("calibrate", "rig", RIG, file, "-o", folder, "--json")
     assert done.code == 0, done
-    told = json.loads(done.out)
-    assert told["good_enough"]
-    assert told["held_out_mm"] < told["before_mm"] / 3.0
+    document = json.loads(done.out)
+    assert document["good_enough"]
+    assert document["held_out_mm"] < document["before_mm"] / 3.0
     (result,) = folder.glob("calibration_rig_rig_*.yaml")
     assert "good enough" in result.with_suffix(".html").read_text(encoding="utf-8")
     same = call("calibrate", "diff", result, result)
@@ -61,10 +61,10 @@ def test_the_recorded_session_calibrates_its_rig_to_a_tenth_of_a_millimetre(
     truth = samples(rig, 20, tilt=0.05, seed=8, noise=0.0)
     winches, data = WinchMap(corrected), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
-    told, _ = poses_near(corrected, lengths, truth.positions, truth.rotations, steps=10)
-    assert np.linalg.norm(told - truth.positions, axis=1).max() < 0.2e-3
-    way = ("--by-mm", "0", "0", "2", "--no-scene", "--fast", "-o", tmp_path / "jog")
-    jogged = call("jog", RIG, *way, "--calibration", result, "--json")
+    found, _ = poses_near(corrected, lengths, truth.positions, truth.rotations, steps=10)
+    assert np.linalg.norm(found - truth.positions, axis=1).max() < 0.2e-3
+    motion = ("--by-mm", "0", "0", "2", "--no-scene", "--fast", "-o", tmp_path / "jog")
+    jogged = call("jog", RIG, *motion, "--calibration", result, "--json")
     assert jogged.code == 0, jogged
     ran = json.loads((tmp_path / "jog" / "rig.json").read_text(encoding="utf-8"))
     assert ran["outlets_mm"] == json.loads(done.out)["outlets_mm"]
@@ -143,7 +143,7 @@ def changed(file: Path, tmp_path: Path, how: str) -> Path:
         ("deviation", "a standard deviation is not positive"),
     ],
 )
-def test_a_file_that_cannot_be_used_is_refused_with_its_place(
+def test_an_unusable_file_is_refused_with_its_location(
     file: Path, tmp_path: Path, how: str, what: str
 ) -> None:
     folder = tmp_path / "out"
@@ -159,7 +159,7 @@ def test_a_file_that_is_named_twice_is_refused(file: Path) -> None:
     assert "given twice" in done.err
 
 
-def test_poses_that_no_such_rig_can_hold_are_told_of_file_and_rig(tmp_path: Path) -> None:
+def test_poses_that_no_such_rig_can_hold_are_reported_with_file_and_rig(tmp_path: Path) -> None:
     """x in inches: near the middle of the rig, and the outlets that would fit cannot hold home."""
     names, *lines = (SESSION / "places.csv").read_text(encoding="utf-8").splitlines()
     x, rows = names.split(",").index("x_mm"), [line.split(",") for line in lines]
@@ -170,14 +170,14 @@ def test_poses_that_no_such_rig_can_hold_are_told_of_file_and_rig(tmp_path: Path
     folder = tmp_path / "out"
     done = call("calibrate", "rig", RIG, path, "-o", folder, "--json")
     assert done.code == 2, done
-    told = json.loads(done.out)
-    assert str(RIG) in told["what"]
-    assert str(path) in told["where"]
-    assert told["next_step"].startswith("check units, the order of the cables")
+    document = json.loads(done.out)
+    assert str(RIG) in document["what"]
+    assert str(path) in document["where"]
+    assert document["next_step"].startswith("check units, the order of the cables")
     assert not list(folder.glob("*"))
 
 
-def test_a_file_in_place_of_the_folder_is_told_with_a_next_step(file: Path) -> None:
+def test_a_file_instead_of_the_folder_is_reported_with_a_next_step(file: Path) -> None:
     other = file.with_name("other")
     other.write_text("mine")
     done = call("calibrate", "rig", RIG, file, "-o", other, "--json")
@@ -192,7 +192,7 @@ def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:
 
 
 def test_the_options_have_the_deviations_that_poses_are_chosen_by() -> None:
-    """The options have units of their own, so the defaults are written there once more."""
+    """The options have other units, so the defaults are repeated there."""
     options = inspect.signature(rig_verb.rig).parameters
     for group, deviation in DEFAULT_DEVIATIONS.items():
         percent = group in ("drum_scale", "stiffness")
@@ -202,8 +202,8 @@ def test_the_options_have_the_deviations_that_poses_are_chosen_by() -> None:
         assert options[f"{group}_{unit}"].default == pytest.approx(deviation * scale), group
 
 
-def test_a_run_with_too_few_rests_is_told_so(finished_run: Path) -> None:
-    """Without a camera; it stands still at its start and its goal, if at all."""
+def test_a_run_with_too_few_rests_is_reported(finished_run: Path) -> None:
+    """Without a camera; it rests at most at its start and its goal."""
     done = call("calibrate", "rig", ROOT / "configs/gachon_8_6.yaml", finished_run, "--json")
     assert done.code == 2
     answer = json.loads(done.out)
@@ -222,10 +222,10 @@ def test_lengths_alone_in_a_file_need_no_poses(rig: Rig, tmp_path: Path) -> None
     write_samples(path, data, poses=False)
     done = call("calibrate", "rig", RIG, path, "--known", "outlets", "--json")
     assert done.code in (0, 3), done
-    told = json.loads(done.out)
-    assert not told["with_poses"]
-    assert told["held_out_mm"] < told["before_mm"]
-    assert np.array(told["outlets_mm"]) == pytest.approx(rig.outlets * 1e3)
+    document = json.loads(done.out)
+    assert not document["with_poses"]
+    assert document["held_out_mm"] < document["before_mm"]
+    assert np.array(document["outlets_mm"]) == pytest.approx(rig.outlets * 1e3)
 
 
 @pytest.mark.slow  # compiled planner
@@ -244,8 +244,8 @@ def test_poses_for_measuring_are_planned_and_their_plan_holds(tmp_path: Path) ->
     )
     done = call("calibrate", "poses", RIG, ROOT / "configs/turn.yaml", "-o", plan, *arguments)
     assert done.code == 0, done
-    told = json.loads(done.out)
-    assert len(told["stops"]) == 10
-    assert 2.0 < max(told["turned_deg"]) <= 5.0 + 1e-9
+    document = json.loads(done.out)
+    assert len(document["stops"]) == 10
+    assert 2.0 < max(document["turned_deg"]) <= 5.0 + 1e-9
     assert call("check", plan).code == 0
     assert call("calibrate", "poses", RIG, ROOT / "configs/turn.yaml", "-o", plan).code == 2

@@ -51,7 +51,7 @@ def as_mounted() -> Rig:
 
 
 def before_the_camera(count: int) -> list[Pose]:
-    """Poses ``camera_from_platform``: turned every way, no face straight at the camera."""
+    """Poses ``camera_from_platform``: rotated in all directions, no face square to the camera."""
     rng, poses = np.random.default_rng(8), []
     while len(poses) < count:
         turn = Rotation.random(random_state=rng).as_matrix()
@@ -108,7 +108,7 @@ def test_the_tags_are_found_where_they_were_glued_and_the_result_used(folder, tm
         assert tag["position_mm"] == pytest.approx(other["position_mm"], abs=0.05)
 
 
-def test_pictures_that_were_saved_anew_count_once(folder, tmp_path) -> None:
+def test_images_saved_again_count_once(folder, tmp_path) -> None:
     for k in range(18):
         image = cv2.imread(str(folder / f"{k}.png"), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(tmp_path / f"{k}.png"), image)
@@ -143,7 +143,7 @@ def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: st
     one_message(answer, 2, named)
 
 
-def test_pictures_of_no_platform_are_told(folder, tmp_path) -> None:
+def test_images_without_the_platform_are_reported(folder, tmp_path) -> None:
     (tmp_path / "a.png").write_bytes((folder / "wall.png").read_bytes())
     answer = call("calibrate", "tags", RIG, tmp_path)
     one_message(answer, 2, "none of the tag36h11 tags 301", "a.png shows no complete tag")

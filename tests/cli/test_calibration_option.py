@@ -42,13 +42,13 @@ def test_results_about_another_camera_are_refused_by_name(tmp_path: Path, verb: 
 
 
 @pytest.mark.parametrize("good", [True, False])
-def test_a_result_that_is_not_good_enough_is_used_and_told(tmp_path: Path, good: bool) -> None:
+def test_a_result_that_is_not_good_enough_is_used_and_reported(tmp_path: Path, good: bool) -> None:
     why = "not good enough: few [images]"
     changes = {} if good else {"good_enough": False, "verdict": why}
     result = write_result(tmp_path, camera_result_of().model_copy(update=changes))
     answer = call("status", RIG, "--calibration", result)
-    told = f"remark calibration camera front, 2026-03-01: {why}"
-    assert (told in answer.err) != good
+    remark = f"remark calibration camera front, 2026-03-01: {why}"
+    assert (remark in answer.err) != good
 
 
 def test_a_file_that_is_no_result_is_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`cdpr doctor` says what is missing, each with the command that mends it."""
+"""`cdpr doctor` lists what is missing, each with the command that fixes it."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def kernel_with_can(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "kernel_support", lambda: MachineCheck("kernel", True, "there"))
 
 
-def test_a_healthy_interface_has_nothing_to_mend() -> None:
+def test_a_healthy_interface_has_nothing_to_fix() -> None:
     answers = looked()
     assert len(answers) == 4
     assert all(answer.good for answer in answers.values())
@@ -127,7 +127,7 @@ def test_other_interfaces_are_left_out() -> None:
     assert parse_interfaces("") == ()
 
 
-def test_an_ip_that_says_something_else_is_told(tmp_path: Path) -> None:
+def test_unexpected_output_of_ip_is_reported(tmp_path: Path) -> None:
     program = tmp_path / "ip"
     program.write_text("#!/bin/sh\necho no idea\n")
     program.chmod(0o755)
@@ -166,7 +166,7 @@ class FakeCapture:
         return True
 
     def set(self, *_: object) -> None:
-        """Cameras take settings and do as they like."""
+        """Cameras accept settings and may ignore them."""
 
     def read(self) -> tuple[bool, np.ndarray]:
         return True, np.zeros(self.size, dtype=np.uint8)
@@ -206,7 +206,7 @@ def test_a_camera_needs_the_rig_that_describes_it() -> None:
     assert "cdpr doctor RIG --camera INDEX" in answer.said
 
 
-def test_a_bus_too_slow_and_an_interface_missing_are_both_told(tmp_path: Path) -> None:
+def test_a_bus_too_slow_and_an_interface_missing_are_both_reported(tmp_path: Path) -> None:
     text = RIG.read_text().replace("interface: virtual", "interface: socketcan")
     rig = tmp_path / "rig.yaml"
     rig.write_text(
@@ -214,11 +214,11 @@ def test_a_bus_too_slow_and_an_interface_missing_are_both_told(tmp_path: Path) -
     )
     answer = call("doctor", rig, "--json")
     assert answer.code == 4
-    told = {one["name"]: one for one in json.loads(answer.out)}
-    assert not told["bus load"]["good"]
-    assert "4 or more" in told["bus load"]["fix"]
-    assert not told["interface can77"]["good"]
-    assert "real-time priority" in told
+    document = {one["name"]: one for one in json.loads(answer.out)}
+    assert not document["bus load"]["good"]
+    assert "4 or more" in document["bus load"]["fix"]
+    assert not document["interface can77"]["good"]
+    assert "real-time priority" in document
 
 
 def with_profile(tmp_path: Path, profile: str) -> Path:
@@ -233,12 +233,12 @@ def test_objects_of_all_drives_are_read_in_one_table(tmp_path: Path) -> None:
     assert "of 8 drives read, nothing written; 0 to change" in answer.out
     assert "stop by SYNC after 30 ms: up to 0.7 mm" in answer.out
     answer = call("doctor", RIG, "--drives", "--json")
-    told = json.loads(answer.out)
-    assert told["drives"]["answered"] == list(range(1, 9))
-    assert {one["verdict"] for one in told["drives"]["objects"]} <= {"ok", "remark"}
+    document = json.loads(answer.out)
+    assert document["drives"]["answered"] == list(range(1, 9))
+    assert {one["verdict"] for one in document["drives"]["objects"]} <= {"ok", "remark"}
 
 
-def test_drives_of_another_make_are_told_with_what_to_change(
+def test_drives_of_another_make_are_reported_with_what_to_change(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Drives of the standard have no current limit of Maxon's, and no units."""

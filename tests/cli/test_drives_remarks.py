@@ -1,4 +1,4 @@
-"""What drives cannot do is told to the operator when they are armed."""
+"""Missing functions of drives are reported to the operator when arming."""
 
 from __future__ import annotations
 

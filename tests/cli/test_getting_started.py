@@ -1,4 +1,4 @@
-"""What the first page tells a newcomer to type does what the page says."""
+"""The commands of the first page do what the page says."""
 
 from __future__ import annotations
 

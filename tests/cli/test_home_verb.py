@@ -1,4 +1,4 @@
-"""`cdpr home` and `cdpr jog --cable` as typed: what is not clearly meant is denied."""
+"""`cdpr home` and `cdpr jog --cable` as typed: ambiguous commands are refused."""
 
 from __future__ import annotations
 
@@ -68,29 +68,29 @@ def test_a_no_moves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.json"))
 
 
-def test_nobody_is_asked_without_being_told_what_for(tmp_path: Path) -> None:
-    """With --json too: what is about to happen is on standard error, before the question."""
+def test_every_question_is_preceded_by_what_will_happen(tmp_path: Path) -> None:
+    """With --json too: what will happen is on standard error, before the question."""
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41990", "--json")
     asked = {
         "pretension": ("home", RIG, "--at-home", *bus),
         "cable 1 (drive 1)": ("jog", RIG, "--cable", "1", "--mm", "1", *bus),
         "no fault latched": ("reset", RIG, *bus),
     }
-    for told, arguments in asked.items():
+    for title, arguments in asked.items():
         answer = call(*arguments, answers="n\n")
         assert (answer.code, json.loads(answer.out)["error"]) == (130, "stopped")
-        assert 0 <= answer.err.index(told) < answer.err.index("[y/N]")
+        assert 0 <= answer.err.index(title) < answer.err.index("[y/N]")
     assert not list(tmp_path.rglob("*.json"))
 
 
-def test_a_rehearsal_tells_the_reference_and_keeps_nothing(tmp_path: Path) -> None:
+def test_a_rehearsal_shows_the_reference_and_stores_nothing(tmp_path: Path) -> None:
     answer = call("home", RIG, "--camera", "synthetic", "--pictures", "5", "--fast", "--json")
     assert answer.code == 0, answer
-    told = json.loads(answer.out)
-    assert told["file"] is None
-    assert 0.0 < told["uncertainty_mm"] < 0.5
-    assert len(told["home_counts"]) == 8
-    assert min(told["tensions_n"]) >= 7.5
+    document = json.loads(answer.out)
+    assert document["file"] is None
+    assert 0.0 < document["uncertainty_mm"] < 0.5
+    assert len(document["home_counts"]) == 8
+    assert min(document["tensions_n"]) >= 7.5
     assert not list(tmp_path.rglob("*.json"))
 
 
@@ -105,7 +105,7 @@ def test_a_camera_that_is_not_there_is_found_out_before_anything_moves(
 
 
 def test_a_stop_while_the_camera_looks_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C is heard though the camera does not answer any more."""
+    """Ctrl-C works although the camera has stopped answering."""
     ask, asked = CameraProcess.ask, []
 
     def stop_at_second(process: CameraProcess, trigger: FrameRequest) -> None:
@@ -124,7 +124,7 @@ def test_a_stop_while_the_camera_looks_ends_it(monkeypatch: pytest.MonkeyPatch) 
     assert asked == [0, 0, 1]
 
 
-def test_one_cable_on_a_taut_platform_ends_in_a_stop_that_is_told() -> None:
+def test_one_cable_on_a_taut_platform_ends_in_a_reported_stop() -> None:
     answer = call("jog", RIG, "--cable", "3", "--mm", "-5", "--fast")
     assert answer.code == 1
     assert "more than" in answer.err

@@ -1,4 +1,4 @@
-"""Keys of the terminal: read as they are pressed, they watch and steer a run, and hold a jog."""
+"""Keys of the terminal: they monitor and control a run, and hold a jog."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SENT = {name: b"\x1b[" + code for code, name in NAMES.items()} | {
 
 
 @given(st.lists(st.sampled_from([*SENT, "unknown"])))
-def test_keys_are_told_apart_however_many_come_at_once(keys: list[str]) -> None:
+def test_keys_are_distinguished_however_many_come_at_once(keys: list[str]) -> None:
     data = b"".join(SENT.get(key, b"\x1b[1;5P") for key in keys)
     assert names_of(data) == [key for key in keys if key != "unknown"]
 
@@ -54,7 +54,7 @@ def test_no_bytes_are_too_odd(data: bytes) -> None:
 
 @contextmanager
 def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    """A terminal as standard input; its other end."""
+    """The other end of a terminal that is standard input."""
     operator, program = pty.openpty()
     with os.fdopen(program) as stream, monkeypatch.context() as patched:
         patched.setattr(sys, "stdin", stream)
@@ -85,7 +85,7 @@ def test_a_pipe_has_no_keys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 
 class Typed:
-    """Keys by simulated time, in place of a terminal."""
+    """Keys by simulated time, instead of a terminal."""
 
     def __init__(self, script: Sequence[tuple[float, float, str]]) -> None:
         self._script, self.now = script, 0.0
@@ -100,7 +100,7 @@ class Typed:
 
 
 def jogged(script: Sequence[tuple[float, float, str]]) -> list[tuple[float, Any]]:
-    """Time and place of the platform, cycle by cycle, from when the drives are ready."""
+    """Time and position of the platform in every cycle once the drives are ready."""
     typed, seen = Typed(script), []
     keys = JogKeys(typed, 20.0)  # type: ignore[arg-type]
     begun: list[float] = []
@@ -120,13 +120,13 @@ def jogged(script: Sequence[tuple[float, float, str]]) -> list[tuple[float, Any]
 
 def test_the_platform_moves_while_a_key_repeats_and_rests_soon_after() -> None:
     seen = jogged([(1.0, 2.0, "right"), (4.0, 9.0, "q")])
-    times, places = np.array([t for t, _ in seen]), np.array([p for _, p in seen])
-    moved = places[-1] - places[0]
+    times, positions = np.array([t for t, _ in seen]), np.array([p for _, p in seen])
+    moved = positions[-1] - positions[0]
     assert moved[0] > 0.010
     assert np.abs(moved[1:]).max() < 1e-9
     rig = load_rig(RIG)
     to_rest = 0.020 / rig.motion.acceleration + rig.motion.acceleration / rig.motion.jerk
-    rests = places[times > 2.0 + TIMEOUT + to_rest + 0.1]
+    rests = positions[times > 2.0 + TIMEOUT + to_rest + 0.1]
     assert len(rests) > 20
     assert np.ptp(rests, axis=0).max() == 0.0
     assert times[-1] < 5.0, "q ends the session"
@@ -152,7 +152,7 @@ def test_space_stops_the_session_while_it_moves() -> None:
 
 
 class Script:
-    """Keys one call after the other."""
+    """Scripted keys, one list per call."""
 
     def __init__(self, *keys: str) -> None:
         self._keys = list(keys)
@@ -171,7 +171,7 @@ def test_the_monitors_keys_ask_what_the_verbs_ask(monkeypatch: pytest.MonkeyPatc
     assert [one.percent for one in said[2:]] == [60, 70, 60]  # type: ignore[union-attr]
     assert list(operator.between(0.0)) == []
     assert stopped == [1]
-    assert operator.line == "stop asked for"
+    assert operator.line == "stop requested"
     assert list(operator.between(0.0)) == []
     with pytest.raises(KeyboardInterrupt):
         operator.between(0.0)
@@ -199,8 +199,8 @@ def test_a_run_is_waited_for_and_takes_what_it_is_sent(monkeypatch: pytest.Monke
         return [make_line("hold")]
 
     monkeypatch.setattr(client, "find_runs", later)
-    told = WinchStatus(load_rig(RIG), board, simulated_time=False)
-    with advertised() as listeners, serving(listeners, board, told):
+    run_status = WinchStatus(load_rig(RIG), board, simulated_time=False)
+    with advertised() as listeners, serving(listeners, board, run_status):
         following = follow_run(None, 10.0, waits=True, between=between)
         first = next(following)
         assert passed[0] == pytest.approx(2 * client.LOOK)
@@ -218,8 +218,8 @@ def test_the_monitor_shows_where_the_platform_is_by_the_runs_own_rig(tmp_path: P
         | {"set_counts": int(counts), "tension_n": float(run.cycles.planned_tensions[k, i])}
         for i, counts in enumerate(run.cycles.set_counts[k])
     ]
-    told = status(folder=str(folder.path), drives=drives)
-    seen = monitor._Robot().seen(told)
+    run_status = status(folder=str(folder.path), drives=drives)
+    seen = monitor._Robot().seen(run_status)
     assert seen is not None
     view, robot = seen
     np.testing.assert_allclose(robot.pose.position, run.cycles.planned[k], atol=2e-5)

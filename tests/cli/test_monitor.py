@@ -1,4 +1,4 @@
-"""What `cdpr monitor` shows of a status, without a run."""
+"""Output of `cdpr monitor` for a status, without a run."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ def status(**changes: Any) -> dict[str, Any]:
                 "trouble": "gave no answer for 2 s",
             }
         ],
-        "events": [{"time_s": 0.05, "code": "broken", "text": "what [drives] told"}],
+        "events": [{"time_s": 0.05, "code": "broken", "text": "what [drives] reported"}],
         **changes,
     }
 
 
-def live(told: dict[str, Any]) -> str:
+def live(report: dict[str, Any]) -> str:
     console = Console(file=io.StringIO(), force_terminal=True, width=160, no_color=True)
-    console.print(_view(told))
+    console.print(_view(report))
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
@@ -85,7 +85,7 @@ def test_everything_of_a_run_is_shown_as_it_is(shown: Any) -> None:
     for part in (
         *("holding", "gachon_8_6", "77", "runs/[first]", "10.0 of 58.3 mm", "0 % of 50 %"),
         *("late 0.06 ms, at most 0.20 ms", "following error – mm", "3 lost replies"),
-        *("12", "operation enabled", "-4711", "-3", "20.50", "broken", "what [drives] told"),
+        *("12", "operation enabled", "-4711", "-3", "20.50", "broken", "what [drives] reported"),
         "camera side (rtsp://x/[y]), 9.8 images/s, 5.3 ms, 2 tags, 3 of 12 with a pose, 4",
         "4 dropped, gave no answer for 2 s",
     ):
@@ -108,17 +108,17 @@ def test_a_session_of_jogs_has_no_progress_to_show(shown: Any) -> None:
 @pytest.mark.parametrize("shown", [live, status_text])
 def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> None:
     rig = load_rig(RIG)
-    told = WinchStatus(rig, LocalRequests(), simulated_time=False)
-    before = told.as_dict()
-    told.folder = Path("runs/[first]")
+    report = WinchStatus(rig, LocalRequests(), simulated_time=False)
+    before = report.as_dict()
+    report.folder = Path("runs/[first]")
     assert before.keys() == status().keys()
     assert "preparing" in shown(before)
-    told.take_release()
-    assert "releasing" in shown(told.as_dict()).lower()
+    report.take_release()
+    assert "releasing" in shown(report.as_dict()).lower()
     for cycle in range(3):
-        told.take_cycle(replace(_record(cycle), index=25.0))
-    told.take_event(LoopEvent(1, 50.01, "moving", "winding in"))
-    now = told.as_dict()
+        report.take_cycle(replace(_record(cycle), index=25.0))
+    report.take_event(LoopEvent(1, 50.01, "moving", "winding in"))
+    now = report.as_dict()
     assert now.keys() == status().keys()
     assert {key for key, value in now.items() if value is None} == {
         *("path_mm", "path_length_mm", "next_stop", "cause", "measured")
@@ -163,7 +163,7 @@ def _record(cycle: int) -> CycleRecord:
 
 
 @pytest.mark.parametrize(
-    ("last", "code", "told"),
+    ("last", "code", "text"),
     [
         ({"state": "finished"}, 0, "ended: finished"),
         ({"state": "stopped", "cause": "stop requested"}, 130, "ended: stopped, stop requested"),
@@ -172,9 +172,9 @@ def _record(cycle: int) -> CycleRecord:
     ],
 )
 def test_the_monitor_ends_as_the_run_did(
-    last: dict[str, Any], code: int, told: str, capsys: pytest.CaptureFixture[str]
+    last: dict[str, Any], code: int, text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(typer.Exit) as ended:
         _lines(iter([status(), status(**last)]), as_json=False)
     assert ended.value.exit_code == code
-    assert told in capsys.readouterr().out.splitlines()[-1]
+    assert text in capsys.readouterr().out.splitlines()[-1]

@@ -1,4 +1,4 @@
-"""`cdpr new` writes a rig file that the other verbs accept, or nothing and says why."""
+"""`cdpr new` writes a rig file that the other verbs accept, or nothing, with a reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the program tells a user to do next can be done: each printed command is run here."""
+"""The next steps that the program prints can be done: each command is run here."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cdpr.cli.operate.run import show
 from cdpr.cli.output import progress_bar
 from executor.interlock.interlock import ReferenceStatus
 from executor.recording.verdict import page_text
-from executor.remote.client import request_run as told
+from executor.remote.client import request_run as request
 from executor.run_result import RunResult
 from executor.service import StatusResult
 from model.errors import Fault
@@ -95,7 +95,7 @@ def test_a_run_that_failed_has_a_next_step_and_its_faults_explained(
 def test_a_run_that_went_well_points_to_no_fault(
     capsys: pytest.CaptureFixture[str], verdict: str
 ) -> None:
-    """A reply that was lost and did not matter is no reason to read about it."""
+    """A lost reply without effect is not reported."""
     events = [{"code": "pass"}, {"code": "reply_lost"}]
     summary = {"verdict": verdict, "sentence": "", "reasons": [], "events": events}
     show(RunResult(Path("run"), summary), as_json=False)
@@ -120,7 +120,7 @@ def test_status_says_what_has_to_be_done_before_a_run() -> None:
 
 def test_monitor_calls_itself_by_its_name() -> None:
     with pytest.raises(Fault, match="no active run") as caught:
-        told("status", None, verb="monitor")
+        request("status", None, verb="monitor")
     assert caught.value.where == "cdpr monitor"
     assert "cdpr status" not in str(caught.value)
     answer = call("monitor", "--once")
@@ -143,7 +143,7 @@ def test_no_coordinate_is_a_negative_zero(short: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def short(tmp_path: Path) -> Path:
-    """A plan that begins a hair below zero."""
+    """A plan that begins slightly below zero."""
     scene = load_scene(SCENE)
     path = tmp_path / "plan.json"
     start = [-0.00001, 0.0, float(scene.start.position[2]) * 1000.0]
@@ -158,7 +158,7 @@ def short(tmp_path: Path) -> Path:
 def test_compiling_is_no_part_of_planning(
     monkeypatch: pytest.MonkeyPatch, settings: OptimalSettings | PlannerSettings
 ) -> None:
-    """The first plan with new machine code is a short one that is thrown away."""
+    """New machine code is first used for a short plan that is discarded."""
     made: list[Any] = []
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""Options of `cdpr plan`: each planner takes its own, and says what it cannot heed."""
+"""Options of `cdpr plan`: each planner accepts its own and refuses others."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def test_weights_seed_rounds_and_limit_are_in_the_plan(tmp_path: Path) -> None:
     options += ["--rounds", "90", "--longest-mm", "700", "--json"]
     answer = call("plan", RIG, SCENE, "-o", plan, *options)
     assert answer.code == 0, answer
-    told = json.loads(answer.out)["planner"]
-    assert told == json.loads(plan.read_text())["planner"]
-    assert told == {
+    planner = json.loads(answer.out)["planner"]
+    assert planner == json.loads(plan.read_text())["planner"]
+    assert planner == {
         "name": "optimal",
         "weights": {"length": 1.0, "kinematic": 0.5, "clearance": 0.0, "capacity": 0.0},
         "seed": 3,

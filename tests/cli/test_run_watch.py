@@ -1,4 +1,4 @@
-"""What the cameras of a run tell while it goes on, and what the run is stopped for."""
+"""Reports of the cameras during a run, and what stops the run."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tests.executor.test_run_cameras import MODEL, RATE, Scripted
 def watched(
     moments: int, limit: float, *cameras: Any, clearance_stop: bool = True
 ) -> tuple[LocalRequests, list[tuple[str, str]]]:
-    """The board after so many moments, and what was told."""
-    board, told = LocalRequests(), list[tuple[str, str]]()
+    """The board after a number of frames, and the reports."""
+    board, reported = LocalRequests(), list[tuple[str, str]]()
     status: Any = SimpleNamespace(
         take_cameras=lambda _cameras: None, take_measured=lambda *_measured: None
     )
@@ -25,24 +25,24 @@ def watched(
         RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE),
         status,
         board,
-        lambda code, text, _at: told.append((code, text)),
+        lambda code, text, _at: reported.append((code, text)),
         clearance_stop=clearance_stop,
     )
     for k in range(moments):
         watch.trigger(k / RATE, k / RATE, None, None)
-    return board, told
+    return board, reported
 
 
-def test_when_the_last_camera_fails_that_is_told_and_the_run_is_stopped_for_it() -> None:
-    board, told = watched(5, 0.0, Scripted("front", [0, -2]))
+def test_failure_of_the_last_camera_is_reported_and_stops_the_run() -> None:
+    board, reported = watched(5, 0.0, Scripted("front", [0, -2]))
     why = "the process of camera front ended without an answer"
-    assert told == [("camera", f"camera front failed ({why}); clearance is not measured")]
+    assert reported == [("camera", f"camera front failed ({why}); clearance is not measured")]
     assert board.read().for_what == StopReason("camera", f"all cameras failed: front: {why}")
 
 
 def test_while_one_camera_is_left_nothing_is_stopped() -> None:
-    board, told = watched(5, 0.0, Scripted("front", [0, -2]), Scripted("side", [0]))
-    assert [code for code, _ in told] == ["camera"]
+    board, reported = watched(5, 0.0, Scripted("front", [0, -2]), Scripted("side", [0]))
+    assert [code for code, _ in reported] == ["camera"]
     assert not board.read().stop
 
 

@@ -1,4 +1,4 @@
-"""How the program talks: help with examples, JSON for programs, plain text where nobody looks."""
+"""Output of the program: help with examples, JSON for programs, plain text outside terminals."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_nothing_asked_shows_the_help() -> None:
     assert " demo " in answer.said
 
 
-def test_version_is_told() -> None:
+def test_version_is_shown() -> None:
     answer = call("--version")
     assert answer.code == 0
     assert re.fullmatch(r"cdpr \d+\.\d+\.\d+\S*\n", answer.out)
@@ -89,7 +89,7 @@ def test_json_of_plan_and_check(tmp_path: Path) -> None:
     assert document(checked)["hash"] == document(planned)["hash"]
 
 
-def test_compiling_is_told_where_it_does_not_disturb_json(
+def test_compiling_is_reported_without_disturbing_json(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     noted: list[str] = []
@@ -118,10 +118,10 @@ def test_json_of_report_doctor_and_stop(finished_run: Path) -> None:
     "verb", [("hold",), ("resume",), ("speed", "50"), ("monitor",), ("monitor", "--once", "--json")]
 )
 def test_a_wish_that_reaches_no_run_is_no_success(verb: tuple[str, ...]) -> None:
-    told = call(*verb)
-    assert told.code == 1
-    assert "no active run found" in told.err
-    assert "emergency stop" in told.err
+    reply = call(*verb)
+    assert reply.code == 1
+    assert "no active run found" in reply.err
+    assert "emergency stop" in reply.err
 
 
 @pytest.mark.parametrize("percent", ["0", "101", "-5", "fast"])
@@ -130,11 +130,11 @@ def test_a_speed_that_is_none_is_bad_input(percent: str) -> None:
 
 
 def test_a_stop_that_stops_nothing_is_no_success() -> None:
-    """Who presses stop and sees something move must not read that all is well."""
-    told = call("stop")
-    assert told.code == 1
-    assert "no active run found" in told.err
-    assert "emergency stop" in told.err
+    """An operator who stops while something moves must not read that all is well."""
+    reply = call("stop")
+    assert reply.code == 1
+    assert "no active run found" in reply.err
+    assert "emergency stop" in reply.err
     nobody = {"stopped_processes": [], "silent_processes": []}
     assert document(call("stop", "--json")) == nobody
     assert call("stop", "--json").code == 1
@@ -165,15 +165,15 @@ def test_an_error_is_json_too_when_json_was_asked_for(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     answer = call(*arguments, "--json")
-    told = document(answer)
+    reply = document(answer)
     assert answer.code == code
-    assert told["exit_code"] == code
-    assert told["what"]
-    assert told["next_step"]
+    assert reply["exit_code"] == code
+    assert reply["what"]
+    assert reply["next_step"]
     assert "error: " in answer.err
 
 
-def test_nothing_but_the_result_is_on_standard_output_and_no_escape_codes_where_nobody_looks(
+def test_only_the_result_is_on_standard_output_without_escape_codes(
     short_plan: Path, finished_run: Path
 ) -> None:
     for arguments in (["check", short_plan], ["report", finished_run], ["doctor"]):
@@ -199,7 +199,7 @@ def test_no_sentence_is_broken_where_a_program_reads_it(
 
 
 def in_terminal(*arguments: str | Path, **variables: str) -> str:
-    """What the program writes when its standard output is a terminal."""
+    """Output of the program when its standard output is a terminal."""
     main_end, far_end = pty.openpty()
     program = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cdpr.cli import main; main()"
     environment = {"PATH": os.environ["PATH"], "TERM": "xterm-256color", **variables}

@@ -27,8 +27,8 @@ def rig_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data = yaml.safe_load(RIG.read_text())
     (front,) = load_rig(RIG).cameras
     quarter = matrix_from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
-    place = front.world_from_camera
-    side = Pose(quarter @ place.position, quarter @ place.rotation)
+    front_pose = front.world_from_camera
+    side = Pose(quarter @ front_pose.position, quarter @ front_pose.rotation)
     where = {
         "position_mm": (side.position * 1e3).tolist(),
         "rotation_wxyz": side.quaternion.tolist(),

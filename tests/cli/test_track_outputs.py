@@ -1,4 +1,4 @@
-"""`cdpr track`: pose log, clearance, MCAP, and images with what was measured in them."""
+"""`cdpr track`: pose log, clearance, MCAP, and images with the measurements."""
 
 from __future__ import annotations
 
@@ -70,20 +70,20 @@ def test_poses_clearance_mcap_and_pictures_agree(plan: Path, tmp_path: Path) -> 
     assert greenish.sum() > 100, "outlines of the tags"
 
 
-def test_a_picture_of_another_size_is_skipped_and_told(tmp_path: Path) -> None:
+def test_an_image_of_another_size_is_skipped_and_reported(tmp_path: Path) -> None:
     for picture in picture_files(SESSION)[:2]:
         (tmp_path / picture.name).write_bytes(picture.read_bytes())
     cv2.imwrite(str(tmp_path / "a[0].png"), np.zeros((48, 64), np.uint8))
     rig = CONFIGS / "gachon_8_6_rehearsal.yaml"
     answer = call("track", rig, tmp_path, "-o", tmp_path / "poses.csv", "--json")
     assert answer.code == 0, answer
-    told = json.loads(answer.out)
-    assert told["pictures"] == 2
-    assert told["unused"] == {"a[0].png": "has 64 x 48 px, the camera has 1280 x 720 px"}
+    document = json.loads(answer.out)
+    assert document["pictures"] == 2
+    assert document["unused"] == {"a[0].png": "has 64 x 48 px, the camera has 1280 x 720 px"}
     assert "skipped: a[0].png has 64 x 48 px" in " ".join(answer.err.split())
 
 
-def test_mirrored_pictures_are_told(tmp_path: Path) -> None:
+def test_mirrored_images_are_reported(tmp_path: Path) -> None:
     grey = read_picture(picture_files(SESSION)[0])
     assert grey is not None
     cv2.imwrite(str(tmp_path / "a.png"), grey[:, ::-1])
@@ -94,20 +94,20 @@ def test_mirrored_pictures_are_told(tmp_path: Path) -> None:
     )
 
 
-def test_tags_that_are_not_as_told_are_named_as_the_cause(tmp_path: Path) -> None:
+def test_tags_that_differ_from_the_rig_file_are_named_as_the_cause(tmp_path: Path) -> None:
     (tmp_path / "pictures").mkdir()
     picture = picture_files(SESSION)[0]
     (tmp_path / "pictures" / picture.name).write_bytes(picture.read_bytes())
     rig = load_rig(CONFIGS / "gachon_8_6_rehearsal.yaml")
     tags = tuple(replace(tag, size=0.4 * tag.size) for tag in rig.platform_tags)
     wrong = replace(rig, platform_tags=tags)
-    with pytest.raises(BadInput) as told:
+    with pytest.raises(BadInput) as caught:
         list(
             tracked(
                 ImageFolder(tmp_path / "pictures", rig.cameras[0]), Tracker(wrong, rig.cameras[0])
             )
         )
-    assert "size_mm, position_mm and rotation_wxyz of tags.platform" in told.value.next_step
+    assert "size_mm, position_mm and rotation_wxyz of tags.platform" in caught.value.next_step
 
 
 @pytest.mark.parametrize("blur", [3.5, 8.0])
@@ -121,10 +121,10 @@ def test_pictures_out_of_focus_are_not_blamed_on_the_tags_sizes(
     cv2.imwrite(str(tmp_path / "pictures" / "a.png"), soft)
     rig = load_rig(CONFIGS / "gachon_8_6_rehearsal.yaml")
     source = ImageFolder(tmp_path / "pictures", rig.cameras[0])
-    with pytest.raises(BadInput) as told:
+    with pytest.raises(BadInput) as caught:
         list(tracked(source, Tracker(rig, rig.cameras[0])))
-    assert "focus the camera" in told.value.next_step
-    assert "size_mm" not in told.value.next_step
+    assert "focus the camera" in caught.value.next_step
+    assert "size_mm" not in caught.value.next_step
 
 
 def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -> None:
@@ -146,13 +146,13 @@ def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -
         ("there.avi", "the file exists already"),
     ],
 )
-def test_a_place_that_cannot_be_drawn_to_is_refused(
+def test_an_output_that_cannot_be_written_is_refused(
     plan: Path, tmp_path: Path, name: str, words: str
 ) -> None:
     (tmp_path / "there.avi").write_text("kept")
-    log, place = tmp_path / "poses.csv", tmp_path / name
+    log, target = tmp_path / "poses.csv", tmp_path / name
     with nothing_written(tmp_path):
-        answer = call("track", RIG, "synthetic", "--plan", plan, "-o", log, "--overlay", place)
+        answer = call("track", RIG, "synthetic", "--plan", plan, "-o", log, "--overlay", target)
     one_message(answer, 2, words, name)
 
 

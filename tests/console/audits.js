@@ -1,4 +1,4 @@
-/* What tests ask of the whole page; an object whose functions give texts that name what is wrong or what is there. */
+/* Checks of the whole page: an object of functions that return errors or findings as texts. */
 ({
   nameOf(e) {
     return e.id || e.getAttribute("aria-label") || e.textContent.trim();
@@ -8,14 +8,14 @@
     return [...document.querySelectorAll(selector)].filter((e) => e.checkVisibility());
   },
 
-  /** Controls that could be used now, by mouse or keyboard. */
+  /** Controls that can be used now, by mouse or keyboard. */
   usable() {
     return this.shown("button, input, select, a, canvas[tabindex], summary")
       .filter((e) => !e.disabled && !e.closest("[inert]") && !e.getAttribute("aria-disabled"))
       .map(this.nameOf);
   },
 
-  /** Controls that Tab must reach: of tabs and radio buttons one is, by arrows the others are. */
+  /** Controls that Tab must reach: one of each group of tabs or radio buttons; arrow keys reach the others. */
   tabbable() {
     return this.shown("button, input, select, canvas[tabindex], summary, a")
       .filter((e) => !e.disabled && e.type !== "radio" && e.role !== "tab")
@@ -29,21 +29,21 @@
       .map((e) => e.outerHTML);
   },
 
-  /** Too small for a finger. */
+  /** Controls too small for a finger. */
   small() {
     return this.shown("button, input[type=text], .choices label")
       .filter((e) => e.getBoundingClientRect().height < 43.5 || e.getBoundingClientRect().width < 40)
       .map(this.nameOf);
   },
 
-  /** Texts that do not fit where they are. */
+  /** Texts that do not fit in their element. */
   cut() {
     return this.shown("button, .tiles dt, .tiles dd, .lamps span, #stop-words, #tensions .value")
       .filter((e) => e.clientWidth > 0 && e.scrollWidth > e.clientWidth + 1)
       .map(this.nameOf);
   },
 
-  /** Texts with less contrast than WCAG 2.2 asks for at level AA (1.4.3); what is disabled is exempt. */
+  /** Texts with less contrast than WCAG 2.2 asks for at level AA (1.4.3); disabled controls are exempt. */
   weak() {
     const parse = (colour) => colour.match(/[\d.]+/g).map(Number);
     const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);

@@ -1,4 +1,4 @@
-"""A browser on the console's page, served by the fake server: what the page's tests share."""
+"""Shared by the page's tests: a browser on the console's page, served by the fake server."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1400, 900)}
 
 @dataclass
 class Fake:
-    """The fake server, from outside."""
+    """Client of the fake server."""
 
     address: str
 
@@ -44,7 +44,7 @@ class Fake:
         return self.address.split("/?")[0]
 
     def ask(self, **hooks: Any) -> dict[str, Any]:
-        """What it received so far, after ``hooks`` were set."""
+        """Messages received so far, after ``hooks`` were set."""
         data = json.dumps(hooks).encode() if hooks else None
         with urllib.request.urlopen(f"{self.origin}/fake", data=data, timeout=10) as answer:
             found = json.load(answer)
@@ -65,14 +65,14 @@ class Fake:
         raise AssertionError(f"did not come: {found['received'][-5:]}")
 
     def let_pass(self, page: Page, ticks: int = 8) -> dict[str, Any]:
-        """Waits for as many periods of the server, 50 ms each."""
+        """Waits for a number of periods of the server, 50 ms each."""
         until = self.ask()["ticks"] + ticks
         return self.wait(page, lambda found: bool(found["ticks"] >= until))
 
 
 @dataclass
 class Visit:
-    """A page, the server behind it, and what went wrong on it."""
+    """A page, its server, and the page's errors."""
 
     page: Page
     fake: Fake
@@ -80,14 +80,14 @@ class Visit:
     asked: list[str] = field(default_factory=list)
 
     def audit(self, name: str, of: str = "") -> list[str]:
-        """What one of `audits.js` finds on the page."""
+        """Findings of one of `audits.js` on the page."""
         script = AUDITS[AUDITS.index("({") :].rstrip()
         found = self.page.evaluate(f"() => [({script}).{name}({of})].flat()")
         assert isinstance(found, list)
         return found
 
     def view(self, name: str) -> None:
-        """Chooses a view, where it is not shown already."""
+        """Selects a view, if it is not shown already."""
         tab = self.page.locator(f"#tab-{name}")
         if tab.is_visible():
             tab.click()
@@ -176,7 +176,7 @@ def browser_at(path: str) -> Iterator[Browser]:
 
 @contextlib.contextmanager
 def fake_server() -> Iterator[Fake]:
-    """The fake server in a process of its own."""
+    """The fake server in a separate process."""
     command = [sys.executable, "-m", "tests.console.fake_server"]
     with tempfile.TemporaryFile("w+") as errors:
         server = subprocess.Popen(

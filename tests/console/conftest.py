@@ -1,4 +1,4 @@
-"""A browser and the fake server, one of each for a module; a page for a test."""
+"""A browser and the fake server per module, and a page per test."""
 
 from __future__ import annotations
 

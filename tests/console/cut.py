@@ -1,4 +1,4 @@
-"""A TCP connection to a server that can fall silent or be cut, as a network does it."""
+"""A TCP proxy that can go silent or cut the connection, like a network."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _CHUNK = 65536
 
 
 class CutConnection:
-    """Passes on what both sides say, until it is told not to; a context manager.
+    """Forwards the data of both sides until paused; a context manager.
 
     Attributes:
         port: Of this side of it, on the loopback.
     """
 
     def __init__(self, to: int) -> None:
-        """In front of a port of this machine."""
+        """A proxy for a local port."""
         self._to = to
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
@@ -48,7 +48,7 @@ class CutConnection:
 
     @contextmanager
     def silent(self) -> Iterator[None]:
-        """Nothing is passed on, and nobody is told: a cable that is pulled."""
+        """Forwards nothing and reports nothing, like an unplugged cable."""
         self.pause()
         try:
             yield
@@ -56,15 +56,15 @@ class CutConnection:
             self.resume()
 
     def pause(self) -> None:
-        """From now on nothing is passed on."""
+        """Stops forwarding."""
         self._passing.clear()
 
     def resume(self) -> None:
-        """What waited is passed on."""
+        """Forwards what waited, and continues."""
         self._passing.set()
 
     def hang_up(self) -> None:
-        """Both sides see an end."""
+        """Closes both connections."""
         self._hang_up.set()
         self._waker.send(b".")
 
@@ -78,20 +78,20 @@ class CutConnection:
             for one in list(self._other):
                 self._close(one)
 
-    def _serve(self, places: list[object]) -> bool:
-        for place in places:
-            assert isinstance(place, socket.socket)
-            if place is self._woken:
-                if not place.recv(_CHUNK):
+    def _serve(self, ends: list[object]) -> bool:
+        for end in ends:
+            assert isinstance(end, socket.socket)
+            if end is self._woken:
+                if not end.recv(_CHUNK):
                     return False
                 if self._hang_up.is_set():
                     self._hang_up.clear()
                     for one in list(self._other):
                         self._close(one)
-            elif place is self._listener:
-                self._join(place)
-            elif self._passing.is_set() and place in self._other:
-                self._pass_on(place)
+            elif end is self._listener:
+                self._join(end)
+            elif self._passing.is_set() and end in self._other:
+                self._pass_on(end)
         if not self._passing.is_set():
             self._passing.wait(0.02)
         return True
@@ -107,17 +107,17 @@ class CutConnection:
             self._other[one] = other
             self._ready.register(one, selectors.EVENT_READ)
 
-    def _pass_on(self, place: socket.socket) -> None:
+    def _pass_on(self, end: socket.socket) -> None:
         try:
-            got = place.recv(_CHUNK)
-            self._other[place].sendall(got)
+            got = end.recv(_CHUNK)
+            self._other[end].sendall(got)
         except OSError:
             got = b""
         if not got:
-            self._close(place)
+            self._close(end)
 
-    def _close(self, place: socket.socket) -> None:
-        for one in (place, self._other.get(place)):
+    def _close(self, end: socket.socket) -> None:
+        for one in (end, self._other.get(end)):
             if one is not None and one in self._other:
                 del self._other[one]
                 with suppress(KeyError):

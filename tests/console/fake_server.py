@@ -2,7 +2,7 @@
 
     python -m tests.console.fake_server --port 8402
 
-It moves the platform of the paper's rig on a circle and obeys commands in a simple way. `POST
+It moves the platform of the paper's rig on a circle and executes commands in simplified form. `POST
 /fake` lays values over the states that it sends (`{"state": {…}}`) and over its own (`{"set":
 {…}}`), makes it silent (`{"silent": true}`), hang up (`{"hang_up": true}`), refuse sockets
 (`{"refuse": true}`) or begin again (`{"renew": true}`). `GET /fake` gives what came in.
@@ -127,7 +127,7 @@ def preview(name: str) -> dict[str, Any]:
 
 
 class Fake:
-    """The state that is sent, and what came in."""
+    """The state sent, and the messages received."""
 
     def __init__(self) -> None:
         self.over: dict[str, Any] = {}
@@ -183,9 +183,9 @@ class Fake:
             self.spent, self.held = max(self.spent, self.held["hold"]), None
         if self.held and self.cable_ready:
             sign = 1.0 if self.held["sense"] == "pay_out" else -1.0
-            way = sign * self.held["speed_mm_s"] * PERIOD_S
-            self.cables_mm[self.held["cable"] - 1] += way
-            self.press_mm += way
+            travel = sign * self.held["speed_mm_s"] * PERIOD_S
+            self.cables_mm[self.held["cable"] - 1] += travel
+            self.press_mm += travel
         elif self.held:
             step = np.array(self.held["direction"]) * self.held["speed_mm_s"] * PERIOD_S / 1e3
             self.position = np.clip(self.position + step, RIG.workspace_lower, RIG.workspace_upper)
@@ -214,7 +214,7 @@ class Fake:
         self.events = [*self.events, {"time_s": at, "code": code, "text": text}][-12:]
 
     def state(self, reader: WebSocket) -> dict[str, Any]:
-        """What one page is sent."""
+        """The state for one page."""
         name = None if self.in_control is None else self.sockets.get(self.in_control)
         tensions = working_tensions(RIG, Pose.level(self.position)).tensions
         near = float(np.linalg.norm(self.position[:2] - [-0.15, 0.0]) - 0.115) * 1e3
@@ -376,7 +376,7 @@ class Fake:
         }
 
     def take(self, page: WebSocket, message: dict[str, Any]) -> tuple[bool, str]:
-        """What a page asks for; whether it was done, and what to answer."""
+        """Executes a page's command; returns whether it was done, and the answer."""
         self.received.append(message)
         kind = message["kind"]
         ready = self.cable_ready if "cable" in message else self.jog_ready
@@ -542,7 +542,7 @@ def application(fake: Fake) -> Starlette:
 
 
 async def speak(fake: Fake, page: WebSocket) -> None:
-    """With one page, until it leaves."""
+    """Serves one page until it leaves."""
     if fake.refuse:
         return await page.close()
     await page.accept()
@@ -565,7 +565,7 @@ async def speak(fake: Fake, page: WebSocket) -> None:
 
 @contextlib.asynccontextmanager
 async def moving(fake: Fake) -> AsyncIterator[None]:
-    """The platform moves, and every page is sent the state, 20 times a second."""
+    """Moves the platform and sends every page the state, 20 times a second."""
 
     async def go_on() -> None:
         while True:
@@ -586,7 +586,7 @@ async def moving(fake: Fake) -> AsyncIterator[None]:
 
 
 def main() -> None:
-    """Serves until it is ended; prints its address."""
+    """Serves until terminated; prints its address."""
     parser = argparse.ArgumentParser(description="The console's protocol without drives.")
     parser.add_argument("--port", type=int, default=0)
     chosen = parser.parse_args()

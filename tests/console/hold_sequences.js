@@ -1,6 +1,6 @@
-/* Random sequences of presses, releases, refusals, lost sockets and pauses, in simulated time, against hold.js.
+/* Random sequences of presses, releases, refusals, lost connections and pauses, in simulated time, against hold.js.
 
-Gives what was wrong, as texts, and how many messages were sent: `(Hold, rounds, seed) => {wrong, held, ended}`. */
+Returns errors as texts, and how many messages were sent: `(Hold, rounds, seed) => {wrong, held, ended}`. */
 (Hold, rounds, seed) => {
   const random = () => { // mulberry32
     seed = (seed + 0x6d2b79f5) | 0;
@@ -11,7 +11,7 @@ Gives what was wrong, as texts, and how many messages were sent: `(Hold, rounds,
   const one = (list) => list[Math.floor(random() * list.length)];
   const wrong = [], over = new Set(), letGo = new Map(), sources = ["pointer 1", "key ArrowUp", "gamepad"];
   let now = 0, act = null, due = Infinity, open = true, refusal = null;
-  let said = "", press = null, newest = 0, last = 0, held = 0, ended = 0; // press: {source, number} by what the page was told
+  let said = "", press = null, newest = 0, last = 0, held = 0, ended = 0; // press: {source, number} as the page sees it
 
   const clock = {
     now: () => now,
@@ -59,7 +59,7 @@ Gives what was wrong, as texts, and how many messages were sent: `(Hold, rounds,
     },
     () => (refusal = random() < 0.3 ? "stale" : null),
     () => (open = random() < 0.8),
-    () => (now += random() < 0.1 ? 1000 * random() : 0), // the page is held up: no tick came in time
+    () => (now += random() < 0.1 ? 1000 * random() : 0), // the page is delayed: no tick came in time
     ...Array(4).fill(() => {
       for (const until = now + 120 * random(); due <= until; ) {
         now = Math.max(now, due);

@@ -1,10 +1,10 @@
-"""Random sequences of what happens at consoles, in simulated time, against a session that moves.
+"""Random sequences of console events, in simulated time, during a jog session.
 
-The console is the real one, with its command socket; so is the session of jogs, with drives that
-are simulated in this process. Pages hold and let go, two at once, take control and lose it, are cut
-off, reloaded with a clock that jumped, send again what is over, change what they do, and STOP. What
-the pages truly held is kept apart; every cycle is judged by it. A session moves the platform, or
-one cable at a time, which only pages in service mode may.
+The console and its command socket are real; so is the jog session, with drives simulated in this
+process. Pages press and release controls, two at once, take control and lose it, lose their
+connection, are reloaded with a clock that jumped, repeat old messages, change modes, and STOP. The
+test records separately which controls were pressed and checks every cycle against this record. A
+session moves the platform, or one cable at a time, for which a page must be in service mode.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from model.scene import load_scene
 from tests.cli.plans import RIG
 
 SCENE = RIG.parent / "environment_1.yaml"
-#: Of a jog, [m/s].
+#: Jog speed, [m/s].
 SPEED = 0.020
-#: What two processes may be apart, [cycles].
+#: Delay allowed between two processes, [cycles].
 CYCLES_LATE = 3
-#: The console waits so long for the session's answers, [s] of real time.
+#: How long the console waits for the session's answers, [s] of real time.
 PATIENCE = 60.0
-#: A page says that it holds every so many cycles of 10 ms.
-SAID_EVERY = 5
+#: A page with a pressed control sends a message every 5 cycles of 10 ms.
+SEND_EVERY = 5
 DIRECTIONS = [[*row] for sign in (1.0, -1.0) for row in (sign * np.eye(3)).tolist()]
 
 
 @dataclass
-class PageAtHand:
-    """One page as the operator at it sees it."""
+class SimulatedPage:
+    """One page and what its operator does."""
 
     number: int
     hold: int
-    said: int = 0  # the highest number that it named
+    highest: int = 0  # the highest press number that it sent
     motion: dict[str, object] = field(default_factory=dict)
     step: float | None = None
     speed: float = 20.0
@@ -63,15 +63,15 @@ class PageAtHand:
     is_over: bool = False
     over: list[str] = field(default_factory=list)
 
-    def word(self, hold: int | None = None) -> str:
-        """What it says as long as it holds."""
-        said = {"kind": "held", "hold": self.hold if hold is None else hold, "seq": 1}
-        return json.dumps(said | self.motion | {"step_mm": self.step, "speed_mm_s": self.speed})
+    def message(self, hold: int | None = None) -> str:
+        """The message that it sends as long as its control is pressed."""
+        message = {"kind": "held", "hold": self.hold if hold is None else hold, "seq": 1}
+        return json.dumps(message | self.motion | {"step_mm": self.step, "speed_mm_s": self.speed})
 
 
 @dataclass
 class Figures:
-    """What was done, and what was wrong."""
+    """What happened, and which errors were found."""
 
     sequences: int = 0
     cycles: int = 0
@@ -82,7 +82,7 @@ class Figures:
     wrong: list[str] = field(default_factory=list)
 
     def report(self) -> str:
-        """In a few lines."""
+        """A few lines of text."""
         did = ", ".join(f"{name} {count}" for name, count in sorted(self.did.items()))
         return (
             f"{self.sequences} sequences in {self.sessions} sessions: {self.presses} presses,"
@@ -91,8 +91,8 @@ class Figures:
         )
 
 
-class Judge:
-    """Holds every cycle against what was truly held."""
+class CycleCheck:
+    """Checks every cycle against the controls that were pressed."""
 
     def __init__(self, figures: Figures, rig: Rig) -> None:
         self._figures = figures
@@ -101,12 +101,12 @@ class Judge:
         self._rig = rig
         self._model = ClearanceModel(self._rig, load_scene(SCENE))
         self._required = load_scene(SCENE).obstacle_clearance
-        self.heard = float("-inf")
-        """When a press was truly held last, [s]."""
-        self.heard_of: dict[tuple[int, bool], float] | None = None
-        """The same of each cable, from 1, and whether it was paid out; None of the platform."""
+        self.pressed_at = float("-inf")
+        """When a control was last pressed, [s]."""
+        self.pressed_cables: dict[tuple[int, bool], float] | None = None
+        """The same for each cable (from 1) and direction (True: out); None in platform jogs."""
         limits = self._rig.motion
-        # To rest, [s], from the jog speed and still speeding up at the limit of acceleration.
+        # Time to stop, [s], from the jog speed while still accelerating at the limit.
         self._ramp = SPEED / limits.acceleration + 2.0 * limits.acceleration / limits.jerk
         cycle = self._rig.document.bus.cycle_ms / 1000.0
         # The anchor of a cable moves with the platform; nothing is wound in faster than it moves.
@@ -115,16 +115,16 @@ class Judge:
         ]
 
     def begin(self) -> None:
-        """A new session; the drives stand."""
-        self._last, self.heard = None, float("-inf")
-        if self.heard_of is not None:
-            self.heard_of = {}
+        """A new session, with the drives at rest."""
+        self._last, self.pressed_at = None, float("-inf")
+        if self.pressed_cables is not None:
+            self.pressed_cables = {}
 
     def release(self, now: float) -> None:
-        """What was held is not any more: as if it had been silent for long enough."""
-        self.heard = min(self.heard, now - TIMEOUT)
+        """The control was released: as if no message had come for the timeout."""
+        self.pressed_at = min(self.pressed_at, now - TIMEOUT)
 
-    def judge(self, record: CycleRecord) -> None:
+    def check(self, record: CycleRecord) -> None:
         """One cycle."""
         self._figures.cycles += 1
         before, self._last = self._last, record
@@ -132,37 +132,39 @@ class Judge:
             return
         ahead = np.subtract(record.targets, before.targets)
         late = CYCLES_LATE * self._rig.document.bus.cycle_ms / 1000.0
-        since = record.at - self.heard
+        since = record.at - self.pressed_at
         if ahead.any():
             self._figures.moving_cycles += 1
             if since > TIMEOUT + self._ramp + late:
-                self._say(record, f"moves though nothing was held for {since:.3f} s")
-            self._judge_cables(record, ahead, late)
+                self._report(record, f"moves though nothing was pressed for {since:.3f} s")
+            self._check_cables(record, ahead, late)
             if np.any(np.abs(ahead) > self._step):
-                self._say(record, f"a set-point is {np.abs(ahead).max()} counts ahead")
-        # With limited jerk it still speeds up for a moment, and less and less.
+                self._report(record, f"a set-point is {np.abs(ahead).max()} counts ahead")
+        # With limited jerk the rate still rises for a moment, ever more slowly.
         ahead_before, self._ahead = self._ahead, record.rate - before.rate
         if self._ahead > max(ahead_before, 0.0) + 1e-9 and since > TIMEOUT + late:
-            self._say(record, f"speeds up though nothing was held for {since:.3f} s")
+            self._report(record, f"speeds up though nothing was pressed for {since:.3f} s")
         if record.state is State.LATCHED:
-            self._say(record, "latched")
+            self._report(record, "latched")
 
-    def _judge_cables(self, record: CycleRecord, ahead: Array, late: float) -> None:
-        """Only the cable moves that was held, in its sense, and no tension is beyond the limit."""
-        if self.heard_of is None:
+    def _check_cables(self, record: CycleRecord, ahead: Array, late: float) -> None:
+        """Only the selected cable moves, in its direction, and no tension exceeds the limit."""
+        if self.pressed_cables is None:
             return
         for cable in np.flatnonzero(ahead):
             pays_out = bool(ahead[cable] * self._rig.winches[cable].counts_per_metre > 0.0)
-            since = record.at - self.heard_of.get((int(cable) + 1, pays_out), float("-inf"))
+            since = record.at - self.pressed_cables.get((int(cable) + 1, pays_out), float("-inf"))
             if since > TIMEOUT + self._ramp + late:
                 sense = "paid out" if pays_out else "wound in"
-                self._say(record, f"cable {cable + 1} is {sense}, held {since:.3f} s ago")
+                self._report(
+                    record, f"cable {cable + 1} is {sense}, last pressed {since:.3f} s ago"
+                )
         most = float(np.max(self._rig.tensions_by(record.torques)))
         if most > limit_of(self._rig, None):
-            self._say(record, f"a cable carries {most:.1f} N")
+            self._report(record, f"a cable carries {most:.1f} N")
 
-    def look_around(self, console: Console) -> None:
-        """Where the platform is keeps what the scene asks for."""
+    def check_clearance(self, console: Console) -> None:
+        """The platform keeps the clearance that the scene requires."""
         jog = (console.watch.last.status or {}).get("jog")
         if jog is not None:
             position = np.array(jog["position_mm"]) / 1000.0
@@ -174,14 +176,14 @@ class Judge:
             if event["code"] in ("gate_denied", "traceback", "broken"):
                 self._figures.wrong.append(f"{event['code']}: {event['text']}")
 
-    def _say(self, record: CycleRecord, text: str) -> None:
+    def _report(self, record: CycleRecord, text: str) -> None:
         self._figures.wrong.append(
             f"at {record.at:.2f} s of session {self._figures.sessions}: {text}"
         )
 
 
 class Sequences:
-    """Pages at one console, and the sessions that it jogs."""
+    """Pages at one console, and its jog sessions."""
 
     def __init__(self, seed: int, *, cables: bool = False) -> None:
         self._random, self._cables = random.Random(seed), cables
@@ -191,19 +193,19 @@ class Sequences:
         self._started: list[str] = []
         self.console.verbs.start = self._start  # type: ignore[method-assign]
         self.figures = Figures()
-        self._judge = Judge(self.figures, rig)
+        self._check = CycleCheck(self.figures, rig)
         if cables:
-            self._judge.heard_of = {}
-        self._pages: list[PageAtHand] = []
+            self._check.pressed_cables = {}
+        self._pages: list[SimulatedPage] = []
         self._goal = self._left = self._cycle = 0
         self._now = 0.0
 
     def run(self, count: int) -> Figures:
-        """So many sequences, in as many sessions as STOP and mode changes make of them."""
+        """Run `count` sequences; STOP and mode changes divide them into sessions."""
         self._goal = count
         while self.figures.sequences < count and not self.figures.wrong:
             self.figures.sessions += 1
-            self._judge.begin()
+            self._check.begin()
             try:
                 self._session()
             except StoppedByOperator:
@@ -231,53 +233,53 @@ class Sequences:
         self._started.append(verb)
 
     def _on_cycle(self, record: CycleRecord, board: PressBoard, _: object) -> None:
-        self._judge.judge(record)
+        self._check.check(record)
         self._cycle, self._now = self._cycle + 1, record.at
         if record.state is not State.MOVING:
             return
-        if self._cycle % SAID_EVERY == 0:
-            self.console.look()
-            self._words()
+        if self._cycle % SEND_EVERY == 0:
+            self.console.update()
+            self._send_pressed()
         if self._cycle % 50 == 0:
-            self._judge.look_around(self.console)
+            self._check.check_clearance(self.console)
         self._left -= 1
         if self._left <= 0:
             self._act(board)
 
-    def _words(self) -> None:
-        """What pages say that hold a control, unless they are held up."""
+    def _send_pressed(self) -> None:
+        """Messages of the pages whose control is pressed, unless a page is delayed."""
         for page in self._pages:
-            page.silent = max(0, page.silent - SAID_EVERY)
+            page.silent = max(0, page.silent - SEND_EVERY)
             if page.pressed and not page.silent:
                 self._hold(page)
 
-    def _hold(self, page: PageAtHand) -> None:
+    def _hold(self, page: SimulatedPage) -> None:
         control = self.console.control
         mine = control.holder == page.number
         if not mine or (self._cables and not control.is_service):
             page.is_over = True  # it has to be pressed again
         elif not page.is_over:
-            self._judge.heard = self._now
-            if self._judge.heard_of is not None:
+            self._check.pressed_at = self._now
+            if self._check.pressed_cables is not None:
                 cable, sense = page.motion["cable"], page.motion["sense"]
                 assert isinstance(cable, int)
-                self._judge.heard_of[cable, sense == "pay_out"] = self._now
-        self._held(page, page.word())
+                self._check.pressed_cables[cable, sense == "pay_out"] = self._now
+        self._send(page, page.message())
 
-    def _held(self, page: PageAtHand, text: str) -> None:
+    def _send(self, page: SimulatedPage, text: str) -> None:
         message = parse_message(text)
         assert isinstance(message, Held)
-        page.said = max(page.said, message.hold)
+        page.highest = max(page.highest, message.hold)
         self.console.held(page.number, message)
 
-    def _command(self, page: PageAtHand, command: str, **values: object) -> str:
+    def _command(self, page: SimulatedPage, command: str, **values: object) -> str:
         text = json.dumps({"kind": "command", "id": 1, "command": command, **values})
         message = parse_message(text)
         assert not isinstance(message, Held | LetGo)
         return self.console.command(page.number, message)
 
     def _act(self, board: PressBoard) -> None:
-        """The next thing that happens; a sequence is about a handful of them."""
+        """The next event; a sequence has about four of them."""
         if self._random.random() < 0.25:
             self.figures.sequences += 1
             if self.figures.sequences >= self._goal:
@@ -291,7 +293,7 @@ class Sequences:
 
     def _join(self) -> None:
         base = self._random.choice((1, 1_000, 1_700_000_000_000))  # its clock jumped
-        page = PageAtHand(self.console.control.join("test"), base)
+        page = SimulatedPage(self.console.control.join("test"), base)
         page.motion = self._motion()
         self._pages.append(page)
 
@@ -301,9 +303,9 @@ class Sequences:
         sense = self._random.choice(("wind_in", "pay_out"))
         return {"cable": self._random.randint(1, 8), "sense": sense}
 
-    # What happens.
+    # The events.
 
-    def _press(self, page: PageAtHand) -> None:
+    def _press(self, page: SimulatedPage) -> None:
         if page.pressed:
             return
         self.figures.presses += 1
@@ -315,88 +317,88 @@ class Sequences:
         page.is_over = False
         self._hold(page)
 
-    def _let_go(self, page: PageAtHand) -> None:
+    def _let_go(self, page: SimulatedPage) -> None:
         if page.pressed:
-            page.over.append(page.word())
+            page.over.append(page.message())
             self._release(page)
         page.pressed = False
         message = parse_message(json.dumps({"kind": "let_go", "hold": page.hold}))
         assert isinstance(message, LetGo)
-        page.said = max(page.said, message.hold)
+        page.highest = max(page.highest, message.hold)
         self.console.let_go(page.number, message)
 
-    def _release(self, page: PageAtHand) -> None:
+    def _release(self, page: SimulatedPage) -> None:
         if self.console.control.holder == page.number:
-            self._judge.release(self._now)
+            self._check.release(self._now)
 
-    def _take(self, page: PageAtHand) -> None:
+    def _take(self, page: SimulatedPage) -> None:
         self._command(page, "take_control", force=self._random.random() < 0.5)
         if self._cables and self._random.random() < 0.8:
             self._change_mode(page, "service_begin")
 
-    def _give(self, page: PageAtHand) -> None:
+    def _give(self, page: SimulatedPage) -> None:
         self._release(page)
         self._command(page, "give_control")
 
-    def _cut(self, page: PageAtHand) -> None:
-        """The socket is lost, and the page may come back as another one."""
+    def _cut(self, page: SimulatedPage) -> None:
+        """The connection is lost; the page may come back as a new one."""
         self._release(page)
         self.console.leave(page.number)
         self._pages.remove(page)
 
-    def _held_up(self, page: PageAtHand) -> None:
+    def _delay(self, page: SimulatedPage) -> None:
         page.silent = self._random.choice((10, 20, 60))
         if page.silent > 100.0 * TIMEOUT:
             page.pressed = False  # as hold.js does
-            page.over.append(page.word())
+            page.over.append(page.message())
 
-    def _replay(self, page: PageAtHand) -> None:
-        """Words of presses that are over, from any page's memory."""
+    def _replay(self, page: SimulatedPage) -> None:
+        """Messages of finished presses, of any page."""
         over = [text for other in self._pages for text in other.over[-5:]]
         for text in self._random.sample(over, min(3, len(over))):
             message = json.loads(text)
-            # A higher number would be a new press: of this page such words are over by now.
-            message["hold"] = min(message["hold"], page.said - page.pressed)
+            # A higher number would be a new press, so the number is limited to finished ones.
+            message["hold"] = min(message["hold"], page.highest - page.pressed)
             if message["hold"] > 0:
-                self._held(page, json.dumps(message))
+                self._send(page, json.dumps(message))
 
-    def _mode(self, page: PageAtHand) -> None:
-        """What else a page may want; nothing of it is done while the session is there."""
+    def _mode(self, page: SimulatedPage) -> None:
+        """Other commands of a page; none may start during the session."""
         verbs = ("home", "reset", "release", "run", "jog_begin", "cable_begin", "resume")
         command = self._random.choice(verbs)
         self._command(page, command)
         if self._started:
             self.figures.wrong.append(f"{self._started.pop()} was started during a session")
 
-    def _service(self, page: PageAtHand) -> None:
-        """In and out of service mode, which ends what the page holds, and out of it the session."""
+    def _service(self, page: SimulatedPage) -> None:
+        """Enter or leave service mode: this ends a press, and leaving also ends the session."""
         enters = not self._cables or self._random.random() < 0.95
         self._change_mode(page, "service_begin" if enters else "service_end")
 
-    def _change_mode(self, page: PageAtHand, command: str) -> None:
+    def _change_mode(self, page: SimulatedPage, command: str) -> None:
         if not self._command(page, command):
             self._release(page)
             page.is_over |= page.pressed
 
-    def _feed(self, page: PageAtHand) -> None:
+    def _feed(self, page: SimulatedPage) -> None:
         self._command(page, "speed", percent=self._random.choice((1, 50, 100)))
         self._command(page, self._random.choice(("hold", "resume")))
 
-    def _stop(self, page: PageAtHand) -> None:
+    def _stop(self, page: SimulatedPage) -> None:
         self._command(page, "stop")
 
-    def _end(self, page: PageAtHand) -> None:
+    def _end(self, page: SimulatedPage) -> None:
         self._command(page, "jog_end")
 
 
-Act = Callable[[Sequences, PageAtHand], None]
+Act = Callable[[Sequences, SimulatedPage], None]
 _WEIGHTED: list[tuple[Act, float]] = [
     (Sequences._press, 8.0),
     (Sequences._let_go, 3.0),
     (Sequences._take, 2.0),
     (Sequences._give, 0.7),
     (Sequences._cut, 0.7),
-    (Sequences._held_up, 1.5),
+    (Sequences._delay, 1.5),
     (Sequences._replay, 2.0),
     (Sequences._mode, 1.0),
     (Sequences._service, 1.0),
@@ -409,16 +411,16 @@ WEIGHTS = [weight for _, weight in _WEIGHTED]
 
 
 def open_files() -> set[str]:
-    """Descriptors of this process, without the one that keeps the cache of machine code."""
+    """File descriptors of this process, except those of the cache of machine code."""
     found = set()
     for name in os.listdir("/proc/self/fd"):
-        with suppress(OSError):  # the one by which the folder was read
+        with suppress(OSError):  # the one that listed the folder
             found.add(f"{name} {os.readlink(f'/proc/self/fd/{name}')}")
     return {file for file in found if "/kernels/" not in file}
 
 
 def children() -> set[str]:
-    """Processes that this one started and that are there still."""
+    """Child processes that still run."""
     tasks = Path("/proc/self/task")
     found = ""
     for task in tasks.iterdir():
@@ -427,31 +429,31 @@ def children() -> set[str]:
     return {f"process {number}" for number in found.split()}
 
 
-def held() -> set[str]:
-    """What this process would leave behind; what an earlier test left may end meanwhile."""
+def resources() -> set[str]:
+    """Threads, open files and child processes; those of an earlier test may end meanwhile."""
     threads = {f"thread {thread.ident} {thread.name}" for thread in threading.enumerate()}
     return threads | open_files() | children()
 
 
 def with_soft_cables(rig: Rig) -> Rig:
-    """On which one cable moves by more than steel stretches."""
+    """The rig with cables so soft that moving one alone does not overload the others."""
     cables = rig.document.cables
     soft = cables.model_copy(update={"stiffness_n": 0.002 * cables.stiffness_n})
     return rig_from_document(rig.document.model_copy(update={"cables": soft}))
 
 
 def sequences(count: int, seed: int, *, cables: bool = False) -> Figures:
-    """So many sequences; threads, sockets and processes that are left count as wrong."""
-    before, interval = held(), sys.getswitchinterval()
+    """Run `count` sequences; remaining threads, sockets and processes count as errors."""
+    before, interval = resources(), sys.getswitchinterval()
     patience = watch.PATIENCE, watch.ANSWERED_WITHIN
     sys.setswitchinterval(1e-4)  # the session and its socket's thread take turns all the time
-    # Time stands still while the session is asked: a busy computer makes no word late in it.
+    # Time stops while the session is queried, so that a busy computer delays no message.
     watch.PATIENCE = watch.ANSWERED_WITHIN = PATIENCE
     try:
         figures = Sequences(seed, cables=cables).run(count)
     finally:
         sys.setswitchinterval(interval)
         watch.PATIENCE, watch.ANSWERED_WITHIN = patience
-    if left := held() - before:
+    if left := resources() - before:
         figures.wrong.append(f"left behind: {sorted(left)}")
     return figures

@@ -1,4 +1,4 @@
-"""Who may operate, and which press is meant, for any order of pages, presses and leavings."""
+"""Control and press numbers, for any order of pages, presses and disconnections."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cdpr.console.commands import PageControl
 
 
 class ControlMachine(RuleBasedStateMachine):
-    """Pages come, go, take, give, hold and let go; the oracle keeps what was forwarded."""
+    """Pages join, leave, take and release control, hold and release; the oracle tracks presses."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -163,7 +163,7 @@ def test_a_holder_is_named_when_control_is_refused(moving: bool) -> None:
 
 
 def test_two_consoles_at_once_never_number_a_press_alike() -> None:
-    """A console that begins anew, or a second one, goes on with no press of another."""
+    """A restarted or second console continues no press of another."""
     times = iter(range(1_000, 2_000))
     consoles = [PageControl(lambda: next(times)) for _ in range(2)]
     pages = [control.join("a") for control in consoles]

@@ -1,4 +1,4 @@
-"""What a program sees that connects as Foxglove does, by the schemas that it is given."""
+"""Messages that a client like Foxglove receives, decoded by the announced schemas."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _DATA = struct.Struct("<BIQ")  # opcode, subscription, time; the protocol's docu
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def run_status(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A run's status in the middle of its path."""
     run = fake_run.make(rate_hz=2.0, every=20)
     folder = fake_run.write(run, tmp_path_factory.mktemp("live") / "run", pictures=False)
@@ -41,7 +41,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def decoded(channel: dict[str, Any], data: bytes) -> Any:
-    """A message by nothing but the schema that the server gave with its channel."""
+    """A message decoded only by the schema of its channel."""
     if channel["encoding"] == "json":
         return json.loads(data)
     files = descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(channel["schema"]))
@@ -52,9 +52,9 @@ def decoded(channel: dict[str, Any], data: bytes) -> Any:
     return kind.FromString(data)
 
 
-def seen_by_a_client(told: dict[str, Any]) -> dict[str, Any]:
+def seen_by_a_client(run_status: dict[str, Any]) -> dict[str, Any]:
     """The first message of each topic."""
-    robot = monitor._Robot().seen(told)
+    robot = monitor._Robot().seen(run_status)
     found: dict[str, Any] = {}
     with (
         foxglove_stream(0) as stream,
@@ -70,7 +70,7 @@ def seen_by_a_client(told: dict[str, Any]) -> dict[str, Any]:
         while len(found) < len(TOPICS):
             stream._scene_at = float("-inf")  # the client may have subscribed after the first
             stream._told = []
-            stream.take(told, robot)
+            stream.take(run_status, robot)
             for data in _received(client):
                 _, number, _ = _DATA.unpack_from(data)
                 found[channels[number]["topic"]] = decoded(channels[number], data[_DATA.size :])
@@ -87,21 +87,23 @@ def _received(client: Any) -> Iterator[bytes]:
             yield message
 
 
-def test_a_client_sees_robot_scene_drives_clearance_and_events(told: dict[str, Any]) -> None:
-    seen = seen_by_a_client(told)
+def test_a_client_sees_robot_scene_drives_clearance_and_events(run_status: dict[str, Any]) -> None:
+    seen = seen_by_a_client(run_status)
     assert seen.keys() == set(TOPICS)
     position = seen["/encoder_pose"].pose.position
-    np.testing.assert_allclose([position.x, position.y, position.z], told["planned"], atol=2e-5)
+    np.testing.assert_allclose(
+        [position.x, position.y, position.z], run_status["planned"], atol=2e-5
+    )
     moved = seen["/tf"].transforms[0]
     assert (moved.parent_frame_id, moved.child_frame_id) == ("world", "platform")
     names = {entity.id for entity in seen["/scene"].entities}
-    assert names == {f"obstacle {o.name}" for o in told["obstacles"]} | {"planned path"}
+    assert names == {f"obstacle {o.name}" for o in run_status["obstacles"]} | {"planned path"}
     assert len(seen["/drives"]["drives"]) == 8
-    assert seen["/events"].message == "what [drives] told"
+    assert seen["/events"].message == "what [drives] reported"
     assert 0.0 < seen["/clearance"]["distance_mm"] < 1000.0
 
 
-def test_a_port_that_is_taken_is_told() -> None:
+def test_a_port_in_use_is_reported() -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

@@ -1,4 +1,4 @@
-"""The console's page in a real browser: STOP, stale data, what it asks before, what it shows."""
+"""The console's page in a real browser: STOP, stale data, confirmations, contents."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ STALE = re.compile("No data from the console’s server")
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_stop_is_at_the_same_place_in_every_view(browser: Browser, fake: Fake, size: str) -> None:
+def test_stop_is_at_the_same_position_in_every_view(
+    browser: Browser, fake: Fake, size: str
+) -> None:
     """The lower left corner; whole, large enough for a finger, and in front of everything."""
     with visit(browser, fake, size) as found:
         boxes = []
@@ -190,7 +192,7 @@ def test_after_a_reconnection_nothing_goes_on_by_itself(desk: Visit) -> None:
     expect(desk.page.locator("#stale")).to_be_visible()
     expect(desk.page.locator("#stale")).to_be_hidden()
     after = desk.fake.let_pass(desk.page)["received"][before:]
-    # What was on its way when the socket was closed; nothing since, though the mouse is still down.
+    # Messages in transit when the socket was closed; none since, though the mouse is still down.
     assert len([m for m in after if m["kind"] == "held"]) <= 3
     assert [m for m in after if m["kind"] == "command"] == []
     count = len(desk.fake.ask()["received"])
@@ -283,7 +285,7 @@ def test_poses_are_taught_named_ordered_forgotten_and_planned(desk: Visit) -> No
     desk.taught("one", "two", "three")
     desk.page.get_by_role("button", name="Move three up").click()
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["one", "three", "two"])
-    desk.page.get_by_role("button", name="Forget one").click()
+    desk.page.get_by_role("button", name="Remove one").click()
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["three", "two"])
     desk.page.get_by_role("textbox", name="Name of pose 2").fill("home")
     desk.page.get_by_role("textbox", name="Name of pose 2").press("Enter")
@@ -326,7 +328,7 @@ def test_nothing_known_is_shown_as_not_known(desk: Visit) -> None:
     desk.fake.ask(state={**dict.fromkeys(keys), "reference": {"counts": False, "why_not": None}})
     for name in ("x", "tilt", "clearance", "stop", "following", "lost"):
         expect(desk.page.locator(f"#value-{name}")).to_have_text("–")
-    expect(desk.page.locator("#tension-trouble")).to_contain_text("Not known")
+    expect(desk.page.locator("#tension-trouble")).to_contain_text("Unknown")
 
 
 def test_texts_of_the_server_never_become_markup(desk: Visit) -> None:
@@ -405,7 +407,7 @@ def test_control_is_taken_from_another_page_only_after_a_question(
     other.goto(desk.fake.address)
     expect(other.locator("#lamp-control")).to_have_text("Control: page 1")
     other.locator("#take-control").click()
-    expect(other.locator("#dialog")).to_contain_text("page 1 has control, and loses it at once")
+    expect(other.locator("#dialog")).to_contain_text("page 1 has control, and loses it immediately")
     other.locator(".confirm").click()
     expect(other.locator("#lamp-control")).to_have_text("You have control")
     expect(desk.page.locator("#lamp-control")).to_have_text("Control: page 2")

@@ -68,7 +68,7 @@ def test_what_it_means_for_the_reference_is_said_before(desk: Visit, homed: bool
     desk.fake.ask(set={"homed": homed, "service": True})
     desk.view("service")
     desk.page.locator("#cable-begin").click()
-    text = "the reference stays" if homed else "are not homed, and are not by this"
+    text = "the reference stays" if homed else "are not homed"
     expect(desk.page.locator("#dialog .cause")).to_contain_text(text)
     assert desk.fake.received("cable_begin") == []
 
@@ -100,7 +100,7 @@ def test_a_key_that_is_held_ends_with_a_finger_and_begins_nothing(desk: Visit) -
 @pytest.mark.parametrize(
     ("axes", "sense"), [([0, -0.5, 0, 0], "wind_in"), ([0, 0, 0, 0.6], "pay_out")]
 )
-def test_a_stick_winds_in_and_pays_out_and_ends_where_it_is_turned(
+def test_a_stick_winds_in_and_pays_out_and_ends_when_it_changes_direction(
     desk: Visit, axes: list[float], sense: str
 ) -> None:
     desk.ready_to_jog_cables()
@@ -113,25 +113,27 @@ def test_a_stick_winds_in_and_pays_out_and_ends_where_it_is_turned(
     assert found["sense"] == sense
     desk.page.evaluate("(axes) => { fakePad.axes = axes.map((v) => -v); }", axes)
     desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
-    assert desk.fake.let_pass(desk.page)["received"][-1]["kind"] == "let_go", "not the other way"
+    assert desk.fake.let_pass(desk.page)["received"][-1]["kind"] == "let_go", (
+        "not the other direction"
+    )
 
 
-def test_tension_and_way_are_shown(desk: Visit) -> None:
+def test_tension_and_travel_are_shown(desk: Visit) -> None:
     desk.ready_to_jog_cables()
     cable = {**AT_REST, "ready": True, "cable": 3, "press_mm": -0.25, "limit_n": 62.0}
-    way = [0.0, 0.0, 1.25, 0.0, 0.0, 0.0, 0.0, 0.0]
+    travel = [0.0, 0.0, 1.25, 0.0, 0.0, 0.0, 0.0, 0.0]
     limit = "cable 3 carries 55.1 N, near the limit of 62 N"
     desk.fake.ask(
         state={
-            "cable": {**cable, "session_mm": way, "limit": limit},
+            "cable": {**cable, "session_mm": travel, "limit": limit},
             "tensions_n": [20.0, 20.0, 55.1, 20.0, 20.0, 20.0, 20.0, 20.0],
         }
     )
     desk.page.locator("input[name=cable][value='3']").check(force=True)
     expect(desk.page.locator("#cable-tension")).to_have_text("Cable 3: 55.1\u00a0N")
     expect(desk.page.locator("#cable-range")).to_contain_text("limit 62\u00a0N")
-    expect(desk.page.locator("#cable-way")).to_have_text(
-        "By this press 0.250\u00a0mm wound in · since the session began 1.250\u00a0mm paid out"
+    expect(desk.page.locator("#cable-travel")).to_have_text(
+        "This press: 0.250\u00a0mm wound in · since the session began 1.250\u00a0mm paid out"
     )
     expect(desk.page.locator("#cable-limit")).to_have_text(limit)
 

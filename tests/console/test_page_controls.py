@@ -295,7 +295,7 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     page.get_by_role("textbox", name="Name of pose 1").fill("grip")
     page.get_by_role("textbox", name="Name of pose 1").press("Enter")
     page.locator("#plan-poses").click()
-    page.get_by_role("button", name="Forget pose 1").click()
+    page.get_by_role("button", name="Remove pose 1").click()
     desk.view("jog")
     page.locator("#jog-begin").click()
     expect(page.locator("#jog-state")).to_contain_text("Ready")

@@ -1,4 +1,4 @@
-"""Jogging from the page, in a real browser: whatever ends a press ends it for good."""
+"""Jogging from the page, in a real browser: a press that ended never continues."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ def test_the_pad_stays_where_it_is_whatever_is_shown(browser: Browser, fake: Fak
             limit = "stops in 17.1 mm: obstacle clearance too small, platform – obstacle_1"
             outcome = {"verb": "jog", "ok": False, "text": "a\n" * 20, "report": None}
             changes = {"jog": {**jog, "limit": limit}, "latched": "slack: cable 3 " * 4}
-            busy = {"verb": "jog", "text": "a long line of what is under way " * 3}
+            busy = {"verb": "jog", "text": "a long line about the command in progress " * 3}
             more = {"outcome": {**outcome, "fault_page": "/help/slack"}, "busy": busy}
             found.hold()
             found.page.evaluate("() => window.dispatchEvent(new Event('blur'))")

@@ -77,7 +77,7 @@ def test_an_old_measurement_is_not_shown_as_one_of_now(desk: Visit) -> None:
     expect(desk.page.locator("#measured-x")).to_have_text("measured –")
     until_painted(desk, "tag", 0)
     desk.fake.ask(state={"measured": {**measured, **more, "age_s": 0.1, "stated": False}})
-    expect(desk.page.locator("#note-measured")).to_contain_text("by scatter alone")
+    expect(desk.page.locator("#note-measured")).to_contain_text("from scatter only")
 
 
 def test_pictures_of_cameras_come_at_most_five_times_a_second(desk: Visit) -> None:

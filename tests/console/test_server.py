@@ -1,4 +1,4 @@
-"""The console's server: who may look, who may operate, and what it makes of anything else."""
+"""The console's server: access, control, and refusal of everything else."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tests.console import fake_server
 
 
 class Served:
-    """A console of the paper's rig, simulated in the process of a verb; a server around it."""
+    """A console of the paper's simulated rig, with its server."""
 
     def __init__(self, *, read_only: bool = False) -> None:
         rig = load_rig(RIG)
@@ -44,7 +44,7 @@ class Served:
         self.console = Console(files)
         self.said: list[tuple[str, dict[str, Any]]] = []
         self.started: list[tuple[str, list[str]]] = []
-        self.console.watch.say = self._say  # type: ignore[method-assign]
+        self.console.watch.send = self._say  # type: ignore[method-assign]
         self.console.verbs.start = self._start  # type: ignore[method-assign]
         self.server = ConsoleServer(self.console)
 
@@ -107,7 +107,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class MovesOn:
-    """Stands in for `RunStatus`: of a run, nothing but its bus."""
+    """A minimal `RunStatus` with only the bus of a run."""
 
     def __init__(self, bus: str) -> None:
         self._bus = bus
@@ -118,7 +118,7 @@ class MovesOn:
 
 @pytest.fixture(autouse=True)
 def own_announcements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No run of another test is seen here."""
+    """Hides the runs of other tests."""
     for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
@@ -132,7 +132,7 @@ def served(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
 
 
 def state(page: ClientConnection) -> dict[str, Any]:
-    """The next state; answers before it are left out."""
+    """The next state; skips answers."""
     while True:
         message = json.loads(page.recv(timeout=10))
         if message["kind"] == "state":
@@ -140,8 +140,8 @@ def state(page: ClientConnection) -> dict[str, Any]:
             return message
 
 
-def told(page: ClientConnection, text: str) -> dict[str, Any]:
-    """The answer to what is sent."""
+def answer_to(page: ClientConnection, text: str) -> dict[str, Any]:
+    """Sends a message and returns its answer."""
     page.send(text)
     while True:
         message = json.loads(page.recv(timeout=30))
@@ -151,7 +151,7 @@ def told(page: ClientConnection, text: str) -> dict[str, Any]:
 
 
 def command(page: ClientConnection, name: str, **values: Any) -> dict[str, Any]:
-    return told(page, json.dumps({"kind": "command", "id": 7, "command": name, **values}))
+    return answer_to(page, json.dumps({"kind": "command", "id": 7, "command": name, **values}))
 
 
 def held(hold: int) -> str:
@@ -186,7 +186,7 @@ def test_stop_waits_for_no_other_command_of_any_page(
             assert (answer["to"], answer["what"]) == (7, "nothing moves")
         for _ in range(2 * MOST_WAITING):
             me.send(json.dumps(load))
-        assert "not done yet" in command(me, "hold")["what"]
+        assert "not finished yet" in command(me, "hold")["what"]
 
 
 def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
@@ -203,7 +203,7 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
     with advertised() as listeners:
         silent = f"process {os.getpid()} moves a robot and does not answer; wait, or stop it"
         assert [asked("reset"), asked("service_begin")] == [silent] * 2
-        state = console.look()
+        state = console.update()
         assert state["motion"] is None
         here: Any = MovesOn(state["bus"])
         with commands(listeners, LocalRequests(), here):
@@ -219,7 +219,7 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/scene", "/api/files", "/runs/one/report.html"])
-def test_nothing_is_told_without_the_token(served: Served, path: str) -> None:
+def test_nothing_is_sent_without_the_token(served: Served, path: str) -> None:
     assert served.get(path, token=False)[0] == 403
     assert served.get(f"{path}?token=wrong", token=False)[0] == 403
     assert served.get(path)[0] == 200
@@ -289,7 +289,7 @@ def test_help_is_given_by_code(served: Served) -> None:
     assert b"# " in body
 
 
-def test_the_fake_server_tells_what_this_one_tells(served: Served) -> None:
+def test_the_fake_server_sends_what_this_one_sends(served: Served) -> None:
     """What the page's own tests rest on; a key that one has and the other lacks is found here."""
     with served.page() as page:
         real = state(page)
@@ -423,7 +423,7 @@ def test_what_names_no_cable_and_sense_moves_nothing(
     with served.something_moves(), served.page() as page:
         command(page, "take_control")
         command(page, "service_begin")
-        assert told(page, held_cable(1, **changes))["ok"] is False
+        assert answer_to(page, held_cable(1, **changes))["ok"] is False
         assert served.said == []
 
 
@@ -521,7 +521,7 @@ SMALL = st.recursive(
 @given(said=SMALL)
 def test_nonsense_is_refused_and_nothing_starts(served: Served, said: Any) -> None:
     with served.page() as page:
-        answer = told(page, json.dumps(said))
+        answer = answer_to(page, json.dumps(said))
         assert not answer["ok"]
         assert answer["what"]
     assert not served.started
@@ -543,7 +543,7 @@ def test_a_console_that_only_shows_does_nothing_but_stop(
     with serving(Served(read_only=True)) as served, served.page() as page:
         assert state(page)["read_only"]
         for name in ("take_control", "home", "run", "jog_begin", "hold", "release", "reset"):
-            assert "only shows" in command(page, name)["what"]
+            assert "read-only" in command(page, name)["what"]
         assert command(page, "stop")["what"] == "nothing moves"
         assert not served.started
         assert not served.said

@@ -1,4 +1,4 @@
-"""Taught poses: what is in the file is what is in the list, whatever is done to them."""
+"""Taught poses: file and list agree after any operation."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def test_list_and_file_agree_with_a_plain_list(
         else:
             assert ok
             names = expected
-        assert [one["name"] for one in taught.told()] == names
-        assert TaughtPoses(path).told() == taught.told()
+        assert [one["name"] for one in taught.as_dicts()] == names
+        assert TaughtPoses(path).as_dicts() == taught.as_dicts()
 
 
 def test_they_become_a_scene_that_is_read_again(tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_they_become_a_scene_that_is_read_again(tmp_path: Path) -> None:
     assert yaml.safe_load(path.read_text())["schema_version"] == 1
 
 
-def test_orientations_that_noise_tells_apart_are_made_one(tmp_path: Path) -> None:
+def test_orientations_that_differ_by_noise_are_made_equal(tmp_path: Path) -> None:
     """The planner of scenes without free rotation wants the very same orientation."""
     taught = TaughtPoses(tmp_path / "poses.json")
     for k in range(3):
@@ -95,7 +95,7 @@ def test_orientations_that_noise_tells_apart_are_made_one(tmp_path: Path) -> Non
     assert scene.start.angle_to(scene.stops[0].pose) == 0.0
 
 
-def test_poses_that_are_turned_keep_their_orientation(tmp_path: Path) -> None:
+def test_rotated_poses_keep_their_orientation(tmp_path: Path) -> None:
     taught = TaughtPoses(tmp_path / "poses.json")
     turn = matrix_from_rotation_vector(np.array([0.0, 0.1, 0.2]))
     taught.teach("level", pose(0))

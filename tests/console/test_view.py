@@ -1,4 +1,4 @@
-"""What the page is given of the robot: the closest pair, the measured pose with its ellipsoid."""
+"""Data for the page: the closest pair, and the measured pose with its ellipsoid."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import chi2
 
-from cdpr.console.view import SURE_IN_SPACE, RobotView, measured_data, nearest_data
+from cdpr.console.view import ELLIPSOID_SCALE, RobotView, measured_data, nearest_data
 from executor.recording.run_folder import RunFolder
 from executor.remote import status
 from model.clearance import ClearanceModel
@@ -32,7 +32,7 @@ THE_RIG = load_rig(RIG)
 
 
 def status_at(pose: Pose) -> dict[str, Any]:
-    """What a motion says whose drives hold the platform there."""
+    """Status of a motion whose drives hold the platform at a pose."""
     winches, tensions = WinchMap(THE_RIG), working_tensions(THE_RIG, pose, SCENE.load).tensions
     counts = winches.counts(winches.unstrained(cable_lengths(THE_RIG, pose), tensions))
     drives = [
@@ -75,7 +75,7 @@ def test_a_run_that_is_under_way_is_seen_in_its_own_scene(tmp_path: Path) -> Non
     assert view.scene.obstacles != SCENE.obstacles
 
 
-def told(covariance: Array) -> dict[str, Any]:
+def measurement_with(covariance: Array) -> dict[str, Any]:
     flat = covariance.reshape(-1).tolist()
     return {
         "position_mm": [1.0, 2.0, 3.0],
@@ -89,20 +89,20 @@ def told(covariance: Array) -> dict[str, Any]:
 def test_the_ellipsoid_is_that_of_the_covariance(root: Array) -> None:
     """Its half axes are at right angles, and their squares add up to the covariance."""
     covariance = root @ root.T
-    shown = measured_data(told(covariance), 0.1)
+    shown = measured_data(measurement_with(covariance), 0.1)
     axes = np.array(shown["half_axes_mm"])
-    assert axes.T @ axes / SURE_IN_SPACE**2 == pytest.approx(covariance, abs=2e-3)
+    assert axes.T @ axes / ELLIPSOID_SCALE**2 == pytest.approx(covariance, abs=2e-3)
     apart = axes @ axes.T
     assert apart - np.diag(np.diag(apart)) == pytest.approx(np.zeros((3, 3)), abs=2e-2)
     assert shown["within_mm"] == pytest.approx(np.linalg.norm(axes, axis=1).max(), abs=2e-3)
 
 
 def test_the_ellipsoid_holds_95_percent() -> None:
-    assert chi2.cdf(SURE_IN_SPACE**2, 3) == pytest.approx(0.95, abs=1e-5)
+    assert chi2.cdf(ELLIPSOID_SCALE**2, 3) == pytest.approx(0.95, abs=1e-5)
 
 
 def test_a_run_states_all_errors_of_a_measured_position() -> None:
-    """Those that all images share count as much as the scatter; rotations have no place in it."""
+    """Errors common to all images count as much as the scatter; rotations are left out."""
     own, shared = np.diag([1e-8] * 3 + [1.0] * 3), np.diag([3e-8] * 3 + [1.0] * 3)
     pose = Pose(np.array([0.1, -0.2, 0.3]), np.eye(3))
     found = PoseMeasurement(1.25, pose, own, (1,), 0.1, "tracked", shared, unstated=False)

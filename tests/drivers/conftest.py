@@ -31,7 +31,7 @@ def pulley_rig() -> Rig:
 
 @pytest.fixture
 def bench(rig: Rig) -> Iterator[Bench]:
-    """All in one thread, time passes with SYNC."""
+    """All in one thread; time advances with SYNC."""
     settings = BusSettings("virtual", f"drivers-{next(_CHANNELS)}")
     with three_on_a_bus(settings) as (master, drives, ear):
         rehearsal = SimulatedCia402Rig(rig, drives, rig.home)
@@ -40,7 +40,7 @@ def bench(rig: Rig) -> Iterator[Bench]:
 
 @pytest.fixture(params=["virtual", "udp_multicast"])
 def served_bench(request: pytest.FixtureRequest, rig: Rig) -> Iterator[Bench]:
-    """The drives answer by themselves, as behind a real bus; no common thread, no pump."""
+    """The drives answer in their own thread, as on a real bus."""
     kind = request.param
     channel = free_udp_channel() if kind == "udp_multicast" else f"served-{next(_CHANNELS)}"
     clock = SteppedClock(rig.document.bus.cycle_ms / 1000.0)

@@ -1,4 +1,4 @@
-"""A master and a whole simulated rig on one bus, both in this process, for tests to drive."""
+"""A master and a simulated rig on one bus, both in this process."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from simulation.drives.cia402_rig import SimulatedCia402Rig
 
 
 class Bench:
-    """Master, drives and a listener that hears every control word."""
+    """Master, drives and a listener for every control word."""
 
     def __init__(
         self, rig: Rig, group: DriveGroup, rehearsal: SimulatedCia402Rig, ear: can.BusABC
@@ -37,7 +37,7 @@ class Bench:
         return self.rehearsal.drives
 
     def cycle(self, targets: list[int] | None = None) -> CycleStatus:
-        """One cycle; without targets the drives stay where they were told to be."""
+        """One cycle; without targets the drives keep their last targets."""
         self.before_cycle()
         self.group.send_cycle(self.group.targets.tolist() if targets is None else targets)
         self.status = self.group.receive(self.reply_timeout)
@@ -101,14 +101,14 @@ def three_on_a_bus(settings: BusSettings) -> Iterator[tuple[can.BusABC, can.BusA
 
 
 def free_udp_channel() -> str:
-    """Loopback multicast that no other test run on this machine hears."""
+    """A loopback multicast channel separate from other test runs on this machine."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))
         return f"239.74.163.2:{probe.getsockname()[1]}"
 
 
 class SteppedClock:
-    """The time of drives that are served by a thread: one cycle more for each cycle sent."""
+    """Clock of drives served by a thread, which advances one cycle per cycle sent."""
 
     def __init__(self, cycle: float) -> None:
         self.cycle, self.now = cycle, 0.0

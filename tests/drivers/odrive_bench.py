@@ -48,7 +48,7 @@ def write_endpoints(path: Path, rig: Rig, firmware: str = "0.6.11") -> Path:
 
 @dataclass
 class OdriveBench:
-    """Both ends of a bus, in one thread; a cycle passes with each reply that is waited for."""
+    """Both ends of a bus in one thread; a cycle passes with each awaited reply."""
 
     rig: Rig
     group: OdriveGroup
@@ -79,7 +79,7 @@ class OdriveBench:
         return status
 
     def frames(self) -> list[can.Message]:
-        """What was said since the last call."""
+        """Frames since the last call."""
         heard = []
         while (message := self.ear.recv(0.0)) is not None:
             heard.append(message)

@@ -1,4 +1,4 @@
-"""A drive that shares no code with ours: canopen's LocalNode and the CiA 402 state machine anew.
+"""An independent drive: canopen's LocalNode and a separate CiA 402 state machine.
 
 It has only what the standards ask for, sets bits of the status word that are the maker's, boots in
 SWITCH ON DISABLED, answers late, and takes set-points at SYNC.

@@ -34,7 +34,7 @@ def eds_of(profile: str) -> Path:
 
 @lru_cache(maxsize=64)
 def _dictionary(eds: Path, node: int) -> canopen.ObjectDictionary:
-    """Read-only: drives keep their values apart."""
+    """Read-only, as each drive stores its values separately."""
     return canopen.import_od(str(eds), node)
 
 
@@ -102,7 +102,7 @@ class ScriptedDrive:
 
 
 class ScriptedBus:
-    """What `SetupNetwork` needs of a bus; time passes only while something is waited for."""
+    """The bus interface that `SetupNetwork` needs; time advances only during waits."""
 
     channel_info = "scripted"
 

@@ -1,4 +1,4 @@
-"""Opening a bus, and how full it gets."""
+"""Opening a bus, and its load."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_missing_kernel_interface_says_how_to_bring_it_up() -> None:
     ("flags", "queue", "what"),
     [("0x40080", 128, "down"), ("0x40081", 10, "transmit queue")],
 )
-def test_a_kernel_interface_that_is_down_or_short_of_queue_is_told(
+def test_a_kernel_interface_that_is_down_or_short_of_queue_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, queue: int, what: str
 ) -> None:
     folder = tmp_path / "can0"
@@ -102,8 +102,8 @@ def test_the_bus_in_one_process_behaves_as_that_of_python_can() -> None:
                 bus.send(frame)
             for end in (theirs, other):
                 came = [end.recv(0.0), end.recv(0.01), end.recv(0.0), end.recv(0.0)]
-                told = [(m.arbitration_id, bytes(m.data), m.is_rx) for m in came if m]
-                assert told == [(0x181, b"a", True), (0x80, b"", True), (0x182, b"b", True)]
+                received = [(m.arbitration_id, bytes(m.data), m.is_rx) for m in came if m]
+                assert received == [(0x181, b"a", True), (0x80, b"", True), (0x182, b"b", True)]
                 assert all(m.timestamp > 0.0 and m.channel == "as-python-can" for m in came if m)
             assert bus.recv(0.0) is None
             other.set_filters([{"can_id": 0x182, "can_mask": 0x7FF}])

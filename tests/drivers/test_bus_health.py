@@ -1,4 +1,4 @@
-"""What is wrong with the bus, or with what comes over it, ends in a fault with a name."""
+"""Problems of the bus or its frames end in a fault with a code."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_what_a_back_end_raises_gets_a_name(error: Exception, kind: type[BusFaul
 
 
 def test_an_error_number_may_be_in_the_cause() -> None:
-    """The UDP back end tells it only there."""
+    """The UDP back end gives it only there."""
     error = can.CanOperationError("failed to send via socket")
     error.__cause__ = OSError(errno.ENETDOWN, "Network is down")
     assert type(bus_fault("sending", "bus", error)) is BusDown
@@ -125,7 +125,7 @@ def test_a_bus_without_a_socket_loses_nothing_that_could_be_counted() -> None:
 
 
 def say(bench: Bench, can_id: int, data: bytes = b"", *, error: bool = False) -> None:
-    """Somebody else on the bus sends a frame."""
+    """Another device on the bus sends a frame."""
     bench._ear.send(
         can.Message(arbitration_id=can_id, data=data, is_extended_id=False, is_error_frame=error)
     )
@@ -151,7 +151,7 @@ def test_it_stops_the_drives_and_is_latched(
     with pytest.raises(kind) as caught:
         bench.cycle()
     assert bench.group.state is GroupState.FAULT
-    status = bench.cycle()  # told once; what the drives do now is still taken in
+    status = bench.cycle()  # raised once; replies of the drives are still processed
     assert (WHOLE_BUS, caught.value.what) in status.faults
     bench.cycle()
     assert [d.state for d in bench.drives] == [HOLDING] * 8
@@ -159,7 +159,7 @@ def test_it_stops_the_drives_and_is_latched(
         bench.group.command(GroupCommand.ENABLE)
     bench.group.command(GroupCommand.RESET_FAULT)
     happens(bench)
-    with pytest.raises(kind):  # what is still wrong is told again
+    with pytest.raises(kind):  # a persisting fault is raised again
         bench.cycle()
 
 
@@ -208,7 +208,7 @@ class TestAnotherProgramWhileDrivesAreSetUp:
             (0x605, "objects of drive 5"),
         ],
     )
-    def test_is_told(self, bench: Bench, can_id: int, words: str) -> None:
+    def test_is_reported(self, bench: Bench, can_id: int, words: str) -> None:
         reply = bench.drives[0]._bus_send
         read = bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0))
         bench.drives[0]._bus_send = lambda i, d: (say(bench, can_id, read), reply(i, d))
@@ -218,7 +218,7 @@ class TestAnotherProgramWhileDrivesAreSetUp:
         assert bench.group.state is GroupState.OFFLINE
 
 
-def test_two_devices_with_one_node_id_are_told_before_anything_is_written(bench: Bench) -> None:
+def test_two_devices_with_one_node_id_are_reported_before_anything_is_written(bench: Bench) -> None:
     send = bench.drives[4]._bus_send
     bench.drives[4]._bus_send = lambda i, d: (send(i, d), send(i, d))
     with pytest.raises(Refused, match="drive 5 answered twice"):
@@ -249,7 +249,7 @@ def test_an_answer_to_another_question_is_no_silence(bench: Bench) -> None:
 
 
 def spoil(bench: Bench, drive: int, times: int, change: Callable[[bytes], bytes]) -> None:
-    """Changes the next replies of a drive on their way."""
+    """Changes the next replies of a drive in transit."""
     send, left = bench.drives[drive]._bus_send, [times]
 
     def on_its_way(can_id: int, data: bytes) -> None:
@@ -303,7 +303,7 @@ def test_a_first_position_that_is_wrong_becomes_no_target(bench: Bench) -> None:
     assert bench.group.read_positions().positions.tolist() == true
 
 
-def test_drives_that_were_turned_by_hand_between_two_readings_are_believed(bench: Bench) -> None:
+def test_drives_rotated_by_hand_between_two_readings_are_accepted(bench: Bench) -> None:
     bench.group.configure()
     bench.group.read_positions()
     for drive, position in zip(bench.drives, bench.lifted(0.05), strict=True):
@@ -312,11 +312,11 @@ def test_drives_that_were_turned_by_hand_between_two_readings_are_believed(bench
     assert bench.group.read_positions().positions.tolist() == true
 
 
-def test_a_position_with_its_sign_flipped_is_not_believed() -> None:
+def test_a_position_with_its_sign_flipped_is_not_accepted() -> None:
     check = ReplyCheck({1: "drive 1"}, (500.0,))
     check.begin_cycle()
-    assert check.believed(0, 40_000)
-    assert not check.believed(0, -40_000)
+    assert check.accept(0, 40_000)
+    assert not check.accept(0, -40_000)
     assert check.rejected == 1
 
 
@@ -325,18 +325,18 @@ def test_a_position_with_its_sign_flipped_is_not_believed() -> None:
     gap=st.integers(0, 5),
     start=st.integers(-(2**30), 2**30),
 )
-def test_a_position_is_believed_exactly_when_the_drum_can_have_turned_so_far(
+def test_a_position_is_accepted_exactly_when_the_drum_can_have_rotated_that_far(
     step: int, gap: int, start: int
 ) -> None:
     check = ReplyCheck({1: "drive 1"}, (500.0,))
     check.begin_cycle()
-    assert check.believed(0, start)
+    assert check.accept(0, start)
     check.end_cycle()
     for _ in range(gap):
         check.begin_cycle()
         check.end_cycle()
     check.begin_cycle()
-    believed = check.believed(0, start + step)
+    believed = check.accept(0, start + step)
     assert believed == (abs(step) <= 500 * (gap + 1))
 
 
@@ -355,7 +355,7 @@ def test_where_a_sender_hears_itself_only_what_was_not_sent_is_foreign(script: l
             assert own.is_foreign(0x080)
 
 
-def test_drives_with_few_heartbeat_entries_are_told_of(bench: Bench) -> None:
+def test_drives_with_few_heartbeat_entries_are_reported(bench: Bench) -> None:
     assert bench.group.configure() == ()
     bench.group.close()
     for drive in (2, 6):

@@ -1,4 +1,4 @@
-"""Simulated drives say so themselves; what says anything else, or nothing, is a real drive."""
+"""Simulated drives identify themselves; any others count as real."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import can
 import pytest
 
 from drivers.cia402 import inspection
-from drivers.cia402.inspection import SIMULATED, say_simulated
+from drivers.cia402.inspection import SIMULATED, are_simulated
 from model.errors import HardwareMissing, Refused
 
 Answer = bytes | None | Exception
@@ -52,5 +52,5 @@ def test_only_drives_that_all_say_so_are_simulated(
     network = Network(answers)
     monkeypatch.setattr(inspection, "SetupNetwork", lambda *_: network)
     bus: Any = can.BusABC
-    assert say_simulated(bus, None, range(1, len(answers) + 1)) is simulated
+    assert are_simulated(bus, None, range(1, len(answers) + 1)) is simulated
     assert network.asked == asked

@@ -70,7 +70,7 @@ def test_an_emergency_of_a_drive_that_is_not_enabled_is_news() -> None:
     assert [node for node, _ in watch.news()] == [3]
 
 
-def test_a_reason_that_is_over_is_told_as_such() -> None:
+def test_a_reason_that_is_over_is_reported_as_such() -> None:
     watch = watch_of(ENABLED, ENABLED)
     watch.take(EMCY_BASE + 5, make_emergency(HOT, 1))
     watch.take(EMCY_BASE + 5, make_emergency(0, 0))
@@ -83,6 +83,6 @@ def test_a_reason_that_is_over_is_told_as_such() -> None:
 def test_the_group_goes_on_while_its_drive_does(bench: Bench) -> None:
     bench.enable()
     bench.drives[2]._emergency(HOT)
-    told = [bench.cycle() for _ in range(3)]
-    assert all(status.state is GroupState.ENABLED and not status.faults for status in told)
-    assert [warning.stops for status in told for warning in status.warnings] == [True]
+    statuses = [bench.cycle() for _ in range(3)]
+    assert all(status.state is GroupState.ENABLED and not status.faults for status in statuses)
+    assert [warning.stops for status in statuses for warning in status.warnings] == [True]

@@ -42,7 +42,7 @@ def test_golden_bytes() -> None:
 
 
 def test_identifiers_are_those_of_the_standard() -> None:
-    """CiA 301, table "pre-defined connection set", written out: nobody else checks these."""
+    """CiA 301, table "pre-defined connection set", written out, as no other test checks these."""
     assert frames.NMT_ID == 0x000
     assert frames.SYNC_ID == 0x080
     assert frames.EMCY_BASE == 0x080
@@ -141,8 +141,8 @@ OF_ANOTHER_TOOL = {
 }
 
 
-def test_identifiers_of_a_master_are_told_by_what_it_does() -> None:
+def test_identifiers_of_a_master_are_described_by_what_it_does() -> None:
     assert commanding_ids([1, 8]) == OF_ANOTHER_MASTER.keys()
     assert set_up_ids([1, 8]) == OF_ANOTHER_MASTER.keys() | OF_ANOTHER_TOOL.keys()
-    for can_id, told in (OF_ANOTHER_MASTER | OF_ANOTHER_TOOL).items():
-        assert foreign_master_message(can_id) == f"another program {told}"
+    for can_id, action in (OF_ANOTHER_MASTER | OF_ANOTHER_TOOL).items():
+        assert foreign_master_message(can_id) == f"another program {action}"

@@ -22,7 +22,7 @@ HOLDING = DriveState.QUICK_STOP_ACTIVE
 
 
 class TestFromSetUpToPowerOff:
-    """The whole way, the same on every kind of bus."""
+    """All steps, the same on every kind of bus."""
 
     def test_configure_enable_follow_stop_disable(self, served_bench: Bench) -> None:
         bench = served_bench
@@ -46,7 +46,7 @@ class TestFromSetUpToPowerOff:
             status = bench.cycle(bench.lifted(height(cycle)))
             assert not status.missing.any()
             assert not status.faults
-            # An ideal drive is at a SYNC where the set-point of the cycle before told it to be.
+            # At a SYNC an ideal drive is at the set-point of the previous cycle.
             assert np.abs(status.positions - status.demands).max() <= 1
             assert (status.torques > 0).all()  # positive is pulling
         group.command(GroupCommand.QUICK_STOP)
@@ -112,7 +112,7 @@ def test_a_drive_that_falls_silent_after_set_up_is_named(bench: Bench) -> None:
         bench.group.read_positions()
 
 
-def test_a_drive_that_was_switched_on_since_it_was_set_up_is_told(bench: Bench) -> None:
+def test_a_drive_power_cycled_since_its_configuration_is_reported(bench: Bench) -> None:
     assert bench.group.restarted == ()
     bench.group.configure()
     assert bench.group.restarted == tuple(range(1, 9)), "never set up"
@@ -124,11 +124,11 @@ def test_a_drive_that_was_switched_on_since_it_was_set_up_is_told(bench: Bench) 
 
 
 def test_what_cannot_be_noted_is_not_wiped_out(bench: Bench) -> None:
-    """The set-up of drives that restarted is the only thing that tells of it."""
-    told: list[tuple[int, ...]] = []
+    """Only the missing configuration shows that drives restarted."""
+    reported: list[tuple[int, ...]] = []
 
     def not_kept(nodes: tuple[int, ...]) -> None:
-        told.append(nodes)
+        reported.append(nodes)
         raise Refused("the homing reference cannot be written")
 
     bench.group.configure()
@@ -136,17 +136,17 @@ def test_what_cannot_be_noted_is_not_wiped_out(bench: Bench) -> None:
     for _ in range(2):
         with pytest.raises(Refused, match="cannot be written"):
             bench.group.configure(on_restarted=not_kept)
-    assert told == [(5,), (5,)]
+    assert reported == [(5,), (5,)]
 
 
 def needed(settings: Sequence[Setting]) -> dict[tuple[int, int], int]:
-    """What every drive must hold in the end; an inhibit time only where there is one."""
+    """Final values of every drive; an inhibit time only where it exists."""
     kept = {(s.index, s.sub): s.value for s in settings if not s.transient}
     return {key: value for key, value in kept.items() if key != (0x1800, 3)}
 
 
 def written_objects(bench: Bench) -> dict[tuple[int, int], int]:
-    """What node 6 must hold in the end."""
+    """Final values of node 6."""
     settings_of_6 = settings_for(bench.rig, 5, bench.rehearsal.plant.winch_map)
     written = needed(settings_of_6)
     return {**written, (0x1016, 1): 127 << 16 | 100, (0x1016, 8): 8 << 16 | 100}
@@ -224,9 +224,9 @@ def test_a_fault_of_one_while_moving_stops_the_others(bench: Bench) -> None:
     states = [d.state for d in bench.drives]
     assert states == [HOLDING] * 2 + [DriveState.FAULT] + [HOLDING] * 5
     assert bench.group.state is GroupState.FAULT
-    told = [text for node, text in bench.status.faults if node == 3]
-    assert len(told) == 1, "the emergency, and not its state once more"
-    assert "over-current" in told[0]
+    reported = [text for node, text in bench.status.faults if node == 3]
+    assert len(reported) == 1, "the emergency, and not its state once more"
+    assert "over-current" in reported[0]
 
 
 def test_a_fault_is_latched_until_it_is_reset(bench: Bench) -> None:
@@ -254,7 +254,7 @@ def test_a_fault_is_latched_until_it_is_reset(bench: Bench) -> None:
     bench.until(GroupState.ENABLED)
 
 
-def test_a_silent_drive_is_told_every_cycle_and_left_to_the_executor(bench: Bench) -> None:
+def test_a_silent_drive_is_reported_every_cycle_and_left_to_the_executor(bench: Bench) -> None:
     bench.enable()
     bench.drives[7].silent = True
     for _ in range(4):
@@ -322,8 +322,8 @@ def test_torque_that_goes_while_drives_hold_is_a_fault_of_that_cycle(
         bench.group.read_positions()
     bench.drives[6].state = DriveState.SWITCH_ON_DISABLED
     bench.cycle()
-    told = ((7, "cable 7 (drive 7) lost its torque: switch on disabled"),)
-    assert bench.status.faults == told
+    reported = ((7, "cable 7 (drive 7) lost its torque: switch on disabled"),)
+    assert bench.status.faults == reported
     assert bench.group.state is GroupState.FAULT
 
 
@@ -414,7 +414,7 @@ def test_a_frame_that_the_bus_refuses_does_not_hold_up_the_stop(
 
 
 def test_a_bus_that_fails_is_a_fault_of_ours(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No exception of python-can leaks, and it says what the drives do now."""
+    """No exception of python-can leaks, and the message says what the drives do."""
 
     def down(timeout: float) -> None:
         raise can.CanOperationError("Network is down")
@@ -451,7 +451,7 @@ def test_stale_replies_are_not_taken_for_new_ones(bench: Bench) -> None:
     moved = bench.lifted(0.0001)
     bench.cycle(moved)
     bench.group.send_cycle(moved)
-    bench.rehearsal.pump()  # replies from the new place wait in the queue; nobody takes them
+    bench.rehearsal.pump()  # replies from the new position wait unread in the queue
     bench.drives[3].silent = True
     bench.group.send_cycle(moved)
     status = bench.group.receive(0.0)
@@ -489,7 +489,7 @@ def test_while_one_drive_is_slow_to_enable_the_others_hold_and_do_not_sag(
     assert bench.group.state is GroupState.ENABLING
     bench.until(GroupState.FAULT, limit=120)
     assert bench.status.faults[0][0] == 8
-    assert "on the way to operation enabled" in bench.status.faults[0][1]
+    assert "instead of operation enabled" in bench.status.faults[0][1]
     bench.cycle()
     assert [d.state for d in bench.drives[:7]] == [HOLDING] * 7
 

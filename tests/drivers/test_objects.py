@@ -1,4 +1,4 @@
-"""What is written to a drive: the values that the stop rules rest on."""
+"""Values written to a drive on which the stop rules depend."""
 
 from __future__ import annotations
 
@@ -70,16 +70,18 @@ def test_a_cycle_that_60c2_cannot_hold_is_refused() -> None:
 
 
 @given(
-    place=st.tuples(*[st.floats(0, 1)] * 3),
+    fraction=st.tuples(*[st.floats(0, 1)] * 3),
     turn=st.tuples(*[st.floats(-0.5, 0.5)] * 3),
     pulleys=st.booleans(),
 )
 def test_software_limits_hold_every_pose_of_the_workspace(
-    rig: Rig, pulley_rig: Rig, place: tuple[float, ...], turn: tuple[float, ...], pulleys: bool
+    rig: Rig, pulley_rig: Rig, fraction: tuple[float, ...], turn: tuple[float, ...], pulleys: bool
 ) -> None:
     robot = pulley_rig if pulleys else rig
     span = robot.workspace_upper - robot.workspace_lower
-    pose = Pose(robot.workspace_lower + np.array(place) * span, matrix_from_rotation_vector(turn))
+    pose = Pose(
+        robot.workspace_lower + np.array(fraction) * span, matrix_from_rotation_vector(turn)
+    )
     winch_map = WinchMap(robot)
     counts = winch_map.counts(winch_map.unstrained(cable_lengths(robot, pose), robot.max_tension))
     for drive in (0, robot.cable_count - 1):

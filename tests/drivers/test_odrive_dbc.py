@@ -64,9 +64,9 @@ def test_a_message_has_the_bytes_of_the_documentation(
 def test_feed_forward_that_does_not_fit_is_as_large_as_it_may_be(
     turns: float, speed: float, torque: float
 ) -> None:
-    told = struct.unpack("<fhh", own().set_input_pos.pack(turns, speed, torque))
-    assert told[0] == turns
-    for raw, value in zip(told[1:], (speed, torque), strict=True):
+    packed = struct.unpack("<fhh", own().set_input_pos.pack(turns, speed, torque))
+    assert packed[0] == turns
+    for raw, value in zip(packed[1:], (speed, torque), strict=True):
         assert abs(raw) <= 32768
         assert raw * 0.001 == pytest.approx(max(-32.768, min(32.767, value)), abs=0.0006)
 
@@ -132,7 +132,7 @@ def test_without_cantools_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) ->
     assert "cdpr[odrive]" in caught.value.next_step
 
 
-def test_errors_and_states_are_told_in_words() -> None:
+def test_errors_and_states_are_shown_as_text() -> None:
     assert "watchdog" in error_text(AxisError.WATCHDOG_TIMER_EXPIRED)
     both = error_text(0x2000 | AxisError.ESTOP_REQUESTED)
     assert "motor over-temperature, emergency stop" in both

@@ -1,4 +1,4 @@
-"""ODrives as one group: looked at, enabled together, stopped together, never one alone."""
+"""ODrives as one group: read, enabled and stopped together, never one alone."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def states(bench: OdriveBench) -> set[AxisState]:
     return {drive.state for drive in bench.drives}
 
 
-def test_all_drives_are_enabled_where_they_stand_and_follow(bench: OdriveBench) -> None:
+def test_all_drives_are_enabled_at_their_positions_and_follow(bench: OdriveBench) -> None:
     status = bench.enable()
     assert status.state is GroupState.ENABLED
     assert status.holding
@@ -56,8 +56,8 @@ def test_torques_are_tensions_in_per_mille_of_rated_torque(bench: OdriveBench) -
     bench.enable()
     status = bench.cycles(3)
     rated = np.array([w.torque_constant for w in bench.rig.winches])
-    told = status.torques / 1000.0 * rated
-    assert told == pytest.approx(bench.rehearsal.tensions, abs=0.51e-3 * rated.max())
+    reported = status.torques / 1000.0 * rated
+    assert reported == pytest.approx(bench.rehearsal.tensions, abs=0.51e-3 * rated.max())
     assert (status.torques > 0).all()
 
 
@@ -182,7 +182,7 @@ def test_a_fault_of_one_is_a_hold_of_all_then_brakes(bench: OdriveBench, name: s
     happens, words, within = FAULTS[name]
     bench.enable()
     bench.cycles(8)
-    bench.rehearsal._feel = lambda: None  # type: ignore[method-assign]  # a NaN has no equilibrium
+    bench.rehearsal._begin_torque_update = lambda: None  # type: ignore[method-assign]  # a NaN has no equilibrium
     targets = bench.group.targets
     happens(bench)
     others = [drive for i, drive in enumerate(bench.drives) if i != 2]
@@ -239,27 +239,27 @@ def test_a_drive_that_is_not_calibrated_is_named_and_no_other_stays_enabled(
     bench.group.command(GroupCommand.ENABLE)
     status = bench.cycles(105)
     assert status.state is GroupState.FAULT
-    told = status.faults[0][1]
-    assert told.startswith("cable 6 (drive 6) stays idle on the way to closed loop control")
-    assert "not calibrated" in told
+    reported = status.faults[0][1]
+    assert reported.startswith("cable 6 (drive 6) stays idle instead of closed loop control")
+    assert "not calibrated" in reported
     bench.cycles(15)
     assert states(bench) == {AxisState.IDLE}
 
 
 def _twin(bench: OdriveBench) -> None:
     twin = OdriveRehearsalTwin(bench)
-    bench.rehearsal._by_node[4].hear = twin.hear  # type: ignore[method-assign]
+    bench.rehearsal._by_node[4].receive = twin.receive  # type: ignore[method-assign]
 
 
 class OdriveRehearsalTwin:
-    """Two devices with one node id: each question is answered twice."""
+    """Two devices with one node id: each request is answered twice."""
 
     def __init__(self, bench: OdriveBench) -> None:
-        self._hear = bench.rehearsal._by_node[4].hear
+        self._receive = bench.rehearsal._by_node[4].receive
 
-    def hear(self, command: int, data: bytes) -> None:
-        self._hear(command, data)
-        self._hear(command, data)
+    def receive(self, command: int, data: bytes) -> None:
+        self._receive(command, data)
+        self._receive(command, data)
 
 
 REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]] = {
@@ -303,7 +303,7 @@ def test_drives_that_are_not_fit_are_refused_before_anything_is_enabled(
     assert bench.group.state is GroupState.OFFLINE
 
 
-def test_without_endpoints_it_is_told_that_settings_were_not_read_back(bench: OdriveBench) -> None:
+def test_without_endpoints_settings_not_read_back_are_reported(bench: OdriveBench) -> None:
     (remark,) = bench.group.configure()
     assert "not read back" in remark
 
@@ -390,9 +390,9 @@ def test_drives_in_fault_are_taken_to_be_reset(bench: OdriveBench) -> None:
     assert bench.cycles(10).state is GroupState.CONFIGURED
 
 
-def test_what_drives_tell_is_the_rig_files(bench: OdriveBench) -> None:
-    told = bench.group.capabilities
-    assert (told.sync, told.has_brake, told.watchdog_ms) == (False, True, 100.0)
+def test_capabilities_of_the_drives_are_the_rig_files(bench: OdriveBench) -> None:
+    reported = bench.group.capabilities
+    assert (reported.sync, reported.has_brake, reported.watchdog_ms) == (False, True, 100.0)
     with odrive_bench(odrive_rig(brakes=False, watchdog_ms=None)) as other:
         assert not other.group.capabilities.has_brake
         assert other.group.capabilities.watchdog_ms is None
@@ -405,21 +405,21 @@ def with_counts(rig: Rig, counts_per_rev: int) -> Rig:
     return rig_from_document(rig.document.model_copy(update={"winches": winches}))
 
 
-def test_counts_that_a_float_cannot_tell_apart_are_refused() -> None:
+def test_counts_that_a_float_cannot_resolve_are_refused() -> None:
     check_resolution(with_counts(odrive_rig(), 100_000))
     with pytest.raises(BadInput, match="an ODrive's set-point does not resolve") as caught:
         check_resolution(with_counts(odrive_rig(), 2_000_000))
     assert "counts_per_rev" in caught.value.next_step
 
 
-def test_who_only_looks_sends_nothing(bench: OdriveBench) -> None:
+def test_reading_alone_sends_nothing(bench: OdriveBench) -> None:
     seen = read_drives(bench.rig, bench.group._bus, bench.rehearsal.pump)
     assert seen.positions.tolist() == [round(drive.motor.position) for drive in bench.drives]
     assert not seen.torques.any(), "their brakes hold"
     assert seen.restarted == ()
     assert all("idle" in state for state in drive_states(bench.rig, seen.status_words.tolist()))
-    told = {node_and_command(message.arbitration_id)[1] for message in bench.frames()}
-    assert told == {HEARTBEAT, ENCODER_ESTIMATES, TORQUES}
+    reported = {node_and_command(message.arbitration_id)[1] for message in bench.frames()}
+    assert reported == {HEARTBEAT, ENCODER_ESTIMATES, TORQUES}
 
 
 def test_released_drives_are_disarmed_and_their_brakes_hold(bench: OdriveBench) -> None:
@@ -431,8 +431,8 @@ def test_released_drives_are_disarmed_and_their_brakes_hold(bench: OdriveBench) 
     assert states(bench) == {AxisState.IDLE}
 
 
-def test_who_only_looks_believes_no_count_that_may_have_begun_anew() -> None:
-    """As `configure` has it: an ODrive does not tell whether its power was gone."""
+def test_reading_alone_trusts_no_count_that_may_have_restarted() -> None:
+    """As in `configure`: an ODrive does not report a loss of power."""
     document = odrive_rig().document
     counting = [winch.model_copy(update={"encoder": "incremental"}) for winch in document.winches]
     rig = rig_from_document(document.model_copy(update={"winches": counting}))

@@ -1,4 +1,4 @@
-"""The master moves a drive that it shares no code with: only the standards are relied on."""
+"""The master moves a drive without shared code, based only on the standards."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.drivers.drive_bench import SteppedClock, three_on_a_bus
 from tests.drivers.other_drive import ENABLED, STOPPING, OtherDrive
 
 _CHANNELS = itertools.count()
-NODE, PLACE = 4, 3
+NODE, INDEX = 4, 3
 MOST = 100
 
 
@@ -32,9 +32,9 @@ def beside_others(
     over = threading.Event()
     with three_on_a_bus(BusSettings("virtual", f"other-{next(_CHANNELS)}")) as (near, far, third):
         rehearsal = SimulatedCia402Rig(rig, far, rig.home)
-        rehearsal.drives[PLACE].silent = True
-        place = round(rehearsal.drives[PLACE].motor.position)
-        other = OtherDrive(third, NODE, place, late=late, missing=missing)
+        rehearsal.drives[INDEX].silent = True
+        start = round(rehearsal.drives[INDEX].motor.position)
+        other = OtherDrive(third, NODE, start, late=late, missing=missing)
         ours = threading.Thread(
             target=rehearsal.serve, args=(over.is_set,), kwargs={"clock": clock}
         )
@@ -63,19 +63,19 @@ def test_it_is_set_up_enabled_moved_and_stopped(rig: Rig, late: float) -> None:
         remarks = group.configure()
         for missing in ("1007h", "1029h", "605Ch", "605Eh", "1016h has 2"):
             assert any(missing in remark for remark in remarks), remarks
-        place = group.read_positions().positions[PLACE]
-        assert place == other.position
+        start = group.read_positions().positions[INDEX]
+        assert start == other.position
         group.command(GroupCommand.ENABLE)
         until(group, clock, GroupState.ENABLED)
         assert other.state == ENABLED
         targets = group.targets.tolist()
         for _ in range(10):
-            targets[PLACE] += 5
+            targets[INDEX] += 5
             clock.tick()
             group.send_cycle(targets)
             status = group.receive(5.0)
-        assert other.position == place + 50
-        assert status.positions[PLACE] == place + 45, "told before the set-point acts"
+        assert other.position == start + 50
+        assert status.positions[INDEX] == start + 45, "reported before the set-point acts"
         assert status.state is GroupState.ENABLED
         group.quick_stop_now()
         until(group, clock, GroupState.QUICK_STOP)

@@ -1,4 +1,4 @@
-"""Drive profiles: makers' drives are set up with theirs, refused with reasons without."""
+"""Drive profiles: real drives are configured with theirs, and refused with reasons without."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def eight_of(profile: str) -> ScriptedBus:
 
 @pytest.fixture(autouse=True)
 def _simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The set-up waits in the time of the scripted bus."""
+    """The configuration waits in the time of the scripted bus."""
 
     class Timed(SetupNetwork):
         def __init__(self, bus: can.BusABC, *arguments: object, timeout: float) -> None:
@@ -93,7 +93,7 @@ def test_drives_of_a_profile_are_set_up_with_it(rig: Rig, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["akd", "epos4", "nanotec-c5e"])
-def test_with_another_profile_everything_wrong_is_told_at_once(rig: Rig, name: str) -> None:
+def test_with_another_profile_everything_wrong_is_reported_at_once(rig: Rig, name: str) -> None:
     bus = eight_of("cia402" if name == "akd" else name)
     if name == "akd":
         for drive in bus.drives.values():
@@ -104,11 +104,11 @@ def test_with_another_profile_everything_wrong_is_told_at_once(rig: Rig, name: s
             drive.aborts[0x6007, 0] = 0x06010002
     with pytest.raises(Refused) as caught:
         set_up(rig, bus)
-    told = caught.value.what
+    message = caught.value.what
     wanted = {"akd": ("1006h", "6072h"), "epos4": ("1006h", "6072h")}
     for index in wanted.get(name, ("6072h", "6007h")):
-        assert index in told
-    assert "drive 1, 2, 3, 4, 5, 6, 7, 8" in told
+        assert index in message
+    assert "drive 1, 2, 3, 4, 5, 6, 7, 8" in message
     assert "cdpr doctor RIG --drives" in caught.value.next_step
     starts = [m for m in bus.sent if m.arbitration_id == 0 and m.data[0] == 0x01]
     assert not starts, "no drive is started"
@@ -211,13 +211,13 @@ def test_a_pdo_that_is_there_but_not_now_is_refused(rig: Rig, index: int, code: 
 
 
 def test_a_slow_drive_is_set_up_all_the_same(rig: Rig) -> None:
-    """Answers after 0.7 s were blamed on other objects."""
+    """Answers after 0.7 s were attributed to other objects."""
     bus = eight_of("cia402")
     bus.times = lambda node, _key: (0.7,) if node == 3 else (0.001,)
     assert set_up(rig, bus) == ()
 
 
-def test_doctor_tells_all_objects_of_all_drives_and_writes_nothing(rig: Rig) -> None:
+def test_doctor_reports_all_objects_of_all_drives_and_writes_nothing(rig: Rig) -> None:
     bus = eight_of("epos4")
     bus.drives[7].values[0x6502, 0] = 0x65
     found = examined(rig, bus)
@@ -258,16 +258,20 @@ TURN = 131072
     ("objects", "verdict", "text"),
     [
         ({}, "ok", "absent"),
-        ({0x608F: (TURN, 1)}, "ok", f"{TURN} by 608Fh"),
-        ({0x6092: (10 * TURN, 1), 0x6091: (10, 1)}, "ok", f"{TURN} by 6092h/6091h"),
-        ({0x6092: (3 * TURN, 3)}, "ok", f"{TURN} by 6092h/6091h"),
+        ({0x608F: (TURN, 1)}, "ok", f"{TURN} from 608Fh"),
+        ({0x6092: (10 * TURN, 1), 0x6091: (10, 1)}, "ok", f"{TURN} from 6092h/6091h"),
+        ({0x6092: (3 * TURN, 3)}, "ok", f"{TURN} from 6092h/6091h"),
         (
             {0x6092: (TURN, 1), 0x608F: (1 << 22, 1)},
             "ok",
-            f"{TURN} by 6092h/6091h, 4194304 by 608Fh",
+            f"{TURN} from 6092h/6091h, 4194304 from 608Fh",
         ),
-        ({0x6092: (3600, 1), 0x608F: (2000, 1)}, "remark", "3600 by 6092h/6091h, 2000 by 608Fh"),
-        ({0x608F: (TURN + 1, 1)}, "remark", f"{TURN + 1} by 608Fh"),
+        (
+            {0x6092: (3600, 1), 0x608F: (2000, 1)},
+            "remark",
+            "3600 from 6092h/6091h, 2000 from 608Fh",
+        ),
+        ({0x608F: (TURN + 1, 1)}, "remark", f"{TURN + 1} from 608Fh"),
         ({0x608F: (TURN, 0)}, "ok", "absent"),
     ],
 )
@@ -295,15 +299,15 @@ def test_doctor_reads_the_mode_that_a_set_up_waits_for(rig: Rig) -> None:
 @pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
 @pytest.mark.parametrize("code", ABORTS, ids=hex)
 def test_doctor_reads_the_pdos_that_a_set_up_switches_off(rig: Rig, index: int, code: int) -> None:
-    """It says what the set-up will say: a remark, or nothing."""
+    """It reports the same as the configuration: a remark, or nothing."""
     bus = eight_of("cia402")
     bus.drives[3].aborts[index, 1] = code
     found = examined(rig, bus)
     (row,) = (row for row in found.rows if row.object.startswith(f"{index:04X}h:01"))
     assert found.good
     assert row.verdict == ("ok" if code in NOT_THERE else "remark")
-    (told,) = (text for text, nodes in row.found.items() if 3 in nodes)
-    assert told.startswith("absent" if code in NOT_THERE else "refused: ")
+    (message,) = (text for text, nodes in row.found.items() if 3 in nodes)
+    assert message.startswith("absent" if code in NOT_THERE else "refused: ")
 
 
 def test_doctor_names_silent_drives_and_reads_the_others(rig: Rig) -> None:
@@ -415,7 +419,7 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "told"),
+    ("line", "message"),
     [
         ('absent: ["6073h:00"]', "6072h:00"),
         ("abscent: []", "absent"),
@@ -430,14 +434,14 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
     ],
 )
 def test_a_wrong_profile_file_says_what_where_and_what_there_is(
-    tmp_path: Path, line: str, told: str
+    tmp_path: Path, line: str, message: str
 ) -> None:
     path = tmp_path / "lab.yaml"
     path.write_text(f"name: Ours\nsources: [our bench]\n{line}\n")
     with pytest.raises(InvalidFile) as caught:
         load_profile(str(path))
     text = str(caught.value)
-    assert told in text
+    assert message in text
     assert "lab.yaml:3" in text or ":3:" in text
 
 
@@ -508,7 +512,7 @@ def test_process_data_beyond_the_fourth_is_switched_off(rig: Rig) -> None:
 def test_an_object_that_the_profile_denies_must_not_hold_another_value(
     rig: Rig, tmp_path: Path, held: int
 ) -> None:
-    """What an earlier program wrote there would count unseen."""
+    """A value written by an earlier program would be active unnoticed."""
     bus = eight_of("cia402")
     for drive in bus.drives.values():
         drive.values[0x1006, 0] = 0
@@ -520,7 +524,7 @@ def test_an_object_that_the_profile_denies_must_not_hold_another_value(
     if not held:
         set_up(theirs, bus)
         return
-    with pytest.raises(Refused, match="its profile says that it is absent") as caught:
+    with pytest.raises(Refused, match="the profile declares it absent") as caught:
         set_up(theirs, bus)
     assert caught.value.values["node"] == 5
     assert not downloads(bus)
@@ -561,15 +565,15 @@ def test_doctor_names_what_a_profile_of_ones_own_says(rig: Rig) -> None:
     for key in ((0x1006, 0), (0x6066, 0), (0x6007, 0)):
         bus.drives[2].aborts[key] = 0x06020000
     change = {row.object[:8]: row.change for row in examined(rig, bus).rows}
-    assert change["6066h:00"] == "name it as absent in a drive profile of your own"
-    assert change["1006h:00"].startswith("name it as absent in a drive profile of your own, with")
+    assert change["6066h:00"] == "list it as absent in your own drive profile"
+    assert change["1006h:00"].startswith("list it as absent in your own drive profile, with")
     assert "monitoring: heartbeat" in change["1006h:00"]
     assert "no profile" in change["6007h:00"]
 
 
 def test_doctor_prints_mappings_as_manuals_do(rig: Rig) -> None:
     (row,) = (row for row in examined(rig, eight_of("cia402")).rows if row.object[:8] == "1600h:02")
-    assert row.needed == "607A0020h, written at set-up"
+    assert row.needed == "607A0020h, written at configuration"
 
 
 @pytest.mark.parametrize(("word", "said"), [(0x0240, "voltage enabled"), (0x0050, "remote")])

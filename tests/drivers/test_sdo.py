@@ -79,7 +79,7 @@ def test_no_answer_never_means_that_an_object_is_absent() -> None:
 
 
 @given(code=st.integers(0, 0xFFFFFFFF))
-def test_every_abort_code_is_told_with_its_object(code: int) -> None:
+def test_every_abort_code_is_reported_with_its_object(code: int) -> None:
     network, bus = network_of()
     bus.drives[NODE].aborts[0x6072, 0] = code or 1
     with pytest.raises(Refused) as caught:

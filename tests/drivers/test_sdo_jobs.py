@@ -1,4 +1,4 @@
-"""SDO requests beside the cycle: golden bytes, one at a time, no answer that was not asked."""
+"""SDO requests during cyclic operation: golden bytes, one at a time, only matching answers."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def test_words_never_free_a_cable_and_enable_all_or_none(
     goal: Goal, drives: list[tuple[DriveState, bool]]
 ) -> None:
     states = [state for state, _ in drives]
-    words = next_words(goal, states, [told for _, told in drives])
+    words = next_words(goal, states, [commanded for _, commanded in drives])
     assert len(words) == len(states)
     assert all(word & 0x02 for word in words)
     if ControlWord.ENABLE_OPERATION in words:
@@ -51,7 +51,7 @@ def test_words_never_free_a_cable_and_enable_all_or_none(
         assert set(states) <= READY
     for state, word in zip(states, words, strict=True):
         if state is DriveState.QUICK_STOP_ACTIVE:
-            # Holding drives are only told to go on holding, or to follow again with all others.
+            # Holding drives are only commanded to keep holding, or to follow again with all others.
             assert word in (ControlWord.QUICK_STOP, ControlWord.ENABLE_OPERATION)
         if state is DriveState.OPERATION_ENABLED and word is ControlWord.SHUTDOWN:
             pytest.fail("shutdown of a drive under torque")
@@ -76,12 +76,12 @@ def test_any_mixture_without_fault_is_enabled_and_released(
     states: list[DriveState],
 ) -> None:
     def run(goal: Goal, states: list[DriveState]) -> list[DriveState]:
-        told_to_stop = [False] * len(states)
+        stop_commanded = [False] * len(states)
         for _ in range(8):
-            words = next_words(goal, states, told_to_stop)
-            told_to_stop = [
+            words = next_words(goal, states, stop_commanded)
+            stop_commanded = [
                 s is DriveState.QUICK_STOP_ACTIVE and (r or w is ControlWord.QUICK_STOP)
-                for s, r, w in zip(states, told_to_stop, words, strict=True)
+                for s, r, w in zip(states, stop_commanded, words, strict=True)
             ]
             states = [after(s, w) for s, w in zip(states, words, strict=True)]
         return states
@@ -99,7 +99,7 @@ def test_a_fault_of_one_stops_all(goal: Goal, bad: DriveState) -> None:
     assert set(next_words(goal, states, [True] * 8)) == {ControlWord.QUICK_STOP}
 
 
-def test_a_drive_that_stopped_by_itself_is_first_told_to_stop() -> None:
+def test_a_drive_that_stopped_by_itself_is_first_stop_commanded() -> None:
     """The word that it was already getting must not enable it again."""
     states = [DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE]
     assert next_words(Goal.ENABLE, states, [False, False])[1] is ControlWord.QUICK_STOP
@@ -112,7 +112,7 @@ def test_only_faulted_drives_get_a_reset() -> None:
     assert words == (ControlWord.RESET_FAULT, ControlWord.SHUTDOWN)
 
 
-def test_unknown_drives_are_told_to_stop() -> None:
+def test_unknown_drives_are_stop_commanded() -> None:
     """A drive not heard yet may be holding the platform from an earlier run."""
     assert next_words(Goal.IDLE, [DriveState.NOT_READY], [False]) == (ControlWord.QUICK_STOP,)
 

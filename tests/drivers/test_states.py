@@ -98,7 +98,7 @@ def test_a_drive_that_is_not_enabled_in_time_says_what_keeps_it(word: int, said:
     wanted = (DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED)
     (found,) = late_drives({4: "cable 1", 5: "cable 2"}, (word, 0x0237), wanted, 1.0)
     assert found[0] == 4
-    assert found[1].startswith(f"cable 1 is in {state_of(word).value} on the way to operation")
+    assert found[1].startswith(f"cable 1 is in {state_of(word).value} instead of operation")
     assert said in found[1]
     assert (";" in found[1]) == bool(said)
     assert ("bit 9" in found[1]) == (said == "remote")
@@ -109,8 +109,8 @@ def test_only_a_drive_with_torque_and_no_fault_holds() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(DriveState), st.booleans()), min_size=1, max_size=8))
-def test_a_stop_tells_every_drive_to_stop_whatever_it_said(
+def test_a_stop_commands_every_drive_to_stop_whatever_it_reported(
     drives: list[tuple[DriveState, bool]],
 ) -> None:
-    states, told = zip(*drives, strict=True)
-    assert next_words(Goal.STOP, states, told) == (ControlWord.QUICK_STOP,) * len(states)
+    states, commanded = zip(*drives, strict=True)
+    assert next_words(Goal.STOP, states, commanded) == (ControlWord.QUICK_STOP,) * len(states)

@@ -75,7 +75,7 @@ class Group:
         self.paced = [pace(), pace()]
         return "read"
 
-    def look(self, pace: Callable[[], float]) -> str:
+    def read_state(self, pace: Callable[[], float]) -> str:
         self.paced = [pace()]
         return "looked"
 

@@ -149,7 +149,7 @@ CASES = {
         7,
     ),
     "emergency stop of one": Case(
-        lambda stage: stage.drives[2].hear(2, b""), "drive_fault", "emergency stop", 7
+        lambda stage: stage.drives[2].receive(2, b""), "drive_fault", "emergency stop", 7
     ),
     "starts anew": Case(
         lambda stage: stage.drives[2].power_on(), "drive_fault", "(drive 3) disarmed itself", 7

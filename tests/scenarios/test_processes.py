@@ -105,7 +105,7 @@ def test_a_run_with_the_drives_in_another_process_loses_no_frame(
     # On a clock of its own, beside the number of the cycle: late cycles make it longer.
     nominal = summary["cycles"] * cycle_ms / 1000.0
     assert nominal - cycle_ms / 1000.0 <= summary["duration_s"] <= 2.0 * nominal
-    assert last == "the simulated drives have ended\n"
+    assert last == "simulation ended\n"
 
 
 def waited_for(events: Path, code: str, process: subprocess.Popen[str]) -> None:

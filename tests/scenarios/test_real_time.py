@@ -256,7 +256,7 @@ def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
         assert "applies after `cdpr resume`" in out
         code, out, err = finished("resume")
         assert (code, err) == (0, "")
-        assert f"asked process {moving.pid} to resume" in out
+        assert f"process {moving.pid} received the request to resume" in out
         code, out, err = finished("monitor")
         assert (code, err) == (0, ""), "it ends with the run"
         assert "resume: continuing along the path at 100%" in out

@@ -24,9 +24,9 @@ farther_away = st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(0
 
 def drawn(start: tuple[float, ...], end: tuple[float, ...], wall: bool) -> Image8:
     """A white image with one cable, and a wall behind which nothing shows on its right half."""
-    way = np.array(end) - start
-    length = float(np.linalg.norm(way))
-    cable = Cables(np.array([start]), np.array([end]), -way[None] / length, np.array([length]))
+    span = np.array(end) - start
+    length = float(np.linalg.norm(span))
+    cable = Cables(np.array([start]), np.array([end]), -span[None] / length, np.array([length]))
     picture = np.full((240, 320), 220, np.uint8)
     depth = np.full((240, 320), np.inf, np.float32)
     if wall:

@@ -1,4 +1,4 @@
-"""The synthetic camera's exposure: what moves is smeared, what stands still is not."""
+"""The synthetic camera's exposure: moving objects are blurred, resting ones are not."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def variance(columns: Array, share: Array) -> float:
 
 
 @pytest.mark.parametrize(("speed", "exposure"), [(0.5, 0.008), (0.25, 0.012), (-1.0, 0.006)])
-def test_a_smear_is_as_long_as_the_way_while_exposed(
+def test_a_smear_is_as_long_as_the_motion_during_exposure(
     rig: Rig, scene: Scene, facing: Camera, speed: float, exposure: float
 ) -> None:
     """An edge smeared over L pixels is a ramp, whose slope has the variance L² / 12 more."""
@@ -103,11 +103,11 @@ def test_a_film_smears_by_the_velocity_since_the_picture_before(
 ) -> None:
     camera = SyntheticCamera(rig, scene, facing, optics=Optics(noise=0.0, exposure=0.01))
     before = Pose(rig.home.position - [0.02, 0.0, 0.01], matrix_from_rotation_vector([0, 0, -0.05]))
-    film = Film(camera)
+    film = ImageSequence(camera)
     assert np.array_equal(film.picture(0.0, before, 0), camera.render(before, 0))
     motion = PlatformMotion(np.array([0.2, 0.0, 0.1]), np.array([0.0, 0.0, 0.5]))
     assert np.array_equal(film.picture(0.1, rig.home, 1), camera.render(rig.home, 1, motion))
-    again = film.picture(0.1, before, 2)  # at the same time: told anew, not moved
+    again = film.picture(0.1, before, 2)  # at the same time: the pose is restated, not moved
     assert np.array_equal(again, camera.render(before, 2))
 
 

@@ -1,4 +1,4 @@
-"""What the standards let a drive do and makers' drives do: monitoring, named behaviours."""
+"""Behaviour of drives within the standards: monitoring, named behaviours."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_heartbeat_loss_as_a_fault(
 
 
 def answers(line: Line, seconds: float) -> list[float]:
-    """Times after the question at which answers come, [s]."""
+    """Delays of the answers, [s]."""
     line.ask(0x40, 0x1000, 0)
     times = [0.0] * len(line.take(0x585))
     for step in range(1, round(seconds / 0.01) + 1):
@@ -266,7 +266,7 @@ def test_noise_is_in_what_is_reported_only(name: str, at: int) -> None:
     assert line.drive.motor.position == 1000.0
 
 
-def test_stick_slip_stands_and_then_jumps() -> None:
+def test_stick_slip_rests_and_then_jumps() -> None:
     line = named("stick-slip=40")
     line.enable()
     positions = []
@@ -285,11 +285,11 @@ def torques_out_and_back(rig: Rig, friction: float) -> list[float]:
         torques = []
         for drive in rehearsal.drives:
             drive.state = DriveState.OPERATION_ENABLED
-        for turned in (2.0, -2.0, 0.0):
+        for rotation in (2.0, -2.0, 0.0):
             for drive in rehearsal.drives:
-                drive.motor.position += turned
-            rehearsal._feel()
-            rehearsal._finish_feeling()
+                drive.motor.position += rotation
+            rehearsal._begin_torque_update()
+            rehearsal._finish_torque_update()
             torques.append(rehearsal.drives[0].torque)
     return torques
 

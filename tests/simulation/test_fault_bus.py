@@ -1,4 +1,4 @@
-"""The bus with faults: rules do what they say, in both directions, and the wire takes its time."""
+"""The bus with faults: rules work in both directions, and frames take their time on the wire."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def line() -> Iterator[Line]:
         yield made
 
 
-def test_without_rules_frames_pass_both_ways_in_order(line: Line) -> None:
+def test_without_rules_frames_pass_in_both_directions_in_order(line: Line) -> None:
     assert line.in_order([3, 1, 2]) == [3, 1, 2]
     for number in (5, 4):
         line.faulty.send(frame(number))
@@ -123,7 +123,7 @@ def test_rules_follow_each_other(line: Line) -> None:
 
 def test_what_another_device_says_no_rule_touches(line: Line) -> None:
     line.faulty.outgoing.append(lose(range(0x800)))
-    line.faulty.say(frame(7))
+    line.faulty.inject(frame(7))
     assert line.went() == [7]
 
 

@@ -1,4 +1,4 @@
-"""A rig that is not built as its file says: drums, anchors, play, noise, lens, light."""
+"""A rig that differs from its file: drums, anchors, backlash, noise, lens, light."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def imperfect(rig: Rig, **simulation: Any) -> Rig:
     return rig_from_document(RigDocument.model_validate(document))
 
 
-def as_told(rig: Rig) -> dict[str, Any]:
+def as_stated(rig: Rig) -> dict[str, Any]:
     """The truth of a rig that is built as its file says."""
     document = rig.document.model_dump(mode="json")
     return {
@@ -62,17 +62,17 @@ def scene() -> Scene:
     return load_scene(ROOT / "configs/environment_3.yaml")
 
 
-def test_a_rig_built_as_its_file_says_stands_where_its_counts_say(rig: Rig) -> None:
+def test_a_rig_built_as_its_file_says_is_where_its_counts_say(rig: Rig) -> None:
     pose = Pose.level(rig.home.apply([0.08, -0.06, 0.05]))
-    for robot in (rig, imperfect(rig, as_built=as_told(rig))):
+    for robot in (rig, imperfect(rig, as_built=as_stated(rig))):
         assert rehearsal_of(robot, pose).pose.distance_to(pose) < 5e-6  # whole counts
 
 
 def test_the_platform_of_wrong_drums_and_outlets_is_where_the_true_lengths_put_it(
     rig: Rig,
 ) -> None:
-    """By another route: told counts, true drums, true geometry, forward kinematics."""
-    truth = as_told(rig)
+    """Independently: nominal counts, true drums, true geometry, forward kinematics."""
+    truth = as_stated(rig)
     truth["outlets_mm"][3][0] += 0.4
     truth["drums_mm_per_rev"][5] *= 1.0005
     robot = imperfect(rig, as_built=truth)
@@ -105,31 +105,33 @@ def test_a_stiffer_cable_is_wound_off_longer_for_the_same_pull(rig: Rig) -> None
 
 
 def test_a_cable_with_too_much_of_it_hangs_slack(rig: Rig) -> None:
-    truth = as_told(rig)
+    truth = as_stated(rig)
     per_metre = rig.winches[6].counts_per_metre
     truth["home_counts"][6] = -0.02 * per_metre  # 20 mm more is out than the drive's count says
     robot = imperfect(rig, as_built=truth)
     assert rehearsal_of(robot, rig.home).tensions[6] == 0.0
 
 
-@given(way=st.lists(st.floats(-500.0, 500.0), min_size=1, max_size=20), play=st.floats(0.0, 50.0))
-def test_a_drum_is_within_half_its_backlash_of_its_motor(way: list[float], play: float) -> None:
+@given(
+    motors=st.lists(st.floats(-500.0, 500.0), min_size=1, max_size=20), play=st.floats(0.0, 50.0)
+)
+def test_a_drum_is_within_half_its_backlash_of_its_motor(motors: list[float], play: float) -> None:
     transmission = Transmission(np.array([play]), 1.0, np.array([0.0]))
     before = 0.0
-    for motor in way:
+    for motor in motors:
         (drum,) = transmission.drums(np.array([motor]))
         assert abs(drum - motor) <= play / 2.0 + 1e-9
         assert drum == before or abs(abs(drum - motor) - play / 2.0) < 1e-9  # rests, or is pushed
         before = drum
 
 
-def test_a_drum_with_steps_stands_only_at_whole_ones() -> None:
+def test_a_drum_with_steps_rests_only_at_whole_ones() -> None:
     transmission = Transmission(np.zeros(3), 8.0, np.zeros(3))
     assert transmission.drums(np.array([3.9, 4.1, -21.0])) == pytest.approx([0.0, 8.0, -24.0])
 
 
-def told_torques(robot: Rig) -> list[list[float]]:
-    """Torques that the drives tell in some cycles, switched on and still."""
+def reported_torques(robot: Rig) -> list[list[float]]:
+    """Torques reported by the resting drives in some cycles after power-on."""
     settings = BusSettings("virtual", f"noisy-{next(_CHANNELS)}")
     with open_bus(settings) as far_end, open_bus(settings) as bus:
         rehearsal = SimulatedCia402Rig(robot, far_end, robot.home)
@@ -137,23 +139,23 @@ def told_torques(robot: Rig) -> list[list[float]]:
         group.configure()
         start = [int(p) for p in group.read_positions().positions]
         group.command(GroupCommand.ENABLE)
-        told = []
+        reported = []
         for _ in range(30):
             group.send_cycle(start)
-            told.append([float(t) for t in group.receive(0.0).torques])
+            reported.append([float(t) for t in group.receive(0.0).torques])
         group.close()
-    return told[-20:]
+    return reported[-20:]
 
 
-def test_tensions_are_told_with_noise_and_with_the_same_noise_again(rig: Rig) -> None:
+def test_tensions_are_reported_with_noise_and_with_the_same_noise_again(rig: Rig) -> None:
     noisy = imperfect(rig, seed=3, winches={"tension_noise_n": 0.5})
-    told = told_torques(noisy)
-    assert told == told_torques(noisy)
-    assert np.std(told, axis=0) == pytest.approx(5.0, abs=3.0)  # per mille of 100 N
-    assert np.std(told_torques(rig), axis=0).max() == 0.0
+    reported = reported_torques(noisy)
+    assert reported == reported_torques(noisy)
+    assert np.std(reported, axis=0) == pytest.approx(5.0, abs=3.0)  # per mille of 100 N
+    assert np.std(reported_torques(rig), axis=0).max() == 0.0
 
 
-def test_pictures_are_taken_through_the_true_lens_and_the_tracker_is_told_another(
+def test_images_are_taken_through_the_true_lens_and_the_tracker_assumes_another(
     rig: Rig, scene: Scene
 ) -> None:
     camera = rig.cameras[0]
@@ -187,7 +189,7 @@ def test_less_light_and_no_cables_show_in_the_picture(rig: Rig, scene: Scene) ->
     assert 100 < np.count_nonzero(shown() != full) < full.size / 20  # thin cables
 
 
-def test_two_cameras_in_one_place_differ_by_their_noise_alone(rig: Rig, scene: Scene) -> None:
+def test_two_cameras_at_one_pose_differ_only_by_their_noise(rig: Rig, scene: Scene) -> None:
     first = rig.document.cameras[0]
     second = first.model_copy(update={"name": "second"})
     two = rig_from_document(rig.document.model_copy(update={"cameras": [first, second]}))
@@ -217,7 +219,7 @@ def test_two_cameras_in_one_place_differ_by_their_noise_alone(rig: Rig, scene: S
 def test_a_simulation_that_does_not_fit_the_rig_is_refused_by_key(
     rig: Rig, simulation: dict[str, Any], key: str, what: str
 ) -> None:
-    truth = as_told(rig)
+    truth = as_stated(rig)
     if simulation.get("as_built") == "short":
         simulation = {"as_built": truth | {"outlets_mm": truth["outlets_mm"][:7]}}
     elif simulation.get("as_built") == "pulleys":
@@ -236,7 +238,7 @@ def test_a_true_lens_with_three_coefficients_is_refused(rig: Rig) -> None:
 
 
 def test_plans_do_not_hang_on_how_a_rig_is_simulated(rig: Rig) -> None:
-    assert imperfect(rig, as_built=as_told(rig)).plan_hash == rig.plan_hash
+    assert imperfect(rig, as_built=as_stated(rig)).plan_hash == rig.plan_hash
 
 
 def test_the_rig_for_rehearsals_is_not_built_as_its_file_says() -> None:

@@ -1,4 +1,4 @@
-"""The plant against statics by another route: equilibrium, stiffness, slack, energy."""
+"""The plant against independent statics: equilibrium, stiffness, slack, energy."""
 
 from __future__ import annotations
 
@@ -28,9 +28,11 @@ share = st.floats(0.1, 0.9)
 turn = st.floats(-0.05, 0.05)
 
 
-def pose_in(rig: Rig, place: tuple[float, ...], rotation: tuple[float, ...]) -> Pose:
+def pose_in(rig: Rig, fraction: tuple[float, ...], rotation: tuple[float, ...]) -> Pose:
     span = rig.workspace_upper - rig.workspace_lower
-    return Pose(rig.workspace_lower + np.array(place) * span, matrix_from_rotation_vector(rotation))
+    return Pose(
+        rig.workspace_lower + np.array(fraction) * span, matrix_from_rotation_vector(rotation)
+    )
 
 
 def changed(rig: Rig, part: str, **values: object) -> Rig:
@@ -39,18 +41,18 @@ def changed(rig: Rig, part: str, **values: object) -> Rig:
     return rig_from_document(RigDocument.model_validate(document))
 
 
-@given(place=st.tuples(share, share, share), rotation=st.tuples(turn, turn, turn))
+@given(fraction=st.tuples(share, share, share), rotation=st.tuples(turn, turn, turn))
 @pytest.mark.parametrize("pulleys", [False, True])
 def test_drums_wound_for_a_pose_hold_the_platform_there(
     rig: Rig,
     pulley_rig: Rig,
     pulleys: bool,
-    place: tuple[float, ...],
+    fraction: tuple[float, ...],
     rotation: tuple[float, ...],
 ) -> None:
     """Counts for pose and tensions, from somewhere else, lead back to pose and tensions."""
     robot = pulley_rig if pulleys else rig
-    pose = pose_in(robot, place, rotation)
+    pose = pose_in(robot, fraction, rotation)
     try:
         tensions = working_tensions(robot, pose).tensions
     except TensionInfeasible:
@@ -75,13 +77,13 @@ def test_home_counts_hold_the_platform_at_home(rig: Rig) -> None:
 
 @given(
     shifts=st.lists(st.floats(-0.02, 0.02), min_size=8, max_size=8),
-    place=st.tuples(share, share, share),
+    fraction=st.tuples(share, share, share),
 )
 def test_cables_and_weight_balance_whatever_the_drums_do(
-    rig: Rig, shifts: list[float], place: tuple[float, ...]
+    rig: Rig, shifts: list[float], fraction: tuple[float, ...]
 ) -> None:
     """Slack or taut, forces and moments add up to nothing and no cable pushes."""
-    pose = pose_in(rig, place, (0.0, 0.0, 0.0))
+    pose = pose_in(rig, fraction, (0.0, 0.0, 0.0))
     plant = Plant(rig, pose)
     counts = plant.counts_for(pose, plant.tensions)
     plant.settle_counts(counts + np.array(shifts) * [w.counts_per_metre for w in rig.winches])
@@ -172,8 +174,8 @@ def test_hanging_on_slack_lower_cables_is_the_lowest_energy(rig: Rig) -> None:
     assert vertical == pytest.approx(WEIGHT, abs=1e-6)
 
     def energy(twist: np.ndarray) -> float:
-        turned = matrix_from_rotation_vector(twist[3:]) @ plant.pose.rotation
-        return plant.energy(Pose(plant.pose.position + twist[:3], turned))
+        rotated = matrix_from_rotation_vector(twist[3:]) @ plant.pose.rotation
+        return plant.energy(Pose(plant.pose.position + twist[:3], rotated))
 
     start = np.array([0.002, -0.001, -0.002, 0.01, -0.01, 0.005])
     other = minimize(energy, start, method="Nelder-Mead", options={"maxiter": 4000})
@@ -201,7 +203,7 @@ def test_absurd_drum_positions_are_a_fault_that_says_so(rig: Rig, bad: float) ->
 
 
 @given(
-    place=st.tuples(share, share, share),
+    fraction=st.tuples(share, share, share),
     rotation=st.tuples(turn, turn, turn),
     winding=st.lists(st.floats(-1e-3, 3e-3), min_size=10, max_size=10),
 )
@@ -210,25 +212,25 @@ def test_compiled_forces_and_stiffness_are_those_of_the_readable_code(
     rig: Rig,
     pulley_rig: Rig,
     pulleys: bool,
-    place: tuple[float, ...],
+    fraction: tuple[float, ...],
     rotation: tuple[float, ...],
     winding: list[float],
 ) -> None:
     """Cables taut and slack, over pulleys and through points: the same numbers to rounding."""
     robot = pulley_rig if pulleys else rig
-    pose, count = pose_in(robot, place, rotation), robot.cable_count
+    pose, count = pose_in(robot, fraction, rotation), robot.cable_count
     winches = WinchMap(robot)
     whole = winches.unstrained(cable_lengths(robot, pose), np.zeros(count))
     hung = Suspension.wound(robot, winches, whole / (1.0 + np.array(winding[:count])), None)
     cables, strains = hung.strained(pose)
     tensions = hung.axial * np.maximum(strains, 0.0)
     rates = hung.rates(strains > 0.0)
-    turned = np.array(pose.rotation)
+    rotated = np.array(pose.rotation)
     seen = Strained(np.empty((count, 3)), np.empty((count, 6)), np.empty(count), np.empty(count))
     gradient, stiffness = np.empty(6), np.empty((6, 6))
-    assert strain(hung.hanging, hung.unstrained, np.array(pose.position), turned, seen)
-    slope(hung.hanging, turned, seen, tensions, gradient)
-    bend(hung.hanging, turned, seen, rates, tensions, stiffness)
+    assert strain(hung.hanging, hung.unstrained, np.array(pose.position), rotated, seen)
+    slope(hung.hanging, rotated, seen, tensions, gradient)
+    bend(hung.hanging, rotated, seen, rates, tensions, stiffness)
     assert seen.strains == pytest.approx(strains, abs=1e-13)
     wanted = hung.gradient(pose, cables, tensions)
     assert gradient == pytest.approx(wanted, rel=1e-10, abs=1e-9)

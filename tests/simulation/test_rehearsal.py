@@ -1,4 +1,4 @@
-"""Drives and plant together: what the drums do is what the platform and the torques show."""
+"""Drives and plant together: platform and torques follow the drums."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def targets_for(robot: Rig, rehearsal: SimulatedCia402Rig, pose: Pose) -> list[i
 
 
 def enabled(robot: Rig, group: DriveGroup, rehearsal: SimulatedCia402Rig) -> list[int]:
-    """Enables; returns where the drives stand."""
+    """Enables the drives; returns their positions."""
     group.configure()
     start = [int(p) for p in group.read_positions().positions]
     group.command(GroupCommand.ENABLE)
@@ -124,7 +124,7 @@ def test_without_torque_the_brakes_hold_the_platform(rig: Rig, channel: BusSetti
 
 
 class ManualTime:
-    """A clock that tells the time it is given, and ends the service after some readings."""
+    """A manual clock that ends the service after some readings."""
 
     def __init__(self, stop: threading.Event, readings: int, step: float) -> None:
         self._stop, self._left, self._step, self._now = stop, readings, step, 0.0
@@ -140,18 +140,18 @@ class ManualTime:
 def test_served_drives_stop_by_themselves_when_the_master_is_gone(
     rig: Rig, channel: BusSettings
 ) -> None:
-    """No frame comes any more; the time-outs run on the clock alone."""
-    stop, told = threading.Event(), list[RehearsalStatus]()
+    """No frame arrives; the time-outs depend only on the clock."""
+    stop, statuses = threading.Event(), list[RehearsalStatus]()
     with open_bus(channel) as master, open_bus(channel) as bus:
         rehearsal = SimulatedCia402Rig(rig, bus, rig.home)
         group = make_drive_group(rig, master, rehearsal.pump)
         enabled(rig, group, rehearsal)
         clock = ManualTime(stop, readings=20, step=0.005)
-        rehearsal.serve(stop.is_set, told.append, status_period=0.02, clock=clock)
-    assert told
-    assert told[0].states == (DriveState.OPERATION_ENABLED,) * 8
-    assert told[-1].states == (DriveState.QUICK_STOP_ACTIVE,) * 8
-    assert told[-1].pose.distance_to(rig.home) < 1e-5
+        rehearsal.serve(stop.is_set, statuses.append, status_period=0.02, clock=clock)
+    assert statuses
+    assert statuses[0].states == (DriveState.OPERATION_ENABLED,) * 8
+    assert statuses[-1].states == (DriveState.QUICK_STOP_ACTIVE,) * 8
+    assert statuses[-1].pose.distance_to(rig.home) < 1e-5
 
 
 def test_other_frames_on_the_bus_do_not_hold_the_time_outs_up(

@@ -87,7 +87,7 @@ def test_a_set_point_acts_at_the_next_sync_and_is_reached_one_cycle_later(line: 
     assert line.drive.motor.position == pytest.approx(1100)
 
 
-def test_position_is_told_before_it_is_enabled(line: Line) -> None:
+def test_position_is_reported_before_it_is_enabled(line: Line) -> None:
     assert line.sync(0x06) == DISABLED
     assert line.position == 1000
 
@@ -239,7 +239,7 @@ def test_software_limits_hold(line: Line) -> None:
     assert line.drive.motor.position == 1040
 
 
-def test_a_short_set_point_is_ignored_and_told(line: Line) -> None:
+def test_a_short_set_point_is_ignored_and_reported(line: Line) -> None:
     line.enable()
     line.drive.on_set_point(b"\0" * 6)
     assert line.sync(None) == ENABLED

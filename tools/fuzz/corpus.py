@@ -1,4 +1,4 @@
-"""The files that are mutated: rigs, scenes, a plan, a run folder, results, images, drives."""
+"""Valid files for mutation: rigs, scenes, a plan, a run folder, results, images, drives."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def build(folder: Path) -> dict[str, list[Path]]:
-    """Writes the whole files into a folder; their paths by kind."""
+    """Writes the valid files into a folder; returns their paths by kind."""
     from calibration.results import write_result
     from tests.calibration.results import camera_result_of
     from tests.executor import fake_run
@@ -73,7 +73,7 @@ def _taught(folder: Path) -> Path:
 
 
 def _messages(folder: Path) -> list[Path]:
-    """What pages say to the console, and programs to the command socket."""
+    """Messages from pages to the console, and from programs to the command socket."""
     held = '"direction": [0.0, 0.6, 0.8], "frame": "world", "step_mm": 0.1'
     texts = (
         f'{{"kind": "held", "hold": 3, {held}, "speed_mm_s": 5.0, "seq": 7}}',
@@ -96,7 +96,7 @@ def _corners(folder: Path) -> Path:
 
 
 def _cut_short(run: Path, folder: Path) -> None:
-    """The folder of a run whose program was killed."""
+    """Writes the folder of a killed run."""
     from executor.recording.record_files import RunCourse
     from executor.recording.run_folder import RunFolder
 
@@ -138,7 +138,7 @@ def _video(path: Path) -> None:
 
 
 def _cameras(folder: Path) -> None:
-    """In every format that is read; OpenCV's also as XML."""
+    """Writes a camera in every supported format; OpenCV's also as XML."""
     import cv2
 
     from calibration.intrinsics.exchange import FORMATS
@@ -177,7 +177,7 @@ def _state(folder: Path) -> None:
 
 
 def _coordinates(path: Path) -> None:
-    """A table for `cdpr new --coordinates`."""
+    """Writes a table for `cdpr new --from`."""
     from model.files.new_rig import CSV_COLUMNS
     from model.rig import load_rig
 

@@ -1,4 +1,4 @@
-"""Makes a file worse: bytes, lines, numbers and words are changed, repeated, moved or cut off."""
+"""Mutates a file: changes, repeats, moves or removes bytes, lines, numbers and words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every reader of files, by name: what it is called with, and the file that is mutated for it."""
+"""Every reader of files by name, with its call and the file to mutate."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ class Reader:
 
     Attributes:
         name: Of the reader, and of its counts.
-        seed: The whole file.
+        seed: The valid file.
         read: Reads a path.
-        place: Where the mutated file is put; None beside all others.
+        target: Path of the mutated file; None for a default path.
     """
 
     name: str
     seed: Path
     read: Callable[[Path], object]
-    place: Path | None = None
+    target: Path | None = None
 
 
 def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
-    """All of them; run folders are copied into ``scratch``."""
+    """All readers; run folders are copied into ``scratch``."""
     from calibration.extrinsics.hand_eye import read_poses
     from calibration.geometry.measurements import read_rig_data
     from calibration.intrinsics.exchange import imported_camera
@@ -98,7 +98,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
 
 
 def _message(path: Path) -> None:
-    """A message to the console, or a line on the command socket; neither may fail otherwise."""
+    """Parses a message to the console or a command line; only their own errors are allowed."""
     from cdpr.console.commands import NotAMessage, parse_message
     from executor.remote.protocol import NotACommand, parse_command
 
@@ -110,13 +110,13 @@ def _message(path: Path) -> None:
 
 
 def _at(file: Any, path: Path) -> Any:
-    """A file of the state folder, elsewhere."""
+    """A file of the state folder, moved to a path."""
     file.path = path
     return file
 
 
 def _again(path: Path) -> object:
-    """What `cdpr plan --from-run` and `cdpr calibrate` take from a run folder."""
+    """Reads a run folder as `cdpr plan --from-run` and `cdpr calibrate` do."""
     from calibration.run_data import poses_of_run, rig_measurements
     from executor.recording.resume import run_end
     from executor.recording.run_folder import RunFolder
@@ -135,7 +135,7 @@ def _again(path: Path) -> object:
 
 
 def _cut(path: Path) -> object:
-    """What `cdpr report` makes of the folder of a run that was killed."""
+    """Evaluates the folder of a killed run as `cdpr report` does."""
     from executor.evaluation import evaluate_cut_short
     from executor.recording.run_folder import RunFolder
 
@@ -143,7 +143,7 @@ def _cut(path: Path) -> object:
 
 
 def _run_part(name: str) -> Callable[[Path], object]:
-    """What `cdpr report` reads of a run folder."""
+    """Reads a run folder as `cdpr report` does."""
     from executor.recording.run_folder import RunFolder
     from executor.report.run_data import read_run
     from executor.report.tiles import (

@@ -1,15 +1,15 @@
-"""Feeds every reader mutated files and every verb odd command lines, and counts what goes wrong.
+"""Feeds every reader mutated files and every verb odd command lines, and counts failures.
 
     python tools/fuzz/run.py [--minutes 10] [--calls N] [--seed 1] [--workers 2] [--only READER]
                              [--keep DIR]
 
-With one seed and as many workers, the k-th call of a reader is the same on every machine. --calls
-ends after so many of each reader and a verb's call for each ten of them: what passed an hour here
-cannot fail in CI by luck.
+With the same seed and number of workers, the k-th call of a reader is the same on every machine.
+--calls limits the calls of each reader, with one call of a verb for every ten: what passed for an
+hour here cannot fail in CI by chance.
 
-What goes wrong is a traceback, a call of more than 10 s of processor time or 30 s in all, more than
-2 GB of memory, a process that dies, or an unfinished output; the file or command line behind each
-is kept. The exit status is 0 when nothing went wrong.
+Failures are tracebacks, calls of more than 10 s of processor time or 30 s in total, more than 2 GB
+of memory, processes that die, and unfinished outputs; the file or command line of each is kept. The
+exit status is 0 without failures.
 """
 
 from __future__ import annotations
@@ -49,28 +49,32 @@ VERBS = "verbs"
 
 
 class Hang(BaseException):
-    """A call took too long."""
+    """A call exceeded its time."""
 
 
 def main() -> int:
     """Runs the workers, restarts those that die, and prints the counts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--calls", type=int, default=10**9, help="of each reader, at most")
+    parser.add_argument(
+        "--calls", type=int, default=10**9, help="largest number of calls per reader"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--only", default="", help="readers whose name begins so; no verbs")
-    parser.add_argument("--keep", type=Path, help="folder for what went wrong")
+    parser.add_argument(
+        "--only", default="", help="only readers whose name begins with this; no verbs"
+    )
+    parser.add_argument("--keep", type=Path, help="folder for failures")
     options = parser.parse_args()
     keep = options.keep or Path(tempfile.mkdtemp(prefix="cdpr-fuzz-"))
     keep.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="cdpr fuzz ") as place:
-        counts = _all(options, Path(place), keep)
+    with tempfile.TemporaryDirectory(prefix="cdpr fuzz ") as folder:
+        counts = _all(options, Path(folder), keep)
     return _report(counts, keep)
 
 
-def _all(options: argparse.Namespace, place: Path, keep: Path) -> Counter[str]:
-    corpus = build(place / "corpus")
+def _all(options: argparse.Namespace, folder: Path, keep: Path) -> Counter[str]:
+    corpus = build(folder / "corpus")
     context = get_context("fork")
     end = time.monotonic() + 60.0 * options.minutes
     running: dict[int, Any] = {}
@@ -78,35 +82,35 @@ def _all(options: argparse.Namespace, place: Path, keep: Path) -> Counter[str]:
     while time.monotonic() < end + SILENT_S + CALL_S:
         for number in range(options.workers):
             worker = running.get(number)
-            beat = place / f"beat-{number}"
+            beat = folder / f"beat-{number}"
             if worker is not None and worker.is_alive():
                 if time.time() - beat.stat().st_mtime > SILENT_S:
-                    worker.kill()  # a call that no signal ends: counted as a dead worker below
+                    worker.kill()  # a call that ignores signals: counted as a dead worker below
                 continue
             if worker is not None and worker.exitcode == 0:
                 continue
             if worker is not None:
-                _note(place, keep, number, worker.exitcode)
+                _note(folder, keep, number, worker.exitcode)
                 starts[number] += 1
             if time.monotonic() < end:
                 beat.touch()
-                task = (options, corpus, place, keep, number, starts[number], end)
+                task = (options, corpus, folder, keep, number, starts[number], end)
                 running[number] = context.Process(target=_work, args=task)
                 running[number].start()
         if time.monotonic() > end and not any(w.is_alive() for w in running.values()):
             break
         time.sleep(0.5)
     total: Counter[str] = Counter()
-    for file in place.glob("counts-*.json"):
+    for file in folder.glob("counts-*.json"):
         total.update(json.loads(file.read_text()))
     return total
 
 
-def _note(place: Path, keep: Path, number: int, code: int) -> None:
-    """Keeps what a worker that died was at."""
-    now = place / f"now-{number}"
+def _note(folder: Path, keep: Path, number: int, code: int) -> None:
+    """Keeps the last input of a worker that died."""
+    now = folder / f"now-{number}"
     shutil.copy(now, keep / f"died-{number}-{time.time_ns()}") if now.exists() else None
-    file = place / f"counts-died-{number}-{time.time_ns()}.json"
+    file = folder / f"counts-died-{number}-{time.time_ns()}.json"
     file.write_text(json.dumps({"died": 1}))
     print(f"worker {number} died with {code}", file=sys.stderr)
 
@@ -114,7 +118,7 @@ def _note(place: Path, keep: Path, number: int, code: int) -> None:
 def _work(
     options: argparse.Namespace,
     corpus: dict[str, list[Path]],
-    place: Path,
+    folder: Path,
     keep: Path,
     number: int,
     start: int,
@@ -122,7 +126,7 @@ def _work(
 ) -> None:
     sys.stdout = sys.stderr = (keep / f"worker-{number}.log").open("a")
     os.dup2(sys.stderr.fileno(), 2)  # what libraries print about damaged images
-    scratch = place / f"worker-{number}-{start}"
+    scratch = folder / f"worker-{number}-{start}"
     scratch.mkdir()
     os.chdir(scratch)
     for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
@@ -139,12 +143,12 @@ def _work(
     made = dict.fromkeys(spent, 0)
     by_name = {reader.name: reader for reader in chosen}
     seeds = {reader.name: reader.seed.read_bytes() for reader in chosen}
-    beat, now = place / f"beat-{number}", place / f"now-{number}"
+    beat, now = folder / f"beat-{number}", folder / f"now-{number}"
     while time.monotonic() < end and any(left.values()):
         os.utime(beat)
-        (place / f"counts-{number}-{start}.json").write_text(json.dumps(counts))
+        (folder / f"counts-{number}-{start}.json").write_text(json.dumps(counts))
         began = time.monotonic()
-        # As much time for each reader, and for the verbs as for a third of them all.
+        # Equal time for each reader; verbs get `VERB_SHARE` of that of all readers.
         name = min(
             (name for name in left if left[name]),
             key=lambda name: (
@@ -165,17 +169,17 @@ def _work(
                 counts[problem[0]] += 1
                 _keep(keep, name, data, problem)
         spent[name] += time.monotonic() - began
-    (place / f"counts-{number}-{start}.json").write_text(json.dumps(counts))
+    (folder / f"counts-{number}-{start}.json").write_text(json.dumps(counts))
 
 
 def _share(options: argparse.Namespace, of_verbs: bool) -> int:
-    """The calls of one worker."""
+    """Number of calls of one worker."""
     calls = options.calls // READER_CALLS_A_VERB if of_verbs else options.calls
     return max(1, calls // options.workers)
 
 
 def _verb(verbs: VerbFuzzer, chance: random.Random, now: Path, keep: Path) -> list[str]:
-    """One call of a verb: what to count."""
+    """Calls a verb once; returns the counters to increment."""
     found = verbs.one(chance, now)
     if any(one.startswith("verb ") for one in found):
         shutil.copy(now, keep / f"verb-{time.time_ns()}")
@@ -183,10 +187,10 @@ def _verb(verbs: VerbFuzzer, chance: random.Random, now: Path, keep: Path) -> li
 
 
 def _read(reader: Reader, data: bytes, scratch: Path, now: Path) -> tuple[str, str] | None:
-    """One call: nothing, or what went wrong and how."""
+    """Calls a reader once; returns None, or the kind of failure and its trace."""
     from model.errors import CdprError
 
-    path = reader.place or scratch / f"file{reader.seed.suffix}"
+    path = reader.target or scratch / f"file{reader.seed.suffix}"
     path.write_bytes(data)
     now.write_bytes(data)
     signal.setitimer(signal.ITIMER_PROF, CALL_S)
@@ -202,13 +206,13 @@ def _read(reader: Reader, data: bytes, scratch: Path, now: Path) -> tuple[str, s
         return "tracebacks", traceback.format_exc(limit=-8)
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
-        if reader.place is not None:
+        if reader.target is not None:
             shutil.copyfile(reader.seed, path)
     return None
 
 
 def _keep(keep: Path, name: str, data: bytes, problem: tuple[str, str]) -> None:
-    """One file of each cause, with its trace."""
+    """Keeps one file per cause, with its trace."""
     last = "\n".join(problem[1].strip().splitlines()[-4:])
     mark = f"{name.replace('/', '_')}-{problem[0]}-{abs(hash(last[:200])) % 10**8:08d}"
     if not (keep / f"{mark}.txt").exists() and len(list(keep.iterdir())) < 500:
@@ -232,9 +236,9 @@ def _report(counts: Counter[str], keep: Path) -> int:
     for trace in sorted(keep.glob("*.txt")):
         print(f"{trace.name}:\n{trace.read_text()}")
     if wrong:
-        print(f"what went wrong is in {keep}")
+        print(f"failures are in {keep}")
     print(f"{counts['reader calls']} reader calls, {counts['verb calls']} verb calls: ", end="")
-    print(", ".join(f"{count} {key}" for key, count in wrong.items()) or "nothing went wrong")
+    print(", ".join(f"{count} {key}" for key, count in wrong.items()) or "no failures")
     return 1 if wrong or not counts["reader calls"] else 0
 
 

@@ -1,4 +1,4 @@
-"""Odd command lines for every verb, each in a process of its own."""
+"""Odd command lines for every verb, each in a separate process."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any
 import typer.main
 
 CALL_S, SILENT_S, LONG_S = 10, 25, 6
-"""Of a call: processor time, time in all, and time that a long one is watched for, [s]."""
+"""Limits of a call, [s]: processor time, total time, and total time of a long one."""
 
 PRELOADED = (
     "calibration.result_files",
@@ -29,9 +29,9 @@ PRELOADED = (
     "tracking.tracker",
 )
 
-#: Not called: they act on whatever run is under way on this machine.
+#: Not called: they act on any run in progress on this machine.
 LEFT_OUT = ("stop", "hold", "resume", "speed")
-#: What these are asked for may take longer than a call may; they are ended after it, uncounted.
+#: These may take longer than a call may; they are then killed, which is not a failure.
 LONG = (
     "demo", "plan", "run", "sim", "bench", "workspace", "monitor", "home", "jog", "track",
     "calibrate", "check", "doctor", "console",
@@ -75,17 +75,17 @@ VALUES = (
 
 
 class VerbFuzzer:
-    """Makes command lines and calls them.
+    """Generates and runs command lines.
 
     Args:
-        corpus: Whole files by kind.
-        scratch: Where they are called.
+        corpus: Valid files by kind.
+        scratch: Working folder.
     """
 
     def __init__(self, corpus: dict[str, list[Path]], scratch: Path) -> None:
         from cdpr.cli.app import build_app
 
-        for module in PRELOADED:  # once, and not in every call
+        for module in PRELOADED:  # once instead of in every call
             import_module(module)
         self._corpus, self._scratch = corpus, scratch
         self._verbs = dict(_commands(typer.main.get_command(build_app())))
@@ -94,18 +94,18 @@ class VerbFuzzer:
         shutil.copytree(corpus["picture"][0].parent, scratch / "pictures")
 
     def one(self, chance: random.Random, now: Path) -> list[str]:
-        """Calls one; what went wrong, each beginning with ``verb ``, and which verb it was."""
+        """Runs one; returns the verb's counter, and failures, each beginning with ``verb ``."""
         words, command = chance.choice(sorted(self._verbs.items(), key=lambda item: item[0]))
         arguments = [*words, *self._arguments(command, chance)]
         now.write_text(shlex.join(arguments), errors="surrogateescape")
         folder = self._scratch / "out"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
-        code, said = self._called(arguments, chance)
+        code, output_text = self._called(arguments, chance)
         found = [f"calls of {' '.join(words)}"]
         if code is None and words[0] not in LONG:
             found.append("verb hangs")
-        if "this is a defect of cdpr" in said or "Traceback" in said:
+        if "this is a defect in cdpr" in output_text or "Traceback" in output_text:
             found.append("verb tracebacks")
         if code is not None and code < 0:
             found.append(f"verb died with {code}")
@@ -113,11 +113,11 @@ class VerbFuzzer:
             found.append("verb left an unfinished output")
         if len(found) > 1:
             with now.open("a") as stream:
-                stream.write("\n\n" + said)
+                stream.write("\n\n" + output_text)
         return found
 
     def _arguments(self, command: Any, chance: random.Random) -> list[str]:
-        """Arguments as they should be, with one to three odd values among them."""
+        """Valid arguments with up to three odd values among them."""
         odd = chance.choice((0, 1, 1, 2, 3))
         chosen: list[str] = []
         params = list(command.params)
@@ -162,25 +162,25 @@ class VerbFuzzer:
         return [chance.choice(("1", "2", "5", "10")) for _ in range(max(1, param.nargs))]
 
     def _called(self, arguments: list[str], chance: random.Random) -> tuple[int | None, str]:
-        """Exit code, None for one that was ended, negative for a signal; and what it said."""
-        log = self._scratch / "said"
+        """Exit code (None if killed here, negative for a signal), and the output."""
+        log = self._scratch / "log"
         output = "/dev/full" if chance.random() < 0.1 else str(log)
         encoding = chance.choice(("utf-8", "utf-8", "ascii"))
         child = os.fork()
         if child == 0:
-            _be_the_verb(arguments, output, str(log), encoding)
+            _run_verb(arguments, output, str(log), encoding)
         code = _waited(child, LONG_S if arguments[0] in LONG else SILENT_S)
         if code == -signal.SIGPROF:
             code = None
         return code, log.read_text(errors="replace") if log.exists() else ""
 
 
-def _be_the_verb(arguments: list[str], output: str, log: str, encoding: str) -> None:
-    """The child: the command line, and nothing after it."""
+def _run_verb(arguments: list[str], output: str, log: str, encoding: str) -> None:
+    """Runs the command line in the child process, then exits."""
     code = 99
     try:
         signal.signal(signal.SIGPROF, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_PROF, CALL_S)  # of processor time; it kills
+        signal.setitimer(signal.ITIMER_PROF, CALL_S)  # processor time; its signal kills
         os.setsid()
         Path(log).write_text("")
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)

@@ -1,8 +1,8 @@
-"""A Linux with SocketCAN to boot: the distribution's kernel and a small first file system.
+"""A bootable Linux with SocketCAN: the distribution's kernel and a small initramfs.
 
-Nothing is installed on this machine: the kernel's package is fetched with apt and unpacked in
-memory, and the modules that a virtual CAN bus and a shared root need are put into an initramfs
-beside busybox and `guest_init`.
+Nothing is installed on this machine: the kernel package is downloaded with apt and unpacked in
+memory; the modules for a virtual CAN bus and a shared root go into an initramfs with busybox and
+`guest_init`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import tarfile
 from pathlib import Path
 
 META_PACKAGE = "linux-image-amd64"
-"""The ordinary kernel: Debian's cloud kernel has no CAN."""
+"""The standard kernel, as Debian's cloud kernel has no CAN."""
 
 MODULES = ("virtio_pci", "9pnet_virtio", "9p", "overlay", "can_raw", "vcan")
 BUSYBOX = Path("/bin/busybox")
@@ -27,14 +27,14 @@ _FOLDERS = ("bin", "dev", "modules", "proc", "sys", "shared", "upper", "new")
 
 
 class VmFailed(Exception):
-    """The machine could not be made or did not come up; says what to do next."""
+    """The machine could not be created or did not boot; the message has the next step."""
 
 
 def boot_files(cache: Path) -> tuple[Path, Path]:
-    """Kernel and initramfs, made once for each version of the package and of this folder.
+    """Kernel and initramfs, created once per version of the package and of this folder.
 
     Raises:
-        VmFailed: apt or busybox is missing, or the package is not what it should be.
+        VmFailed: apt or busybox is missing, or the package is not as expected.
     """
     if not BUSYBOX.is_file():
         raise VmFailed("busybox is missing; next: sudo apt-get install busybox-static")
@@ -52,7 +52,7 @@ def boot_files(cache: Path) -> tuple[Path, Path]:
 
 
 def _package_name() -> str:
-    """The package that the distribution's kernel stands for, such as linux-image-6.1.0-9-amd64."""
+    """The package of the distribution's current kernel, such as linux-image-6.1.0-9-amd64."""
     listed = _apt("apt-cache", "depends", META_PACKAGE)
     found = re.search(r"Depends: (linux-image-\S+)", listed)
     if found is None:
@@ -65,12 +65,12 @@ def _apt(*command: str, folder: Path | None = None) -> str:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
     except FileNotFoundError as error:
         raise VmFailed(
-            f"{command[0]} is missing: the virtual machine takes its kernel from Debian's packages;"
+            f"{command[0]} is missing: the virtual machine's kernel comes from Debian's packages;"
             " next: run on a machine whose kernel has vcan (sudo modprobe vcan)"
         ) from error
     except subprocess.CalledProcessError as error:
-        told = error.stderr.strip() or error.stdout.strip()
-        raise VmFailed(f"{' '.join(command)}: {told}; next: sudo apt-get update") from error
+        output = error.stderr.strip() or error.stdout.strip()
+        raise VmFailed(f"{' '.join(command)}: {output}; next: sudo apt-get update") from error
     return done.stdout
 
 
@@ -84,7 +84,7 @@ def _make(package: str, folder: Path) -> None:
 
 
 def _unpacked(deb: Path) -> tuple[bytes, dict[str, bytes]]:
-    """The kernel's image, and every module by name."""
+    """The kernel image, and every module by name."""
     image, modules = b"", {}
     unpack = ["dpkg-deb", "--fsys-tarfile", deb]
     with (
@@ -110,12 +110,12 @@ def _content(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
 
 
 def _module(name: str) -> str:
-    """The kernel writes - and _ as it likes."""
+    """Module name with underscores, as the kernel mixes - and _."""
     return name.replace("-", "_")
 
 
 def _in_order(modules: dict[str, bytes]) -> dict[str, bytes]:
-    """The modules that are needed, each behind those it needs; what is built in has no file."""
+    """The required modules in loading order; built-in ones have no file."""
     ordered: dict[str, bytes] = {}
 
     def add(name: str) -> None:
@@ -151,7 +151,7 @@ def _initramfs(modules: dict[str, bytes]) -> bytes:
 
 
 def _append(archive: io.BytesIO, name: str, mode: int, data: bytes) -> None:
-    inode = archive.tell() + 1  # any number that no other entry has
+    inode = archive.tell() + 1  # unique in the archive
     path = name.encode() + b"\0"
     numbers = (inode, mode, 0, 0, 1, 0, len(data), 0, 0, 0, 0, len(path), 0)
     archive.write(b"070701" + b"".join(b"%08X" % number for number in numbers) + path)

@@ -1,12 +1,12 @@
-"""Runs the tests marked `hil` on a virtual CAN bus: of this machine, else of a virtual one.
+"""Runs the tests marked `hil` on a virtual CAN bus of this or of a virtual machine.
 
     python tools/hil/run.py [--part runs|table|epos4|nanotec-c5e|akd] [--artefacts DIR]
         [--limit-s S] [pytest's arguments]
     python tools/hil/run.py --missing
 
-The exit status is pytest's; 125 when there is no bus to run them on. With --missing it only names
-the Debian packages that must be installed before, in one line; needs no environment of its own.
-Parts may run at once: in machines of their own, or in turn on the bus of this one.
+The exit status is pytest's, or 125 without a bus. With --missing it only prints the Debian packages
+to install first, in one line; this needs no virtual environment. Parts may run at the same time:
+each in its own virtual machine, or one after the other on this machine's bus.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ PARTS = {
     "table": (TABLE,),
     **{make: (MAKERS, "-k", make) for make in MAKES},
 }
-"""What a part runs; without a name, all."""
+"""Arguments of each part; the empty name runs all."""
 NEEDED = {"ip": "iproute2", "candump": "can-utils"}
 NEEDED_BY_VM = {QEMU: "qemu-system-x86", str(BUSYBOX): "busybox-static"}
 KERNELS = "from executor.kernels import ready_to_simulate; ready_to_simulate()"
@@ -58,7 +58,7 @@ COMPILED = (
 
 
 def main() -> int:
-    """Chooses where, and runs there."""
+    """Selects a bus, and runs the tests on it."""
     parser = argparse.ArgumentParser(description="run the hardware-in-the-loop tests on vcan")
     parser.add_argument("--part", choices=[name for name in PARTS if name], default="")
     parser.add_argument("--artefacts", type=Path)
@@ -75,17 +75,17 @@ def main() -> int:
     if artefacts == own.resolve():
         shutil.rmtree(artefacts, ignore_errors=True)
     elif artefacts.exists() and any(artefacts.iterdir()):
-        parser.error(f"--artefacts {artefacts} holds something already; name an empty folder")
+        parser.error(f"--artefacts {artefacts} is not empty; name an empty folder")
     artefacts.mkdir(parents=True, exist_ok=True)
     tests = [*PYTEST, *PARTS[options.part], *(rest or ["-m", "hil"])]
     try:
         _require_tools()
         if _host_has_can():
             print(f"hil: on this machine's {CHANNEL}; traces in {artefacts}", flush=True)
-            with _alone():
+            with _exclusive():
                 return _on_host(tests, artefacts)
         print(f"hil: no AF_CAN here, so in a virtual machine; traces in {artefacts}", flush=True)
-        with _alone():
+        with _exclusive():
             _compile(plans=options.part in MAKES)
             boot_files(_cache())
         return run_in_vm(_job(tests), artefacts, _cache(), options.limit_s)
@@ -100,8 +100,8 @@ def _cache() -> Path:
 
 
 @contextmanager
-def _alone() -> Iterator[None]:
-    """Another part waits meanwhile: for the bus, or for what both need."""
+def _exclusive() -> Iterator[None]:
+    """Excludes other parts, which wait for the bus or for shared files."""
     _cache().mkdir(parents=True, exist_ok=True)
     with (_cache() / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -115,7 +115,7 @@ def _require_tools() -> None:
 
 
 def _missing() -> list[str]:
-    """Packages whose tools are not here."""
+    """Packages of missing tools."""
     path = os.pathsep.join((os.environ.get("PATH", ""), "/usr/sbin", "/sbin"))
     needed = NEEDED if _host_has_can() else NEEDED | NEEDED_BY_VM
     return [package for tool, package in needed.items() if not shutil.which(tool, path=path)]
@@ -130,7 +130,7 @@ def _host_has_can() -> bool:
 
 
 def _on_host(tests: list[str], artefacts: Path) -> int:
-    """On an interface of this machine; one that is missing can be made by root alone."""
+    """Runs on an interface of this machine; creating a missing one requires root."""
     if not Path("/sys/class/net", CHANNEL).exists():
         made = subprocess.run(
             ["sh", "-c", _bring_up()], capture_output=True, text=True, check=False
@@ -150,13 +150,13 @@ def _environment(artefacts: Path) -> dict[str, str]:
 
 
 def _compile(*, plans: bool) -> None:
-    """What the programs run, here: it takes twenty times as long where instructions are counted.
+    """Compiles the programs here, as the virtual machine would take twenty times as long.
 
-    To bytecode, and the simulated platform to machine code that both processors understand; the
-    planner as well for a part that jogs along planned paths.
+    To bytecode, and the simulated platform to machine code for both processors; also the planner
+    for a part that uses planned paths.
     """
     command = [sys.executable, "-m", "compileall", "-q", *COMPILED]
-    subprocess.run(command, cwd=ROOT, check=False)  # a folder that is read-only costs time alone
+    subprocess.run(command, cwd=ROOT, check=False)  # a read-only folder only costs time
     environment = {**os.environ, **_for_any_processor()}
     subprocess.run([sys.executable, "-c", KERNELS], cwd=ROOT, env=environment, check=True)
     if plans:
@@ -167,13 +167,13 @@ def _compile(*, plans: bool) -> None:
 
 
 def _for_any_processor() -> dict[str, str]:
-    """Numba keeps machine code by processor, and the virtual one is not this one."""
+    """Settings for machine code that both processors share: Numba caches it by processor."""
     kept = str(_cache() / "kernels")
     return {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": kept}
 
 
 def _job(tests: list[str]) -> str:
-    """What the virtual machine runs, with this Python and in this folder."""
+    """Shell script for the virtual machine, with this Python in this folder."""
     passed = {name: value for name, value in os.environ.items() if name.startswith("CDPR_HIL_")}
     own = {"HOME": "/root", "COLUMNS": "100"}
     environment = {**passed, **_environment(Path("/mnt/job")), **_for_any_processor(), **own}

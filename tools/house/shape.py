@@ -1,8 +1,8 @@
 """Measures the shape of the product: `python tools/house/shape.py`.
 
-Files in a folder, lengths of modules and functions, circles and back arrows of imports, the command
-line's share, exported names, and long documentation lines. The limits are those of
-`tests/repository/test_shape.py`. Tests, benchmarks, tools and examples are no product.
+Files per folder, lengths of modules and functions, import cycles and upward imports, size of the
+command line, exported names, and long documentation lines. The limits are in
+`tests/repository/test_shape.py`. Tests, benchmarks, tools and examples are not counted.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from functools import cached_property
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Lower ranks import from higher ones; packages of one rank do not import each other.
+#: Lower ranks import from higher ones; packages of the same rank do not import each other.
 RANKS = {
     "cdpr": 0,
     "calibration": 1,
@@ -35,10 +35,10 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 @dataclass(frozen=True)
 class Module:
-    """A file of the product.
+    """A module of the product.
 
     Attributes:
-        path: Below the repository's root.
+        path: Relative to the repository's root.
         text: Its content.
     """
 
@@ -52,7 +52,7 @@ class Module:
 
     @cached_property
     def name(self) -> str:
-        """As it is imported."""
+        """Import name."""
         return self.path[: -len(".py")].replace("/", ".").removesuffix(".__init__")
 
     @property
@@ -62,11 +62,11 @@ class Module:
 
     @property
     def is_bare_init(self) -> bool:
-        """An `__init__` that holds next to nothing is not counted as a module."""
+        """Whether it is a short `__init__`, which is not counted as a module."""
         return self.path.endswith("__init__.py") and self.lines < 40
 
     def functions(self) -> Iterator[tuple[str, int]]:
-        """Each function with its number of lines, those of its docstring left out."""
+        """Yields each function with its number of lines without the docstring."""
         for node in ast.walk(self.tree):
             if isinstance(node, Function):
                 text = ast.get_docstring(node, clean=False)
@@ -74,7 +74,7 @@ class Module:
                 yield f"{self.path}:{node.name}", (node.end_lineno or 0) - node.lineno + 1 - doc
 
     def imports(self) -> Iterator[str]:
-        """Names that are imported when the program runs: at the top or inside a function."""
+        """Names imported at run time, at the top or inside a function."""
         for node in _executed(self.tree):
             if isinstance(node, ast.Import):
                 yield from (alias.name for alias in node.names)
@@ -83,7 +83,7 @@ class Module:
                 yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
     def inner_imports(self) -> int:
-        """Import statements inside functions."""
+        """Number of import statements inside functions."""
         found: set[ast.AST] = set()
         for node in ast.walk(self.tree):
             if isinstance(node, Function):
@@ -91,7 +91,7 @@ class Module:
         return len(found)
 
     def prints(self) -> int:
-        """Calls of `print` and `input`."""
+        """Number of calls of `print` and `input`."""
         return sum(
             isinstance(node, ast.Call)
             and isinstance(node.func, ast.Name)
@@ -108,7 +108,7 @@ class Module:
 
 
 def _executed(node: ast.AST) -> Iterator[ast.AST]:
-    """All nodes but those below `if TYPE_CHECKING:`."""
+    """All nodes except those below `if TYPE_CHECKING:`."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
             yield from (n for other in child.orelse for n in _executed(other))
@@ -118,7 +118,7 @@ def _executed(node: ast.AST) -> Iterator[ast.AST]:
 
 
 class House:
-    """The product in a folder."""
+    """The product's modules in a folder."""
 
     def __init__(self, root: Path = ROOT) -> None:
         """Reads every module."""
@@ -130,18 +130,18 @@ class House:
 
     @cached_property
     def edges(self) -> dict[str, set[str]]:
-        """For each module the modules that it imports."""
+        """The modules that each module imports."""
         return {
             m.name: {n for n in m.imports() if n in self.by_name and n != m.name}
             for m in self.modules
         }
 
     def folders(self) -> Counter[str]:
-        """Python files in each folder."""
+        """Number of Python files per folder."""
         return Counter(str(Path(module.path).parent) for module in self.modules)
 
     def circles(self) -> list[list[str]]:
-        """Groups of modules each of which imports all others, by way of others too."""
+        """Import cycles: groups of modules that import each other, directly or indirectly."""
         reached = {name: self._reached(name) for name in self.edges}
         groups = {
             tuple(sorted({name} | {o for o in reached[name] if name in reached[o]}))
@@ -160,7 +160,7 @@ class House:
         return found
 
     def back_arrows(self) -> list[str]:
-        """Imports from a package of a lower rank, or from another one of the same rank."""
+        """Imports from a package of lower rank, or from another of the same rank."""
         return sorted(
             f"{name} -> {other}"
             for name, others in self.edges.items()
@@ -169,26 +169,26 @@ class House:
         )
 
     def functions(self) -> list[tuple[int, str]]:
-        """Lengths and names, the longest first."""
+        """Lengths and names of functions, longest first."""
         found = ((lines, name) for module in self.modules for name, lines in module.functions())
         return sorted(found, reverse=True)
 
     def namesakes(self) -> dict[str, list[str]]:
-        """Public classes whose name several modules define, with the modules."""
+        """Names of public classes defined in several modules, with the modules."""
         found: dict[str, list[str]] = {}
         for module in self.modules:
             for node in module.tree.body:
                 if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                     found.setdefault(node.name, []).append(module.name)
-        return {name: places for name, places in found.items() if len(places) > 1}
+        return {name: modules for name, modules in found.items() if len(modules) > 1}
 
     def single_importers(self) -> list[str]:
-        """Modules that exactly one other module imports."""
+        """Modules imported by exactly one other module."""
         count = Counter(other for others in self.edges.values() for other in others)
         return [module.name for module in self.counted if count[module.name] == 1]
 
     def long_lines(self) -> list[str]:
-        """Documentation lines that are too long: ``file:line``."""
+        """Too long documentation lines, as ``file:line``."""
         pages = [*self.root.glob("*.md"), *sorted((self.root / "docs").rglob("*.md"))]
         return [
             f"{page.relative_to(self.root)}:{number}"
@@ -198,7 +198,7 @@ class House:
 
 
 def long_lines(text: str) -> list[int]:
-    """Numbers of lines longer than `LINE`; tables, code, comments and lone links are left out."""
+    """Numbers of lines longer than `LINE`, except tables, code, comments and single links."""
     found, in_code = [], False
     for number, line in enumerate(text.splitlines(), start=1):
         if line.lstrip().startswith("```"):
@@ -211,7 +211,7 @@ def long_lines(text: str) -> list[int]:
 
 
 def figures(house: House) -> Iterator[tuple[str, str]]:
-    """What is shown: name and value."""
+    """Names and values to print."""
     sizes = [module.lines for module in house.counted]
     short = sum(size <= SHORT_MODULE for size in sizes)
     cli = [module for module in house.modules if module.path.startswith("cdpr/cli/")]

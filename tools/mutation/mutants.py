@@ -1,7 +1,7 @@
-"""Every small change of a module: limits by one, comparisons, signs, missing statements. Pure.
+"""All small changes of a module: limits by one, comparisons, signs, missing statements. Pure.
 
-Left alone is what decides nothing at run time: annotations, docstrings, texts, and switches by name
-(``frozen=True``). Idea: opendbc's ``safety/tests/mutation.py``.
+Annotations, docstrings, texts and named switches (``frozen=True``) are not changed, as they decide
+nothing at run time. Idea: opendbc's ``safety/tests/mutation.py``.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class Mutant:
     """One change of one module.
 
     Attributes:
-        line: Where, counted from 1.
-        scope: Function or class that holds it, dotted; empty for the module.
-        was: First line of the statement, as `ast.unparse` writes it.
+        line: Line number from 1.
+        scope: Enclosing function or class, dotted; empty for the module.
+        was: First line of the statement by `ast.unparse`.
         now: The same after the change.
         code: The changed module, compiled.
     """
@@ -61,7 +61,7 @@ class Mutant:
 
 @dataclass(frozen=True)
 class _Spot:
-    """A node, what stands above it, and how to put another one there."""
+    """A node, its statement and scope, and a function that replaces it."""
 
     node: ast.AST
     statement: ast.stmt | None
@@ -70,7 +70,7 @@ class _Spot:
 
 
 def mutants(source: str, path: str) -> list[Mutant]:
-    """Every changed module, in the order of the lines."""
+    """All mutants of a module, in the order of the lines."""
     tree = ast.parse(source)
     return [
         _mutant(tree, spot, changed, path)
@@ -91,7 +91,7 @@ def _mutant(tree: ast.Module, spot: _Spot, changed: ast.AST, path: str) -> Mutan
 
 
 def _text(statement: ast.AST, node: ast.AST) -> str:
-    """The head of the statement where it is short, else the changed node alone."""
+    """The statement's first line if it is short, else only the changed node."""
     lines = ast.unparse(statement).splitlines()
     head = lines[0] if isinstance(statement, ast.If | ast.While | ast.For) else " ".join(lines)
     is_part = node is not statement
@@ -101,7 +101,7 @@ def _text(statement: ast.AST, node: ast.AST) -> str:
 
 
 def _spots(node: ast.AST, statement: ast.stmt | None, scope: str) -> Iterator[_Spot]:
-    """All nodes below one, without those that decide nothing."""
+    """All nodes below one, except those that decide nothing."""
     inner = scope
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
         inner = f"{scope}.{node.name}".lstrip(".")
@@ -111,9 +111,9 @@ def _spots(node: ast.AST, statement: ast.stmt | None, scope: str) -> Iterator[_S
         if isinstance(value, ast.AST):
             yield from _spot(value, statement, inner, _putter(node, name, None))
         elif isinstance(value, list):
-            for place, item in enumerate(value):
+            for index, item in enumerate(value):
                 if isinstance(item, ast.AST) and not _is_text(item):
-                    yield from _spot(item, statement, inner, _putter(node, name, place))
+                    yield from _spot(item, statement, inner, _putter(node, name, index))
 
 
 def _spot(
@@ -125,12 +125,12 @@ def _spot(
     yield from _spots(node, own, scope)
 
 
-def _putter(parent: ast.AST, name: str, place: int | None) -> Callable[[ast.AST], None]:
+def _putter(parent: ast.AST, name: str, index: int | None) -> Callable[[ast.AST], None]:
     def put(node: ast.AST) -> None:
-        if place is None:
+        if index is None:
             setattr(parent, name, node)
         else:
-            getattr(parent, name)[place] = node
+            getattr(parent, name)[index] = node
 
     return put
 
@@ -140,16 +140,16 @@ def _is_switch(node: ast.AST) -> bool:
 
 
 def _is_text(node: ast.AST) -> bool:
-    """A docstring, one of the strings that describe an attribute, or an ellipsis."""
+    """Whether a node is a docstring, a string that describes an attribute, or an ellipsis."""
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
 
 
 def _changes(node: ast.AST) -> Iterator[ast.AST]:
-    """Every small change of one node."""
+    """All small changes of one node."""
     if isinstance(node, ast.Compare):
-        for place, operator in enumerate(node.ops):
+        for index, operator in enumerate(node.ops):
             for other in COMPARED.get(type(operator), ()):
-                ops = [other() if k == place else op for k, op in enumerate(node.ops)]
+                ops = [other() if k == index else op for k, op in enumerate(node.ops)]
                 yield ast.Compare(node.left, ops, node.comparators)
     elif isinstance(node, ast.BoolOp):
         yield ast.BoolOp(ast.Or() if isinstance(node.op, ast.And) else ast.And(), node.values)
@@ -165,8 +165,8 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
     elif isinstance(node, ast.IfExp):
         yield ast.IfExp(node.test, node.orelse, node.body)
     elif isinstance(node, ast.Set) and len(node.elts) > 1:
-        for place in range(len(node.elts)):
-            yield ast.Set([e for k, e in enumerate(node.elts) if k != place])
+        for index in range(len(node.elts)):
+            yield ast.Set([e for k, e in enumerate(node.elts) if k != index])
     elif isinstance(node, ast.Call):
         yield from _other_calls(node)
     elif isinstance(node, ast.If):
@@ -201,6 +201,6 @@ def _other_calls(call: ast.Call) -> Iterator[ast.AST]:
 def _without_one(
     values: list[ast.expr], made: Callable[[list[ast.expr]], ast.expr]
 ) -> Iterator[ast.expr]:
-    for place in range(len(values)):
-        left = [value for k, value in enumerate(values) if k != place]
+    for index in range(len(values)):
+        left = [value for k, value in enumerate(values) if k != index]
         yield made(left) if len(left) > 1 else left[0]

@@ -1,14 +1,14 @@
-"""Changes the code that keeps people safe in every small way and counts what the tests notice.
+"""Mutation tests of the safety code: makes every small change and counts what the tests notice.
 
     python tools/mutation/run.py                       # everything: takes a while
-    python tools/mutation/run.py executor/safety       # what lies below a path
+        python tools/mutation/run.py executor/safety       # files below a path
     python tools/mutation/run.py --changed [BASE]      # lines changed since BASE (HEAD~1), < 60 s
 
-Each survivor is printed with file, line and change. The exit code is 1 when less than 99 % of the
-changes below `executor/safety` were noticed, or nothing could be tried; 2 when tests fail without
-any change. Which tests belong to which file is in `targets.toml`; changes that alter nothing are in
-`equivalent.toml`, with the reason. Every change runs in a process of its own, forked from one that
-has loaded all modules but the changed one and those that import it.
+Each survivor is printed with file, line and change. The exit code is 1 if less than 99 % of the
+changes below `executor/safety` were noticed, or none could be tried; 2 if tests fail without any
+change. `targets.toml` assigns tests to files; `equivalent.toml` lists changes without effect, with
+the reason. Every change runs in a separate process, forked from one that has loaded all modules
+except the changed one and those that import it.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 SAFETY, WANTED = "executor/safety/", 0.99
 BUDGET_S = 50.0
-"""Of --changed; what is left of a minute is for the tests that run then."""
+"""Time budget of --changed; the rest of a minute is for the tests still running."""
 GRACE_S = 3.0
-"""After the budget; then what is still under way is not waited for."""
+"""Time after the budget for which running tests are awaited."""
 LEAST_PATIENCE_S = 20.0
 MEMORY = 8 << 30
 NO_TESTS = 5
 SEED = 20260
 MOST = 40
-"""Changes that --changed tries, the same ones every time; of every file about as many."""
+"""Number of changes that --changed tries, always the same, spread evenly over the files."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A file and what must notice its changes."""
+    """A file and the tests that must notice its changes."""
 
     path: str
     tests: tuple[str, ...]
@@ -66,13 +66,13 @@ class Target:
 
     @property
     def module(self) -> str:
-        """As it is imported."""
+        """Import name."""
         return self.path.removesuffix(".py").replace("/", ".")
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One change to try; the number is that of `mutants`."""
+    """One change to try; the number is its index in `mutants`."""
 
     target: Target
     number: int
@@ -81,14 +81,14 @@ class Trial:
 
 @dataclass(frozen=True)
 class Score:
-    """What came of a file."""
+    """Result of a file."""
 
     tried: int
     survivors: tuple[Trial, ...]
 
 
 def targets() -> list[Target]:
-    """As in the data file."""
+    """The targets in the data file."""
     rows = tomllib.loads((HERE / "targets.toml").read_text("utf-8"))["target"]
     return [
         Target(path, tuple(row["tests"]), tuple(row.get("only", ())))
@@ -98,7 +98,7 @@ def targets() -> list[Target]:
 
 
 def trials(target: Target) -> list[Trial]:
-    """All changes of a file but those that alter nothing."""
+    """All changes of a file, except equivalent ones."""
     listed = tomllib.loads((HERE / "equivalent.toml").read_text("utf-8")).get("equivalent", [])
     equivalent = {(e["file"], e["scope"], e["was"], e["now"]) for e in listed}
     source = (ROOT / target.path).read_text("utf-8")
@@ -110,7 +110,7 @@ def trials(target: Target) -> list[Trial]:
 
 
 def changed_lines(base: str) -> dict[str, set[int]]:
-    """Lines of each file that were added or changed since a commit, the working tree included."""
+    """Lines of each file added or changed since a commit, including the working tree."""
     command = ["git", "diff", "--unified=0", "--no-color", "--no-ext-diff", base, "--", "*.py"]
     text = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     lines: dict[str, set[int]] = {}
@@ -125,7 +125,7 @@ def changed_lines(base: str) -> dict[str, set[int]]:
 
 
 def project_modules() -> dict[str, set[str]]:
-    """Each loaded module of this repository and what it imports."""
+    """Imports of each loaded module of this repository."""
     found: dict[str, set[str]] = {}
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
@@ -143,7 +143,7 @@ def project_modules() -> dict[str, set[str]]:
 
 
 def forget(module: str) -> None:
-    """Unloads a module, all that import it in any number of steps, and the tests."""
+    """Unloads a module, all modules that import it directly or indirectly, and the tests."""
     imports = project_modules()
     stale = {module, *(name for name in imports if name.startswith("tests"))}
     while more := {name for name, used in imports.items() if used & stale} - stale:
@@ -168,13 +168,13 @@ def put(module: str, code: CodeType) -> None:
 
 
 def tests_fail(target: Target, code: CodeType | None, patience: float, until: float) -> bool | None:
-    """Whether a test fails with other code (None: with the file's own), or takes for ever.
+    """Whether a test fails or times out with other code (None: the file's own).
 
     Args:
         target: The file.
-        code: What it is changed to.
-        patience: What takes longer takes for ever, [s].
-        until: Then it is given up, on the monotonic clock, and None is returned.
+        code: Changed code.
+        patience: Time-out, [s].
+        until: Time on the monotonic clock at which None is returned.
     """
     left = max(until - time.monotonic(), 0.01)
     child = os.fork()
@@ -208,7 +208,7 @@ def _in_child(target: Target, code: CodeType | None, patience: float) -> int:
 
 
 def serve(target: Target, share: Sequence[Trial], until: float, link: Connection) -> None:
-    """Tries changes of one file in turn; sends each one's number and whether it was noticed."""
+    """Tries changes of one file; sends the number of each and whether it was noticed."""
     os.chdir(ROOT)
     sys.path.insert(0, str(ROOT))
     for test in target.tests:
@@ -229,7 +229,7 @@ def serve(target: Target, share: Sequence[Trial], until: float, link: Connection
 
 
 def tried(asked: Sequence[Trial], jobs: int, until: float) -> dict[Trial, bool]:
-    """Tries changes on some cores; which were noticed. Those that time ran out for are left out."""
+    """Tries changes in parallel; returns whether each was noticed, for those tried in time."""
     context = multiprocessing.get_context("fork")
     waiting: list[tuple[Target, list[Trial]]] = []
     for target in dict.fromkeys(trial.target for trial in asked):
@@ -249,7 +249,7 @@ def tried(asked: Sequence[Trial], jobs: int, until: float) -> dict[Trial, bool]:
             running[link] = (target, share)
         left = None if until == float("inf") else max(until + GRACE_S - time.monotonic(), 0.0)
         came = wait(list(running), left)
-        if not came:  # busy with loading modules still; daemons end with this program
+        if not came:  # still loading modules; daemons end with this program
             break
         for ready in came:
             assert isinstance(ready, Connection)
@@ -260,7 +260,9 @@ def tried(asked: Sequence[Trial], jobs: int, until: float) -> dict[Trial, bool]:
                 del running[ready]
                 continue
             if number < 0:
-                raise SystemExit(f"{target.path}: {', '.join(target.tests)} fail as they are")
+                raise SystemExit(
+                    f"{target.path}: {', '.join(target.tests)} fail without any change"
+                )
             (trial,) = (t for t in share if t.number == number)
             noticed[trial] = result
             if not result:
@@ -269,7 +271,7 @@ def tried(asked: Sequence[Trial], jobs: int, until: float) -> dict[Trial, bool]:
 
 
 def show(trial: Trial) -> None:
-    """A survivor."""
+    """Prints a survivor."""
     mutant = trial.mutant
     scope = f" in {mutant.scope}" if mutant.scope else ""
     print(f"{trial.target.path}:{mutant.line}{scope}", flush=True)
@@ -277,7 +279,7 @@ def show(trial: Trial) -> None:
 
 
 def show_table(asked: Sequence[Trial], noticed: dict[Trial, bool]) -> float:
-    """One line a file; the share that was noticed below executor/safety, 1 when none was tried."""
+    """Prints one line per file; returns the share noticed in executor/safety, 1 if none tried."""
     print("| file | changes | tried | noticed | |\n|---|---|---|---|---|")
     safe = all_safe = 0
     for path in dict.fromkeys(trial.target.path for trial in asked):
@@ -292,7 +294,7 @@ def show_table(asked: Sequence[Trial], noticed: dict[Trial, bool]) -> float:
 
 
 def asked_for(paths: Iterable[str], base: str | None) -> list[Trial]:
-    """The changes of files below some paths, or on lines changed since a commit."""
+    """Changes of files below some paths, or on lines changed since a commit."""
     chosen = [t for t in targets() if any(t.path.startswith(path) for path in paths or [""])]
     lines = changed_lines(base) if base is not None else None
     found = [
@@ -306,7 +308,7 @@ def asked_for(paths: Iterable[str], base: str | None) -> list[Trial]:
 
 
 def sample(found: Sequence[Trial]) -> list[Trial]:
-    """At most `MOST` changes, the same ones every time: executor/safety first."""
+    """At most `MOST` changes, always the same, executor/safety first."""
     shuffled = random.Random(SEED).sample(list(found), len(found))
     turn: dict[str, int] = {}
     turns = []
@@ -329,10 +331,10 @@ def main() -> int:
     try:
         asked = asked_for(options.paths, options.changed)
     except subprocess.CalledProcessError:
-        print(f"git does not know {options.changed}, so it is not known what changed")
+        print(f"git does not know {options.changed}: cannot determine the changed lines")
         return 0
     if not asked:
-        print("nothing that `tools/mutation/targets.toml` names was changed")
+        print("no file listed in `tools/mutation/targets.toml` was changed")
         return 0
     until = began + BUDGET_S if options.changed is not None else float("inf")
     noticed = tried(asked, options.jobs, until)

@@ -1,4 +1,4 @@
-"""Options that say which board was printed, and `cdpr calibrate print`, which prints it."""
+"""Options that describe a calibration board, and `cdpr calibrate print`, which prints it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SIZES = ("square_mm", "marker_mm", "spacing_mm", "diameter_mm", "tag_mm", "gap_
 
 @dataclass(frozen=True, slots=True)
 class BoardOptions:
-    """What was said about a board; every field is an option of the verbs that know boards."""
+    """Description of a board; every field is an option of the verbs that use boards."""
 
     board: Annotated[BoardName, typer.Option(help="kind of target")] = "chessboard"
     columns: Annotated[
@@ -51,27 +51,26 @@ class BoardOptions:
         bool, typer.Option("--legacy", help="charuco layout of OpenCV before 4.6")
     ] = False
     spacing_mm: Annotated[
-        float | None, typer.Option(help="of neighbouring rows (circles), from centre to centre")
+        float | None, typer.Option(help="row spacing, centre to centre (circles)")
     ] = None
-    diameter_mm: Annotated[float | None, typer.Option(help="of a circle (circles)")] = None
+    diameter_mm: Annotated[float | None, typer.Option(help="circle diameter (circles)")] = None
     asymmetric: Annotated[
         bool, typer.Option("--asymmetric", help="every other row is shifted (circles)")
     ] = False
     tag_mm: Annotated[float | None, typer.Option(help="side of a tag's black square (tags)")] = None
-    gap_mm: Annotated[float | None, typer.Option(help="between black squares (tags)")] = None
-    family: Annotated[str, typer.Option(help="of the tags (tags)")] = "tag36h11"
-    first: Annotated[int, typer.Option(min=0, help="the smallest number (tags)")] = 0
+    gap_mm: Annotated[float | None, typer.Option(help="gap between black squares (tags)")] = None
+    family: Annotated[str, typer.Option(help="tag family (tags)")] = "tag36h11"
+    first: Annotated[int, typer.Option(min=0, help="lowest tag number (tags)")] = 0
     order: Annotated[
         TagOrder,
-        typer.Option(help="numbered from the top left down, or as Kalibr's AprilGrid (tags)"),
+        typer.Option(help="numbered from the top left, or as in Kalibr's AprilGrid (tags)"),
     ] = "rows"
 
     def made(self) -> Board:
         """The board.
 
         Raises:
-            BadInput: A number or size is missing or one too many is given, or there can be no such
-                board.
+            BadInput: A count or size is missing, does not apply to this board, or is invalid.
         """
         if self.columns is None or self.rows is None:
             raise BadInput(
@@ -124,7 +123,7 @@ def print_(
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a calibration board, or the tags of a rig, as a PDF in exact size.
+    """Make a calibration board, or the tags of a rig, as a PDF at exact scale.
 
     [dim]Examples:[/dim]
 
@@ -144,9 +143,9 @@ def print_(
     require_new_file(output, force)
     if rig is not None and printed != BoardOptions():
         raise BadInput(
-            "--rig prints the rig's tags in the sizes given by its file",
+            "--rig prints the rig's tags in the sizes of the rig file",
             where="--rig",
-            next_step="leave out the board's options, or leave out --rig",
+            next_step="leave out the board options, or leave out --rig",
         )
     if rig is None and printed == BoardOptions():
         raise BadInput(
@@ -170,6 +169,6 @@ def print_(
             }
         )
     else:
-        turned = "upright" if pages[0].width_mm < pages[0].height_mm else "across"
-        on = f"{len(pages)} of {paper}, {turned}"
+        layout = "portrait" if pages[0].width_mm < pages[0].height_mm else "landscape"
+        on = f"{len(pages)} of {paper}, {layout}"
         show_facts("print", [("what", what), ("pages", on), ("file", str(output)), ("next", step)])

@@ -18,7 +18,7 @@ from calibration.results import require_file_name
 from calibration.targets.boards import Board
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.output import (
-    NOWHERE,
+    DEFAULT_RESULT,
     CameraOption,
     ResultOptions,
     WantedOption,
@@ -44,7 +44,7 @@ def camera(
     folder: Annotated[
         Path,
         typer.Argument(
-            help="folder of pictures of the board, a video, or corners (CSV); or for --live",
+            help="folder of images of the board, a video, or corners (CSV); output of --live",
             metavar="DIR",
         ),
     ],
@@ -64,16 +64,16 @@ def camera(
     wanted_mm: WantedOption = 1.0,
     distance_m: Annotated[
         float | None,
-        typer.Option(min=0.01, help="working distance of the camera (default: that of the target)"),
+        typer.Option(min=0.01, help="working distance of the camera (default: the target's)"),
     ] = None,
     lens: Annotated[
-        LensChoice, typer.Option(help="its model; auto: what fits held-out pictures best")
+        LensChoice, typer.Option(help="lens model; auto: the one that fits held-out images best")
     ] = "auto",
-    result: ResultOptions = NOWHERE,
+    result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
-    """Calibrate a camera's matrix and lens distortion, with a verdict on the accuracy.
+    """Calibrate a camera's matrix and lens distortion, and state the accuracy.
 
-    Exit code 3 where they are not. Files that cannot be used are named; the others are used.
+    Exit code 3 where the result is not good enough. Files that cannot be used are listed.
 
     [dim]Examples:[/dim]
 
@@ -92,7 +92,7 @@ def camera(
             raise BadInput(
                 "a file of corners needs --size-px",
                 where=str(folder),
-                next_step="pass width and height of the images that they were detected in",
+                next_step="pass the width and height of the images that show the corners",
             )
         made = calibrate_camera_from_corners(
             folder,
@@ -134,7 +134,7 @@ def camera(
 def _take_pictures(
     source: str, folder: Path, board: Board, wanted: int, size: tuple[int, int]
 ) -> None:
-    """Takes images until enough are there, the video ends, or Ctrl-C."""
+    """Captures images until there are enough, the video ends, or Ctrl-C."""
     requests = LocalRequests()
     with stop_requests(requests):
         capture_images(
@@ -150,7 +150,7 @@ def _take_pictures(
         err.print("capture stopped; the images so far are used")
 
 
-# `cdpr calibrate readout`: how long a camera takes from its top row to its bottom row.
+# `cdpr calibrate readout`: readout time of a rolling shutter, top row to bottom row.
 
 
 @with_option_groups
@@ -169,17 +169,17 @@ def readout(
     speed_mm_s: Annotated[
         float | None,
         typer.Option(
-            min=0.1, callback=finite, help="for which the error is stated (default: motion's)"
+            min=0.1, callback=finite, help="speed for the error bound (default: the motion's)"
         ),
     ] = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 0.1,
-    result: ResultOptions = NOWHERE,
+    result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
     """Measure a rolling shutter, from images of the platform while it moves.
 
-    The platform goes up and down and sideways before the camera, which stands still. Exit code 3
-    where the result is not good enough.
+    Move the platform up, down and sideways in front of the stationary camera. Exit code 3 where the
+    result is not good enough.
 
     [dim]Examples:[/dim]
 

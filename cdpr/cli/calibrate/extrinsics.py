@@ -1,4 +1,4 @@
-"""`cdpr calibrate extrinsics` and `tags`: where a camera is, and where the platform's tags are."""
+"""`cdpr calibrate extrinsics` and `tags`: poses of a camera and of the platform's tags."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from calibration.pictures import DEFAULT_IMAGES, DEFAULT_TAG_IMAGES, ImageSet, o
 from calibration.procedures import locate_camera, locate_tags
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.output import (
-    NOWHERE,
+    DEFAULT_RESULT,
     CameraOption,
     PicturesOption,
     ResultOptions,
@@ -50,7 +50,7 @@ def extrinsics(
     beside: Annotated[
         str | None,
         typer.Option(
-            help="use another camera whose pose is known, and its images of the same moments",
+            help="use another camera of known pose, and its images taken at the same times",
             metavar="NAME=SOURCE",
         ),
     ] = None,
@@ -67,20 +67,19 @@ def extrinsics(
         typer.Option(
             min=0.0,
             callback=finite,
-            help="standard deviation of frame tags' rotations; --survey-mm is then of whole"
-            " tags (default: each corner was surveyed by itself)",
+            help="standard deviation of frame tags' rotations; --survey-mm then applies to whole"
+            " tags (default: each corner was surveyed separately)",
         ),
     ] = None,
     printed: BoardOptions = NO_BOARD,
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 1.0,
-    result: ResultOptions = NOWHERE,
+    result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
     """Find a camera's pose, from surveyed tags on the frame or from the rig's motion.
 
-    Images must be taken while the camera stands still. Exit code 3 where the result is not good
-    enough.
+    The camera must not move between images. Exit code 3 where the result is not good enough.
 
     [dim]Examples:[/dim]
 
@@ -99,7 +98,7 @@ def extrinsics(
             raise BadInput(
                 "--beside and --poses exclude each other",
                 where="calibrate extrinsics",
-                next_step="use the rig's motion, or another camera",
+                next_step="pass --poses for the rig's motion, or --beside for another camera",
             )
         name, _, other = beside.partition("=")
         made = locate_camera_by_another(
@@ -133,7 +132,7 @@ def _opener(
     return lambda: open_source(source, camera, pictures, usual)
 
 
-# `cdpr calibrate tags`: where the tags are on the platform.
+# `cdpr calibrate tags`: poses of the tags on the platform.
 
 
 @with_option_groups
@@ -144,18 +143,18 @@ def tags(
     fixed_tag: Annotated[
         int | None,
         typer.Option(
-            min=0, help="keep this tag as in the rig file (default: best fit of all tags)"
+            min=0, help="keep this tag's pose from the rig file (default: best fit of all tags)"
         ),
     ] = None,
     pictures: PicturesOption = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 0.2,
-    result: ResultOptions = NOWHERE,
+    result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
-    """Find the tags' poses on the platform, from images that show two or more at once.
+    """Find the tags' poses on the platform, from images that each show two or more.
 
-    Turn the platform before the camera, or carry the camera around it: every image may be taken
-    from anywhere. Exit code 3 where the result is not good enough.
+    Rotate the platform in front of the camera, or carry the camera around it. Exit code 3 where the
+    result is not good enough.
 
     [dim]Examples:[/dim]
 

@@ -1,4 +1,4 @@
-"""Options that the `cdpr calibrate` verbs share, and how each of them ends."""
+"""Options and result output shared by the `cdpr calibrate` verbs."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ CameraOption = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class ResultOptions:
-    """Where a calibration's result goes, and who reads it; every field is an option."""
+    """Destination and output format of a calibration's result; every field is an option."""
 
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="folder for the result and its report")
     ] = None
     force: Annotated[
-        bool, typer.Option("--force", help="replace a result of the same name and date")
+        bool, typer.Option("--force", help="replace a result with the same name and date")
     ] = False
     as_json: JsonOption = False
 
@@ -47,11 +47,11 @@ class ResultOptions:
 
     @property
     def listener(self) -> Terminal:
-        """What shows the progress."""
+        """Shows the progress on standard error."""
         return Terminal(quiet=self.as_json)
 
     def show(self, made: Calibration[Any, Any, Any]) -> None:
-        """Shows a calibration that was written, and exits with 3 if it is not good enough."""
+        """Shows a calibration, and exits with 3 if it is not good enough."""
         result = made.result
         if self.as_json:
             show_json(result.sealed().model_dump(mode="json"))
@@ -68,4 +68,4 @@ class ResultOptions:
             raise typer.Exit(3)
 
 
-NOWHERE = ResultOptions()
+DEFAULT_RESULT = ResultOptions()

@@ -1,4 +1,4 @@
-"""`cdpr calibrate diff`, `apply`, `export`, `import`: what becomes of calibration results."""
+"""`cdpr calibrate diff`, `apply`, `export`, `import`: use of calibration results."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def diff(
     second: Annotated[Path, typer.Argument(help="result file (YAML)", metavar="B")],
     as_json: JsonOption = False,
 ) -> None:
-    """Compare two calibration results: every number against its interval, and the effect in mm.
+    """Compare two calibration results: each number with its interval, and the effect in mm.
 
-    Exit code 3 where they are further apart than they state.
+    Exit code 3 where they differ by more than their intervals.
 
     [dim]Example:[/dim]
 
@@ -42,7 +42,7 @@ def diff(
         raise typer.Exit(3)
 
 
-# `cdpr calibrate apply`: a new rig file with calibration results in place.
+# `cdpr calibrate apply`: a new rig file with calibration results.
 
 
 def apply(
@@ -51,13 +51,13 @@ def apply(
         list[Path], typer.Argument(help="result files of `cdpr calibrate`", metavar="RESULT...")
     ],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="rig file to write; must not exist yet")
+        Path, typer.Option("-o", "--output", help="rig file to write; must not exist")
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Write a new rig file with calibration results in place of its own values.
+    """Write a new rig file in which calibration results replace the values of RIG.
 
-    The rig file itself is never changed, and comments of it are not copied.
+    RIG itself is not changed; its comments are not copied.
 
     [dim]Example:[/dim]
 
@@ -83,7 +83,7 @@ def apply(
 def export(
     rig: RigArgument,
     output: Annotated[Path, typer.Option("-o", "--output", help="file to write")],
-    to: Annotated[FormatName, typer.Option(help="whose format")] = "opencv",
+    to: Annotated[FormatName, typer.Option(help="file format")] = "opencv",
     camera: CameraOption = None,
     calibration: CalibrationOption = None,
     force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
@@ -111,20 +111,22 @@ def export(
 
 def import_(
     rig: RigArgument,
-    file: Annotated[Path, typer.Argument(help="of OpenCV, ROS, Kalibr or mrcal", metavar="CAMERA")],
+    file: Annotated[
+        Path, typer.Argument(help="camera file of OpenCV, ROS, Kalibr or mrcal", metavar="CAMERA")
+    ],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="rig file to write; it must not exist yet")
+        Path, typer.Option("-o", "--output", help="rig file to write; must not exist")
     ],
     camera: CameraOption = None,
     entry: Annotated[
-        str | None, typer.Option(help="of a Kalibr camchain with several cameras, such as cam1")
+        str | None, typer.Option(help="camera of a Kalibr camchain with several, such as cam1")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write a new rig file with a camera's matrix and lens from another program.
 
-    CAMERA is OpenCV's YAML, ROS's camera_info, Kalibr's camchain or mrcal's .cameramodel. How sure
-    its numbers are it does not say; `cdpr calibrate camera` does.
+    CAMERA is OpenCV's YAML, ROS's camera_info, Kalibr's camchain or mrcal's .cameramodel. These
+    files state no uncertainty; `cdpr calibrate camera` does.
 
     [dim]Example:[/dim]
 

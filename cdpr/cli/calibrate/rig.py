@@ -1,4 +1,4 @@
-"""`cdpr calibrate poses`, which plans where to measure, and `rig`, from samples at rest."""
+"""`cdpr calibrate poses` plans measurement poses; `rig` calibrates from stationary samples."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import typer
 
 from calibration.geometry.pose_selection import measurement_poses
 from calibration.procedures import calibrate_rig
-from cdpr.cli.calibrate.output import NOWHERE, ResultOptions, WantedOption
+from cdpr.cli.calibrate.output import DEFAULT_RESULT, ResultOptions, WantedOption
 from cdpr.cli.options import (
     CalibrationOption,
     JsonOption,
@@ -60,8 +60,8 @@ def poses(
 ) -> None:
     """Choose the most informative poses for calibration, and plan a path with stops at them.
 
-    Each can be held, is free, and is turned as far as cables and tensions allow. `cdpr run` runs
-    the plan; `cdpr calibrate rig` reads the run folder.
+    Each pose is wrench-feasible and collision-free, and rotated as far as cables and tensions
+    allow. `cdpr run` runs the plan; `cdpr calibrate rig` reads the run folder.
 
     [dim]Example:[/dim]
 
@@ -92,11 +92,11 @@ def poses(
     show_facts(f"plan {output}", [("poses", text), *sentences, ("next", next_step)])
 
 
-# `cdpr calibrate rig`: outlets, anchors, pulleys, winches, stiffness, from places at rest.
+# `cdpr calibrate rig`: outlets, anchors, pulleys, winches, stiffness, from stationary samples.
 
 
 class GroupName(StrEnum):
-    """Groups of a rig's numbers."""
+    """Groups of rig parameters."""
 
     outlets = "outlets"
     anchors = "anchors"
@@ -108,13 +108,13 @@ class GroupName(StrEnum):
 
 
 def _deviation(of: str, most: float | None = None) -> Any:
-    """An option with a standard deviation."""
+    """An option that is a standard deviation."""
     return typer.Option(min=1e-6, max=most, callback=finite, help=f"standard deviation of {of}")
 
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """How far off the rig file's numbers may be; every field is an option."""
+    """Standard deviations of the rig file's numbers; every field is an option."""
 
     outlets_mm: Annotated[float, _deviation("the outlets in the rig file")] = 4.0
     anchors_mm: Annotated[float, _deviation("the anchors")] = 1.0
@@ -125,19 +125,19 @@ class Deviations:
     stiffness_per_cable: Annotated[
         bool,
         typer.Option(
-            "--stiffness-per-cable", help="find the stiffness of each cable, by measured tensions"
+            "--stiffness-per-cable", help="find each cable's stiffness, from measured tensions"
         ),
     ] = False
     swivel_zeros_deg: Annotated[float, _deviation("the zeros of swivel angles")] = 1.0
     imu_mounting_deg: Annotated[
         float | None,
         _deviation(
-            "an IMU's mounting, which is found; left out, its axes are the platform's", 45.0
+            "an IMU's mounting, then estimated too (default: its axes are the platform's)", 45.0
         ),
     ] = None
 
-    def but(self, known: Sequence[GroupName]) -> dict[str, float]:
-        """By group, [m], [rad] or as a share, without those that are known."""
+    def without(self, known: Sequence[GroupName]) -> dict[str, float]:
+        """By group, in [m], [rad] or as a fraction, without the known groups."""
         deviations = {
             "outlets": self.outlets_mm / 1e3,
             "anchors": self.anchors_mm / 1e3,
@@ -147,17 +147,17 @@ class Deviations:
             "stiffness": self.stiffness_percent / 1e2,
             "swivel_zeros": radians(self.swivel_zeros_deg),
         }
-        sought = {group: size for group, size in deviations.items() if group not in known}
-        if self.stiffness_per_cable and "stiffness" in sought:
-            sought["cable_stiffness"] = sought.pop("stiffness")
+        free = {group: size for group, size in deviations.items() if group not in known}
+        if self.stiffness_per_cable and "stiffness" in free:
+            free["cable_stiffness"] = free.pop("stiffness")
         if self.imu_mounting_deg is not None:
-            sought["imu_mounting"] = radians(self.imu_mounting_deg)
-        return sought
+            free["imu_mounting"] = radians(self.imu_mounting_deg)
+        return free
 
 
 @dataclass(frozen=True, slots=True)
 class Accuracies:
-    """Of the measurements, one standard deviation; every field is an option."""
+    """Standard deviations of the measurements; every field is an option."""
 
     length_mm: Annotated[float, _deviation("cable lengths from the encoders")] = 0.1
     pose_mm: Annotated[float, _deviation("positions, added to that of their file")] = 0.1
@@ -166,7 +166,7 @@ class Accuracies:
     imu_deg: Annotated[float, _deviation("the vertical by an IMU")] = 0.1
 
     def in_si(self) -> dict[str, Any]:
-        """As `calibrate_rig` takes them, [m] and [rad]."""
+        """As arguments of `calibrate_rig`, [m] and [rad]."""
         return {
             "length_deviation": self.length_mm / 1e3,
             "pose_deviations": (self.pose_mm / 1e3, radians(self.pose_deg)),
@@ -175,7 +175,7 @@ class Accuracies:
         }
 
 
-DRAWING, USUAL = Deviations(), Accuracies()
+DEFAULT_DEVIATIONS, DEFAULT_ACCURACIES = Deviations(), Accuracies()
 
 
 @with_option_groups
@@ -195,16 +195,15 @@ def rig(
     reflector_mm: Annotated[
         tuple[float, float, float],
         typer.Option(
-            help="point of the platform whose positions a file without rotations holds, platform"
-            " frame"
+            help="point whose positions a file without rotations contains, in the platform frame"
         ),
     ] = (0.0, 0.0, 0.0),
     known: Annotated[
         list[GroupName] | None,
         typer.Option(help="parameters to keep as in the rig file; repeatable"),
     ] = None,
-    deviations: Deviations = DRAWING,
-    accuracies: Accuracies = USUAL,
+    deviations: Deviations = DEFAULT_DEVIATIONS,
+    accuracies: Accuracies = DEFAULT_ACCURACIES,
     tilt_deg: Annotated[
         float,
         typer.Option(
@@ -213,14 +212,12 @@ def rig(
     ] = 5.0,
     wanted_mm: WantedOption = 1.0,
     name: Annotated[str, typer.Option(help="name of the result")] = "rig",
-    result: ResultOptions = NOWHERE,
+    result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
     """Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.
 
-    Each is given with its uncertainty.
-
-    Exit code 3 where they are not good enough. What cannot be identified stays as in the rig file,
-    and is reported.
+    Every number comes with its uncertainty; what cannot be identified keeps the rig file's value,
+    and is reported. Exit code 3 where the result is not good enough.
 
     [dim]Examples:[/dim]
 
@@ -231,7 +228,7 @@ def rig(
     made = calibrate_rig(
         load_rig(rig),
         data,
-        deviations=deviations.but(known or []),
+        deviations=deviations.without(known or []),
         **accuracies.in_si(),
         without_poses=without_poses,
         reflector=[x / 1e3 for x in reflector_mm],

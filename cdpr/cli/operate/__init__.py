@@ -1,1 +1,1 @@
-"""The verbs of panel "Operate"; each is imported when it is called."""
+"""The verbs of the panel "Operate"; each is imported when it is called."""

@@ -9,7 +9,7 @@ import typer
 
 from cdpr import console as page  # loads the server where it is asked for
 from cdpr.cli.options import (
-    RIGS_OWN,
+    DEFAULT_BUS,
     BusOptions,
     RigArgument,
     WithoutRealTimeOption,
@@ -19,7 +19,7 @@ from cdpr.cli.output import show_line
 from cdpr.console.session import Console, ConsoleFiles
 from model.errors import BadInput, HardwareMissing
 
-#: Only this machine's own browser reaches these.
+#: Addresses that only a browser on this machine reaches.
 _LOCAL = ("127.0.0.1", "::1", "localhost")
 
 
@@ -28,39 +28,40 @@ def console(
     rig: RigArgument,
     scene: Annotated[
         Path | None,
-        typer.Option(help="scene file: obstacles and payload, to jog among"),
+        typer.Option(help="scene file: obstacles and payload for jogging"),
     ] = None,
-    plan: Annotated[Path | None, typer.Option(help="plan file to show at first")] = None,
+    plan: Annotated[Path | None, typer.Option(help="plan file to load at the start")] = None,
     host: Annotated[
         str,
-        typer.Option(help="address to listen on; any but this machine's own needs --allow-others"),
+        typer.Option(help="address to listen on; other than localhost needs --allow-others"),
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="port; 0 for a free one")] = 8402,
     read_only: Annotated[
-        bool, typer.Option("--read-only", help="show only; STOP works all the same")
+        bool, typer.Option("--read-only", help="show only; STOP still works")
     ] = False,
     allow_others: Annotated[
         bool,
         typer.Option(
-            "--allow-others", help="let other machines connect: who knows the address can operate"
+            "--allow-others", help="let other machines connect: anyone with the address can operate"
         ),
     ] = False,
     camera: Annotated[
         list[str] | None,
         typer.Option(
             "--camera",
-            help="measures runs, the first one homing: SOURCE or NAME=SOURCE; repeatable",
+            help="camera that measures runs (the first also homing): SOURCE or NAME=SOURCE;"
+            " repeatable",
             metavar="SOURCE",
         ),
     ] = None,
-    bus: BusOptions = RIGS_OWN,
+    bus: BusOptions = DEFAULT_BUS,
     without_real_time: WithoutRealTimeOption = False,
 ) -> None:
-    """Open the operator's page: see the robot live, jog, teach, preview, run, hold, stop.
+    """Serve the operator's page: live view, jog, teach, preview, run, hold, stop.
 
-    The page is served on this machine; open the address that is printed. What moves runs in
-    processes of its own, and goes on when the console ends. STOP on the page is a software stop: it
-    does not replace the emergency-stop button.
+    Open the printed address in a browser. Runs are separate processes, and continue when the
+    console ends. STOP on the page is a software stop: it does not replace the emergency-stop
+    button.
 
     [dim]Examples:[/dim]
 
@@ -72,8 +73,8 @@ def console(
         raise BadInput(
             f"{host} lets other machines connect",
             where="--host",
-            why="the connection is not encrypted, and who knows the address can move the robot",
-            next_step="use an SSH tunnel, or pass --allow-others in a network that you trust",
+            why="the connection is not encrypted, and anyone with the address can move the robot",
+            next_step="use an SSH tunnel, or pass --allow-others on a network that you trust",
         )
     options = [("--interface", bus.interface), ("--channel", bus.channel)]
     files = ConsoleFiles(
@@ -92,11 +93,11 @@ def console(
 
 
 def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
-    """Serves the page until it is interrupted, and prints its address.
+    """Prints the page's address, and serves it until interrupted.
 
     Args:
-        files: What the console is started with.
-        plan: Shown at first; None for none.
+        files: Rig, scene and options of the console.
+        plan: Loaded at the start; None for none.
         host: Address to listen on.
         port: 0 for a free one.
 
@@ -118,6 +119,6 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
 
     def show_address(address: str) -> None:
         show_line(f"console of {files.rig.name}: {address}")
-        show_line("Ctrl-C ends the console, not what moves")
+        show_line("Ctrl-C ends the console; a run continues")
 
     run_server(shown, host, port, show_address)

@@ -1,4 +1,4 @@
-"""`cdpr demo`: the whole way on the paper's rig, simulated."""
+"""`cdpr demo`: all steps from plan to report on the paper's rig, simulated."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, help="random seed of the planner")] = 0,
     console: Annotated[
         bool,
-        typer.Option("--console", help="run it from the operator's page, in real time"),
+        typer.Option("--console", help="load it into the operator's page, in real time"),
     ] = False,
 ) -> None:
     """Plan, check, run on simulated drives, track with a synthetic camera, and report.
 
-    With --console the plan is loaded into the operator's page, at the address that is printed:
-    drives and cameras are simulated, in real time; take control there, and run it, jog and teach.
+    With --console the plan is loaded into the operator's page at the printed address, with drives
+    and cameras simulated in real time: take control there, then run, jog or teach.
 
     [dim]Examples:[/dim]
 

@@ -1,4 +1,4 @@
-"""`cdpr home`: pretensions the cables and references the drums' counts."""
+"""`cdpr home`: pretensions the cables and sets the encoder reference."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ REACH_MM, SPEED_MM_S, SLACK_MM = 1000.0 * REACH, 1000.0 * SPEED, 1000.0 * SLACK
 
 @dataclass(frozen=True, slots=True)
 class WindingOptions:
-    """How the cables are pretensioned and the pose is measured; every field is an option."""
+    """Settings of pretension and pose measurement; every field is an option."""
 
     tension_n: Annotated[
         float | None, typer.Option(help="pretension (default: twice the rig's smallest tension)")
@@ -66,7 +66,7 @@ class WindingOptions:
     ] = SLACK_MM
 
     def given(self) -> dict[str, object]:
-        """Each option by name with its value, false where it is the default."""
+        """Value of each option by name, false for a default."""
         return {
             "--tension-n": self.tension_n,
             "--limit-n": self.limit_n,
@@ -93,15 +93,17 @@ def home(
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            help="the platform hangs freely and a camera measures it: 'synthetic', an index, or for"
-            " a camera other than the rig file's first, NAME=SOURCE",
+            help="the platform hangs freely and a camera measures it: 'synthetic', an index, or"
+            " NAME=SOURCE for a camera other than the rig file's first",
             metavar="SOURCE",
         ),
     ] = None,
     calibration: CalibrationOption = None,
     as_rig_file: Annotated[
         bool,
-        typer.Option("--as-rig-file", help="move nothing: absolute encoders match the rig file"),
+        typer.Option(
+            "--as-rig-file", help="move nothing: absolute encoders agree with the rig file"
+        ),
     ] = False,
     winding: WindingOptions = DEFAULT_WINDING,
     interface: InterfaceOption = None,
@@ -113,9 +115,9 @@ def home(
 ) -> None:
     """Pretension all cables, then set the encoder reference at a known pose.
 
-    All winches together, slowly, each until its cable carries the pretension; a cable that carries
-    too much, or none after the whole reach, stops all. The reference is a file of its own, which
-    `cdpr run` and `cdpr jog` use. With the interface 'virtual' it is a rehearsal.
+    All winches wind in slowly together, each until its cable carries the pretension; a cable above
+    the limit, or still slack after the full reach, stops all. The reference is stored in a file
+    that `cdpr run` and `cdpr jog` use. With the interface 'virtual' it is a rehearsal.
 
     [dim]Examples:[/dim]
 
@@ -164,7 +166,7 @@ def home(
 
 
 def _use_rig_file_counts(rig: Rig, asks: bool, as_json: bool) -> None:
-    """Drops the reference, so that the rig file's counts are the drives' again."""
+    """Deletes the reference, so that the rig file's counts apply again."""
     confirm = confirmation(asks=asks, as_json=as_json)
     homing.use_rig_file_counts(rig, confirm=confirm)
     if as_json:

@@ -1,4 +1,4 @@
-"""`cdpr jog`: moves the platform a little, straight, slowly, from where it is."""
+"""`cdpr jog`: short, slow, straight motions from the present pose."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from cdpr.cli.operate.supervision import (
     speed_by_key,
 )
 from cdpr.cli.options import (
-    RIGS_OWN,
+    DEFAULT_BUS,
     BusOptions,
     FastOption,
     RigArgument,
@@ -51,7 +51,7 @@ from model.scene import Scene, load_scene
 
 @dataclass(frozen=True, slots=True)
 class PathOptions:
-    """How far the platform is moved, among what; every field is an option of `cdpr jog`."""
+    """Distance and surroundings of a jog; every field is an option of `cdpr jog`."""
 
     by_mm: Annotated[
         tuple[float, float, float] | None,
@@ -75,7 +75,7 @@ class PathOptions:
     ] = None
 
     def given(self) -> dict[str, object]:
-        """Each option by name with its value."""
+        """Value of each option by name."""
         return {
             "--by-mm": self.by_mm,
             "--to-home": self.to_home,
@@ -88,33 +88,33 @@ class PathOptions:
 
 @dataclass(frozen=True, slots=True)
 class HeldOptions:
-    """Controls that are held; every field is an option of `cdpr jog`."""
+    """Hold-to-run controls; every field is an option of `cdpr jog`."""
 
     hold_to_run: Annotated[
         bool,
         typer.Option(
             "--hold-to-run",
-            help="enable the drives and follow held controls, as of `cdpr console`, until it ends",
+            help="enable the drives and follow held controls, such as those of `cdpr console`",
         ),
     ] = False
     keys: Annotated[
         bool,
         typer.Option(
-            "--keys", help="as --hold-to-run, by keys: arrows for x and y, page up and down for z"
+            "--keys", help="as --hold-to-run, with keys: arrows for x and y, page up and down for z"
         ),
     ] = False
     one_cable: Annotated[
         bool,
         typer.Option(
             "--one-cable",
-            help="with --hold-to-run: controls wind one cable in or pay it out, homed or not",
+            help="with --hold-to-run: wind one cable in or pay it out, homed or not",
         ),
     ] = False
 
 
 @dataclass(frozen=True, slots=True)
 class DriveOptions:
-    """How drives are moved, and who reads the result; every field is an option of `cdpr jog`."""
+    """Settings of drives and output; every field is an option of `cdpr jog`."""
 
     fast: FastOption = False
     yes: YesOption = False
@@ -122,11 +122,11 @@ class DriveOptions:
     as_json: SummaryJsonOption = False
 
     def confirm(self, rig: Rig) -> Callable[[Proposal], bool]:
-        """See `confirmation`; simulated drives move unasked."""
+        """See `confirmation`; simulated drives move without a question."""
         return confirmation(asks=not (is_simulated(rig) or self.yes), as_json=self.as_json)
 
 
-#: Keys that hold a jog, and where to.
+#: Keys that hold a jog, and its direction.
 DIRECTIONS = {
     "right": (1.0, 0.0, 0.0),
     "left": (-1.0, 0.0, 0.0),
@@ -136,9 +136,9 @@ DIRECTIONS = {
     "page down": (0.0, 0.0, -1.0),
 }
 HELP = "arrows x and y · page up and down z · + and - speed · f frame · space stop · q end"
-#: The line with the position is renewed this often, [s].
+#: Update period of the line with the position, [s].
 SHOWN_EVERY = 0.2
-DEFAULT_PATH, NOT_HELD, MOVED = PathOptions(), HeldOptions(), DriveOptions()
+DEFAULT_PATH, DEFAULT_HELD, DEFAULT_DRIVES = PathOptions(), HeldOptions(), DriveOptions()
 
 
 @with_option_groups
@@ -146,12 +146,12 @@ def jog(
     rig: RigArgument,
     path: PathOptions = DEFAULT_PATH,
     cable: Annotated[
-        int | None, typer.Option("--cable", min=1, help="move one winch alone, with --mm")
+        int | None, typer.Option("--cable", min=1, help="move one winch by --mm")
     ] = None,
     mm: Annotated[
-        float | None, typer.Option("--mm", help="length to pay out, at most 50; negative winds in")
+        float | None, typer.Option("--mm", help="length to pay out, at most 50; negative: wind in")
     ] = None,
-    held: HeldOptions = NOT_HELD,
+    held: HeldOptions = DEFAULT_HELD,
     limit_n: Annotated[
         float | None,
         typer.Option(
@@ -161,17 +161,17 @@ def jog(
     speed_mm_s: Annotated[
         float, typer.Option(min=0.1, max=1000.0 * FASTEST, help="largest speed, at most the rig's")
     ] = 1000.0 * SPEED,
-    bus: BusOptions = RIGS_OWN,
-    drives: DriveOptions = MOVED,
+    bus: BusOptions = DEFAULT_BUS,
+    drives: DriveOptions = DEFAULT_DRIVES,
 ) -> None:
-    """Move the platform straight slowly by a few millimetres from its present pose.
+    """Move the platform slowly and straight by a few millimetres from its present pose.
 
-    A jog is a run: planned, proved, checked and gated like any other, and it can be stopped, held
-    and watched. With the interface 'virtual' the simulated platform hangs at home. With --cable one
-    winch alone is moved: for commissioning, with cables that carry no load. With --hold-to-run the
-    drives stay enabled, and the platform moves as long as a control is held, over the command
-    socket; `cdpr console` has such controls. With --keys it moves as long as a key is held here.
-    With --hold-to-run --one-cable controls move one winch at a time instead of the platform.
+    A jog is a run: planned, verified and gated like any other, and it can be stopped, held and
+    monitored. With the interface 'virtual' the simulated platform starts at home. With --cable a
+    single winch moves: for commissioning, with unloaded cables. With --hold-to-run the drives stay
+    enabled, and the platform moves while a control is held over the command socket; `cdpr console`
+    has such controls. With --keys it moves while a key is held in this terminal. With --hold-to-run
+    --one-cable controls move one winch at a time instead of the platform.
 
     [dim]Examples:[/dim]
 
@@ -196,7 +196,7 @@ def jog(
     require_unused(
         "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path uses the rig's limits"
     )
-    if held != NOT_HELD:
+    if held != DEFAULT_HELD:
         _held(the_rig, path, held, speed, drives)
         return
     by = None if path.by_mm is None else millimetres(list(path.by_mm))
@@ -236,7 +236,7 @@ def _held(
             "--json": drives.as_json,
             "--fast": drives.fast,
         },
-        "held controls say where to go, in real time",
+        "held controls set the direction, in real time",
     )
     keys = JogKeys(Keys(), 1000.0 * speed) if held.keys else None
     with keys or ExitStack():
@@ -250,7 +250,7 @@ def _held(
             supervisor=SignalSupervisor(),
             on_cycle=None if keys is None else keys.take_cycle,
         )
-    out.print("the session is over; the drives hold")
+    out.print("jogging ended; the drives hold")
 
 
 def _held_cables(
@@ -265,7 +265,7 @@ def _held_cables(
         raise BadInput(
             "--one-cable needs --hold-to-run, without --keys",
             where="cdpr jog",
-            why="single cables are jogged by controls that are held, as of `cdpr console`",
+            why="single cables are jogged by held controls, such as those of `cdpr console`",
             next_step="pass --hold-to-run --one-cable, or --cable N --mm X for a fixed length",
         )
     unused = {**path.given(), "--json": drives.as_json, "--fast": drives.fast}
@@ -279,22 +279,22 @@ def _held_cables(
         confirm=drives.confirm(rig),
         supervisor=SignalSupervisor(),
     )
-    out.print("the session is over; the drives hold")
+    out.print("jogging ended; the drives hold")
 
 
 class JogKeys:
-    """Holds a jog by keys: a key that is held repeats, and counts for 150 ms.
+    """Hold-to-run by keys: a held key repeats, and each repetition counts for 150 ms.
 
-    A terminal says nothing when a key is let go, so that the platform moves until no repetition has
-    come for that time. Between the first press and its first repetition it comes to rest.
+    A terminal does not report the release of a key, so the platform moves until no repetition has
+    arrived for that time. Between the first press and its first repetition it comes to rest.
     """
 
     def __init__(self, keys: Keys, speed_mm_s: float) -> None:
-        """Nothing is held.
+        """Starts with no key held.
 
         Args:
-            keys: Of the terminal; taken when the drives are ready.
-            speed_mm_s: At most.
+            keys: Of the terminal; read once the drives are ready.
+            speed_mm_s: Largest speed, [mm/s].
         """
         self._keys, self._most = keys, speed_mm_s
         self._percent, self._in_platform = 100, False
@@ -305,15 +305,15 @@ class JogKeys:
         self._is_ready = False
 
     def __enter__(self) -> JogKeys:
-        """The terminal is as it was until the drives are ready."""
+        """Leaves the terminal unchanged until the drives are ready."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """It is again."""
+        """Restores the terminal."""
         self._stack.close()
 
     def take_cycle(self, record: CycleRecord, presses: PressBoard, prover: JogProver) -> None:
-        """A cycle is over: takes what was pressed meanwhile, and shows where the platform is."""
+        """After a cycle: reads the keys, and shows the platform's position."""
         if record.state is not State.MOVING:
             return
         if not self._is_ready:
@@ -342,14 +342,14 @@ class JogKeys:
             self._percent = speed_by_key(self._percent, key)
 
     def _hold(self, key: str, presses: PressBoard) -> None:
-        """The press goes on where it is the same key and has not ended; otherwise one begins."""
-        if key == self._key and self._said(presses):
+        """Continues the press of the same key if it has not ended; otherwise begins another."""
+        if key == self._key and self._send(presses):
             return
         self._key = key
         self._number = max(self._number + 1, time.time_ns() // 1_000_000)
-        self._said(presses)
+        self._send(presses)
 
-    def _said(self, presses: PressBoard) -> bool:
+    def _send(self, presses: PressBoard) -> bool:
         return presses.hold(
             self._number,
             np.array(DIRECTIONS[self._key]),
@@ -403,12 +403,12 @@ def _one_cable(
 
 
 def _scene(path: Path | None, without: bool, clearance_mm: float | None) -> Scene | None:
-    """What is around; nothing only when somebody says so."""
+    """The surroundings; None only with ``--no-scene``."""
     if (path is None) != without:
         raise BadInput(
-            "obstacles are not given: pass either --scene SCENE or --no-scene",
+            "obstacles are unknown: pass either --scene SCENE or --no-scene",
             where="--scene",
-            next_step="pass --scene with the file, or --no-scene if there are no obstacles",
+            next_step="pass --scene with the scene file, or --no-scene if there are no obstacles",
         )
     if path is None:
         return None

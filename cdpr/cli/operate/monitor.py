@@ -1,4 +1,4 @@
-"""`cdpr monitor`: shows a run that is under way, takes keys, or prints it for a program."""
+"""`cdpr monitor`: shows a run live and takes keys, or prints its status for a program."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from model.errors import CdprError
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
 
-#: Of a run that ended so; what ends without a word was killed.
+#: Exit codes by final state; a run without one was killed.
 _EXIT_CODES = {"finished": 0, "stopped": 130, "latched": 1}
 _KEYS = "space stop · h hold · r resume · + and - speed · q leave"
 _BAR = 20
@@ -69,7 +69,7 @@ def monitor(
             "--foxglove",
             min=0,
             max=65535,
-            help="also serve Foxglove at this port of this computer, such as 8765",
+            help="also serve Foxglove on this local port, such as 8765",
             metavar="PORT",
         ),
     ] = None,
@@ -82,7 +82,7 @@ def monitor(
 
     In a terminal it takes keys: space stops the run, h holds it, r resumes it, + and - change its
     speed by ten per cent of the planned one. Ctrl-C or q ends the monitor, not the run. Exit code:
-    0 when the motion finished, 130 when it was stopped, 1 otherwise.
+    0 if the motion finished, 130 if it was stopped, 1 otherwise.
 
     [dim]Examples:[/dim]
 
@@ -111,10 +111,10 @@ def monitor(
 
 
 def _first(process: int | None, rate: float) -> dict[str, Any]:
-    """How a run stands that is waited for.
+    """The first status of a run, after waiting for one.
 
     Raises:
-        Fault: It ended without a word.
+        Fault: It ended without a status.
     """
     for status in follow_run(process, rate, waits=True):
         return status
@@ -133,14 +133,14 @@ def _foxglove(port: int | None) -> Iterator[console.FoxgloveStream | None]:
 
 
 def _lines(
-    looks: Iterator[dict[str, Any]], as_json: bool, stream: console.FoxgloveStream | None = None
+    statuses: Iterator[dict[str, Any]], as_json: bool, stream: console.FoxgloveStream | None = None
 ) -> None:
-    """For a file or a program: a line a look, and each event once."""
+    """For a file or a program: one line per status, and each event once."""
     seen: list[dict[str, Any]] = []
     status: dict[str, Any] = {"state": "gone"}
     robot = _Robot()
     try:
-        for status in looks:
+        for status in statuses:
             if stream is not None:
                 stream.take(status, robot.seen(status))
             if as_json:
@@ -153,7 +153,7 @@ def _lines(
             typer.echo(status_line(status))
     except KeyboardInterrupt:
         return
-    _tell_end(status, as_json)
+    _show_end(status, as_json)
 
 
 def _live(process: int | None, rate: float, stream: console.FoxgloveStream | None) -> None:
@@ -174,32 +174,32 @@ def _live(process: int | None, rate: float, stream: console.FoxgloveStream | Non
                 live.update(_view(status, seen, operator.line), refresh=True)
     except KeyboardInterrupt:
         return
-    _tell_end(status, False)
+    _show_end(status, False)
 
 
 class _Operator:
-    """What the keys ask for."""
+    """Requests by keys."""
 
     def __init__(self, keys: Keys | None) -> None:
-        """None where standard input is no terminal: then nothing is asked for."""
+        """Without keys where standard input is not a terminal."""
         self._keys = keys
         self.status: dict[str, Any] = {}
-        """Of the run, as it was seen last; empty before."""
+        """Last status of the run; empty before."""
         self.line = _KEYS if keys else "no keys: standard input is not a terminal"
-        """Shown below the state."""
+        """Text below the state."""
 
     def between(self, seconds: float) -> Sequence[bytes]:
         """See `executor.remote.client.follow_run`.
 
         Raises:
-            KeyboardInterrupt: The monitor is to end.
+            KeyboardInterrupt: The operator ends the monitor.
         """
         if self._keys is None:
             time.sleep(seconds)
             return ()
-        return [line for key in self._keys.pressed(seconds) for line in self._asked(key)]
+        return [line for key in self._keys.pressed(seconds) for line in self._request(key)]
 
-    def _asked(self, key: str) -> Sequence[bytes]:
+    def _request(self, key: str) -> Sequence[bytes]:
         if key == "q":
             raise KeyboardInterrupt
         if key == " ":
@@ -213,18 +213,18 @@ class _Operator:
         return ()
 
     def _stop(self) -> None:
-        """As `cdpr stop`: every run of this user."""
-        told = stop_runs()
-        self.line = "stop asked for" if told.stopped else "nothing moves"
-        if told.silent:
+        """Stops every run of this user, as `cdpr stop` does."""
+        result = stop_runs()
+        self.line = "stop requested" if result.stopped else "no run is in progress"
+        if result.silent:
             self.line = "A RUN DOES NOT ANSWER: PRESS THE EMERGENCY STOP"
 
 
 class _Robot:
-    """Pose and clearance of a run by its drives; its folder says which rig and plan it has."""
+    """Pose and clearance of a run from its encoders; rig and plan come from its folder."""
 
     def __init__(self) -> None:
-        """Not seen yet."""
+        """Before the first status."""
         self._view: RobotView | None = None
 
     def seen(self, status: dict[str, Any]) -> tuple[RobotView, RobotNow] | None:
@@ -233,14 +233,14 @@ class _Robot:
         if self._view is None and (folder / RIG).is_file():
             try:
                 self._view = RobotView(RunFolder(folder).rig(), None)
-            except CdprError:  # half written: the next look finds it whole
+            except CdprError:  # half written; complete at the next status
                 return None
         now = None if self._view is None else self._view.take(status)
         return None if self._view is None or now is None else (self._view, now)
 
 
-def _tell_end(status: dict[str, Any], as_json: bool) -> None:
-    """The last word, and an exit code as that of the run."""
+def _show_end(status: dict[str, Any], as_json: bool) -> None:
+    """Shows how the run ended, and exits with its exit code."""
     state, cause = status["state"], status.get("cause")
     if not as_json:
         if state not in _EXIT_CODES:
@@ -255,7 +255,7 @@ def _view(
     robot: tuple[RobotView, RobotNow] | None = None,
     keys: str = "",
 ) -> Group:
-    """The live image, the most important on top: a small window shows no more."""
+    """The live view, most important first: a small window crops the rest."""
     title = Text.assemble(
         (status["state"].upper(), _STATES.get(status["state"], "bold")),
         f"  {status['rig']} on {status['bus']}  process {status['process']}  {status['folder']}",
@@ -281,7 +281,7 @@ def _view(
 def _where(view: RobotView, now: RobotNow) -> str:
     x, y, z = now.pose.position * 1e3
     tilt = math.degrees(now.pose.tilt)
-    text = f"platform {x:.1f}, {y:.1f}, {z:.1f} mm, tilt {tilt:.2f}° by the drives"
+    text = f"platform {x:.1f}, {y:.1f}, {z:.1f} mm, tilt {tilt:.2f}° from the encoders"
     if now.nearest is None:
         return text
     return (
@@ -291,7 +291,7 @@ def _where(view: RobotView, now: RobotNow) -> str:
 
 
 def _drives(status: dict[str, Any], limits: tuple[float, float] | None) -> Table:
-    """A line a drive; tensions between their limits where these are known, [N]."""
+    """One row per drive, with its tension between the limits [N] where these are known."""
     drives = Table("drive", box=None, padding=(0, 1), header_style="dim")
     drives.add_column("state", no_wrap=True)
     for name in ("position, counts", "off, counts", "tension, N"):
@@ -313,10 +313,12 @@ def _drives(status: dict[str, Any], limits: tuple[float, float] | None) -> Table
 
 
 def _bar(tension: float, low: float, high: float) -> Text:
-    """A tension from zero to a little above its upper limit; the limits are marked."""
+    """A tension as a bar from zero to 110 % of the upper limit, with both limits marked."""
     cells = [" "] * _BAR
-    place = [min(max(int(v / (1.1 * high) * _BAR), 0), _BAR - 1) for v in (tension, low, high)]
-    cells[: place[0]] = "━" * place[0]
-    for mark in place[1:]:
+    end, *marks = (
+        min(max(int(v / (1.1 * high) * _BAR), 0), _BAR - 1) for v in (tension, low, high)
+    )
+    cells[:end] = "━" * end
+    for mark in marks:
         cells[mark] = "│"
     return Text("".join(cells), style="" if low <= tension <= high else "bold red")

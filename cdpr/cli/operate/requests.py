@@ -1,4 +1,4 @@
-"""`cdpr stop`, `hold`, `resume`, `speed`: what an operator asks of a run that is under way."""
+"""`cdpr stop`, `hold`, `resume`, `speed`: an operator's requests to a run in progress."""
 
 from __future__ import annotations
 
@@ -37,10 +37,7 @@ def stop(
         raise no_answer("stop", silent)
 
 
-# `cdpr hold`, `cdpr resume`, `cdpr speed`: what an operator wants of a run that is under way.
-
-
-#: The path is over, or the run is about to end.
+#: States in which requests come too late.
 OVER = {State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED, State.LATCHED}
 
 _Process = Annotated[
@@ -94,7 +91,9 @@ def _request(verb: str, process: int | None, as_json: bool, percent: int | None 
     if State(status["state"]) in OVER:
         show_line(f"too late: process {status['process']} is {status['state']}")
         return
-    wish = {"hold": "hold", "resume": "resume", "speed": f"run at {percent} %"}[verb]
-    show_line(f"asked process {status['process']} to {wish}; it is {status['state']}")
+    request = {"hold": "hold", "resume": "resume", "speed": f"run at {percent} %"}[verb]
+    show_line(
+        f"process {status['process']} received the request to {request}; state {status['state']}"
+    )
     if verb == "speed" and status["wished"]["hold"]:
         out.print("it is on hold: the speed applies after `cdpr resume`")

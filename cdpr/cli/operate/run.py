@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from cdpr.cli.operate.supervision import RunSupervisor, confirmation, say
+from cdpr.cli.operate.supervision import RunSupervisor, confirmation, print_safely
 from cdpr.cli.options import (
     CalibrationOption,
     ChannelOption,
@@ -41,7 +41,7 @@ def run(
     rig: Annotated[
         Path | None,
         typer.Option(
-            help="rig file (YAML); without it the plan's own rig, on simulated drives",
+            help="rig file (YAML; default: the plan's rig, on simulated drives)",
             metavar="RIG",
         ),
     ] = None,
@@ -50,7 +50,7 @@ def run(
         typer.Option(
             "-o",
             "--output",
-            help="run folder to create, with its parents (default: runs/ and the time)",
+            help="run folder to create, with its parents (default: runs/TIME)",
             metavar="RUNDIR",
         ),
     ] = None,
@@ -58,7 +58,7 @@ def run(
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            help="a camera's index, or 'synthetic': all of the rig file's (the default with the"
+            help="camera index, or 'synthetic' for all of the rig file's cameras (default with the"
             " interface 'virtual'); for several cameras NAME=SOURCE, repeated",
             metavar="SOURCE",
         ),
@@ -123,7 +123,7 @@ def run(
 def agreement(
     supervisor: RunSupervisor, rig: Rig, yes: bool, as_json: bool
 ) -> Callable[[MotionProposal], bool]:
-    """A `confirm` callback after whose yes the signals are the run's."""
+    """A `confirm` callback that hands the signals to the run once the operator agrees."""
     ask = confirmation(asks=not (is_simulated(rig) or yes), as_json=as_json)
 
     def confirm(proposal: MotionProposal) -> bool:
@@ -136,7 +136,7 @@ def agreement(
 
 
 def show(result: RunResult, as_json: bool) -> None:
-    """The verdict of a run."""
+    """Shows the verdict of a run."""
     if as_json:
         show_json({"run": str(result.folder), **result.summary})
         return
@@ -147,25 +147,25 @@ def show(result: RunResult, as_json: bool) -> None:
 
 
 def show_files(result: RunResult, as_json: bool) -> None:
-    """The report of a run, and what could not be written."""
+    """Shows the path of a run's report, and what could not be written."""
     if result.report is not None and not as_json:
         line = f"report: {result.report}"
-        say(lambda: show_line(line), result)
+        print_safely(lambda: show_line(line), result)
     if missing := result.missing_text():
         show_line(f"error: {missing}", err)
 
 
 def _simulated(rig: Rig, interface: str | None, channel: str | None) -> Rig:
-    """The rig of a plan, with drives that are simulated in this process.
+    """The rig of a plan, with drives simulated in this process.
 
     Raises:
-        BadInput: A bus was named; a plan must not decide which drives move.
+        BadInput: A bus was given; a plan must not decide which drives move.
     """
     if channel is not None or interface not in (None, IN_PROCESS):
         raise BadInput(
             "a run on a bus needs the rig file",
             where="--rig",
-            why="without it the plan's own rig runs on simulated drives",
+            why="without it the plan's rig runs on simulated drives",
             next_step="pass the rig file with --rig, or leave out --interface and --channel",
         )
     return rig.with_bus(IN_PROCESS)

@@ -1,4 +1,4 @@
-"""`cdpr status`, `reset`, `release`: the state of a rig, out of a fault, the end of a day."""
+"""`cdpr status`, `reset`, `release`: show a rig's state, release its fault latch or drives."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
-    RIGS_OWN,
+    DEFAULT_BUS,
     BusOptions,
     JsonOption,
     NoQuestionOption,
@@ -21,13 +21,12 @@ from executor import service
 @with_option_groups
 def status(
     rig: RigArgument,
-    bus: BusOptions = RIGS_OWN,
+    bus: BusOptions = DEFAULT_BUS,
     as_json: JsonOption = False,
 ) -> None:
     """Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.
 
-    While a run is under way, or being prepared, the drives are not asked; `cdpr monitor` shows
-    them.
+    Drives are not queried while a run is in progress or being prepared; `cdpr monitor` shows them.
 
     [dim]Example:[/dim]
 
@@ -45,20 +44,20 @@ def status(
         raise result.missing
 
 
-# `cdpr reset`: the only way out of a latched fault.
+# `cdpr reset`: the only command that releases a latched fault.
 
 
 @with_option_groups
 def reset(
     rig: RigArgument,
-    bus: BusOptions = RIGS_OWN,
+    bus: BusOptions = DEFAULT_BUS,
     yes: NoQuestionOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Release a latched fault once its cause is removed: resets drives in fault, moves nothing.
+    """Release a latched fault once its cause is removed: reset drives in fault, move nothing.
 
     Drives that hold keep holding. A drive in fault is not reset while others hold the platform.
-    Afterwards a run starts only from where the platform stands.
+    The next run must start at the platform's present pose.
 
     [dim]Example:[/dim]
 
@@ -82,21 +81,21 @@ def reset(
     out.print(f"{latch_now}; the next run must start from the platform's present pose")
 
 
-# `cdpr release`: the end of a day; brakes close and the torque goes, of all drives together.
+# `cdpr release`: close all brakes, then remove the torque of all drives.
 
 
 @with_option_groups
 def release(
     rig: RigArgument,
-    bus: BusOptions = RIGS_OWN,
+    bus: BusOptions = DEFAULT_BUS,
     yes: NoQuestionOption = False,
     without_real_time: WithoutRealTimeOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Release the drives with the platform on a support: close brakes, remove torque.
 
-    All drives together; set-points move nothing. Winches without brakes let their cables go, so
-    that the drives have to be referenced again.
+    All drives are released together, without motion commands. Winches without brakes pay out
+    their cables, so home the rig again afterwards.
 
     [dim]Example:[/dim]
 
@@ -112,5 +111,5 @@ def release(
     if as_json:
         show_json(asdict(result))
         return
-    out.print(f"all drives are without torque: {', '.join(sorted(set(result.drives)))}")
+    out.print(f"torque removed from all drives: {', '.join(sorted(set(result.drives)))}")
     show_line(f"reference: {result.reference}")

@@ -1,4 +1,4 @@
-"""The operator at the terminal: asked before something moves, heard while it moves."""
+"""The operator at the terminal: confirmation before a motion, signals and keys during it."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _T = TypeVar("_T")
 
 #: A closed terminal (SIGHUP) must not leave the rig without its loop.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_GIVING_UP = b"\nleaving out what is not written yet; press Ctrl-C again to leave at once\n"
+_GIVING_UP = b"\nskipping the files not yet written; press Ctrl-C again to exit at once\n"
 
 
 def confirmation(*, asks: bool, as_json: bool) -> Callable[[Proposal], bool]:
-    """A `confirm` callback: shows what is about to happen, then asks.
+    """A `confirm` callback: shows what will happen, then asks.
 
     Args:
-        asks: There is something to ask; False with ``--yes``.
-        as_json: Standard output is for a program, so that it is shown on standard error.
+        asks: Whether to ask; False with ``--yes``.
+        as_json: Standard output is for a program, so the text goes to standard error.
     """
 
     def confirm(proposal: Proposal) -> bool:
@@ -45,7 +45,7 @@ def confirmation(*, asks: bool, as_json: bool) -> Callable[[Proposal], bool]:
 
 
 def show_proposal(proposal: Proposal, on: Console) -> None:
-    """Shows what is about to happen."""
+    """Shows what will happen."""
     facts = proposal.facts()
     if facts:
         show_facts(proposal.title, facts, on)
@@ -54,14 +54,14 @@ def show_proposal(proposal: Proposal, on: Console) -> None:
 
 
 def has_agreed(question: str, otherwise: str) -> bool:
-    """Whether the answer is yes; silence is none.
+    """Whether the answer is yes; an empty answer means no.
 
     Args:
         question: Shown to the operator.
-        otherwise: What a no leaves, such as ``nothing was moved``.
+        otherwise: Outcome of a no, such as ``nothing was moved``.
 
     Raises:
-        BadInput: There is no terminal to ask on.
+        BadInput: Standard input has ended.
     """
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     answer = sys.stdin.readline()
@@ -70,16 +70,16 @@ def has_agreed(question: str, otherwise: str) -> bool:
         raise BadInput(
             f"no answer to: {question}",
             where="standard input",
-            next_step=f"run it in a terminal, or pass --yes; {otherwise}",
+            next_step=f"run the command in a terminal, or pass --yes; {otherwise}",
         )
     return answer.strip().lower() in ("y", "yes")
 
 
 @contextmanager
 def _handling(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """The signals of the operator call a function to the end of the block."""
+    """Routes the operator's signals to a function until the end of the block."""
     before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
-    if before[signal.SIGHUP] is signal.SIG_IGN:  # started with nohup: meant to outlive its terminal
+    if before[signal.SIGHUP] is signal.SIG_IGN:  # started with nohup: outlives its terminal
         del before[signal.SIGHUP]
     try:
         for number in before:
@@ -92,13 +92,13 @@ def _handling(handler: Callable[[int, FrameType | None], None]) -> Iterator[None
 
 @contextmanager
 def stop_requests(board: RequestBoard) -> Iterator[None]:
-    """Turns Ctrl-C, SIGTERM and a closed terminal into the wish to stop."""
+    """Turns Ctrl-C, SIGTERM and a closed terminal into a stop request."""
     with _handling(lambda _number, _frame: board.ask_stop()):
         yield
 
 
 class SignalSupervisor(Supervisor):
-    """Turns the signals of the operator into a stop, while a motion is under way."""
+    """Turns the operator's signals into a stop during a motion."""
 
     def during(self, board: RequestBoard, motion: Callable[[], _T]) -> _T:
         """See `Supervisor`."""
@@ -107,14 +107,14 @@ class SignalSupervisor(Supervisor):
 
 
 class RunSupervisor(SignalSupervisor):
-    """What Ctrl-C, SIGTERM and a closed terminal mean before, during and after a run's motion.
+    """Handles Ctrl-C, SIGTERM and a closed terminal before, during and after a run's motion.
 
-    Once something moved, the exit code rests on what the drives did alone: neither a terminal that
-    is gone nor Ctrl-C while the report is made changes it.
+    After a motion, the exit code depends only on what the drives did: neither a closed terminal
+    nor Ctrl-C during the report changes it.
     """
 
     def __init__(self, show: Callable[[Any], None]) -> None:
-        """Nothing moved yet.
+        """Before any motion.
 
         Args:
             show: Shows a `RunResult` when its verdict is known.
@@ -122,7 +122,7 @@ class RunSupervisor(SignalSupervisor):
         super().__init__()
         self.moved = False
         self.code: int | None = None
-        """The exit code, once it is decided."""
+        """The exit code, once decided."""
         self._given_up = False
         self._show = show
         self._signals = ExitStack()
@@ -132,11 +132,11 @@ class RunSupervisor(SignalSupervisor):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """They have it again."""
+        """Restores the usual meaning of signals."""
         self._signals.close()
 
     def take_over(self) -> None:
-        """From now on signals are the run's: the operator agreed to it."""
+        """Takes over the signals, once the operator agreed to the run."""
         self._signals.enter_context(_handling(self._on_signal))
 
     def on_motion(self) -> None:
@@ -146,14 +146,14 @@ class RunSupervisor(SignalSupervisor):
     def on_verdict(self, result: Any) -> None:
         """See `Supervisor`."""
         self.code = result.exit_code
-        say(lambda: self._show(result), result)
+        print_safely(lambda: self._show(result), result)
 
     def leaves_files_out(self) -> bool:
         """See `Supervisor`."""
         return self._given_up
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
-        """Before the motion the end; up to the verdict nothing; then the files are left out.
+        """Interrupts before the motion, does nothing until the verdict, then skips the files.
 
         Raises:
             KeyboardInterrupt: Nothing moved.
@@ -163,17 +163,17 @@ class RunSupervisor(SignalSupervisor):
         if self.code is None:
             return
         if self._given_up:
-            os._exit(self.code)  # a disk that hangs keeps every milder end waiting
+            os._exit(self.code)  # a disk that hangs would block any cleaner exit
         self._given_up = True
         with suppress(OSError):
-            os.write(2, _GIVING_UP)  # print is not to be called in a signal handler
+            os.write(2, _GIVING_UP)  # print is not safe in a signal handler
 
 
-def say(write: Callable[[], None], result: Any) -> None:
-    """Writes to standard output; where that is full or gone, the verdict to standard error.
+def print_safely(write: Callable[[], None], result: Any) -> None:
+    """Writes to standard output; where that fails, the verdict to standard error.
 
     Args:
-        write: Writes it.
+        write: Called to write the text.
         result: The `RunResult`.
     """
     try:
@@ -183,18 +183,18 @@ def say(write: Callable[[], None], result: Any) -> None:
         with suppress(OSError, ValueError):
             output = sys.stdout.fileno()
             nothing = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nothing, output)  # or the interpreter fails to flush it at its end
+            os.dup2(nothing, output)  # or the interpreter fails to flush it at exit
             os.close(nothing)
         line = f"{result.verdict} {result.sentence}"
         show_line(line, err)
 
 
-# Keys of the terminal as they are pressed, for verbs that an operator drives by hand.
+# Keys of the terminal as they are pressed.
 
 
 _ONE = re.compile(rb"\x1b[\[O][0-9;]*[A-Za-z~]|.", re.DOTALL)
 _CHUNK = 4096
-#: Keys that send more than one byte, by what follows the escape and ``[`` or ``O``.
+#: Keys that send more than one byte, by the bytes after the escape and ``[`` or ``O``.
 NAMES = {
     b"A": "up",
     b"B": "down",
@@ -205,30 +205,30 @@ NAMES = {
 }
 
 
-#: What + and - change a speed by, in per cent.
+#: Step of the speed for + and -, in per cent.
 SPEED_STEP = 10
 
 
 def speed_by_key(percent: int, key: str) -> int:
-    """A speed after ``+`` or ``-``, in per cent of the largest."""
+    """The speed after ``+`` or ``-``, in per cent of the largest."""
     step = SPEED_STEP if key == "+" else -SPEED_STEP
     return min(max(percent + step, SLOWEST), FASTEST)
 
 
 class Keys:
-    """Reads keys without Enter and without echo, to the end of the ``with`` block."""
+    """Reads keys without Enter and without echo until the end of the ``with`` block."""
 
     def __init__(self) -> None:
-        """Of standard input.
+        """Keys from standard input.
 
         Raises:
-            BadInput: It is no terminal.
+            BadInput: It is not a terminal.
         """
         if not sys.stdin.isatty():
             raise BadInput(
                 "standard input is not a terminal",
                 where="keys",
-                next_step="run it in a terminal, without a pipe",
+                next_step="run the command in a terminal, without a pipe",
             )
         self._input = sys.stdin.fileno()
         self._before = termios.tcgetattr(self._input)
@@ -239,14 +239,14 @@ class Keys:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """What was typed and not read is thrown away: it was not meant for the shell."""
+        """Discards keys typed but not read: they were not meant for the shell."""
         termios.tcsetattr(self._input, termios.TCSAFLUSH, self._before)
 
     def pressed(self, wait: float = 0.0) -> list[str]:
         """Keys pressed since the last call: characters, and names as in `NAMES`.
 
         Args:
-            wait: For the first one, [s].
+            wait: Longest wait for the first one, [s].
         """
         if not select.select([self._input], [], [], wait)[0]:
             return []
@@ -254,7 +254,7 @@ class Keys:
 
 
 def names_of(data: bytes) -> list[str]:
-    """The keys in what a terminal sent; those without a name here are left out."""
+    """The keys in the bytes of a terminal; keys without a name in `NAMES` are left out."""
     found = []
     for one in _ONE.findall(data):
         name = NAMES.get(one[2:]) if len(one) > 1 else one.decode("ascii", errors="ignore")

@@ -1,17 +1,17 @@
-/* Which button is possible in which state, and why not: one table, and what it does to the page.
+/* When each button is enabled, and the reason when not: one table, applied to the page.
 
-`situation` is `{ state, stale }`: the server's last state, and why it does not count (text) or null. */
+`situation` is `{ state, stale }`: the server's last state, and why it is stale (text) or null. */
 
 import { mark } from "./elements.js";
 
 const MOVING = ["enabling", "approaching", "moving", "holding", "stopping", "securing"];
 const ACTIVE = ["preparing", ...MOVING];
-const VERBS = { run: "A run is under way", home: "Homing is under way", reset: "A reset is under way", release: "The drives are being released", plan: "A plan is being made", jog: "Jogging is enabled: end it first" };
+const VERBS = { run: "A run is in progress", home: "Homing is in progress", reset: "A reset is in progress", release: "The drives are being released", plan: "Planning is in progress", jog: "Jogging is enabled: end it first" };
 
 export const isActive = (motion) => motion !== null && ACTIVE.includes(motion.state);
 const isJogging = ({ busy, jog, cable }) => jog.ready || cable.ready || busy?.verb === "jog";
 
-/** Each is a reason why not, or null. Order in `BUTTONS` is the order in which reasons are given. */
+/** Each gives a reason, or null if fulfilled; `BUTTONS` orders them. */
 const REQUIREMENTS = {
   fresh: ({ stale, state }) => stale ?? (state ? null : "Waiting for data"),
   writable: ({ state }) => (state.read_only ? "This console is read-only" : null),
@@ -22,31 +22,31 @@ const REQUIREMENTS = {
   unlatched: ({ state }) => (state.latched === null ? null : "A fault is latched: reset it first"),
   homed: ({ state: { reference } }) => (reference.counts ? null : reference.why_not || "The drives are not homed"),
   idle: ({ state }) => {
-    if (state.busy) return VERBS[state.busy.verb] ?? "Something is under way";
+    if (state.busy) return VERBS[state.busy.verb] ?? "A command is in progress";
     if (state.jog.ready || state.cable.ready) return VERBS.jog;
     return isActive(state.motion) ? "The platform is in motion" : null;
   },
   moves: ({ state: { motion } }) => (motion && MOVING.includes(motion.state) ? null : "Nothing is moving"),
-  path: ({ state }) => (isJogging(state) ? "A jog has no path: let go to stop it" : null),
-  going: ({ state: { motion } }) => (motion.wished.stop || ["stopping", "securing"].includes(motion.state) ? "It is stopping" : null),
-  unheld: ({ state: { motion } }) => (motion.wished.hold ? "It is held already" : null),
-  held: ({ state: { motion } }) => (motion.wished.hold ? null : "It is not held"),
+  path: ({ state }) => (isJogging(state) ? "A jog has no path: release the control to stop" : null),
+  going: ({ state: { motion } }) => (motion.wished.stop || ["stopping", "securing"].includes(motion.state) ? "The run is stopping" : null),
+  unheld: ({ state: { motion } }) => (motion.wished.hold ? "The run is already held" : null),
+  held: ({ state: { motion } }) => (motion.wished.hold ? null : "The run is not held"),
   planned: ({ state }) => (state.preview ? null : "Load or make a plan first"),
-  proved: ({ preview }) => (preview === undefined || !preview ? "The plan is being read" : preview.passed ? null : "The plan did not pass its check"),
+  proved: ({ preview }) => (preview === undefined || !preview ? "The plan is loading" : preview.passed ? null : "The plan did not pass its check"),
   jogging: ({ state }) => (isJogging(state) ? null : "Jogging is not enabled"),
   jog_ready: ({ state: { jog } }) => (jog.ready ? null : jog.why_not || "Enable the drives for jogging first"),
   cable_ready: ({ state: { cable } }) => (cable.ready ? null : cable.why_not || "Enable the drives for single cables first"),
   service: ({ state: { control } }) => (control.mode === "service" ? null : "Enter service mode first"),
   not_service: ({ state: { control } }) => (control.mode === "service" ? "This page is in service mode" : null),
   idle_but_cables: (situation) => (situation.state.cable.ready ? null : REQUIREMENTS.idle(situation)),
-  located: ({ state }) => (state.platform ? null : "The platform’s position is not known"),
-  poses: ({ state }) => (state.poses.length ? null : "No pose is taught yet"),
+  located: ({ state }) => (state.platform ? null : "The platform’s position is unknown"),
+  poses: ({ state }) => (state.poses.length ? null : "No pose has been taught"),
   two_poses: ({ state }) => (state.poses.length > 1 ? null : "Teach two poses first"),
 };
 
 const OPERATOR = ["fresh", "writable", "control"];
 
-/** What each button needs. STOP needs nothing. */
+/** Requirements of each button; STOP has none. */
 export const BUTTONS = {
   stop: [],
   take_control: ["fresh", "writable", "not_mine"],
@@ -76,7 +76,7 @@ export const BUTTONS = {
   edit_pose: [...OPERATOR, "poses"],
 };
 
-/** Why a button is not possible now, or null. */
+/** Why a button is disabled, or null. */
 export function whyNot(button, situation) {
   for (const name of BUTTONS[button]) {
     const reason = REQUIREMENTS[name](situation);
@@ -85,7 +85,7 @@ export function whyNot(button, situation) {
   return null;
 }
 
-/** Marks every element that has `data-button`: it stays reachable, so that its reason can be read. */
+/** Updates every element with `data-button`; disabled buttons stay focusable, so that the reason can be read. */
 export function applyButtons(root, situation) {
   const reasons = Object.fromEntries(Object.keys(BUTTONS).map((name) => [name, whyNot(name, situation)]));
   for (const element of root.querySelectorAll("[data-button]")) {
@@ -98,7 +98,7 @@ export function applyButtons(root, situation) {
   }
 }
 
-/** A press of a button that is not possible does nothing but say why: `say(text)`. */
+/** A press of a disabled button only shows the reason, by `say(text)`. */
 export function guardButtons(root, say) {
   root.addEventListener("click", (event) => {
     const button = event.target instanceof Element && event.target.closest("button[aria-disabled=true]");

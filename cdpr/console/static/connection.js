@@ -1,21 +1,21 @@
-/* The connection to the server and the age of what it sent, by the page's own monotonic clock.
+/* The connection to the server and the age of its data, on the page's monotonic clock.
 
-Nothing is kept for later: a message that cannot be sent now is never sent. After a reconnection nothing goes on
-by itself. Events: "state" (a new one), "age" (every 50 ms), "stale" (data became too old), "closed", "refused" (a
-message that the server did not understand; `detail` says why). */
+Nothing is queued: a message that cannot be sent now is never sent, and no motion continues after a reconnection.
+Events: "state" (a new one), "age" (every 50 ms), "stale" (data became too old), "closed", "refused" (a message that
+the server rejected; `detail` gives the reason). */
 
-/** One frame of the page and one state less than the 0.5 s within which it must say so. */
+/** The page must report stale data within 0.5 s: less one frame and one state. */
 export const STALE_S = 0.45;
 const TICK_MS = 50, ANSWER_MS = 5000, RECONNECT_MS = [250, 500, 1000, 2000];
-/** States of a run whose own report must be young; before and after them nothing moves. */
+/** States of a run whose own status must be fresh; in all others nothing moves. */
 const REPORTING = ["enabling", "approaching", "moving", "holding", "stopping", "securing"];
 
-/** The token of the page's address, or of its head. */
+/** The token from the page's address or head. */
 export function pageToken() {
   return new URLSearchParams(location.search).get("token") || document.querySelector("meta[name=token]")?.content || "";
 }
 
-/** An address of this server with the token. */
+/** A path on this server, with the token. */
 export function address(path) {
   return `${path}${path.includes("?") ? "&" : "?"}token=${encodeURIComponent(pageToken())}`;
 }
@@ -24,11 +24,11 @@ export class Connection extends EventTarget {
   state = null;
   #socket = null;
   #received = null; // performance.now() of the last state
-  #answers = new Map(); // id → what to do with the answer
+  #answers = new Map(); // id → callback
   #id = 0;
   #tries = 0;
   #wasFresh = false;
-  #due = 0; // timer of the moment at which the last state becomes too old
+  #due = 0; // timer for the time at which the last state becomes stale
 
   start() {
     this.#connect();
@@ -39,7 +39,7 @@ export class Connection extends EventTarget {
     return this.#socket?.readyState === WebSocket.OPEN;
   }
 
-  /** Why the data do not count, or null; the age of the data, [s]. */
+  /** Why the data are stale, or null; the age of the data, [s]. */
   freshness() {
     if (this.#received === null) return { why: this.open ? "Waiting for data" : "Not connected to the console’s server", age: null };
     const here = (performance.now() - this.#received) / 1000;
@@ -52,14 +52,14 @@ export class Connection extends EventTarget {
     return { why: `No data from ${who} for ${age.toFixed(1)} s`, age };
   }
 
-  /** Whether it went out. */
+  /** Whether the message was sent. */
   send(message) {
     if (!this.open) return false;
     this.#socket.send(JSON.stringify(message));
     return true;
   }
 
-  /** Sends a command; its answer `{ok, what}`, also where there is none. */
+  /** Sends a command; resolves to `{ok, what}`, also without an answer. */
   command(command, fields = {}) {
     const id = ++this.#id;
     return new Promise((resolve) => {
@@ -74,7 +74,7 @@ export class Connection extends EventTarget {
     });
   }
 
-  /** Asks for a stop along the path by every route that is there; the first good answer, or else why not. */
+  /** Requests a path stop by every available route; resolves to the first success, or else a failure. */
   async stop() {
     const routes = [];
     if (this.open) routes.push(this.command("stop"));
@@ -93,7 +93,7 @@ export class Connection extends EventTarget {
   }
 
   #closed() {
-    for (const give of [...this.#answers.values()]) give({ ok: false, what: "The connection was lost before the answer." });
+    for (const give of [...this.#answers.values()]) give({ ok: false, what: "The connection was lost before an answer arrived." });
     this.#wasFresh = false;
     this.dispatchEvent(new Event("closed"));
     setTimeout(() => this.#connect(), RECONNECT_MS[Math.min(this.#tries++, RECONNECT_MS.length - 1)]);

@@ -30,7 +30,7 @@ const tensionLines = (count) => [
 ];
 const CLEARANCE = [{ label: "clearance", role: "encoder" }, { label: "required", role: "limit", dash: [6, 4] }];
 
-/** A figure whose plot is as wide as it is. */
+/** A plot that fills the width of its figure. */
 class Plot {
   #plot;
 
@@ -62,7 +62,7 @@ export class Curves {
   #drawn = 0;
   #limits = [0, 0];
 
-  /** Takes a state that came at `now`, [ms]. */
+  /** Takes a state received at `now`, [ms]. */
   show(state, now) {
     const { tensions_n: tensions, clearance_mm: clearance, motion } = state;
     this.#limits = state.tension_limits_n;
@@ -98,7 +98,7 @@ export class Curves {
   }
 }
 
-/** The curves of a plan; those that were there go. */
+/** The curves of the loaded plan. */
 export class PlanCurves {
   #plots = [];
 

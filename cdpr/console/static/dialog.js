@@ -1,12 +1,12 @@
-/* A question before something that cannot be taken back. It is not modal to STOP, which stays in its place above it. */
+/* A confirmation before a command. STOP stays visible above it and usable. */
 
 import { at, make } from "./elements.js";
 
 let open = null; // {possible, close}
 
 /**
- * Asks; true when it was confirmed. `lines` are plain texts or nodes. The question goes away by itself when `possible()`
- * gives a reason why not, which is handed to `say`.
+ * Asks; resolves to true when confirmed. `lines` are plain texts or nodes. The question closes when `possible()` returns a
+ * reason, which is passed to `say`.
  */
 export function ask({ title, lines, confirm, possible, say }) {
   open?.close(false);
@@ -29,8 +29,8 @@ export function ask({ title, lines, confirm, possible, say }) {
     box.addEventListener("keydown", (event) => {
       if (event.key !== "Tab") return;
       event.preventDefault(); // between the two answers and STOP
-      const round = [cancel, yes, at("stop")], place = round.indexOf(document.activeElement);
-      round[(place + (event.shiftKey ? 2 : 1)) % 3].focus();
+      const round = [cancel, yes, at("stop")], index = round.indexOf(document.activeElement);
+      round[(index + (event.shiftKey ? 2 : 1)) % 3].focus();
     });
     shade.replaceChildren(box);
     shade.hidden = false;
@@ -40,7 +40,7 @@ export function ask({ title, lines, confirm, possible, say }) {
   });
 }
 
-/** Ends a question that is no longer possible; to be called with every state. */
+/** Closes a question that no longer applies; to be called with every state. */
 export function checkDialog() {
   const why = open?.possible();
   if (!why) return;

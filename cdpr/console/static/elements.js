@@ -1,4 +1,4 @@
-/* Small things of the page's tree: finding and making elements, writing texts and numbers. */
+/* DOM elements: finding and creating them, writing texts and numbers. */
 
 export const at = (id) => document.getElementById(id);
 
@@ -14,36 +14,36 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** The value of the radio button of a name that is chosen, or null. */
+/** The value of the checked radio button of a group, or null. */
 export function chosen(name) {
   return document.querySelector(`input[name="${name}"]:checked`)?.value ?? null;
 }
 
-/** Writes a text where it differs: a screen reader would read what is written again. */
+/** Writes a text only if it differs: a screen reader would repeat it otherwise. */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** Sets an attribute where it differs; null removes it. */
+/** Sets an attribute only if it differs; null removes it. */
 export function mark(element, name, value) {
   if (value === null) element.removeAttribute(name);
   else if (element.getAttribute(name) !== value) element.setAttribute(name, value);
 }
 
-/** A number with its unit, or a dash for one that is not known. */
+/** A number with its unit, or a dash if unknown. */
 export function known(value, digits, unit = "") {
   const number = value === null || value === undefined ? "–" : value.toFixed(digits).replace("-", "\u2212");
   return unit && number !== "–" ? `${number}\u00a0${unit}` : number;
 }
 
-/** Seconds as people write them. */
+/** A duration as text. */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";
   const whole = Math.round(seconds);
   return whole < 60 ? `${seconds.toFixed(1)}\u00a0s` : `${Math.floor(whole / 60)}\u00a0min ${whole % 60}\u00a0s`;
 }
 
-/** Whether a key typed there is text: a space belongs to it. */
+/** Whether keys typed there are text, including the space. */
 export function isTextField(target) {
   if (!(target instanceof Element)) return false;
   if (target.closest("textarea, [contenteditable='true']")) return true;
@@ -51,13 +51,13 @@ export function isTextField(target) {
   return target instanceof HTMLInputElement && !other.includes(target.type);
 }
 
-/** A link within this server, in a tab of its own; null for any other address. */
+/** A link to this server that opens a new tab; null for any other address. */
 export function link(address, text) {
   if (typeof address !== "string" || !address.startsWith("/") || address.startsWith("//")) return null;
   return make("a", { href: address, target: "_blank", rel: "noopener" }, text);
 }
 
-/** The first of "pose 1", "pose 2" … that no pose has. */
+/** The first of "pose 1", "pose 2" … that is not in use. */
 export function freeName(kind, poses) {
   const taken = poses.map(({ name }) => name);
   return taken.concat("").map((_, k) => `${kind} ${k + 1}`).find((name) => !taken.includes(name));

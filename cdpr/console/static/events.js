@@ -1,10 +1,10 @@
-/* What happened, how cameras and drives do, and what went wrong on the bus. */
+/* Events, state of cameras and drives, and error counts of the bus. */
 
 import { address } from "./connection.js";
 import { at, known, make, write } from "./elements.js";
 
 const MOST = 200;
-/** Codes that have a page of help, `/help/CODE`; the files of docs/faults. */
+/** Codes with a help page `/help/CODE`; the files of docs/faults. */
 export const HELP = new Set([
   "broken", "bus_down", "bus_errors", "bus_failed", "bus_gone", "bus_lost", "bus_off", "bus_passive", "cable_loose", "camera",
   "camera_sees_nothing", "clearance_low", "drive_fault", "drive_silent", "drive_stuck", "drive_warning", "following_error",
@@ -13,7 +13,7 @@ export const HELP = new Set([
   "stop_not_sent", "supervisor_lost", "transmit_queue_full", "went_slack",
 ]);
 
-/** Keeps events of all motions that this page saw, the newest first. */
+/** Keeps the events of all motions since the page was opened, newest first. */
 export class Events {
   #seen = new Set();
   #rows = [];
@@ -40,7 +40,7 @@ export class Events {
 
 function row({ time_s: time, code, text }) {
   const help = HELP.has(code)
-    ? make("a", { href: address(`/help/${code}`), target: "_blank", rel: "noopener", title: "What it means and what to do" }, code)
+    ? make("a", { href: address(`/help/${code}`), target: "_blank", rel: "noopener", title: "Meaning and next step" }, code)
     : code;
   return make("li", {}, make("span", { class: "time figure" }, known(time, 2, "s")), make("b", {}, help), make("span", {}, text));
 }
@@ -56,7 +56,7 @@ function driveCells(drive, cable) {
   return [`${cable} (drive ${drive.node})`, known(drive.tension_n, 1, "N"), drive.state, known(drive.position_counts, 0), known(drive.set_counts, 0)];
 }
 
-/** Rows of a table, written over those that are there; the table goes when there is none. */
+/** Updates the rows of a table in place; an empty table is hidden. */
 function fill(name, rows) {
   const body = at(name);
   at(`${name}-table`).hidden = rows.length === 0;

@@ -1,14 +1,14 @@
-/* Hold-to-run: one press, from its begin to its end, as messages; no page in here, and the clock is given.
+/* Hold-to-run: one press from begin to end, as messages; independent of the page and its clock.
 
 A press has a source (a pointer, a key, a stick) and a motion: `{direction}` of the platform, or `{cable, sense}` of one
-cable. While it lasts `held` goes out every 50 ms, and `let_go` at once when
-it ends, by whatever. A press that ended never comes back: the source has to be released and pressed again. */
+cable. `held` is sent every 50 ms while it lasts, and `let_go` immediately when it ends, for any reason. An ended press
+never continues: the source has to be released and pressed again. */
 
 const EVERY_MS = 50;
-/** The server has ended a jog after 150 ms without a word: a page that was held up longer must not go on. */
+/** The run ends a jog after 150 ms without a message: a page delayed for longer must not continue. */
 const LONGEST_GAP_MS = 150;
 
-/** The page's clock: milliseconds that only rise, and something done again and again until it is cancelled. */
+/** The page's clock: monotonic milliseconds, and a repeated call that can be cancelled. */
 const CLOCK = {
   now: () => performance.now(),
   every: (milliseconds, act) => {
@@ -21,15 +21,15 @@ export class Hold {
   #options;
   #cancel = null;
   #press = null; // {number, source, motion, share}
-  // Rises with each press, over a reload as well.
+  // Rises with each press, also across a reload.
   #number = Date.now();
   #seq = 0;
   #last = 0;
 
   /**
-   * `send(message)` is false when it could not be sent; `whyNot(motion)` says why it is not possible, or null;
-   * `settings(motion)` gives `{step_mm, speed_mm_s}` and of the platform `frame`; `changed(press, why)` hears of each
-   * begin (null) and end; `clock` is for tests.
+   * `send(message)` returns false if not sent; `whyNot(motion)` returns a reason or null; `settings(motion)` returns
+   * `{step_mm, speed_mm_s}`, and `frame` for the platform; `changed(press, why)` is called at each begin (null) and end;
+   * `clock` is for tests.
    */
   constructor(options) {
     this.#options = { clock: CLOCK, ...options };
@@ -39,7 +39,7 @@ export class Hold {
     return this.#press?.source ?? null;
   }
 
-  /** Begins a press, or ends the one there is: two at once are a mistake. `share` is of the speed, 0 to 1. */
+  /** Begins a press, or ends the present one: two at once are an error. `share` is a fraction of the speed, 0 to 1. */
   press(source, motion, share = 1) {
     if (this.#press) return this.end(source === this.#press.source ? "pressed twice" : "a second control was pressed");
     const why = this.#options.whyNot(motion);
@@ -48,17 +48,17 @@ export class Hold {
     this.#last = this.#options.clock.now();
     this.#cancel = this.#options.clock.every(EVERY_MS, () => this.#tick());
     this.#options.changed(this.#press, null);
-    this.#say();
+    this.#sendHeld();
   }
 
-  /** A stick that is held farther, or less far; one that points elsewhere ends the press: its motion is fixed. */
+  /** A stick's deflection changes the speed; a new direction ends the press, as its motion is fixed. */
   steer(source, motion, share) {
     if (this.#press?.source !== source) return;
     if (isSame(this.#press.motion, normed(motion))) this.#press.share = share;
-    else this.end("the stick was turned");
+    else this.end("the stick changed direction");
   }
 
-  /** The source is no longer pressed. */
+  /** The source was released. */
   release(source) {
     if (this.#press?.source === source) this.end("released");
   }
@@ -75,21 +75,21 @@ export class Hold {
 
   #tick() {
     const now = this.#options.clock.now(), gap = now - this.#last;
-    if (gap > LONGEST_GAP_MS) return this.end(`this page was held up for ${Math.round(gap)} ms`);
+    if (gap > LONGEST_GAP_MS) return this.end(`this page was delayed by ${Math.round(gap)} ms`);
     const why = this.#options.whyNot(this.#press.motion);
     if (why) return this.end(why);
     this.#last = now;
-    this.#say();
+    this.#sendHeld();
   }
 
-  #say() {
+  #sendHeld() {
     const { number, motion, share } = this.#press, { speed_mm_s, ...settings } = this.#options.settings(motion);
     const message = { kind: "held", hold: number, ...motion, ...settings, speed_mm_s: share * speed_mm_s, seq: ++this.#seq };
     if (!this.#options.send(message)) this.end("the connection was lost");
   }
 }
 
-/** Of its directions, the longest angle apart that still is one: 45°. */
+/** Cosine of the largest angle between directions of one press, 45°. */
 const SAME = Math.SQRT1_2;
 
 function isSame(one, other) {

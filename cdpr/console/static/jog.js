@@ -1,10 +1,10 @@
-/* The jog panels, of the platform and of one cable: buttons, keys and a gamepad hold the one press of hold.js. */
+/* The jog panels of the platform and of one cable: buttons, keys and a gamepad hold the single press of hold.js. */
 
 import { at, chosen, known, make, mark, write } from "./elements.js";
 import { Hold } from "./hold.js";
 import { whyNot } from "./buttons.js";
 
-/** Axes of the standard gamepad: left stick x and y, right stick up and down; a stick counts beyond the dead zone. */
+/** Axes of the standard gamepad: left stick x and y, right stick z, each beyond the dead zone. */
 const DEAD_ZONE = 0.25, POLL_MS = 50, SHOULDERS = [4, 5];
 
 function beyond(v) {
@@ -16,7 +16,7 @@ function stepOf(group) {
   return step === "null" ? null : Number(step);
 }
 
-/** What differs between both panels, by the name of the panel and of its buttons. */
+/** Differences between the two panels, by panel name. */
 const PADS = {
   jog: {
     view: "jog",
@@ -43,8 +43,8 @@ const motionOf = (button) => PADS[button.closest("#jog-pad") ? "jog" : "cable"].
 const panelOf = (motion) => (motion.direction ? "jog" : "cable");
 
 /**
- * Binds both panels. `situation()` as in buttons.js; `command(name)` sends one. The answer has `end(why)`, to be called
- * when the page changes under the operator's hands, and `show(state)`.
+ * Binds both panels. `situation()` as in buttons.js; `command(name)` sends a command. Returns `end(why)`, to be called
+ * when the page changes during a press, and `show(state)`.
  */
 export function bindJog(connection, situation, command) {
   const hold = new Hold({
@@ -75,7 +75,7 @@ export function bindJog(connection, situation, command) {
   at("jog-begin").addEventListener("click", () => command("jog_begin"));
   bindPointers(hold);
   bindEnds(hold);
-  at("cables").addEventListener("change", () => hold.end("another cable was chosen"));
+  at("cables").addEventListener("change", () => hold.end("another cable was selected"));
   for (const event of ["stale", "closed"]) connection.addEventListener(event, () => hold.end("data are too old"));
 
   return {
@@ -90,7 +90,7 @@ export function bindJog(connection, situation, command) {
 function showPad(panel, jog, text) {
   at(`${panel}-pad`).classList.toggle("ready", jog.ready);
   write(at(`${panel}-state`), text);
-  if (jog.speed_mm_s) mark(at(`${panel}-speed`), "max", String(jog.speed_mm_s)); // the fastest that it may be
+  if (jog.speed_mm_s) mark(at(`${panel}-speed`), "max", String(jog.speed_mm_s)); // the limit of the session
   showSpeed(panel);
   write(at(`${panel}-limit`), jog.limit ?? "");
   at(`${panel}-limit`).hidden = !jog.limit;
@@ -111,15 +111,15 @@ function showCable({ cable: jog, tensions_n: tensions, tension_limits_n: [low, h
   track.style.setProperty("--high", `${(100 * limit) / full}%`);
   at("cable-bar").style.width = `${tension === null ? 0 : Math.min(100, Math.max(0, (100 * tension) / full))}%`;
   at("cable-bar").style.background = tension === null ? "" : globalThis.tensionColour((tension - low / 2) / (limit - low / 2));
-  write(at("cable-tension"), number ? `Cable ${number}: ${known(tension, 1, "N")}` : "No cable is known yet");
+  write(at("cable-tension"), number ? `Cable ${number}: ${known(tension, 1, "N")}` : "No cable data yet");
   write(at("cable-range"), `slack below ${known(low / 2, 1, "N")}, limit ${known(limit, 0, "N")}`);
   const sense = (mm) => (Math.abs(mm) < 0.0005 ? "not moved" : `${known(Math.abs(mm), 3, "mm")} ${mm > 0 ? "paid out" : "wound in"}`);
-  const own = jog.cable === number ? `By this press ${sense(jog.press_mm)} · since` : "Since";
-  write(at("cable-way"), jog.ready && number ? `${own} the session began ${sense(jog.session_mm[number - 1])}` : "");
+  const own = jog.cable === number ? `This press: ${sense(jog.press_mm)} · since` : "Since";
+  write(at("cable-travel"), jog.ready && number ? `${own} the session began ${sense(jog.session_mm[number - 1])}` : "");
   showPad("cable", jog, jog.ready ? (jog.moving ? `Cable ${jog.cable} is held` : "Ready: hold a button to move the cable") : jog.why_not || "The drives are not enabled");
 }
 
-/** Numbered as in the scene; the first is chosen. */
+/** Cable numbers as in the scene; the first is selected. */
 function makeCables(list, count) {
   const choices = Array.from({ length: count }, (_, k) =>
     make("label", {}, make("input", { type: "radio", name: "cable", value: String(k + 1), "data-button": "cable_setting", checked: k === 0, "aria-label": `Cable ${k + 1}` }), make("span", {}, String(k + 1))));
@@ -133,8 +133,8 @@ function showSpeed(panel) {
 }
 
 function bindPointers(hold) {
-  const down = new Set(); // pointers that are down anywhere on the page
-  let refused = null; // the pointer that ended a press must not begin the next
+  const down = new Set(); // pointers down anywhere on the page
+  let refused = null; // a pointer that ended a press must not begin the next
   window.addEventListener("pointerdown", (event) => {
     down.add(event.pointerId);
     refused = hold.source === null ? null : event.pointerId;
@@ -145,7 +145,7 @@ function bindPointers(hold) {
     hold.release(`pointer ${event.pointerId}`);
   }, { capture: true });
   window.addEventListener("pointermove", (event) => {
-    if (hold.source === `pointer ${event.pointerId}` && event.buttons !== 1) hold.end("another button of the mouse");
+    if (hold.source === `pointer ${event.pointerId}` && event.buttons !== 1) hold.end("another mouse button");
   }, { capture: true });
   for (const button of document.querySelectorAll("[data-jog]")) {
     button.addEventListener("pointerdown", (event) => {
@@ -154,12 +154,12 @@ function bindPointers(hold) {
       hold.press(`pointer ${event.pointerId}`, motionOf(button));
     });
     button.addEventListener("lostpointercapture", (event) => hold.release(`pointer ${event.pointerId}`));
-    // A long touch is a press, not the menu of the browser.
+    // A long touch is a press, not the browser's menu.
     button.addEventListener("touchstart", (event) => event.preventDefault(), { passive: false });
   }
 }
 
-/** Arrows and page keys while the pad has the focus; Enter presses the button that has it. */
+/** Arrow and page keys while the pad has the focus; Enter presses the focused button. */
 function bindKeys(pad, hold, { keys, motion }) {
   pad.addEventListener("keydown", (event) => {
     const name = event.key === "Enter" ? event.target.dataset.jog : keys[event.key];
@@ -185,14 +185,14 @@ function bindEnds(hold) {
   }, { capture: true });
 }
 
-/** A shoulder button held and a stick away from its centre, in that order: a stick alone moves nothing. */
+/** Needs a shoulder button held first, then a deflected stick: a stick alone moves nothing. */
 function bindGamepad(panel, hold, { view, stick }) {
   const box = at(`${panel}-gamepad`), text = at(`${panel}-gamepad-state`), source = `gamepad ${panel}`;
-  let centred = false; // since the last press: a stick that is still held after its press ended must not begin another
+  let centred = false; // since the last press: a stick still deflected after its press ended must not begin another
 
   function poll() {
     const pad = box.checked ? [...navigator.getGamepads()].find((one) => one?.connected && one.mapping === "standard") : null;
-    write(text, !box.checked ? "" : pad ? "Connected: hold a shoulder button and move a stick" : "No gamepad found: press one of its buttons");
+    write(text, !box.checked ? "" : pad ? "Connected: hold a shoulder button and move a stick" : "No gamepad found: press any of its buttons");
     if (!pad) {
       centred = false;
       return hold.release(source);
@@ -215,5 +215,5 @@ function bindGamepad(panel, hold, { view, stick }) {
     centred = false;
     hold.release(source);
   });
-  box.addEventListener("change", () => hold.end("the gamepad was switched"));
+  box.addEventListener("change", () => hold.end("the gamepad was switched on or off"));
 }

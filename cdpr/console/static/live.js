@@ -1,16 +1,16 @@
-/* Figures of this moment: lamps, position, clearance, next stop, tensions between their limits, how the loop keeps time. */
+/* Live figures: lamps, position, clearance, next stop, tensions and their limits, timing of the loop. */
 
 import { isActive } from "./buttons.js";
 import { at, duration, known, make, mark, write } from "./elements.js";
 
-/** Lamps: what is shown, and whether that is good (pass), bad (fail), worth a look (stop) or neither (quiet). */
+/** Lamps: text, and level: good (pass), bad (fail), attention (stop) or neutral (quiet). */
 const LAMPS = {
   control: ({ control, read_only: readOnly }) =>
     readOnly ? ["Read-only", "quiet"] : control.mode === "service" ? ["Service mode", "stop"] : control.yours ? ["You have control", "pass"] : [control.held_by ? `Control: ${control.held_by}` : "Control is free", "quiet"],
   drives: ({ motion, jog, cable }) => {
     const drives = motion?.drives ?? [], on = drives.filter((d) => d.state === "operation enabled").length;
     const ready = jog.ready || cable.ready;
-    if (!drives.length) return [ready ? "Drives on" : "Drives not heard", ready ? "stop" : "quiet"];
+    if (!drives.length) return [ready ? "Drives on" : "No drive data", ready ? "stop" : "quiet"];
     return [`${on} of ${drives.length} drives on`, drives.some((d) => d.state.includes("fault")) ? "fail" : on ? "stop" : "quiet"];
   },
   homed: ({ reference }) => [reference.counts ? "Homed" : "Not homed", reference.counts ? "pass" : "stop"],
@@ -22,7 +22,7 @@ const STATES = {
   stopping: "Stopping", securing: "Securing", finished: "Finished", stopped: "Stopped", latched: "Stopped by a fault", releasing: "Releasing",
 };
 
-/** What moves, in a few words. */
+/** The present motion, in a few words. */
 export function motionText({ motion, busy, jog, cable, latched }) {
   if (jog.ready) return jog.moving ? "Jogging" : "Ready to jog";
   if (cable.ready) return cable.moving ? `Jogging cable ${cable.cable}` : "Ready to jog a cable";
@@ -34,7 +34,7 @@ export function motionText({ motion, busy, jog, cable, latched }) {
   return latched === null ? "At rest" : "Fault latched";
 }
 
-/** A pose by the cameras that is older says nothing of now, [s]. */
+/** Largest age of a measured pose that is shown as current, [s]. */
 const FRESH_S = 1;
 export const isFresh = (measured) => measured !== null && measured.age_s <= FRESH_S;
 
@@ -43,7 +43,7 @@ function measuredClearance(measured) {
   if (!isFresh(measured)) return `no measured pose for ${known(measured.age_s, 0, "s")}`;
   const { clearance, within_mm: within, stated } = measured;
   if (clearance) return `measured ${known(clearance.distance_mm, 1)} (${known(clearance.low_mm, 1)}–${known(clearance.high_mm, 1)})`;
-  return `pose measured to ±${known(within, 2, "mm")}${stated ? "" : " by scatter alone"}`;
+  return `pose measured to ±${known(within, 2, "mm")}${stated ? "" : " from scatter only"}`;
 }
 
 export class Live {
@@ -70,7 +70,7 @@ export class Live {
       write(at(`measured-${axis}`), measured ? `measured ${isFresh(measured) ? known(measured.position_mm[k], 2) : "–"}` : "");
     });
     tile("tilt", known(platform?.tilt_deg, 2));
-    const note = platform === null ? "not known" : platform.source === "plan" ? "by the plan" : `turn ${known(platform.turn_deg, 2)}°`;
+    const note = platform === null ? "unknown" : platform.source === "plan" ? "from the plan" : `turn ${known(platform.turn_deg, 2)}°`;
     write(at("note-tilt"), note);
   }
 
@@ -78,7 +78,7 @@ export class Live {
     tile("clearance", known(clearance?.now, 1));
     const low = Boolean(clearance) && clearance.now < clearance.required;
     at("tile-clearance").classList.toggle("bad", low);
-    write(at("note-clearance"), clearance ? `${low ? "below" : "of"} ${known(clearance.required, 0, "mm")} · ${clearance.pair.join(" – ")}` : "no obstacle near, or not known");
+    write(at("note-clearance"), clearance ? `${low ? "below" : "of"} ${known(clearance.required, 0, "mm")} · ${clearance.pair.join(" – ")}` : "no obstacle near, or unknown");
     write(at("note-measured"), measuredClearance(measured));
     tile("stop", stop ? known(stop.distance_mm, 0) : "–");
     write(at("note-stop"), stop ? `${stop.name} in ${duration(stop.seconds)}` : "none ahead");
@@ -89,7 +89,7 @@ export class Live {
     at("tile-lost").classList.toggle("bad", (motion?.lost_replies ?? 0) > 0);
   }
 
-  /** Bars reach from zero to a little above the upper limit; the allowed range is marked. */
+  /** Bars range from zero to 110 % of the upper limit, with the limits marked. */
   #tensions({ tensions_n: tensions, tension_limits_n: [low, high] }) {
     const list = at("tensions"), full = 1.1 * high;
     if (tensions && this.#bars.length !== tensions.length) this.#make(tensions.length, list);
@@ -106,7 +106,7 @@ export class Live {
     const words = (tensions ?? []).flatMap((t, k) =>
       t < low ? `Cable ${k + 1} is slack: ${known(t, 1, "N")}, at least ${known(low, 0, "N")}`
         : t > high ? `Cable ${k + 1} is too tight: ${known(t, 1, "N")}, at most ${known(high, 0, "N")}` : []);
-    write(at("tension-trouble"), tensions ? words.join(". ") : "Not known: tensions are measured while drives are enabled.");
+    write(at("tension-trouble"), tensions ? words.join(". ") : "Unknown: tensions are measured while the drives are enabled.");
     mark(at("tension-trouble"), "class", words.length ? "trouble" : "quiet");
     at("tension-trouble").hidden = Boolean(tensions) && !words.length;
   }

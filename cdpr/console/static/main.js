@@ -1,4 +1,4 @@
-/* The console's page: puts its parts together, and shows each state to all of them. */
+/* The console's page: creates its parts and passes each state to them. */
 
 import { applyButtons, guardButtons, isActive } from "./buttons.js";
 import { Connection } from "./connection.js";
@@ -21,7 +21,7 @@ const scene = new Scene();
 const situation = () => ({ state: connection.state, stale: connection.freshness().why, preview: operate.plan });
 let noticed = 0;
 
-/** A line above STOP for a while: what the server answered, or why something was not done. */
+/** Shows a line above STOP for a while: the server's answer, or why a command was not executed. */
 function say(text, failed = false) {
   write(at("notice"), text);
   at("notice").classList.toggle("failed", failed);
@@ -36,7 +36,7 @@ async function command(name, fields) {
   return answer;
 }
 
-/** Brings the scene up where it is a view of its own. */
+/** Shows the scene on a narrow screen, where it is a separate view. */
 const showScene = () => wide.matches || view("live");
 const page = { command, situation, say, scene, view, showScene };
 const stopBar = bindStop(connection, () => {
@@ -56,7 +56,7 @@ const wide = matchMedia("(min-width: 900px)");
 function view(name) {
   const chosen = wide.matches && name === "live" ? "operate" : name;
   if (document.body.dataset.view !== chosen) {
-    jog.end("another view was chosen");
+    jog.end("another view was selected");
     document.body.dataset.view = chosen;
     at("panels").scrollTop = 0;
     if (!wide.matches) window.scrollTo(0, 0);
@@ -89,11 +89,11 @@ function showAge() {
   at("stale").hidden = why === null;
   if (why) write(at("stale-text"), why);
   at("stale-hint").hidden = connection.open;
-  // Not its age: that would be read out twenty times a second.
+  // Without the age, which a screen reader would read twenty times a second.
   write(at("stale-said"), why ? "Figures are not current. Only STOP works." : "");
   write(at("lamp-data"), age === null ? "No data" : `Data ${known(age, 1)}\u00a0s old`);
   at("lamp-data").className = why ? "fail" : "pass";
-  // What is stale cannot be used, by keyboard or otherwise; an open question is withdrawn.
+  // Stale controls cannot be used, not even by keyboard; an open question is withdrawn.
   if (why) checkDialog();
   if (at("dialog").hidden) at("main").inert = at("tabs").inert = why !== null;
   applyButtons(document.body, situation());

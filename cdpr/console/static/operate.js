@@ -1,4 +1,4 @@
-/* The operator's panel: control, latch, motion, drives, and a plan from its file to its run. */
+/* The operator's panel: control, fault latch, motion, drives, and plans. */
 
 import { isActive, whyNot } from "./buttons.js";
 import { address } from "./connection.js";
@@ -14,22 +14,22 @@ function isInView(element) {
   return bottom > top && top >= 0 && bottom <= at("stop-bar").getBoundingClientRect().top;
 }
 
-/** Of what a verb printed, the line that says how it went: the last that is neither indented nor an address. */
+/** The line of a verb's output with the result: the last that is neither indented nor a report. */
 function headline(text) {
   const lines = text.trim().split("\n");
   return lines.findLast((line) => /^\S/.test(line) && !line.startsWith("report:")) ?? lines.at(-1);
 }
 
 export class Operate {
-  plan = null; // that is loaded: what /api/preview gave
+  plan = null; // the loaded plan, from /api/preview
   #page;
-  #compared = null; // id of the plan that is compared with it
-  #other = null; // that plan: what /api/compared gave
-  #preview = null; // id of the plan that is being read or was
+  #compared = null; // id of the plan to compare
+  #other = null; // that plan, from /api/compared
+  #preview = null; // id of the plan loaded or being loaded
   #curves = new PlanCurves();
   #outcome = "";
   #busy = null;
-  #sliding = false; // the speed is being chosen: what the run says must not move it
+  #sliding = false; // the operator moves the slider: the run's status must not
 
   /** `page` has `command(name, fields)`, `situation()`, `say(text, failed)` and `scene`. */
   constructor(page) {
@@ -62,16 +62,16 @@ export class Operate {
     this.readFiles();
   }
 
-  /** The files that can be loaded, and what is chosen stays chosen. */
+  /** Lists the files that can be loaded, and keeps the selection. */
   async readFiles() {
     const response = await fetch(address("/api/files")).catch(() => null);
     if (!response?.ok) return;
     const { scenes, plans } = await response.json();
     for (const [group, button, names] of [["scene-file", "plan", scenes], ["plan-file", "load_plan", plans]]) {
       const before = chosen(group);
-      // No <select>: its open list would keep the space bar, and on a phone cover STOP.
+      // Not a <select>: its open list would take the space bar, and cover STOP on a phone.
       const rows = names.map((name) => make("label", {}, make("input", { type: "radio", name: group, value: name, "data-button": button, checked: name === before }), make("span", {}, name)));
-      at(`${group}s`).replaceChildren(...(rows.length ? rows : [make("p", { class: "quiet" }, "No file found in the folder of the console.")]));
+      at(`${group}s`).replaceChildren(...(rows.length ? rows : [make("p", { class: "quiet" }, "No file found in the console’s working folder.")]));
     }
   }
 
@@ -87,7 +87,7 @@ export class Operate {
     at("take-control").hidden = control.yours;
     at("give-control").hidden = !control.yours;
     const isService = control.mode === "service";
-    write(at("service-text"), isService ? "In service mode." : "For commissioning, beside the robot.");
+    write(at("service-text"), isService ? "In service mode." : "For commissioning, with the robot in sight.");
     at("service-begin").hidden = isService;
     at("service-end").hidden = !isService;
     at("latched").hidden = latched === null;
@@ -102,7 +102,7 @@ export class Operate {
     if (this.#busy && !busy) this.readFiles();
     this.#busy = busy?.verb ?? null;
     this.#showOutcome(outcome);
-    write(at("homed-text"), state.reference.counts ? "The drives are homed." : `Not homed: ${state.reference.why_not || "reason not known"}.`);
+    write(at("homed-text"), state.reference.counts ? "The drives are homed." : `Not homed: ${state.reference.why_not || "reason unknown"}.`);
   }
 
   #motion(state) {
@@ -131,7 +131,7 @@ export class Operate {
     at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
     write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
     write(at("outcome-text"), outcome.text);
-    at("outcome-text").scrollTop = at("outcome-text").scrollHeight; // its end says how it went
+    at("outcome-text").scrollTop = at("outcome-text").scrollHeight; // the result is at the end
     const links = [[outcome.report, "Report"], [outcome.fault_page, "What this fault means"]].map(([where, text]) => where && link(address(where), text));
     at("outcome-links").replaceChildren(...links.filter(Boolean));
     if (isNews && !outcome.ok && !isInView(at("outcome"))) this.#page.say(`${at("outcome-title").textContent}: ${headline(outcome.text)}`, true);
@@ -145,7 +145,7 @@ export class Operate {
     this.#leave();
     if (id !== null) {
       const response = await fetch(address("/api/preview")).catch(() => null);
-      if (id !== this.#preview) return; // another one came meanwhile
+      if (id !== this.#preview) return; // superseded meanwhile
       if (response?.ok) this.plan = await response.json();
       else this.#page.say("The plan cannot be read from the server.", true);
     }
@@ -158,7 +158,7 @@ export class Operate {
     this.#other = null;
     if (id !== null) {
       const response = await fetch(address("/api/compared")).catch(() => null);
-      if (id !== this.#compared) return; // another one came meanwhile
+      if (id !== this.#compared) return; // superseded meanwhile
       if (response?.ok) this.#other = await response.json();
       else this.#page.say("The plan to compare cannot be read from the server.", true);
     }
@@ -212,7 +212,7 @@ export class Operate {
     this.#page.scene.look(null);
   }
 
-  // What is asked before.
+  // Confirmations.
 
   async #confirmed(button, question) {
     const { say, situation } = this.#page;
@@ -222,48 +222,48 @@ export class Operate {
   async #takeControl() {
     const holder = this.#page.situation().state.control.held_by;
     if (holder === null) return this.#page.command("take_control");
-    const lines = [`${holder} has control, and loses it at once. Speak to who is there first.`, "It is not taken away while the robot moves."];
+    const lines = [`${holder} has control, and loses it immediately. Talk to its operator first.`, "Control cannot be taken while the robot moves."];
     if (await this.#confirmed("take_control", { title: "Take control away?", lines, confirm: "Take control" })) this.#page.command("take_control", { force: true });
   }
 
   async #service() {
-    const lines = ["In service mode single winches can be moved. Obstacles, workspace and the platform’s pose are not checked then.", "Only enter it where you see the robot. It ends with your control of it."];
+    const lines = ["In service mode single winches can be moved. Obstacles, workspace and the platform’s pose are not checked.", "Enter it only with the robot in sight. It ends when you release control."];
     if (await this.#confirmed("service_begin", { title: "Enter service mode?", lines, confirm: "Enter service mode" })) this.#page.command("service_begin");
   }
 
   async #cables() {
     const { reference } = this.#page.situation().state;
     const lines = [
-      "The drives are enabled where they are. One winch moves as long as you hold a button, a key or a stick.",
-      "Checked are tensions and speed alone: no obstacle, no workspace, no pose. The platform may move, tilt or drop.",
+      "The drives are enabled at their present positions. One winch moves while you hold a button, a key or a stick.",
+      "Only tensions and speed are checked; obstacles, workspace and pose are not. The platform may move, tilt or drop.",
       make("p", { class: "cause" }, make("b", {}, "Homing: "), reference.counts
-        ? "the reference stays, as the drives go on counting. No run begins while their positions fit no pose; then wind back, or home again."
-        : "the drives are not homed, and are not by this. Home them afterwards."),
+        ? "the reference stays valid, as the drives keep counting. No run starts while their positions match no pose; wind back, or home again."
+        : "the drives are not homed. Home them afterwards."),
     ];
     if (await this.#confirmed("cable_begin", { title: "Enable the drives for single cables?", lines, confirm: "Enable the drives" })) this.#page.command("cable_begin");
   }
 
   async #home() {
-    const lines = ["All winches wind in slowly until every cable is taut; the platform may move a little.", "The present homing reference is given up first."];
+    const lines = ["All winches wind in slowly until every cable is taut; the platform may move a little.", "The present homing reference is deleted first."];
     if (await this.#confirmed("home", { title: "Home the drives?", lines, confirm: "Home: winches move" })) this.#page.command("home");
   }
 
   async #reset() {
     const { latched } = this.#page.situation().state;
-    const lines = [make("p", { class: "cause" }, make("b", {}, "Cause: "), latched), "Remove the cause first.", "Reset clears the latched fault and resets drives in fault. Nothing moves; drives that hold keep holding."];
+    const lines = [make("p", { class: "cause" }, make("b", {}, "Cause: "), latched), "Remove the cause first.", "Reset releases the fault latch and resets drives in fault. Nothing moves; drives that hold keep holding."];
     if (await this.#confirmed("reset", { title: "Reset the latched fault?", lines, confirm: "Cause removed: reset" })) this.#page.command("reset");
   }
 
   async #release() {
     const { platform, tensions_n: tensions } = this.#page.situation().state;
     const load = tensions ? ` The tightest cable carries ${known(Math.max(...tensions), 0, "N")}.` : "";
-    const height = platform ? ` It is at z = ${known(platform.position_mm[2], 0, "mm")} now.` : " Its position is not known.";
+    const height = platform ? ` It is at z = ${known(platform.position_mm[2], 0, "mm")} now.` : " Its position is unknown.";
     const lines = [
-      make("p", { class: "cause" }, "The platform drops unless it stands on a support or every winch has a brake."),
-      `Brakes close, then all drives lose their torque together.${height}${load}`,
-      "Winches without brakes let their cables go, and the drives have to be homed again.",
+      make("p", { class: "cause" }, "The platform drops unless it rests on a support or every winch has a brake."),
+      `Brakes close, then the torque of all drives is removed together.${height}${load}`,
+      "Winches without brakes pay out their cables, and the drives have to be homed again.",
     ];
-    if (await this.#confirmed("release", { title: "Take the torque off all drives?", lines, confirm: "Supported: release" })) this.#page.command("release");
+    if (await this.#confirmed("release", { title: "Remove the torque of all drives?", lines, confirm: "Supported: release" })) this.#page.command("release");
   }
 
   async #run() {

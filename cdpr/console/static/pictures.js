@@ -1,11 +1,11 @@
-/* Images of the cameras, with what is seen in them; at most five a second of each, and none is waited for twice. */
+/* Camera images with their detections: at most five per second and camera, one request at a time. */
 
 import { address } from "./connection.js";
 import { at, make, write } from "./elements.js";
 
 const EVERY_MS = 200, AGAIN_MS = 1000, SILENT_MS = 3000;
 
-/** One camera's figure; the next image is asked for when the last one is there, or did not come. */
+/** One camera's figure; the next image is requested once the last one arrived or failed. */
 class Figure {
   #image = make("img", { width: 640, height: 480, hidden: true });
   #caption = make("figcaption", {}, "");

@@ -1,15 +1,15 @@
-/* STOP: along the path, for everybody, from every view, on a stale page as well.
+/* STOP: a path stop for every page, in every view, also with stale data.
 
-It acts on pointerdown and on the space bar and Escape anywhere except in a text field, before anything else of the
-page does. It is an operational stop in black, which IEC 60204-1 prefers for one, and no emergency stop. */
+It acts on pointerdown, and on the space bar and Escape outside text fields, before any other handler. It is an
+operational stop, in black as IEC 60204-1 prefers, not an emergency stop. */
 
 import { at, isTextField, write } from "./elements.js";
 
-const ANSWER_MS = 6000; // as long as an answer is shown
-const SILENT_MS = 1000; // after it the operator must know that nothing answers
+const ANSWER_MS = 6000; // an answer is shown for this time
+const SILENT_MS = 1000; // without an answer by then, the operator is warned
 const STOPPING = "Stopping along the path";
 
-/** Binds STOP; `pressed` hears of each press before it is sent, and `atRest()` is true while nothing is known to move. */
+/** Binds STOP; `pressed()` is called before each is sent; `atRest()` is true while nothing is known to move. */
 export function bindStop(connection, pressed, atRest) {
   const button = at("stop"), answer = at("stop-answer");
   let presses = 0;
@@ -41,24 +41,24 @@ export function bindStop(connection, pressed, atRest) {
     stop();
   });
   button.addEventListener("click", (event) => {
-    if (event.detail === 0) stop(); // Enter, or a screen reader: no pointer was there before
+    if (event.detail === 0) stop(); // Enter or a screen reader: no pointerdown came before
   });
   const isStop = (event) => [" ", "Escape"].includes(event.key) && !event.isComposing && !isTextField(event.target);
   window.addEventListener("keydown", (event) => {
     if (!isStop(event)) return;
-    event.preventDefault(); // the focused button is not pressed, the page does not scroll
+    event.preventDefault(); // no press of the focused button, no scrolling
     if (event.key === " ") event.stopImmediatePropagation();
     if (!event.repeat) stop();
   }, { capture: true });
   window.addEventListener("keyup", (event) => {
     if (isStop(event) && event.key === " ") event.preventDefault(); // buttons act on it
   }, { capture: true });
-  // The space bar is taken, so boxes are ticked with Enter.
+  // The space bar is STOP, so Enter toggles boxes.
   document.addEventListener("keydown", (event) => {
     if (event.key === "Enter" && event.target instanceof HTMLInputElement && ["checkbox", "radio"].includes(event.target.type)) event.target.click();
   });
   return {
-    /** What the run says about it. */
+    /** Shows the run's response. */
     show: (motion) => {
       const asked = motion?.wished.stop && !["finished", "stopped", "latched"].includes(motion.state);
       button.classList.toggle("asked", Boolean(asked));

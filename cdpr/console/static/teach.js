@@ -1,4 +1,4 @@
-/* Taught poses: store where the platform is, name, order and remove them, plan a path through them. */
+/* Taught poses: store the present pose, name, order and remove poses, plan a path through them. */
 
 import { at, chosen, freeName, known, make, mark, write } from "./elements.js";
 
@@ -22,7 +22,7 @@ export class Teach {
   }
 
   show({ poses, platform }) {
-    write(at("teach-here"), platform ? `Now at ${platform.position_mm.map((v) => known(v, 1)).join(", ")} mm` : "The position is not known.");
+    write(at("teach-here"), platform ? `Now at ${platform.position_mm.map((v) => known(v, 1)).join(", ")} mm` : "The position is unknown.");
     const text = JSON.stringify(poses);
     if (text === this.#shown) return;
     this.#shown = text;
@@ -30,10 +30,10 @@ export class Teach {
     this.#arrange(poses);
   }
 
-  /** A pose keeps its row for as long as it has its name, with what is being typed there. */
+  /** A pose keeps its row, with any text being typed, as long as it keeps its name. */
   #arrange(poses) {
     const list = at("poses"), focused = document.activeElement;
-    const place = [...list.children].findIndex((row) => row.contains(focused));
+    const index = [...list.children].findIndex((row) => row.contains(focused));
     const rows = new Map([...list.children].map((row) => [row.dataset.pose, row]));
     for (const [name, row] of rows) if (!poses.some((pose) => pose.name === name)) row.remove();
     poses.forEach(({ name, position_mm: position }, k) => {
@@ -46,9 +46,9 @@ export class Teach {
       part("up").hidden = k === 0;
       part("down").hidden = k === poses.length - 1;
     });
-    // What had the focus has it again; of a row that is gone, the one that took its place.
+    // Restore the focus; if its row is gone, focus the row now at that index.
     if (focused.isConnected) focused.focus();
-    else if (place >= 0) list.children[place]?.querySelector(`[data-key="${focused.dataset.key}"]`)?.focus();
+    else if (index >= 0) list.children[index]?.querySelector(`[data-key="${focused.dataset.key}"]`)?.focus();
   }
 
   #row(name) {
@@ -70,7 +70,7 @@ export class Teach {
       make("div", { class: "row" },
         button("↑", `Move ${name} up`, "up", move(-1)),
         button("↓", `Move ${name} down`, "down", move(1)),
-        button("✕", `Forget ${name}`, "forget", () => command("forget", { pose: name }))));
+        button("✕", `Remove ${name}`, "forget", () => command("forget", { pose: name }))));
     return row;
   }
 }

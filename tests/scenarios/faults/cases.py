@@ -145,22 +145,22 @@ def without_sync_watch(bench: Bench) -> None:
 def bus_off(bench: Bench) -> None:
     bench.line.incoming.append(lose(EVERY_ID))
     bench.line.outgoing.append(lose(EVERY_ID))
-    bench.line.say(BUS_OFF)
+    bench.line.inject(BUS_OFF)
 
 
 def passive(bench: Bench) -> None:
-    bench.line.say(a_message(0x004, b"\0\x20" + bytes(6), error=True))
+    bench.line.inject(a_message(0x004, b"\0\x20" + bytes(6), error=True))
 
 
 def comes(can_id: int, data: bytes = b"") -> Callable[[Bench], object]:
-    return lambda bench: bench.line.say(a_message(can_id, data))
+    return lambda bench: bench.line.inject(a_message(can_id, data))
 
 
 def another_set_point(bench: Bench) -> None:
     """It asks for nothing new: what two masters want is not the question."""
     target = round(bench.drives[3]._target)
     data = make_set_point(ControlWord.ENABLE_OPERATION, target)
-    bench.line.say(a_message(RPDO1_BASE + 4, data))
+    bench.line.inject(a_message(RPDO1_BASE + 4, data))
 
 
 def shifted(counts: int) -> Callable[[bytes], bytes]:
