@@ -204,7 +204,7 @@ class RunCameras:
         self._together: list[CameraSample] = []
         self.newest: tuple[PoseMeasurement, MeasuredClearance | None] | None = None
         """The newest pose of all cameras together, and the clearance at it; None before one."""
-        self._told: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
         self._news: list[CameraNews] = []
 
     @property
@@ -234,7 +234,7 @@ class RunCameras:
         self._now = asked
         for eye in self._eyes:
             self._put(eye, eye.collect())
-        self._judge()
+        self._handle()
         trigger = FrameRequest(self._frame, time, asked, true_pose, by_drives)
         whom = frozenset(eye.name for eye in self._eyes if eye.ask(trigger))
         if whom:
@@ -262,7 +262,7 @@ class RunCameras:
         self._wait_for_all(stopped)
         for eye in self._eyes:
             self._put(eye, eye.finish())
-        self._judge(last=True)
+        self._handle(last=True)
         self._common.finish()
         self._look_for_trouble()
         several = len(self._eyes) > 1
@@ -287,7 +287,7 @@ class RunCameras:
             if look is not None and moment.trigger.frame == look.frame:
                 moment.looks[eye.name] = look
 
-    def _judge(self, last: bool = False) -> None:
+    def _handle(self, last: bool = False) -> None:
         """Takes moments, in their order, for what they are."""
         gone = {eye.name for eye in self._eyes if eye.failed is not None}
         while self._open:
@@ -319,7 +319,7 @@ class RunCameras:
         )
         for eye in self._eyes:
             trouble = troubles[eye.name]
-            if trouble and self._told.get(eye.name) != trouble:
+            if trouble and self._reported.get(eye.name) != trouble:
                 text = f"camera {eye.name} {trouble}; {then}"
                 failed = eye.failed is not None
                 self._news.append(
@@ -327,11 +327,11 @@ class RunCameras:
                     if failed
                     else CameraNews("camera_sees_nothing", text)
                 )
-            self._told[eye.name] = trouble
+            self._reported[eye.name] = trouble
 
 
 #: Takes in an event: its code, its text, and when it was, on the loop's clock [s].
-Tell = Callable[[str, str, float], None]
+EventReport = Callable[[str, str, float], None]
 
 
 class CameraWatch:
@@ -342,7 +342,7 @@ class CameraWatch:
         cameras: RunCameras,
         status: RunStatus,
         board: RequestBoard,
-        report: Tell,
+        report: EventReport,
         *,
         clearance_stop: bool,
         listener: Listener = SILENT,
@@ -360,14 +360,14 @@ class CameraWatch:
         self.rates = ""
         """How fast each camera is and how many tags it sees, for the progress bar."""
         self._cameras, self._status, self._board = cameras, status, board
-        self._tell, self._clearance_stop, self._listener = report, clearance_stop, listener
+        self._report, self._clearance_stop, self._listener = report, clearance_stop, listener
 
     def trigger(
         self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
     ) -> None:
         """An image is due; arguments as for `RunCameras.trigger`."""
         self._cameras.trigger(time, asked, true_pose, by_drives)
-        self._tell_news(asked)
+        self._report_news(asked)
         each = self._cameras.as_dict()
         self._status.take_cameras(each)
         if self._cameras.newest is not None:
@@ -392,12 +392,12 @@ class CameraWatch:
         """
         with self._listener.waiting("waiting for the last images"):
             seen = self._cameras.finish(lambda: self._board.read().stop)
-        self._tell_news(at)
+        self._report_news(at)
         for camera in seen.cameras:
             if camera.dropped:
                 what = f"{camera.dropped} of {camera.dropped + camera.pictures} images skipped"
                 text = f"camera {camera.name}: {what}; the previous one was still being processed"
-                self._tell("pictures_dropped", text, at)
+                self._report("pictures_dropped", text, at)
         return seen
 
     def _stop(self, label: str, told: str, code: str, why: str) -> None:
@@ -407,7 +407,7 @@ class CameraWatch:
         self._board.ask_stop(StopReason(code, why))
         self._listener.warning(f"{label}: {told}")
 
-    def _tell_news(self, at: float) -> None:
+    def _report_news(self, at: float) -> None:
         for news in self._cameras.news():
-            self._tell(news.code, news.text, at)
+            self._report(news.code, news.text, at)
             self._listener.remark(news.text)

@@ -181,7 +181,7 @@ class LivePictures:
         self._camera.close()
 
 
-def look_at_rest(
+def measure_at_rest(
     rig: Rig,
     eye: tuple[Camera, str],
     pictures: int,

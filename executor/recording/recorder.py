@@ -76,7 +76,7 @@ class RunLog:
         actual = _matrix([r.actual for r in records], rig.cable_count)
         lengths, tensions = self._lengths(records, rows)
         encoder, turned = poses_near(rig, lengths, planned.positions[rows], planned.rotations[rows])
-        legs = legs_at(planned.stands, index)
+        legs = legs_at(planned.dwells, index)
         return CycleTable(
             time=np.array([r.at - began for r in records]),
             state=tuple(r.state.value for r in records),
@@ -122,8 +122,8 @@ class RunLog:
 
     def _stop_at(self, row: int) -> str:
         """Name of the stop at which the platform stands; nothing on the way."""
-        for stop, stand in zip(self._scene.stops, self._checked.table.stands, strict=True):
-            if stand.first <= row <= stand.last:
+        for stop, dwell in zip(self._scene.stops, self._checked.table.dwells, strict=True):
+            if dwell.first <= row <= dwell.last:
                 return stop.name
         return ""
 
@@ -305,7 +305,7 @@ class Recorder:
             own_thread: The disk is waited for in a thread, which `writer` ends.
         """
         self.log = RunLog(prepared.rig, prepared.scene, prepared.checked)
-        self._announcements = stop_events(prepared.scene, prepared.checked.table.stands)
+        self._announcements = stop_events(prepared.scene, prepared.checked.table.dwells)
         self._announce, self._on_event = announce, on_event
         self.folder = folder
         """Where events are written."""

@@ -217,7 +217,7 @@ def serving(
 
     Args:
         listeners: Listening; they stay the caller's.
-        board: Where wishes are put up.
+        board: Where requests are put up.
         status: What is reported.
         presses: Of a session of jogs; None for any other motion.
     """

@@ -178,7 +178,7 @@ def answer_to(
 
     Args:
         line: What was asked.
-        board: Where wishes are put up.
+        board: Where requests are put up.
         status: What is reported.
         presses: Of a session of jogs; None for any other motion.
     """

@@ -172,9 +172,9 @@ def _clearance_data(clearance: MeasuredClearance) -> dict[str, Any]:
 
 def wished(board: RequestBoard) -> dict[str, Any]:
     """What the operator wants."""
-    wishes = board.read()
-    speed = round(wishes.speed * 100.0)
-    return {"wished": {"stop": wishes.stop, "hold": wishes.hold, "speed_percent": speed}}
+    requests = board.read()
+    speed = round(requests.speed * 100.0)
+    return {"wished": {"stop": requests.stop, "hold": requests.hold, "speed_percent": speed}}
 
 
 class MotionStatus(ABC):
@@ -202,7 +202,7 @@ class MotionStatus(ABC):
         return {
             **whose(self._rig, self.folder),
             **self._cycles.as_dict(),
-            **self._place(),
+            **self._position_fields(),
             "cameras": self._cameras,
             "measured": None if self._measured is None else measured_data(*self._measured),
             **wished(self._board),
@@ -210,7 +210,7 @@ class MotionStatus(ABC):
         }
 
     @abstractmethod
-    def _place(self) -> dict[str, Any]:
+    def _position_fields(self) -> dict[str, Any]:
         """How far the motion is."""
 
     @abstractmethod
@@ -245,7 +245,7 @@ class RunStatus(MotionStatus):
         """Something happened."""
         self._events.append(event)
 
-    def _place(self) -> dict[str, Any]:
+    def _position_fields(self) -> dict[str, Any]:
         table, record = self._prepared.checked.table, self._cycles.last
         whole = {"rows": len(table), "path_length_mm": round(self._prepared.length * 1e3, 3)}
         if record is None:
@@ -261,7 +261,7 @@ class RunStatus(MotionStatus):
     def _next_stop(self, row: float, path: float) -> dict[str, Any]:
         """The scene's next stop, or the goal."""
         table, stops = self._prepared.checked.table, self._prepared.scene.stops
-        ahead = [(stand.first, stop.name) for stand, stop in zip(table.stands, stops, strict=True)]
+        ahead = [(dwell.first, stop.name) for dwell, stop in zip(table.dwells, stops, strict=True)]
         ahead.append((len(table) - 1, "goal"))
         last, name = next(one for one in ahead if one[0] >= row or one[1] == "goal")
         left = (last - row) * table.cycle / self._board.read().speed
@@ -294,7 +294,7 @@ class WinchStatus(MotionStatus):
         """Something happened."""
         self._events.append(event)
 
-    def _place(self) -> dict[str, Any]:
+    def _position_fields(self) -> dict[str, Any]:
         row = None if self._cycles.last is None else round(self._cycles.last.index, 1)
         return {"row": row, "rows": 100, **_NO_PATH}
 
@@ -309,7 +309,7 @@ class WinchStatus(MotionStatus):
 class SessionStatus(WinchStatus):
     """Of a session of jogs."""
 
-    def _place(self) -> dict[str, Any]:
+    def _position_fields(self) -> dict[str, Any]:
         return {"row": None, "rows": None, **_NO_PATH, **self._jogged()}
 
     @abstractmethod

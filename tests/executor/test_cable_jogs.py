@@ -101,7 +101,7 @@ def test_a_cable_is_paid_out_while_held_and_rests_when_let_go() -> None:
     assert (np.delete(out, 2, axis=1) == 0.0).all(), "the others stand"
     assert not still[at < 0.5].any()
     assert not still[at > 1.0 + TIMEOUT + RAMP].any()
-    assert (np.diff(out[:, 2]) >= 0.0).all(), "never the other way"
+    assert (np.diff(out[:, 2]) >= 0.0).all(), "never in the other direction"
     assert records[-1].state is State.SECURING
     assert script.travel is not None
     assert script.travel.cable == 3
@@ -114,8 +114,8 @@ def test_a_cable_is_paid_out_while_held_and_rests_when_let_go() -> None:
 def test_a_step_ends_where_it_should(length: float, out: bool) -> None:
     robot = rig(soft=0.0002)  # so soft that 10 mm are far from any limit
     script = Script([(0.5, 4.0, hold(1, 3, out=out, step=length))], 4.2)
-    way = moved(script.run(robot), robot)[-1, 2]
-    assert way == pytest.approx(length if out else -length, abs=2e-6)
+    travel = moved(script.run(robot), robot)[-1, 2]
+    assert travel == pytest.approx(length if out else -length, abs=2e-6)
 
 
 def test_a_step_that_is_let_go_ends_early() -> None:
@@ -155,8 +155,8 @@ def test_a_press_moves_a_cable_by_no_more_than_its_longest_way(
     monkeypatch.setattr(sessions, "LONGEST_MM", 8.0)
     robot = rig(soft=SOFT)
     script = Script([(0.5, 6.0, hold(1, 3, out=True))], 6.5)
-    way = moved(script.run(robot), robot)[-1, 2]
-    assert 0.004 < way <= 0.008
+    travel = moved(script.run(robot), robot)[-1, 2]
+    assert 0.004 < travel <= 0.008
 
 
 COMMANDS = st.lists(
@@ -210,12 +210,12 @@ def test_nothing_moves_unless_held_and_no_tension_is_beyond_the_limit(
     held_pull = tensions([r for r in records if r.state is State.MOVING], robot)
     assert held_pull.max() <= limit
     out_of = np.diff(moved(records, robot), axis=0)
-    for record, way in zip(records[1:], out_of, strict=True):
-        for cable in np.flatnonzero(way):
+    for record, travel in zip(records[1:], out_of, strict=True):
+        for cable in np.flatnonzero(travel):
             may = [
                 (a, b)
                 for a, b, which, pays in spans
-                if which == cable and pays == (way[cable] > 0.0)
+                if which == cable and pays == (travel[cable] > 0.0)
             ]
             assert any(a <= record.at <= b + TIMEOUT + RAMP for a, b in may)
     fastest = max(np.abs(out_of).max(), 0.0)
@@ -304,10 +304,10 @@ def test_a_press_stays_within_the_positions_of_its_drive(
     positions = [0] * 8
     positions[cable] = here
     held = PressState(1, 1.0, False, cable + 1, out, step)
-    way = limits.way(robot, positions, held)
-    assert way >= 0.0 if out else way <= 0.0
-    assert abs(way) <= (step or 0.050)
-    end = here + way * robot.winches[cable].counts_per_metre
+    travel = limits.travel(robot, positions, held)
+    assert travel >= 0.0 if out else travel <= 0.0
+    assert abs(travel) <= (step or 0.050)
+    end = here + travel * robot.winches[cable].counts_per_metre
     if low <= here <= high:
         assert low - 1e-6 <= end <= high + 1e-6
     elif (here > high) == (end > here):

@@ -48,7 +48,7 @@ def test_each_command_puts_up_its_wish_and_leaves_the_others():
     board = LocalRequests()
     assert _answer(make_line("status"), board) == {"ok": True, "status": {"state": "moving"}}
     assert board.read() == OperatorRequests()
-    for command, percent, wishes in (
+    for command, percent, requests in (
         ("speed", 40, OperatorRequests(speed=0.4)),
         ("hold", None, OperatorRequests(speed=0.4, hold=True)),
         ("resume", None, OperatorRequests(speed=0.4)),
@@ -56,7 +56,7 @@ def test_each_command_puts_up_its_wish_and_leaves_the_others():
         ("resume", None, OperatorRequests(speed=0.4, stop=True)),
     ):
         assert _answer(make_line(command, percent=percent), board)["ok"] is True
-        assert board.read() == wishes
+        assert board.read() == requests
 
 
 @pytest.mark.parametrize(

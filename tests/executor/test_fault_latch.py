@@ -23,7 +23,7 @@ BUS = BusSettings("udp_multicast", "239.74.163.62")
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(locks, "SHARED", tmp_path / "absent")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    monkeypatch.setattr(fault_latch, "LOOKS_WITHIN", 0.02)
+    monkeypatch.setattr(fault_latch, "LOCK_TIMEOUT", 0.02)
     return tmp_path / "cdpr"
 
 

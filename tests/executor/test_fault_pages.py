@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "faults"
 HEADINGS = ["## What it means", "## Likely cause", "## State of the machine", "## Next step"]
 #: Which argument of a call is the code of an event.
-PLACES = {
+CODE_ARGUMENT = {
     "CameraNews": 0,
     "Alarm": 1,
     "LoopEvent": 2,
@@ -28,9 +28,9 @@ PLACES = {
     "StopReason": 0,
     "_stop": 2,
     "_fault": 0,
-    "_tell": 0,
-    "_tell_cause": 0,
-    "tell": 0,
+    "_report": 0,
+    "_report_cause": 0,
+    "report_event": 0,
 }
 
 
@@ -41,9 +41,9 @@ def codes_in_the_source() -> Iterator[str]:
             if not isinstance(node, ast.Call):
                 continue
             name = getattr(node.func, "attr", getattr(node.func, "id", ""))
-            place = PLACES.get(name)
-            if place is not None and len(node.args) > place:
-                code = node.args[place]
+            index = CODE_ARGUMENT.get(name)
+            if index is not None and len(node.args) > index:
+                code = node.args[index]
                 if isinstance(code, ast.Constant) and isinstance(code.value, str):
                     yield code.value
     yield from ("recorder", "supervisor_lost")  # told in a loop, by name

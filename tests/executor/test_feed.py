@@ -116,26 +116,26 @@ def test_a_stop_harder_than_one_cycle_can_show_is_at_rest_at_once():
     assert places[-1] <= 11.0
 
 
-def _walked(motion: Motion, wishes: list[tuple[int, float]], rows: int = 5000) -> list[float]:
+def _walked(motion: Motion, requests: list[tuple[int, float]], rows: int = 5000) -> list[float]:
     """Places of a feed that is asked for another rate after so many cycles each."""
     feed = Feed(rows, CYCLE, motion)
     places = [feed.index]
-    for cycles, rate in wishes:
+    for cycles, rate in requests:
         feed.go_to(rate)
         places += [feed.advance() for _ in range(cycles)]
     return places
 
 
 @given(
-    wishes=st.lists(st.tuples(st.integers(0, 60), st.floats(0.0, 1.0)), min_size=1, max_size=8),
+    requests=st.lists(st.tuples(st.integers(0, 60), st.floats(0.0, 1.0)), min_size=1, max_size=8),
     motion=motions,
 )
 @settings(max_examples=80)
 def test_whatever_is_asked_for_it_keeps_between_rest_and_full_rate_and_changes_smoothly(
-    wishes, motion
+    requests, motion
 ):
     """Also when one change is interrupted by the next."""
-    places = np.array(_walked(motion, wishes))
+    places = np.array(_walked(motion, requests))
     rates = np.diff(places)
     assert (rates >= 0.0).all()
     assert (rates <= 1.0 + 1e-9).all()

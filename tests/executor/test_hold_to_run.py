@@ -232,7 +232,7 @@ def test_a_line_is_proved_as_a_whole_would_be() -> None:
     """Its pieces, end to end, are the set-points of the line; none is left out or there twice."""
     slow = with_speed(rig(), 0.020)
     line = JogLine(slow, scene(), rig().home, np.array([0.0, 1.0, 0.0]))
-    parts = [line.go_on(FIRST_ROWS), line.go_on(MOST_ROWS), line.go_on(3)]
+    parts = [line.extend(FIRST_ROWS), line.go_on(MOST_ROWS), line.go_on(3)]
     rows = np.concatenate([parts[0].table.setpoints, *(p.table.setpoints[1:] for p in parts[1:])])
     assert len(rows) == line.rows == FIRST_ROWS + MOST_ROWS + 3 + 1
     for before, after in pairwise(parts):
@@ -246,9 +246,9 @@ def test_a_line_is_proved_as_a_whole_would_be() -> None:
 def test_what_cannot_be_proved_is_not_added() -> None:
     slow = with_speed(rig(), 0.020)
     line = JogLine(slow, scene(), rig().home, np.array([0.0, 0.0, -1.0]))
-    line.go_on(FIRST_ROWS)
+    line.extend(FIRST_ROWS)
     with pytest.raises(CdprError):
-        line.go_on(6000)
+        line.extend(6000)
     assert line.rows == FIRST_ROWS + 1
 
 

@@ -56,7 +56,7 @@ def test_a_drive_has_one_name_whoever_speaks_of_it():
     exchange = Cycle(course, SyncMaster(HALL, group, SimulatedClock(0.01)))
     exchange.actual = tuple(HOME[0].tolist())
     done = exchange.cycle(Purpose.HOLD, exchange.actual, at_rest=True)
-    told = {(finding.drive, finding.text.split(":")[0]) for finding in done.findings}
+    told = {(alarm.drive, alarm.text.split(":")[0]) for alarm in done.alarms}
     assert told == {
         (3, "cable 3 (drive 13)"),
         (0, "bus-off"),

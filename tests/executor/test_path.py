@@ -149,5 +149,5 @@ def test_a_polyline_goes_through_its_waypoints():
 
 def test_a_turn_straight_back_is_no_corner():
     """Its curve would stop and reverse at full travelled speed."""
-    with pytest.raises(ValueError, match="straight back"):
+    with pytest.raises(ValueError, match="path reverses"):
         corner(at_mm(0, 0, 0), at_mm(10, 0, 0), at_mm(0, 0, 0), WEIGHT)

@@ -42,7 +42,7 @@ def test_a_motion_that_is_over_leaves_no_stop_behind_on_the_board(
     motion_on_board: Any = (Still(), print, board)
     try:
         with real_time_process.real_time_process(
-            *motion_on_board, need_real_time=False, look_again=str
+            *motion_on_board, need_real_time=False, check_drives=str
         ) as process:
             process.arm(nobody_listens)  # type: ignore[arg-type]
             if goes:

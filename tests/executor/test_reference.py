@@ -73,7 +73,7 @@ def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
         MotionInterlock(rig).file.write(reference_of(rig))
     interlock = MotionInterlock(rig)
     interlock.begin(Path("run"), None)
-    interlock.end(State.LATCHED, "emergency stop", Path("run"), holding=False, stands_at=range(8))
+    interlock.end(State.LATCHED, "emergency stop", Path("run"), holding=False, positions=range(8))
     interlock.cancel()  # as a reset releases the latch
     for ask in (interlock.reference, interlock.require_ready):
         with pytest.raises(Refused, match="homing reference is lost") as caught:
@@ -88,12 +88,12 @@ def test_every_motion_that_counts_from_it_notes_where_the_drives_stand() -> None
     interlock = MotionInterlock(rig)
     interlock.file.write(reference_of(rig))
     interlock.begin(Path("run"), reference_of(rig))
-    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))
     kept = interlock.kept_reference()
     assert kept is not None
     assert kept.stands_at == list(range(8))
     interlock.begin(Path("run"), kept)
-    interlock.end(State.LATCHED, "killed", Path("run"), holding=True, stands_at=None)
+    interlock.end(State.LATCHED, "killed", Path("run"), holding=True, positions=None)
     assert interlock.kept_reference() == kept, "nobody heard anything of the drives"
 
 
@@ -106,7 +106,7 @@ def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
     assert interlock.still_counts(left.stands_at) == left
     assert interlock.still_counts(moved) is None
     interlock.begin(Path("run"), interlock.still_counts(moved))
-    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=moved)
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=moved)
     assert interlock.kept_reference() == left
     absolute = MotionInterlock(rig_with("absolute"))
     assert absolute.still_counts(moved) == left, "it cannot lose count"
@@ -128,7 +128,7 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     assert found is not None
     assert interlock.still_counts(found.stands_at) is None
     interlock.begin(Path("run"), None)
-    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))
     interlock.confirm_held(range(8))
     assert interlock.kept_reference() == found, "no motion and no reset brings it back"
     absolute = MotionInterlock(rig_with("absolute"))
@@ -143,7 +143,7 @@ def test_homing_that_does_not_come_to_its_end_leaves_no_reference(ended: State) 
     interlock = MotionInterlock(rig)
     interlock.file.write(reference_of(rig))
     interlock.begin(Path("run"), reference_of(rig), rehome=True)
-    interlock.end(ended, "stopped", Path("run"), holding=True, stands_at=range(8))
+    interlock.end(ended, "stopped", Path("run"), holding=True, positions=range(8))
     interlock.cancel()
     with pytest.raises(Refused, match="homing reference is lost") as caught:
         interlock.reference()
@@ -163,7 +163,7 @@ def test_an_end_that_cannot_be_kept_leaves_the_bus_latched(
 
     monkeypatch.setattr(interlock.file, "write", full)
     with pytest.raises(Refused, match="cannot be written"):
-        interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+        interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))
     with pytest.raises(Refused, match=r"latched.*cannot be written"):
         interlock.require_free()
 
@@ -189,7 +189,7 @@ def test_a_file_that_cannot_be_read_is_not_ignored(content: str) -> None:
     # Homing replaces it; what was moved meanwhile must not stumble over it.
     interlock.found_restarted((1,))
     interlock.begin(Path("run"), interlock.still_counts(range(8)), rehome=True)
-    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))
     assert interlock.file.path.read_text() == content
     interlock.file.write(reference_of(rig))
     assert interlock.reference() is not None

@@ -81,7 +81,7 @@ class Scripted:
 
 
 def never() -> bool:
-    """Nobody wishes a stop."""
+    """Nobody requests a stop."""
     return False
 
 

@@ -335,7 +335,7 @@ def test_a_table_for_another_cycle_is_refused(factor: float) -> None:
 def test_stands_that_the_scene_has_not_are_refused() -> None:
     table = _made("gachon_8_6")[2]
     said = "the table rests at 1 stops, the scene has 0"
-    assert _refused("gachon_8_6", replace(table, stands=(Dwell(3, 5),))) == said
+    assert _refused("gachon_8_6", replace(table, dwells=(Dwell(3, 5),))) == said
 
 
 @names

@@ -1,4 +1,4 @@
-"""What two processes share: rings that lose nothing silently, and wishes that reach the loop."""
+"""What two processes share: rings that lose nothing silently, and requests that reach the loop."""
 
 from __future__ import annotations
 

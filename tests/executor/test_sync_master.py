@@ -158,7 +158,7 @@ def test_positions_are_read_in_cycles_that_count() -> None:
 def test_the_cycle_goes_on_until_the_word_is_heard() -> None:
     master, group, clock = made()
     words: list[int | None] = [None, None, None, 0]
-    assert master.keep_until(lambda: words.pop(0)) == 0
+    assert master.cycle_until(lambda: words.pop(0)) == 0
     assert clock.cycles == 3
     assert group.sent == [(tuple(TARGETS), True)] * 3
 
@@ -167,7 +167,7 @@ def test_a_drive_that_falls_silent_before_the_word_is_named() -> None:
     master, group, _ = made()
     group.missing[4] = True
     with pytest.raises(HardwareMissing, match=r"cable 5 \(drive 5\) stopped answering") as caught:
-        master.keep_until(lambda: None)
+        master.cycle_until(lambda: None)
     assert len(group.sent) == 2
     assert caught.value.where == "arming"
     assert "nothing was enabled" in caught.value.next_step
@@ -177,7 +177,7 @@ def test_drives_that_fall_silent_all_at_once_have_one_cause() -> None:
     master, group, _ = made()
     group.missing = [True] * len(group.missing)
     with pytest.raises(HardwareMissing, match=r"all 8 drives stopped .*: bus or supply"):
-        master.keep_until(lambda: None)
+        master.cycle_until(lambda: None)
 
 
 def test_it_leaves_as_soon_as_no_drive_watches_it() -> None:
@@ -259,7 +259,7 @@ def test_after_the_end_the_age_of_sync_is_forgotten() -> None:
     master, group, clock = made()
     master.begin()
     master.exchange(TARGETS)
-    master.look()
+    master.read_state()
     assert group.paced == [0.004]
     clock.now += 100.0 * CYCLE
     assert master.age == 0.0

@@ -42,7 +42,7 @@ class Stage:
         folder: The run folder.
         script: Called at the beginning of every cycle with the stage.
         cycle: Counted from 0.
-        board: What the executor sees as the operator's wishes.
+        board: What the executor sees as the operator's requests.
         status: What it tells those who ask.
         lateness: What the clock tells, in cycles.
         now: Its time with all lateness so far, [s].

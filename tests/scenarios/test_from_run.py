@@ -113,7 +113,7 @@ def first(scene: Scene) -> PreparedRun:
 @pytest.fixture(scope="module")
 def stopped(first: PreparedRun, tmp_path_factory: pytest.TempPathFactory) -> Ended:
     """On the second leg, half way from the pick to the way-pose."""
-    take, by, _ = first.checked.table.stands
+    take, by, _ = first.checked.table.dwells
     path = tmp_path_factory.mktemp("stopped") / "run"
     return ended(first, path, after_row(first, (take.last + by.first) // 2))
 
@@ -163,7 +163,7 @@ def test_a_plan_from_a_stopped_run_runs_to_the_goal_through_the_stops_left(
 def test_a_dwell_cut_short_is_done_again_with_the_load_before_it(
     first: PreparedRun, scene: Scene, tmp_path: Path
 ) -> None:
-    take = first.checked.table.stands[0]
+    take = first.checked.table.dwells[0]
     cut = ended(first, tmp_path / "run", after_row(first, take.first + 5))
     end = run_end(cut.folder)
     assert end.waiting_at == "take"

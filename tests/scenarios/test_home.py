@@ -21,11 +21,11 @@ from executor.cameras.client import static_pose
 from executor.control.preconditions import counted_here, require_below, with_reduced_limits
 from executor.control.winch_laws import CableStep, PretensionLaw, WinchLaw, wind_in_speed
 from executor.control.winch_loop import LawMotion, WinchesHere
-from executor.control.winch_motion import WinchesStand, move_winches, require_held
+from executor.control.winch_motion import WinchResult, move_winches, require_held
 from executor.drives import current_pose
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at, referenced
-from executor.jogging import straight_way
+from executor.jogging import plan_straight_move
 from executor.realtime.job import ReadyDrives
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import RunFolder
@@ -80,7 +80,7 @@ class Place:
     as_set_up: Rig
     counts: list[int]
     script: Callable[[Place, int], None] = lambda _place, _cycle: None
-    at_rest: Callable[[WinchesStand], HomingReference | None] = lambda _stand: None
+    at_rest: Callable[[WinchResult], HomingReference | None] = lambda _stand: None
     interlock: MotionInterlock | None = None
     rehome: bool = True
     board: LocalRequests = field(default_factory=LocalRequests)
@@ -88,13 +88,13 @@ class Place:
     events: list[LoopEvent] = field(default_factory=list)
     tensions: list[Array] = field(default_factory=list)
 
-    def take_up(self, reach: float = 0.02) -> WinchesStand:
+    def take_up(self, reach: float = 0.02) -> WinchResult:
         law = PretensionLaw(
             self.as_set_up, self.counts, target=TARGET, limit=LIMIT, reach=reach, speed=0.002
         )
         return self.move(law)
 
-    def move(self, law: WinchLaw) -> WinchesStand:
+    def move(self, law: WinchLaw) -> WinchResult:
         def on_cycle(record: CycleRecord) -> None:
             self.records.append(record)
             self.tensions.append(self.rehearsal.tensions)
@@ -107,7 +107,7 @@ class Place:
             Told(on_cycle, self.events.append),
             record=Path("nowhere"),
             rehome=self.rehome,
-            at_rest=lambda stand, _true_pose: self.at_rest(stand),
+            at_rest=lambda result, _true_pose: self.at_rest(result),
         )
 
     @property
@@ -151,10 +151,10 @@ def test_nobody_else_may_move_the_drives_before_the_reference_is_kept() -> None:
     kept = rig_from_document(rig.document.model_copy(update={"bus": bus}))
     interlock = MotionInterlock(kept)
 
-    def at_rest(stand: WinchesStand) -> HomingReference:
+    def at_rest(result: WinchResult) -> HomingReference:
         with pytest.raises(Refused, match="in progress"):
             MotionInterlock(kept).require_free()
-        return reference_at(kept, kept.home, stand.counts, stand.tensions, "stated pose", 0.0)
+        return reference_at(kept, kept.home, result.counts, result.tensions, "stated pose", 0.0)
 
     with after_power_loss(lost(1, on_a_stand=True)) as place:
         place.interlock, place.at_rest = interlock, at_rest
@@ -174,12 +174,12 @@ def test_slack_cables_are_wound_in_together_and_none_is_paid_out(
         assert place.rehearsal.tensions.min() < 0.1, "some hang slack"
         torque_limits = {drive.objects[0x6072, 0] for drive in place.rehearsal.drives}
         assert torque_limits == {1.2 * LIMIT / 100.0 * 1000.0}, "of the drives themselves, in ‰"
-        stand = place.take_up()
-        assert (stand.state, stand.cause) == (State.FINISHED, "")
+        result = place.take_up()
+        assert (result.state, result.cause) == (State.FINISHED, "")
         assert place.states == {HOLDING}
         assert place.rehearsal.tensions.min() >= 0.75 * TARGET
         assert np.max(place.tensions) <= LIMIT
-        assert np.abs(stand.tensions - place.rehearsal.tensions).max() < 0.1
+        assert np.abs(result.tensions - place.rehearsal.tensions).max() < 0.1
         steps = place.steps()
         assert steps.min() >= 0.0
         assert steps.max() <= 0.00002 + 2e-6
@@ -189,10 +189,10 @@ def test_slack_cables_are_wound_in_together_and_none_is_paid_out(
 
 def test_home_then_run_then_the_tags_agree(tmp_path: Path) -> None:
     with after_power_loss(lost(5, on_a_stand=True)) as place:
-        stand = place.take_up()
+        result = place.take_up()
         rig = referenced(
             place.rig,
-            reference_at(place.rig, place.rig.home, stand.counts, stand.tensions, "stated", 0.0),
+            reference_at(place.rig, place.rig.home, result.counts, result.tensions, "stated", 0.0),
         )
         place.group.close()
         home = place.rig.home.position
@@ -233,18 +233,18 @@ def test_a_platform_that_hangs_free_is_referenced_by_its_tags_and_goes_home(
     tmp_path: Path,
 ) -> None:
     with after_power_loss(lost(7, on_a_stand=False)) as place:
-        stand = place.take_up()
+        result = place.take_up()
         true = place.rehearsal.pose
         assert true.angle_to(place.rig.home) > 0.005, "it came to hang elsewhere"
         seen = static_pose(place.rig, looks(place.rig, true))
         assert seen.pose.distance_to(true) < 4.0 * seen.uncertainty
         reference = reference_at(
-            place.rig, seen.pose, stand.counts, stand.tensions, "tags", seen.uncertainty
+            place.rig, seen.pose, result.counts, result.tensions, "tags", seen.uncertainty
         )
         rig, load = referenced(place.rig, reference), nothing_in_the_way(place.rig).load
-        found = current_pose(rig, stand.counts, load)
+        found = current_pose(rig, result.counts, load)
         assert found.distance_to(true) < 4.0 * seen.uncertainty
-        home = straight_way(rig, nothing_in_the_way(rig), found, rig.home)
+        home = plan_straight_move(rig, nothing_in_the_way(rig), found, rig.home)
         prepared = prepare(verify(plan_from_document(home), rig), rig)
         bus = place.group._bus  # type: ignore[attr-defined]
         place.group.close()
@@ -268,8 +268,8 @@ def test_stop_ends_it_in_every_phase_and_a_hold_waits(phase: int) -> None:
                 place.board.ask_stop()
 
         place.script = script
-        stand = place.take_up()
-        assert stand.state is State.STOPPED
+        result = place.take_up()
+        assert result.state is State.STOPPED
         assert DriveState.OPERATION_ENABLED not in place.states
     with after_power_loss(lost(1, on_a_stand=False)) as place:
 
@@ -304,9 +304,9 @@ def fails(place: Place) -> None:
 def test_every_fault_stops_all_drives_together(happens: Callable[[Place], None]) -> None:
     with after_power_loss(lost(1, on_a_stand=True)) as place:
         place.script = lambda place, cycle: happens(place) if cycle == 80 else None
-        stand = place.take_up()
-        assert stand.state is State.LATCHED
-        assert stand.cause
+        result = place.take_up()
+        assert result.state is State.LATCHED
+        assert result.cause
         assert DriveState.OPERATION_ENABLED not in place.states
         after = np.array([r.targets for r in place.records if r.cycle > 83])
         assert len(np.unique(after, axis=0)) == 1, "nothing is sent on after the fault"
@@ -321,20 +321,20 @@ def test_a_bus_that_dies_at_once_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
         there = SimpleNamespace(positions=np.array(place.counts))
         monkeypatch.setattr(place.group, "read_positions", lambda _pace: there)
         monkeypatch.setattr(place.group, "send_cycle", broken)
-        stand = place.take_up()
-        assert stand.state is State.LATCHED
-        assert "interface is down" in stand.cause
-        assert np.isnan(stand.counts).all()
+        result = place.take_up()
+        assert result.state is State.LATCHED
+        assert "interface is down" in result.cause
+        assert np.isnan(result.counts).all()
 
 
 def test_a_cable_that_stays_slack_after_its_reach_stops_all() -> None:
     slack = np.zeros(8)
     slack[4] = 0.02
     with after_power_loss(PowerLoss(np.zeros(8), slack, on_a_stand=True)) as place:
-        stand = place.take_up(reach=0.004)
-        assert stand.state is State.LATCHED
-        assert "cable 5 carries" in stand.cause
-        assert "off its drum" in stand.cause
+        result = place.take_up(reach=0.004)
+        assert result.state is State.LATCHED
+        assert "cable 5 carries" in result.cause
+        assert "off its drum" in result.cause
         assert np.abs(np.sum(place.steps(), axis=0)).max() <= 0.004 + 1e-5
         found = next(e.cycle for e in place.events if e.code == "not_taut")
         assert len({r.targets for r in place.records if r.cycle >= found - 1}) == 1, "none goes on"
@@ -344,11 +344,11 @@ def test_a_cable_that_stays_slack_after_its_reach_stops_all() -> None:
 def test_one_cable_alone_moves_freely_only_while_it_hangs_slack() -> None:
     with after_power_loss(lost(3, 6.0, on_a_stand=True)) as place:
         law = CableStep(
-            place.as_set_up, place.counts, cable=2, way=-0.001, limit=LIMIT, speed=0.005
+            place.as_set_up, place.counts, cable=2, length=-0.001, limit=LIMIT, speed=0.005
         )
-        stand = place.move(law)
-        assert stand.state is State.FINISHED
-        moved = (stand.counts - place.counts) / [w.counts_per_metre for w in place.rig.winches]
+        result = place.move(law)
+        assert result.state is State.FINISHED
+        moved = (result.counts - place.counts) / [w.counts_per_metre for w in place.rig.winches]
         assert moved == pytest.approx([0, 0, -0.001, 0, 0, 0, 0, 0], abs=3e-6)
         assert place.steps().max() <= 0.005 * 0.01 + 2e-6
 
@@ -356,10 +356,12 @@ def test_one_cable_alone_moves_freely_only_while_it_hangs_slack() -> None:
 @pytest.mark.parametrize(("way", "cause"), [(-0.005, "more than"), (0.005, "went slack")])
 def test_on_a_taut_platform_one_cable_alone_is_stopped(way: float, cause: str) -> None:
     with after_power_loss(None) as place:
-        law = CableStep(place.as_set_up, place.counts, cable=2, way=way, limit=LIMIT, speed=0.005)
-        stand = place.move(law)
-        assert stand.state is State.LATCHED
-        assert cause in stand.cause
+        law = CableStep(
+            place.as_set_up, place.counts, cable=2, length=way, limit=LIMIT, speed=0.005
+        )
+        result = place.move(law)
+        assert result.state is State.LATCHED
+        assert cause in result.cause
         assert place.states == {HOLDING}
         assert np.max(place.tensions) < 1.02 * LIMIT
         stopped = next(r.cycle for r in place.records if r.state is State.SECURING)
@@ -400,9 +402,11 @@ def test_winches_without_a_platform_move_below_what_would_balance_it() -> None:
     rig = load_rig(HALL)
     loose = PowerLoss(np.zeros(rig.cable_count), np.full(rig.cable_count, 0.02), on_a_stand=True)
     with after_power_loss(loose, rig, limit=40.0, speed=0.005) as place:
-        law = CableStep(place.as_set_up, place.counts, cable=0, way=0.002, limit=40.0, speed=0.005)
-        stand = place.move(law)
-        assert stand.state is State.FINISHED, stand.cause
+        law = CableStep(
+            place.as_set_up, place.counts, cable=0, length=0.002, limit=40.0, speed=0.005
+        )
+        result = place.move(law)
+        assert result.state is State.FINISHED, result.cause
         assert {d.objects[0x6072, 0] for d in place.rehearsal.drives} == {
             int(np.ceil(1000.0 * 1.2 * 40.0 / w.torque_constant)) for w in rig.winches
         }
@@ -414,10 +418,10 @@ def test_the_slowest_motion_is_no_jump_of_a_coarse_encoder(speed: float) -> None
     loose = PowerLoss(np.zeros(rig.cable_count), np.full(rig.cable_count, 0.02), on_a_stand=True)
     with after_power_loss(loose, rig, limit=400.0, speed=speed) as place:
         law = CableStep(
-            place.as_set_up, place.counts, cable=0, way=-0.00005, limit=400.0, speed=speed
+            place.as_set_up, place.counts, cable=0, length=-0.00005, limit=400.0, speed=speed
         )
-        stand = place.move(law)
-        assert stand.state is State.FINISHED, stand.cause
+        result = place.move(law)
+        assert result.state is State.FINISHED, result.cause
 
 
 def test_no_winch_is_faster_than_its_rig_file_says() -> None:
@@ -425,7 +429,7 @@ def test_no_winch_is_faster_than_its_rig_file_says() -> None:
     begin = [0] * rig.cable_count
     fastest = np.array([winch.max_speed for winch in rig.winches])
     assert (wind_in_speed(rig, TARGET, LIMIT, 10.0) <= fastest).all()
-    law = CableStep(rig, begin, cable=1, way=0.05, limit=LIMIT, speed=10.0)
+    law = CableStep(rig, begin, cable=1, length=0.05, limit=LIMIT, speed=10.0)
     sent, per_metre = [begin], rig.winches[1].counts_per_metre
     while not law.done:
         sent.append(list(law.next(1.0, [0.0] * rig.cable_count)[0]))
@@ -440,10 +444,10 @@ def test_an_end_that_cannot_be_kept_is_a_fault_that_is_told(
 
     with after_power_loss(lost(1, on_a_stand=True)) as place:
         monkeypatch.setattr(MotionInterlock, "end", full)
-        stand = place.take_up()
-        assert stand.state is State.LATCHED
-        assert "disk full" in stand.cause
-        assert np.isfinite(stand.counts).all()
+        result = place.take_up()
+        assert result.state is State.LATCHED
+        assert "disk full" in result.cause
+        assert np.isfinite(result.counts).all()
         assert (place.events[-1].code, place.states) == ("recorder", {HOLDING})
 
 
@@ -465,14 +469,14 @@ def test_what_happens_while_the_camera_looks_is_noticed(
     happens: Callable[[Place], None], told: str | None
 ) -> None:
     with after_power_loss(lost(1, on_a_stand=True)) as place:
-        stand = place.take_up()
-        assert stand.state is State.FINISHED
+        result = place.take_up()
+        assert result.state is State.FINISHED
         happens(place)
         if told is None:
-            require_held(place.rig, stand, place.group.read_positions())
+            require_held(place.rig, result, place.group.read_positions())
             return
         with pytest.raises(Fault, match=told):
-            require_held(place.rig, stand, place.group.read_positions())
+            require_held(place.rig, result, place.group.read_positions())
 
 
 def no_more_heard(place: Place) -> None:
@@ -501,9 +505,9 @@ def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
         begin = np.array(place.counts)
         interlock.take(reference_at(kept, kept.home, begin, tensions, "stated pose", 0.0))
 
-        def at_rest(stand: WinchesStand) -> HomingReference:
+        def at_rest(result: WinchResult) -> HomingReference:
             happens(place)
-            return reference_at(kept, kept.home, stand.counts, tensions, "new", 0.0)
+            return reference_at(kept, kept.home, result.counts, tensions, "new", 0.0)
 
         place.interlock, place.at_rest, place.rehome = interlock, at_rest, rehome
         with pytest.raises(CdprError, match=told):
@@ -537,7 +541,7 @@ def test_a_record_that_is_full_by_then_leaves_the_cause_and_the_latch() -> None:
     interlock = MotionInterlock(rig_from_document(rig.document.model_copy(update={"bus": bus})))
     with after_power_loss(lost(1, on_a_stand=True)) as place:
 
-        def at_rest(_stand: WinchesStand) -> None:
+        def at_rest(_stand: WinchResult) -> None:
             loses_all_torque(place)
 
         place.interlock, place.at_rest, place.events = interlock, at_rest, Full()
@@ -583,12 +587,12 @@ def test_the_hall_robot_is_taken_up_too() -> None:
         group = make_drive_group(counted, near, rehearsal.pump, max_tension=400.0)
         group.configure()
         law = PretensionLaw(limited, counts, target=60.0, limit=400.0, reach=0.05, speed=0.002)
-        stand = move_winches(
+        result = move_winches(
             mover(limited, law, group, LocalRequests()), rig, MotionInterlock(rig),
             Told(lambda _record: None, lambda _event: None),
             record=Path("nowhere"), rehome=True, at_rest=lambda _stand, _true_pose: None,
         )  # fmt: skip
-        assert stand.state is State.FINISHED, stand.cause
+        assert result.state is State.FINISHED, result.cause
         assert rehearsal.tensions.min() >= 0.7 * 60.0
 
 

@@ -97,7 +97,7 @@ def test_nobody_sees_a_latch_that_does_not_say_its_cause_yet(
 def test_of_two_that_begin_at_once_one_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("executor.interlock.fault_latch.LOOKS_WITHIN", 0.05)
+    monkeypatch.setattr("executor.interlock.fault_latch.LOCK_TIMEOUT", 0.05)
     first = FaultLatch(BUS)
     first.path.parent.mkdir(parents=True)
     first._hold()  # it is about to write why

@@ -135,6 +135,6 @@ def test_the_executor_itself_refuses_a_latched_bus(prepared: PreparedRun, tmp_pa
             nothing,
             pose_every=0,
             need_real_time=False,
-            look_again=nothing,
+            check_drives=nothing,
             before_motion=lambda _denied: pytest.fail("it was about to move"),
         )

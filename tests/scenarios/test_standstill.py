@@ -42,11 +42,11 @@ class Held:
         """Does it; ``each_cycle`` says whether the operator wants to stop."""
         cycles = itertools.count()
 
-        def wishes() -> OperatorRequests:
+        def requests() -> OperatorRequests:
             return OperatorRequests(stop=each_cycle(next(cycles)))
 
         rig, records = load_rig(RIG), list[CycleRecord]()
-        procedure = kind(rig, SyncMaster(rig, self.group, self.clock), wishes, records.append)
+        procedure = kind(rig, SyncMaster(rig, self.group, self.clock), requests, records.append)
         procedure.arm()
         self.ended = procedure.run()
         return procedure

@@ -97,7 +97,7 @@ def test_who_sets_drives_up_waits_for_who_asks_and_does_so_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     settings = BusSettings("socketcan", "can6")
-    monkeypatch.setattr(set_up_lock, "ASKED_WITHIN", 0.05)
+    monkeypatch.setattr(set_up_lock, "READ_TIMEOUT", 0.05)
     with SetUpLock(settings).tried() as alone:
         assert alone
         assert not state_file("set-up", settings).parent.exists(), "who looks makes no file"

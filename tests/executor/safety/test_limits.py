@@ -43,8 +43,8 @@ def test_where_cables_may_hang_slack_the_watch_says_nothing_of_it():
         now = watch
         for _ in range(10):
             seen = Observation(True, [0.0] * 2, [tension, 20.0], [False] * 2, [], 0.0)
-            now, findings = now.look(seen)
-        return {finding.code for finding in findings}
+            now, alarms = now.update(seen)
+        return {alarm.code for alarm in alarms}
 
     assert found(0.0) == found(-1.0) == set()
     assert found(103.0) == {"over_tension"}

@@ -20,7 +20,7 @@ def look(cycles, limits=LIMITS):
     """What is found in the last of some cycles."""
     watch, found = StuckWatch.fresh((limits, limits), NAMES), ()
     for cycle in cycles:
-        watch, found = watch.look(*cycle)
+        watch, found = watch.update(*cycle)
     return found
 
 
@@ -38,7 +38,7 @@ def first_found(positions, demands, limits=LIMITS):
     """The cycle of the first stop, and its text; None where there is none."""
     watch = StuckWatch.fresh((limits,), NAMES[:1])
     for k, (position, demand) in enumerate(zip(positions, demands, strict=True)):
-        watch, found = watch.look(True, (position,), (demand,), (False,))
+        watch, found = watch.update(True, (position,), (demand,), (False,))
         if any(each.code == "drive_stuck" for each in found):
             return k
     return None
@@ -149,7 +149,7 @@ def test_before_the_whole_travel_it_is_not_known_whether_a_drive_follows():
     drive = Drive(StuckLimits(least=1, travel=100))
     for place in range(0, 100, 10):
         drive = drive.seen(place, place)
-        assert (drive.followed, drive.standing) == (False, 0)
+        assert (drive.followed, drive.stalled) == (False, 0)
     assert drive.seen(100, 100).followed
 
 
@@ -177,7 +177,7 @@ def test_drives_that_follow_nothing_are_not_judged():
     cycles = list(steps([0, 100, 200, 200], [0, 100, 200, 300]))
     resting = list(steps([200], [300], following=False))
     assert look([*cycles[:3], *resting, *cycles[3:]]) == ()
-    assert look([*cycles[:3], *resting]) == (), "it would be standing still if it were to follow"
+    assert look([*cycles[:3], *resting]) == (), "it would be stalled still if it were to follow"
     assert Drive(LIMITS, ((0, 0), (1, 1)), True, 3).forgotten() == Drive(LIMITS)
 
 
@@ -187,7 +187,7 @@ def test_an_entry_is_needed_for_every_drive():
         short = list(HERE)
         short[place] = short[place][:1]
         with pytest.raises(ValueError, match="zip"):
-            watch.look(*short)
+            watch.update(*short)
 
 
 def test_no_more_replies_are_kept_than_are_needed():

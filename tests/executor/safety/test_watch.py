@@ -32,12 +32,12 @@ def _look(*cycles: Observation) -> tuple[Alarm, ...]:
     """What is found in the last of some cycles."""
     watch, found = Monitor.fresh(LIMITS, NAMES), ()
     for seen in cycles:
-        watch, found = watch.look(seen)
+        watch, found = watch.update(seen)
     return found
 
 
 def _codes(*cycles: Observation) -> list[tuple[str, StopReaction]]:
-    return [(finding.code, finding.reaction) for finding in _look(*cycles)]
+    return [(alarm.code, alarm.reaction) for alarm in _look(*cycles)]
 
 
 def _with(field: str, drive: int, value: object) -> Observation:
@@ -87,8 +87,8 @@ def test_a_watch_may_be_told_to_wait_longer_for_replies():
     watch, lost = Monitor.fresh(patient, NAMES), _with("missing", 0, True)
     found = []
     for _ in range(5):
-        watch, (finding,) = watch.look(lost)
-        found.append(finding)
+        watch, (alarm,) = watch.update(lost)
+        found.append(alarm)
     assert [f.reaction for f in found] == [StopReaction.NOTE] * 3 + [StopReaction.QUICK_STOP] * 2
     assert [f.text.split(" for ")[1] for f in found[:2]] == ["1 cycle", "2 cycles"]
 
@@ -114,7 +114,7 @@ def test_a_following_error_may_be_the_limit_and_not_more(drive, sign):
 
 def test_a_following_error_is_told_in_millimetres():
     wide = Monitor.fresh(replace(LIMITS, following_error=0.5), NAMES)
-    (found,) = wide.look(_with("following_errors", 0, 2.5))[1]
+    (found,) = wide.update(_with("following_errors", 0, 2.5))[1]
     assert found.text == "cable 1 is 2500.00 mm from its set-point, limit 500.00 mm"
 
 
@@ -278,7 +278,7 @@ def test_an_observation_of_another_number_of_drives_is_an_error(field, count):
     """A row that is too short would hide the last drive."""
     values = (getattr(FINE, field) * 2)[:count]
     with pytest.raises(ValueError, match="entries for 3 drives"):
-        Monitor.fresh(LIMITS, NAMES).look(replace(FINE, **{field: values}))
+        Monitor.fresh(LIMITS, NAMES).update(replace(FINE, **{field: values}))
 
 
 @given(
@@ -293,7 +293,7 @@ def test_counts_are_runs_of_what_was_seen(cycles):
     missing = slack = loose = over = 0
     for following, tension, lost in cycles:
         seen = Observation(following, (0.0,), (tension,), (lost,), (), 0.0)
-        watch, found = watch.look(seen)
+        watch, found = watch.update(seen)
         missing = missing + 1 if lost else 0
         if not lost:
             slack = slack + 1 if following and tension < 5.0 else 0
@@ -313,14 +313,14 @@ def test_counts_are_runs_of_what_was_seen(cycles):
 
 def test_looking_leaves_the_watch_before_unchanged():
     watch = Monitor.fresh(LIMITS, NAMES)
-    watch.look(_with("missing", 0, True))
+    watch.update(_with("missing", 0, True))
     assert watch == Monitor.fresh(LIMITS, NAMES)
 
 
 def test_a_warning_changes_nothing_and_another_emergency_stops_the_path() -> None:
     seen = replace(FINE, warnings=[(1, "mild", False), (3, "hot", True)])
-    _, findings = Monitor.fresh(LIMITS, ("one", "two", "three")).look(seen)
-    assert findings == (
+    _, alarms = Monitor.fresh(LIMITS, ("one", "two", "three")).update(seen)
+    assert alarms == (
         Alarm(StopReaction.NOTE, "drive_warning", "mild", 1),
         Alarm(StopReaction.PATH_STOP, "drive_warning", "hot", 3),
     )
