@@ -32,13 +32,13 @@ class Opening:
 def wait(*cameras: Opening, stop_after: float = float("inf")) -> None:
     looks = 0
 
-    def unless_stopped() -> None:
+    def check_stop() -> None:
         nonlocal looks
         looks += 1
         if looks > stop_after:
             raise StoppedByOperator("stopped before anything moved")
 
-    wait_until_ready([cast(CameraProcess, camera) for camera in cameras], unless_stopped)
+    wait_until_ready([cast(CameraProcess, camera) for camera in cameras], check_stop)
 
 
 def test_each_is_asked_until_it_is_open() -> None:

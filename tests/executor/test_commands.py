@@ -16,11 +16,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.remote.client import ask_all, last_word, no_answer, select_run
+from executor.remote.client import ask_all, final_status, no_answer, select_run
 from executor.remote.command_socket import (
-    LONGEST_QUESTION,
+    LONGEST_REQUEST,
     MOST_CLIENTS,
-    Reached,
+    RunConnection,
     advertised,
     find_runs,
     serving,
@@ -144,7 +144,7 @@ def test_several_lines_at_once_and_a_line_in_pieces_are_understood(board):
 
 def test_a_line_without_end_is_cut_off(board):
     with _connected() as link:
-        link.sendall(b"x" * (LONGEST_QUESTION + 1))
+        link.sendall(b"x" * (LONGEST_REQUEST + 1))
         with suppress(ConnectionResetError):  # what was not read yet is thrown away
             assert link.recv(10) == b""
 
@@ -170,13 +170,13 @@ def test_a_run_that_ends_is_told_apart_from_one_that_hangs(monkeypatch):
     monkeypatch.setattr("executor.remote.client.ANSWER_TIMEOUT", 0.05)
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        (hanging,) = ask_all([Reached(7, ours)], "stop")
+        (hanging,) = ask_all([RunConnection(7, ours)], "stop")
         assert (hanging.status, hanging.ended) == (None, False)
         assert theirs.recv(100) == make_line("stop")
     ours, theirs = socket.socketpair()
     theirs.close()
     with ours:
-        (ended,) = ask_all([Reached(7, ours)], "stop")
+        (ended,) = ask_all([RunConnection(7, ours)], "stop")
         assert (ended.status, ended.ended) == (None, True)
     assert "did not answer" in no_answer("stop", [hanging]).what
     assert "ended" in no_answer("stop", [ended]).what
@@ -197,7 +197,7 @@ def test_a_run_that_refuses_is_quoted(said, what):
     with ours, theirs:
         thread = threading.Thread(target=lambda: (theirs.recv(100), theirs.sendall(said)))
         thread.start()
-        (answer,) = ask_all([Reached(7, ours)], "status")
+        (answer,) = ask_all([RunConnection(7, ours)], "status")
         thread.join()
     assert (answer.status, answer.ended) == (None, False)
     assert what in answer.what
@@ -230,7 +230,7 @@ def test_a_run_that_could_not_be_stopped_from_elsewhere_any_more_is_stopped(monk
 def test_which_run_is_meant_must_be_clear():
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        one, other = Reached(7, ours), Reached(8, theirs)
+        one, other = RunConnection(7, ours), RunConnection(8, theirs)
         assert select_run([one], None, "hold") is one
         assert select_run([one, other], 8, "hold") is other
         with pytest.raises(BadInput, match="2 runs"):
@@ -258,8 +258,8 @@ def test_a_run_that_ends_says_once_more_how_it_stands(
                 assert ask_all(runs, "status")[0].status == {"state": "moving"}
             now = {"state": "latched", "cause": "cable 6 is slack"}
         assert ask_all(runs, "status")[0].ended
-        assert last_word(runs[0]) == now
-        assert last_word(runs[0]) is None
+        assert final_status(runs[0]) == now
+        assert final_status(runs[0]) is None
 
 
 class _Presses:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from executor.recording.clearance import covariance_by_drives, tension_noise
+from executor.recording.clearance import encoder_covariance, tension_noise
 from model.kinematics import cable_lengths, forward_kinematics
 from model.pose import Array, Pose, rotation_vector_from_matrix
 from model.rig import Rig, load_rig, rig_from_document
@@ -43,7 +43,7 @@ def test_it_is_what_many_measurements_show(stiffness_n: float) -> None:
     rig = soft(stiffness_n)
     winches = WinchMap(rig)
     pose = Pose.level(rig.home.position + np.array([0.08, -0.05, 0.06]))
-    stated = covariance_by_drives(winches, rig, pose, np.full(rig.cable_count, 0.5))
+    stated = encoder_covariance(winches, rig, pose, np.full(rig.cable_count, 0.5))
     seen = found(rig, winches, pose, 0.5, 400)
     assert np.sqrt(np.diag(stated)) == pytest.approx(seen.std(axis=0), rel=0.15)
 
@@ -53,7 +53,7 @@ def test_soft_cables_and_noisy_torques_make_it_worse() -> None:
 
     def worst(rig: Rig, noise: float) -> float:
         told = np.full(rig.cable_count, noise)
-        covariance = covariance_by_drives(WinchMap(rig), rig, rig.home, told)
+        covariance = encoder_covariance(WinchMap(rig), rig, rig.home, told)
         return float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
 
     assert worst(stiff, 0.5) < 0.1e-3

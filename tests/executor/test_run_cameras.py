@@ -282,9 +282,9 @@ def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
             assert now < 60.0, "it is told soon"
             run.trigger(now, now, None, None)
             told += [news.text for news in run.news()]
-            if how == "stopped" and len(eyes[1].looks) == 3:
+            if how == "stopped" and len(eyes[1].samples) == 3:
                 os.kill(child("side"), signal.SIGSTOP)
-            front_only = len(eyes[1].looks) >= 3
+            front_only = len(eyes[1].samples) >= 3
             wait_for_answers(processes[:1] if front_only else processes)
         seen = run.finish(never)
     finally:

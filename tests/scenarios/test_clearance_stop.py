@@ -172,7 +172,7 @@ def test_one_picture_alone_does_not_stop_a_run(narrow_plan: Path, tmp_path: Path
     with CameraWorker(rig, rig.cameras[0], Rendered(eye), folder, 1000, named=False) as observer:
         told = []
         for frame, pose in enumerate([near, far, near, near, far]):
-            found = observer.look(FrameRequest(frame, frame * 0.1, 0.0, pose)).found
+            found = observer.measure(FrameRequest(frame, frame * 0.1, 0.0, pose)).found
             assert isinstance(found, PoseMeasurement)
             told.append(bool(watch.take(clearance_of(model, found))))
     assert told == [False, False, False, True, False]

@@ -17,8 +17,10 @@ def test_each_picture_comes_with_the_drives_pose_of_its_own_time(
     """The table of the whole run is made otherwise: all cycles at once, each near its plan."""
     told: list[tuple[float, Pose | None]] = []
 
-    def trigger(time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None) -> None:
-        told.append((time, by_drives))
+    def trigger(
+        time: float, asked: float, true_pose: Pose | None, encoder_pose: Pose | None
+    ) -> None:
+        told.append((time, encoder_pose))
 
     with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
         cycles = stage.run(trigger=trigger).log.table()
