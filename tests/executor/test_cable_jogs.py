@@ -1,4 +1,4 @@
-"""One cable at a time by hold-to-run, in simulated time: only what is held, never too tight."""
+"""One cable at a time by hold-to-run, in simulated time: only while held, never too tight."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from model.rig import Rig, load_rig, rig_from_document
 from tests.cli.plans import RIG
 
 SPEED = 0.020
-#: From the jog speed to rest, [s].
+#: Time from the jog speed to rest, [s].
 RAMP = 0.35
 
 
@@ -49,7 +49,7 @@ Say = Callable[[PressBoard], object]
 
 @dataclass
 class Script:
-    """Holds controls by simulated time, and keeps what the loop did."""
+    """Holds controls in simulated time, and keeps the records of the loop."""
 
     holds: list[tuple[float, float, Say]]
     end: float
@@ -75,7 +75,7 @@ def hold(number: int, cable: int, out: bool, step: float | None = None, percent:
 
 
 def moved(records: list[CycleRecord], robot: Rig) -> Array:
-    """Of each cable and cycle, what was paid out since the begin, shape (n, m), [m]."""
+    """Length paid out since the start, per cycle and cable, shape (n, m), [m]."""
     targets = np.array([record.targets for record in records], dtype=np.float64)
     return (targets - targets[0]) / [winch.counts_per_metre for winch in robot.winches]
 
@@ -98,7 +98,7 @@ def test_a_cable_is_paid_out_while_held_and_rests_when_let_go() -> None:
     at = np.array([record.at for record in records])
     out, still = moved(records, robot), np.array(is_moving(records))
     assert out[-1, 2] > 5e-4
-    assert (np.delete(out, 2, axis=1) == 0.0).all(), "the others stand"
+    assert (np.delete(out, 2, axis=1) == 0.0).all(), "the others rest"
     assert not still[at < 0.5].any()
     assert not still[at > 1.0 + TIMEOUT + RAMP].any()
     assert (np.diff(out[:, 2]) >= 0.0).all(), "never in the other direction"
@@ -149,7 +149,7 @@ def test_what_was_wound_in_can_be_paid_out_again() -> None:
     assert moved(records, rig())[-1, 2] > moved(records, rig())[:, 2].min()
 
 
-def test_a_press_moves_a_cable_by_no_more_than_its_longest_way(
+def test_a_press_moves_a_cable_by_no_more_than_its_longest_travel(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sessions, "LONGEST_MM", 8.0)
@@ -192,7 +192,7 @@ def test_nothing_moves_unless_held_and_no_tension_is_beyond_the_limit(
         say = hold(number, cable, out, step)
         holds.append((begin, until, say))
         spans.append((begin, until, cable - 1, out))
-        if silent:  # heard of again after it was silent for too long: it must stay over
+        if silent:  # reported again after too long a silence: it must stay over
             holds.append((until + 0.25, until + 0.5, say))
             begin = until + 0.6
         else:
@@ -239,7 +239,7 @@ def test_it_slows_down_on_release_with_limited_acceleration() -> None:
 def test_another_cable_that_goes_slack_all_the_same_ends_in_a_fault(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As `cdpr jog --cable`: the platform is then not where anybody thinks."""
+    """As for `cdpr jog --cable`: the platform pose is unknown afterwards."""
     monkeypatch.setattr(winch_laws, "LEAST_SHARE", -100.0)
     script = Script([(0.5, 9.0, hold(1, 1, out=True))], 9.5)
     with pytest.raises(Fault, match="went slack"):

@@ -1,4 +1,4 @@
-"""Cameras open all at once, and a stop is heard while they do."""
+"""Cameras open at the same time, and a stop is handled meanwhile."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from model.errors import Fault, HardwareMissing, StoppedByOperator
 
 
 class Opening:
-    """A camera that is open, or fails, when it was asked so often."""
+    """A camera that is open, or fails, after a number of calls."""
 
     def __init__(self, name: str, after: float, fails: bool = False) -> None:
         self.name, self.asked = name, 0
@@ -47,7 +47,7 @@ def test_each_is_asked_until_it_is_open() -> None:
     assert (slow.asked, fast.asked) == (5, 2)
 
 
-def test_one_that_fails_is_told_though_another_one_hangs() -> None:
+def test_one_that_fails_is_reported_though_another_one_hangs() -> None:
     hung, broken = Opening("hung", float("inf")), Opening("broken", 3, fails=True)
     with pytest.raises(HardwareMissing, match="cannot be opened"):
         wait(hung, broken)

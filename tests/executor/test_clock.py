@@ -16,7 +16,7 @@ CYCLE_NS = 10_000_000
 
 
 class _Time:
-    """A monotonic clock that is moved by hand; sleeping overshoots by a given time."""
+    """A monotonic clock set by the test; sleeping overshoots by a given time."""
 
     def __init__(self) -> None:
         self.now = 5_000_000_000
@@ -61,7 +61,7 @@ def test_cycles_begin_on_time_whatever_the_work_takes(time):
         assert time.now == begin + cycle * CYCLE_NS
 
 
-def test_small_delays_are_told_and_do_not_add_up(time):
+def test_small_delays_are_reported_and_do_not_add_up(time):
     real = RealClock(CYCLE)
     real.next_cycle()
     begin, time.overshoot = time.now, 80_000

@@ -1,4 +1,4 @@
-"""The command socket: what is a command, who is answered, and that nobody keeps others waiting."""
+"""The command socket: commands, answers, and clients that do not block others."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from model.errors import BadInput, Fault
 
 
 class _Status:
-    """Stands in for `RunStatus`: its content is not what these tests are about."""
+    """Replaces `RunStatus`, whose content does not matter here."""
 
     def as_dict(self) -> dict[str, Any]:
         return {"state": "moving"}
@@ -77,7 +77,7 @@ def test_each_command_puts_up_its_wish_and_leaves_the_others():
         b"\xff\xfe",
     ],
 )
-def test_what_is_no_command_changes_nothing_and_is_told(line):
+def test_what_is_no_command_changes_nothing_and_is_reported(line):
     board = LocalRequests()
     answer = _answer(line, board)
     assert answer["ok"] is False
@@ -107,7 +107,7 @@ def test_a_speed_that_is_none_is_no_command(percent):
 
 @pytest.fixture
 def board(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[LocalRequests]:
-    """Of a run that answers."""
+    """The socket of a run that answers."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
@@ -166,7 +166,7 @@ def test_a_client_that_never_reads_or_never_speaks_keeps_nobody_waiting(board):
                 link.close()
 
 
-def test_a_run_that_ends_is_told_apart_from_one_that_hangs(monkeypatch):
+def test_a_run_that_ends_is_distinguished_from_one_that_hangs(monkeypatch):
     monkeypatch.setattr("executor.remote.client.ANSWER_TIMEOUT", 0.05)
     ours, theirs = socket.socketpair()
     with ours, theirs:
@@ -204,7 +204,7 @@ def test_a_run_that_refuses_is_quoted(said, what):
     assert what in no_answer("hold", [answer]).what
 
 
-def test_a_command_counts_although_the_run_cannot_tell_how_it_stands():
+def test_a_command_counts_although_the_run_cannot_report_its_status():
     class Broken:
         def as_dict(self) -> dict[str, Any]:
             raise RuntimeError("half a status")
@@ -242,12 +242,12 @@ def test_which_run_is_meant_must_be_clear():
 
 
 @pytest.mark.parametrize("asked", [0, 1])
-def test_a_run_that_ends_says_once_more_how_it_stands(
+def test_a_run_that_ends_sends_its_status_once_more(
     asked: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """To those who watch it; who looks a few times a second may have missed the end."""
+    """A monitor that reads a few times per second may have missed the end."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setenv("TMPDIR", str(tmp_path))  # root looks at all users' runs there
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # root finds all users' runs there
     monkeypatch.setattr(tempfile, "tempdir", None)
     now = {"state": "moving"}
     status: Any = SimpleNamespace(as_dict=lambda: now)
@@ -263,22 +263,22 @@ def test_a_run_that_ends_says_once_more_how_it_stands(
 
 
 class _Presses:
-    """Keeps what it is told; takes every press but the last."""
+    """Records its calls; accepts every press except the last."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[Any, ...]] = []
+        self.calls: list[tuple[Any, ...]] = []
 
     def hold(
         self, number: int, direction: Any, *, in_platform: bool, step: float | None, percent: int
     ) -> bool:
-        self.told.append((number, direction.tolist(), in_platform, step, percent))
+        self.calls.append((number, direction.tolist(), in_platform, step, percent))
         return number < 9
 
     def let_go(self, number: int) -> None:
-        self.told.append(("let go", number))
+        self.calls.append(("let go", number))
 
     def end(self) -> None:
-        self.told.append(("end",))
+        self.calls.append(("end",))
 
 
 def _said(presses: _Presses | None, **question: Any) -> dict[str, Any]:
@@ -295,7 +295,7 @@ def test_a_session_of_jogs_takes_what_is_said_of_presses() -> None:
     assert _said(presses, command="held", press=4, direction=[1, 1, 0])["ok"]
     assert _said(presses, command="let_go", press=4)["ok"]
     assert _said(presses, command="end")["ok"]
-    first, second, *others = presses.told
+    first, second, *others = presses.calls
     assert first == (3, [0.0, pytest.approx(0.6), pytest.approx(0.8)], True, 0.0001, 25)
     assert second == (4, pytest.approx([0.5**0.5, 0.5**0.5, 0.0]), False, None, 100)
     assert others == [("let go", 4), ("end",)]
@@ -321,9 +321,9 @@ def test_a_press_that_is_none_is_refused(wrong: dict[str, Any]) -> None:
     presses = _Presses()
     good = {"command": "held", "press": 1, "direction": [1, 0, 0]}
     assert _said(presses, **good)["ok"]
-    presses.told.clear()
+    presses.calls.clear()
     assert not _said(presses, **{**good, **wrong})["ok"]
-    assert not presses.told
+    assert not presses.calls
 
 
 @pytest.mark.parametrize("command", ["held", "let_go", "end"])
@@ -333,7 +333,7 @@ def test_any_other_motion_takes_no_jogs(command: str) -> None:
 
 
 class _Noted:
-    """Notes what is said of presses; a cable 9 is not there."""
+    """Records reports of presses; there is no cable 9."""
 
     def __init__(self) -> None:
         self.said: list[Any] = []

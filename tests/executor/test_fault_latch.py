@@ -1,4 +1,4 @@
-"""The latch of a bus: who holds it, what a second program sees, and what cannot be kept."""
+"""The fault latch: who holds it, what a second program sees, and write failures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def two() -> tuple[FaultLatch, FaultLatch]:
-    """Of two programs; locks of two open files keep each other out in one process, too."""
+    """The latches of two programs; locks of two open files also conflict in one process."""
     return FaultLatch(BUS), FaultLatch(BUS)
 
 
@@ -45,7 +45,7 @@ def test_nothing_is_latched_at_first() -> None:
     assert not mine.held_by_another()
 
 
-def test_while_a_motion_is_under_way_others_are_refused_by_its_process(folder: Path) -> None:
+def test_while_a_motion_is_active_others_are_refused_by_its_process(folder: Path) -> None:
     mine, other = two()
     mine.engage("a rig", folder)
     assert not mine.held_by_another(), "it is held by this one"
@@ -155,7 +155,7 @@ def test_what_cannot_be_written_is_refused_with_its_reason(folder: Path, what: s
             other.held_by_another()
 
 
-def test_a_latch_that_cannot_be_removed_is_told_and_stays_held(folder: Path) -> None:
+def test_a_latch_that_cannot_be_removed_is_reported_and_stays_held(folder: Path) -> None:
     mine, other = two()
     mine.engage("a rig", folder)
     mine.path.unlink()
@@ -204,7 +204,7 @@ def test_nothing_moves_when_the_lock_or_its_folder_cannot_be_made(
 def test_a_motion_that_engages_between_two_looks_keeps_the_other_out(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first look is without the lock: what was engaged and settled since counts."""
+    """The first check is without the lock: changes since then count."""
     mine, other = two()
     hold = FaultLatch._hold
 

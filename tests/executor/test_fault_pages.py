@@ -35,7 +35,7 @@ CODE_ARGUMENT = {
 
 
 def codes_in_the_source() -> Iterator[str]:
-    """Codes that are written where events are made; and those of faults of the bus."""
+    """Codes of events in the source, and those of bus faults."""
     for path in [*(ROOT / "executor").rglob("*.py"), *(ROOT / "cdpr").rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.Call):
@@ -46,7 +46,7 @@ def codes_in_the_source() -> Iterator[str]:
                 code = node.args[index]
                 if isinstance(code, ast.Constant) and isinstance(code.value, str):
                     yield code.value
-    yield from ("recorder", "supervisor_lost")  # told in a loop, by name
+    yield from ("recorder", "supervisor_lost")  # reported in a loop, by name
     yield from (kind.code for kind in (BusFault, *BusFault.__subclasses__()))
 
 
@@ -94,7 +94,7 @@ def test_an_event_that_is_no_fault_points_to_no_page(code: str) -> None:
     assert page_of(code) == ""
 
 
-def test_every_page_is_explained_and_a_wrong_code_is_told_the_right_ones() -> None:
+def test_every_page_is_explained_and_a_wrong_code_gets_the_right_ones() -> None:
     for code in fault_codes():
         answer = call("explain", code)
         assert answer.code == 0

@@ -1,4 +1,4 @@
-"""The reference of drives: which rig it counts for, and when it counts no more."""
+"""The homing reference: for which rig it is valid, and when it is lost."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def reference_of(rig: Rig, shift: int = 1000) -> HomingReference:
     return reference_at(rig, rig.home, counts, np.full(rig.cable_count, 20.0), "stated", 0.0)
 
 
-def test_it_takes_the_place_of_the_rig_files_counts() -> None:
+def test_it_replaces_the_rig_files_counts() -> None:
     rig = rig_with("incremental")
     document = reference_of(rig)
     MotionInterlock(rig).file.write(document)
@@ -83,7 +83,7 @@ def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
     assert interlock.reference() is not None
 
 
-def test_every_motion_that_counts_from_it_notes_where_the_drives_stand() -> None:
+def test_every_motion_that_counts_from_it_notes_the_drive_positions() -> None:
     rig = rig_with("incremental")
     interlock = MotionInterlock(rig)
     interlock.file.write(reference_of(rig))
@@ -94,7 +94,7 @@ def test_every_motion_that_counts_from_it_notes_where_the_drives_stand() -> None
     assert kept.stands_at == list(range(8))
     interlock.begin(Path("run"), kept)
     interlock.end(State.LATCHED, "killed", Path("run"), holding=True, positions=None)
-    assert interlock.kept_reference() == kept, "nobody heard anything of the drives"
+    assert interlock.kept_reference() == kept, "the drives' state is unknown"
 
 
 def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
@@ -113,7 +113,7 @@ def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
 
 
 def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
-    """Setting them up wipes out its evidence, so the next opening sees nothing any more."""
+    """Configuration erases the evidence, so that the next opening would not detect it."""
     rig = rig_with("incremental")
     interlock = MotionInterlock(rig)
     interlock.file.write(reference_of(rig))
@@ -186,7 +186,7 @@ def test_a_file_that_cannot_be_read_is_not_ignored(content: str) -> None:
     interlock.file.path.write_text(content)
     with pytest.raises(Refused, match="cannot be read"):
         interlock.reference()
-    # Homing replaces it; what was moved meanwhile must not stumble over it.
+    # Homing replaces it; an earlier motion must not prevent that.
     interlock.found_restarted((1,))
     interlock.begin(Path("run"), interlock.still_counts(range(8)), rehome=True)
     interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))

@@ -11,7 +11,7 @@ NAMES = [f"cable {k} (drive {k + 10})" for k in range(1, 9)]
 
 
 def silent(*drives: int, cycles: int = 2) -> tuple[Alarm, ...]:
-    """What the watch finds when these drives do not answer for so many cycles."""
+    """Alarms when these drives do not answer for a number of cycles."""
     watch = Monitor.fresh(WatchLimits(1e-3, 2.0, 50.0, 0.5), NAMES)
     found: tuple[Alarm, ...] = ()
     missing = [drive in drives for drive in range(1, 9)]

@@ -1,4 +1,4 @@
-"""Tables of runs with stops: exact dwells, loads by legs, and refusals of what is not so."""
+"""Tables of runs with stops: exact dwells, loads by legs, and refusals of violations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PICKED = {"kind": "pick", "dwell_s": 0.5, "mass_kg": 2.0, "mass_centre_mm": [0, 
 
 @lru_cache(maxsize=1)
 def _made() -> tuple[Rig, Scene, Trajectory]:
-    """A pick, a way-pose, a place at the way-pose, and back; the third leg has no length."""
+    """A pick, a via pose, a put-down at the via pose, and back; the third leg has no length."""
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     scene = scene_from_document(
         SceneDocument.model_validate(
@@ -79,7 +79,7 @@ def test_a_table_with_stops_passes_its_check() -> None:
     assert checked.report.length == pytest.approx(table.travelled[-1], abs=1e-5)
 
 
-def test_the_platform_stands_exactly_at_its_stops_for_the_whole_dwell() -> None:
+def test_the_platform_rests_exactly_at_its_stops_for_the_whole_dwell() -> None:
     _, scene, table = _made()
     take, by, leave = table.dwells
     assert by.first == by.last
@@ -109,7 +109,7 @@ def test_tensions_and_counts_are_those_of_each_legs_load() -> None:
         lengths = cables_to(rig, pose.apply(rig.anchors)).lengths
         np.testing.assert_allclose(table.lengths[row], lengths, atol=1e-9)
     stretch = np.abs(table.counts[take.last] - table.counts[take.first])
-    assert stretch.max() > 1.0, "less is wound off for the heavier load, at the same pose"
+    assert stretch.max() > 1.0, "less cable is paid out for the heavier load, at the same pose"
 
 
 def test_during_a_dwell_tensions_go_evenly_from_one_load_to_the_other() -> None:
@@ -123,13 +123,13 @@ def test_during_a_dwell_tensions_go_evenly_from_one_load_to_the_other() -> None:
 
 def test_legs_are_counted_by_the_stops_that_were_left() -> None:
     dwells = [Dwell(10, 20), Dwell(30, 30)]
-    places = np.array([0.0, 10.0, 19.9, 20.0, 29.5, 30.0, 40.0])
-    assert legs_at(dwells, places).tolist() == [1, 1, 1, 2, 2, 3, 3]
-    assert legs_at([], places).tolist() == [1] * 7
+    indices = np.array([0.0, 10.0, 19.9, 20.0, 29.5, 30.0, 40.0])
+    assert legs_at(dwells, indices).tolist() == [1, 1, 1, 2, 2, 3, 3]
+    assert legs_at([], indices).tolist() == [1] * 7
 
 
 def test_tensions_that_do_not_hold_the_load_are_refused() -> None:
-    """The pose, the counts and the limits are right; only the load is another."""
+    """Pose, counts and limits are right; only the load differs."""
     _, scene, table = _made()
     heavier = [s.model_copy() for s in scene.document.stops]
     heavier[0] = heavier[0].model_copy(update={"mass_kg": 2.1})
@@ -148,7 +148,7 @@ def test_tensions_beside_those_of_either_load_are_refused_during_a_dwell() -> No
     )
 
 
-def test_a_stand_elsewhere_than_its_stop_is_refused() -> None:
+def test_a_dwell_elsewhere_than_its_stop_is_refused() -> None:
     _, scene, table = _made()
     moved = [s.model_copy() for s in scene.document.stops]
     moved[1] = moved[1].model_copy(update={"position_mm": [10.0, 8.0, 460.01]})
@@ -172,20 +172,20 @@ def test_a_dwell_that_is_too_short_is_refused() -> None:
         ((Dwell(20, 50), Dwell(60, 90), Dwell(90, 10**6)), "out of order"),
     ],
 )
-def test_stands_that_are_none_are_refused(dwells: tuple[Dwell, ...], words: str) -> None:
+def test_dwells_that_are_invalid_are_refused(dwells: tuple[Dwell, ...], words: str) -> None:
     assert words in _refused(replace(_made()[2], dwells=dwells))
 
 
 def test_stops_are_announced_once_when_they_are_reached_and_left() -> None:
     _, scene, table = _made()
-    told, take = stop_events(scene, table.dwells), table.dwells[0]
-    assert told.due(take.first - 0.5) == []
+    events, take = stop_events(scene, table.dwells), table.dwells[0]
+    assert events.due(take.first - 0.5) == []
     text = "at stop 'take', resting for 0.5 s while 2 kg is picked up"
-    assert told.due(float(take.first)) == [("pick", text)]
-    assert told.due(take.last - 0.5) == []
-    codes = [code for code, _ in told.due(float(len(table)))]
+    assert events.due(float(take.first)) == [("pick", text)]
+    assert events.due(take.last - 0.5) == []
+    codes = [code for code, _ in events.due(float(len(table)))]
     assert codes == ["leaving", "pass", "place", "leaving"]
-    assert told.due(float(len(table))) == []
+    assert events.due(float(len(table))) == []
 
 
 def test_the_load_changes_in_the_middle_of_a_dwell() -> None:

@@ -1,4 +1,4 @@
-"""What winches are told without a path: bounded, in one direction, never more than can be seen."""
+"""Set-points of winches without a path: bounded, in one direction, limited by the feedback."""
 
 from __future__ import annotations
 
@@ -102,18 +102,18 @@ def test_beyond_the_limit_no_winch_goes_on(wrong):
 
 
 def test_near_the_limit_all_go_on_more_slowly():
-    rig, ways = RIGS[0], []
+    rig, steps = RIGS[0], []
     for tension in (10.0, 35.0, 59.9):
         law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002)
         targets, _ = law.next(1.0, [0.0] * 7 + [tension])
         for _ in range(99):
             targets, _ = law.next(1.0, [0.0] * 7 + [tension])
-        ways.append(abs(targets[0]))
-    assert ways[1] == pytest.approx(0.5 * ways[0], rel=0.01)
-    assert ways[2] == pytest.approx(0.05 * ways[0], rel=0.05)
+        steps.append(abs(targets[0]))
+    assert steps[1] == pytest.approx(0.5 * steps[0], rel=0.01)
+    assert steps[2] == pytest.approx(0.05 * steps[0], rel=0.05)
 
 
-def test_a_cable_that_stays_slack_is_told():
+def test_a_cable_that_stays_slack_is_reported():
     rig = RIGS[0]
     law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=1e-5, speed=0.002)
     found = ()
@@ -130,7 +130,7 @@ def test_a_cable_that_stays_slack_is_told():
 
 @settings(max_examples=40, deadline=None)
 @given(length=st.floats(-0.05, 0.05).filter(lambda w: abs(w) > 1e-4), speed=st.floats(1e-3, 0.02))
-def test_one_cable_goes_its_way_smoothly_and_the_others_stand(length, speed):
+def test_one_cable_moves_smoothly_and_the_others_rest(length, speed):
     rig = RIGS[0]
     law = CableStep(rig, [7] * 8, cable=2, length=length, limit=60.0, speed=speed)
     sent = []
@@ -168,7 +168,7 @@ def test_only_a_cable_that_was_taut_may_not_go_slack(was):
     assert codes[4] == (["went_slack"] if was else [])
 
 
-# A jog of one cable that is held: `CableFeed`, and where it comes to rest.
+# A held jog of one cable: `CableFeed`, and where it comes to rest.
 
 
 @settings(max_examples=60, deadline=None)
@@ -179,7 +179,9 @@ def test_only_a_cable_that_was_taut_may_not_go_slack(was):
     paces=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=80),
     seed=st.integers(0, 10**6),
 )
-def test_a_held_cable_goes_one_way_and_no_farther_than_its_reach(rig, length, speed, paces, seed):
+def test_a_held_cable_moves_in_one_direction_and_no_farther_than_its_reach(
+    rig, length, speed, paces, seed
+):
     random = np.random.default_rng(seed)
     law = CableFeed(rig, [7] * 8, cable=2, length=length, limit=60.0, speed=speed)
     counts = rig.winches[2].counts_per_metre
@@ -189,7 +191,7 @@ def test_a_held_cable_goes_one_way_and_no_farther_than_its_reach(rig, length, sp
     before, left = 7, law.cycles_left
     for pace in paces:
         targets, _ = law.next(pace, random.uniform(0.0, 80.0, 8).tolist())
-        assert (np.delete(targets, 2) == 7).all(), "the others stand"
+        assert (np.delete(targets, 2) == 7).all(), "the others rest"
         ahead = targets[2] - before
         assert ahead * np.sign(length * counts) >= 0
         assert abs(ahead) <= abs(counts) * speed * 0.01 * pace + 1
@@ -201,7 +203,7 @@ def test_a_held_cable_goes_one_way_and_no_farther_than_its_reach(rig, length, sp
     assert law.next(1.0, [0.0] * 8)[0] == end
 
 
-def test_a_way_of_nothing_is_done_at_once():
+def test_a_zero_length_is_done_at_once():
     law = CableFeed(RIGS[0], [0] * 8, cable=2, length=0.0, limit=60.0, speed=0.02)
     assert law.done
     assert law.next(1.0, [0.0] * 8) == ((0,) * 8, ())
@@ -210,11 +212,11 @@ def test_a_way_of_nothing_is_done_at_once():
 def test_a_cable_that_goes_slack_speeds_up_without_a_jerk():
     rig = RIGS[0]
     law = CableFeed(rig, [0] * 8, cable=2, length=0.05, limit=60.0, speed=0.02)
-    places = [0]
+    positions = [0]
     for tension in [20.0] * 20 + [0.0] * 60:
         targets, _ = law.next(1.0, [20.0, 20.0, tension] + [20.0] * 5)
-        places.append(abs(targets[2]))
-    steps = np.diff(places) / abs(per_metre(rig)[2])
+        positions.append(abs(targets[2]))
+    steps = np.diff(positions) / abs(per_metre(rig)[2])
     most = rig.motion.acceleration / rig.motion.speed * 0.01 * 0.02 * 0.01
     assert np.diff(steps).max() <= most + 2.0 / abs(per_metre(rig)[2])
     assert steps[-1] > 5.0 * steps[10]
@@ -260,7 +262,7 @@ def test_it_rests_before_another_cable_that_was_taut_is_slack(out):
     assert 0.0 < share(one(6, FLOOR + 0.5), out=out) < 0.1
     assert share(one(2, FLOOR - 0.01), out=out) > 0.2, "its own may go slack"
     hung = one(6, SLACK - 0.5)
-    assert share(one(6, 0.0), out=out, before=hung) > 0.2, "what hung slack may go on so"
+    assert share(one(6, 0.0), out=out, before=hung) > 0.2, "a slack cable may stay slack"
 
 
 @pytest.mark.parametrize("out", [True, False])

@@ -1,4 +1,4 @@
-"""The page with the real server: whoever falls silent, the page says so, and who it is.
+"""The page with the real server: it reports which part has become silent.
 
 How soon is measured by `python benchmarks/console_stale.py`.
 """

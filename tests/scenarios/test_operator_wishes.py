@@ -42,11 +42,11 @@ def states(outcome: Outcome) -> list[str]:
 
 
 def rates_on_path(prepared: PreparedRun, outcome: Outcome) -> tuple[np.ndarray, np.ndarray]:
-    """Rows a cycle, measured from what was sent, and how inexact each is."""
+    """Rows per cycle from the set-points sent, and their uncertainty."""
     table = outcome.log.table()
     on_path = np.isin(table.state, ["moving", "holding", "stopping"])
     index, inexact, off = path_indices(prepared, table.set_counts[on_path])
-    assert off.max() <= 2.0, "every drive is told the same place of the path, to whole counts"
+    assert off.max() <= 2.0, "all drives are at the same path index, to whole counts"
     return np.diff(index), inexact[1:] + inexact[:-1]
 
 
@@ -81,8 +81,8 @@ def test_a_hold_rests_on_the_path_under_power_and_a_resume_goes_on_to_the_goal(
 def test_speeds_are_kept_and_change_smoothly(prepared: PreparedRun, tmp_path: Path) -> None:
     stage, outcome = run(prepared, tmp_path, c100=speed(50), c250=speed(10), c400=speed(100))
     assert outcome.state is State.FINISHED
-    told = [event.text for event in stage.events() if event.code == "speed"]
-    assert [text.split(": ")[1] for text in told] == [
+    reported = [event.text for event in stage.events() if event.code == "speed"]
+    assert [text.split(": ")[1] for text in reported] == [
         f"{share} of the planned speed" for share in ("50%", "10%", "100%")
     ]
     rates, _ = rates_on_path(prepared, outcome)

@@ -1,4 +1,4 @@
-"""The watch: silent within the limits, loud one step beyond, and never fooled by NaN or gaps."""
+"""The monitor: silent within the limits, an alarm one step beyond, robust to NaN and gaps."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _put(values: tuple[object, ...], drive: int, value: object) -> tuple[object,
 
 
 def _look(*cycles: Observation) -> tuple[Alarm, ...]:
-    """What is found in the last of some cycles."""
+    """Alarms in the last of some cycles."""
     watch, found = Monitor.fresh(LIMITS, NAMES), ()
     for seen in cycles:
         watch, found = watch.update(seen)
@@ -82,7 +82,7 @@ def test_replies_are_counted_for_each_drive_alone(drive):
     assert f"{NAMES[drive]} " in _look(_with("missing", drive, True))[0].text
 
 
-def test_a_watch_may_be_told_to_wait_longer_for_replies():
+def test_a_watch_may_be_set_to_wait_longer_for_replies():
     patient = replace(LIMITS, missing_cycles=4)
     watch, lost = Monitor.fresh(patient, NAMES), _with("missing", 0, True)
     found = []
@@ -112,7 +112,7 @@ def test_a_following_error_may_be_the_limit_and_not_more(drive, sign):
     )
 
 
-def test_a_following_error_is_told_in_millimetres():
+def test_a_following_error_is_reported_in_millimetres():
     wide = Monitor.fresh(replace(LIMITS, following_error=0.5), NAMES)
     (found,) = wide.update(_with("following_errors", 0, 2.5))[1]
     assert found.text == "cable 1 is 2500.00 mm from its set-point, limit 500.00 mm"
@@ -128,7 +128,7 @@ def test_a_following_error_that_is_no_number_stops(drive, value):
 
 @each_drive
 def test_a_drive_that_did_not_answer_is_not_judged_by_its_old_position(drive):
-    """One lost reply is a note; the others are judged all the same."""
+    """One lost reply is a note; the other drives are still judged."""
     seen = _with("missing", drive, True)
     old = replace(seen, following_errors=_put(FINE.following_errors, drive, NAN))
     assert _codes(old) == [("reply_lost", StopReaction.NOTE)]
@@ -253,7 +253,7 @@ def test_a_lateness_before_its_time_is_nothing():
     assert _look(replace(FINE, lateness=-0.5)) == ()
 
 
-def test_everything_is_told_at_once_gravest_first():
+def test_everything_is_reported_at_once_gravest_first():
     seen = Observation(
         following=True,
         following_errors=(0.0, 0.1, 0.0),
