@@ -232,7 +232,7 @@ def test_a_line_is_proved_as_a_whole_would_be() -> None:
     """Its pieces, end to end, are the set-points of the line, without gaps or repeats."""
     slow = with_speed(rig(), 0.020)
     line = JogLine(slow, scene(), rig().home, np.array([0.0, 1.0, 0.0]))
-    parts = [line.extend(FIRST_ROWS), line.go_on(MOST_ROWS), line.go_on(3)]
+    parts = [line.extend(FIRST_ROWS), line.extend(MOST_ROWS), line.extend(3)]
     rows = np.concatenate([parts[0].table.setpoints, *(p.table.setpoints[1:] for p in parts[1:])])
     assert len(rows) == line.rows == FIRST_ROWS + MOST_ROWS + 3 + 1
     for before, after in pairwise(parts):

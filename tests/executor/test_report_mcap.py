@@ -71,8 +71,8 @@ def test_times_are_the_start_plus_run_time(run: fake_run.FakeRun, messages: Mess
     times = np.array([time - start for time, _ in messages["/drives"]]) / 1e9
     np.testing.assert_allclose(times, run.cycles.time, atol=1e-9)
     stamps = [m.timestamp for _, m in messages["/tag_pose"]]
-    times = [s.seconds * 1_000_000_000 + s.nanos for s in stamps]
-    assert times == [time for time, _ in messages["/tag_pose"]]
+    at = [s.seconds * 1_000_000_000 + s.nanos for s in stamps]
+    assert at == [time for time, _ in messages["/tag_pose"]]
 
 
 def test_numbers_are_those_of_the_tables(run: fake_run.FakeRun, messages: Messages) -> None:

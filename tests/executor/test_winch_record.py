@@ -41,8 +41,8 @@ def test_every_cycle_and_event_is_there(tmp_path: Path) -> None:
         ("0", "0.000000"), ("1", "0.010000"), ("2", "0.020000")
     ]  # fmt: skip
     assert rows[2]["state"] == "moving"
-    row = {key: rows[2][key] for key in rows[2] if key.endswith(("_1", "_2"))}
-    assert row == {
+    numbers = {key: rows[2][key] for key in rows[2] if key.endswith(("_1", "_2"))}
+    assert numbers == {
         "set_counts_1": "10", "set_counts_2": "20", "counts_1": "11", "counts_2": "-21",
         "torque_per_mille_1": "30", "torque_per_mille_2": "40",
     }  # fmt: skip

@@ -88,8 +88,8 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         assert "cable 6 (drive 6): power-cycled" in jogged.err.replace("\n", " ").replace("  ", "")
         assert [drive.motor.position for drive in rehearsal.drives] == stood
         Path(result["file"]).write_text("{")
-        again = call("home", rig, "--pose-mm", *start, *bus, "--json")
-        assert again.code == 0, again
+        rehomed = call("home", rig, "--pose-mm", *start, *bus, "--json")
+        assert rehomed.code == 0, rehomed
         assert json.loads(Path(result["file"]).read_text())["lost"] == ""
 
 

@@ -27,11 +27,11 @@ def look(cycles, limits=LIMITS):
 def steps(positions, demands, drive=0, missing=(), following=True):
     """One drive at these positions; the other one rests."""
     for k, (position, demand) in enumerate(zip(positions, demands, strict=True)):
-        positions, wanted = [7, 7], [7, 7]
-        positions[drive], wanted[drive] = position, demand
+        row, wanted = [7, 7], [7, 7]
+        row[drive], wanted[drive] = position, demand
         lost = [False, False]
         lost[drive] = k in missing
-        yield following, positions, wanted, lost
+        yield following, row, wanted, lost
 
 
 def first_found(positions, demands, limits=LIMITS):
