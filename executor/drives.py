@@ -134,13 +134,13 @@ def abandoned_drives_fault(document: RigDocument) -> str:
     try:
         snapshot = read_snapshot(rig, rig.home, nothing_in_the_way(rig).load)
     except CdprError as error:
-        return f"it is not known whether the drives hold: {error.what}"
+        return f"state of the drives unknown: {error.what}"
     words = snapshot.status_words.tolist()
     rows = zip(
         rig.drive_names.values(), drive_states(rig, words), stop_alone(rig, words), strict=True
     )
     wrong = [f"{name} is in {state}" for name, state, good in rows if not good]
-    return f"drives do not hold by themselves: {', '.join(wrong)}" if wrong else ""
+    return f"drives do not hold on their own: {', '.join(wrong)}" if wrong else ""
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from executor.cameras.client import static_pose
 from executor.cameras.open import measure_at_rest
-from executor.cameras.sources import choose_one_camera, require_simulated_pictures
+from executor.cameras.sources import choose_one_camera, require_synthetic_images
 from executor.control.winch_laws import PretensionLaw, wind_in_speed
 from executor.control.winch_motion import WinchResult
 from executor.drives import is_simulated, require_own_time
@@ -31,7 +31,7 @@ FURTHEST, FASTEST = 0.200, 0.010
 #: Defaults: reach [m], speed [m/s], number of images, and slack of simulated cables, [m].
 REACH, SPEED, PICTURES, SLACK = 0.050, 0.002, 20, 0.005
 #: Smallest and largest number of images for the pose.
-FEWEST_PICTURES, MOST_PICTURES = 5, 1000
+FEWEST_IMAGES, MOST_IMAGES = 5, 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +118,7 @@ def home(
     _require_slow(reach, speed, pictures)
     source = choose_one_camera(rig, sources, in_process) if sources else None
     if source is not None:
-        require_simulated_pictures(source[1:], not realtime)
+        require_synthetic_images(source[1:], not realtime)
     known = None if source is not None else _stated_pose(rig, pose)
     limit = limit_of(rig, limit)
     target = _target(rig, tension, limit)
@@ -205,9 +205,9 @@ def _require_slow(reach: float, speed: float, pictures: int) -> None:
                 where="home",
                 next_step=f"give a smaller {name}",
             )
-    if not FEWEST_PICTURES <= pictures <= MOST_PICTURES:
+    if not FEWEST_IMAGES <= pictures <= MOST_IMAGES:
         raise BadInput(
-            f"{pictures} images: must be from {FEWEST_PICTURES} to {MOST_PICTURES}",
+            f"{pictures} images: must be from {FEWEST_IMAGES} to {MOST_IMAGES}",
             where="home",
             next_step="give another number of images",
         )

@@ -1,6 +1,6 @@
 """Runs a plan: checks it, arms the drives, moves, measures, computes the verdict, writes files.
 
-Once the platform has moved, the verdict depends only on what the drives did: neither a file that
+Once the platform has moved, the verdict depends only on the motion: neither a file that
 cannot be written nor an interrupt while the report is made changes it.
 """
 
@@ -16,7 +16,7 @@ from typing import Any
 
 from executor.cameras.multi_camera import CameraRecords, CameraWatch
 from executor.cameras.open import asked_rate, open_cameras, require_no_stop
-from executor.cameras.sources import CameraChoice, require_simulated_pictures, resolve_cameras
+from executor.cameras.sources import CameraChoice, require_synthetic_images, resolve_cameras
 from executor.control.path_runs import Outcome, run_in_process, run_in_real_time
 from executor.drives import (
     abandoned_drives_fault,
@@ -125,7 +125,7 @@ def run(
     """
     require_same_rig(plan, rig, plan_file)
     chosen = resolve_cameras(rig, cameras, is_simulated(rig))
-    require_simulated_pictures(chosen.values(), not realtime)
+    require_synthetic_images(chosen.values(), not realtime)
     require_own_time(rig, realtime)
     if plan.scene.obstacles:
         require_stated_errors(rig, list(chosen))
@@ -186,7 +186,7 @@ def run_prepared(
     interface, simulated = prepared.rig.document.bus.interface, is_simulated(prepared.rig)
     course = RunCourse(datetime.now(UTC), interface, simulated, not options.realtime)
     folder = RunFolder.create(output)
-    job, moved = _Job(prepared, folder, cameras, options), _Moved()
+    job, moved = _Job(prepared, folder, cameras, options), _MotionData()
     try:
         folder.write_plan(prepared.plan.plan.document)
         folder.write_rig(prepared.rig.document)
@@ -213,7 +213,7 @@ class _Job:
 
 
 @dataclass(slots=True, eq=False)
-class _Moved:
+class _MotionData:
     """Data of the motion, as far as it got.
 
     Attributes:
@@ -258,7 +258,7 @@ def _preload_results() -> None:
     import executor.report.run_data  # noqa: F401
 
 
-def _move_and_measure(job: _Job, moved: _Moved) -> None:
+def _move_and_measure(job: _Job, moved: _MotionData) -> None:
     """Moves and takes images; a failure after the start of motion becomes part of the outcome."""
     board = SharedRequests() if job.options.realtime else LocalRequests()
     try:
@@ -279,7 +279,7 @@ def _move_and_measure(job: _Job, moved: _Moved) -> None:
             moved.troubles.append(f"writing the results failed: {text}")
 
 
-def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Moved) -> None:
+def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _MotionData) -> None:
     """Moves while the command socket accepts requests such as `cdpr stop`."""
     prepared, options = job.prepared, job.options
     listener, fast = options.listener, not options.realtime
@@ -322,7 +322,7 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
 
 
 def _move(
-    job: _Job, board: LocalRequests | SharedRequests, recorder: Recorder, moved: _Moved
+    job: _Job, board: LocalRequests | SharedRequests, recorder: Recorder, moved: _MotionData
 ) -> Outcome:
     """Arms the drives and runs the loop: here in simulated time, else in another process."""
 
@@ -380,7 +380,7 @@ def _move_in_real_time(
     )
 
 
-def _conclude(job: _Job, moved: _Moved, course: RunCourse) -> RunResult:
+def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
     """Computes the verdict, reports it, then writes the result files."""
     outcome, supervisor = moved.outcome, job.options.supervisor
     assert outcome is not None
@@ -403,7 +403,7 @@ def _conclude(job: _Job, moved: _Moved, course: RunCourse) -> RunResult:
 
 
 def _evaluated(
-    prepared: PreparedRun, moved: _Moved, outcome: Outcome, course: RunCourse
+    prepared: PreparedRun, moved: _MotionData, outcome: Outcome, course: RunCourse
 ) -> tuple[EvaluatedRun | None, dict[str, Any]]:
     """The evaluation and its summary; if that fails, a summary without tables."""
     try:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from executor.cameras.process import CameraProcess, CameraSample, FrameRequest, unseen
+from executor.cameras.process import CameraProcess, CameraSample, FrameRequest, sample_without_pose
 from executor.recording.record_files import CameraRecord
 from model.errors import CdprError, Fault, Refused
 from model.kinematics import structure_matrix
@@ -22,7 +22,7 @@ from tracking.track import FrameRate
 
 
 #: Consecutive images without a pose after which the camera is misaligned or the light is off.
-BLIND_PICTURES = 10
+BLIND_IMAGES = 10
 #: A camera without an answer for this long counts as hung, [s].
 SILENCE = 2.0
 
@@ -55,9 +55,9 @@ class CameraHealth:
         """
         if self._asked is not None and now - self._asked > SILENCE:
             return f"did not answer for {SILENCE:g} s"
-        if self._blind >= BLIND_PICTURES:
+        if self._blind >= BLIND_IMAGES:
             return (
-                f"gave no pose in {BLIND_PICTURES} images in a row (is it where the rig file"
+                f"gave no pose in {BLIND_IMAGES} images in a row (is it where the rig file"
                 " says, are tags in view and lit?)"
             )
         return ""
@@ -67,7 +67,7 @@ class CameraClient:
     """Requests images from one camera and stores its samples."""
 
     def __init__(self, process: CameraProcess, source: str, live_image: int | None = None) -> None:
-        """Nothing was asked for yet.
+        """Without requests.
 
         Args:
             process: Takes and measures the images.
@@ -119,7 +119,7 @@ class CameraClient:
             return None
         if self.failed is None:
             self.failed = CdprError(f"no answer since {unanswered.time:.2f} s")
-        sample = unseen(unanswered.frame, unanswered.time, self.failed.what)
+        sample = sample_without_pose(unanswered.frame, unanswered.time, self.failed.what)
         self.samples.append(sample)
         return sample
 

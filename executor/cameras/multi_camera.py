@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from executor.cameras.client import BLIND_PICTURES, CameraClient
-from executor.cameras.process import CameraSample, FrameRequest, unseen
+from executor.cameras.client import BLIND_IMAGES, CameraClient
+from executor.cameras.process import CameraSample, FrameRequest, sample_without_pose
 from executor.recording.record_files import CameraRecord
 from executor.remote.status import RunStatus
 from executor.supervision import RequestBoard, StopReason
@@ -22,7 +22,7 @@ from tracking.measurement import PoseMeasurement, rates
 
 
 #: Consecutive images with too small a clearance that stop the run.
-NEAR_PICTURES = 2
+NEAR_IMAGES = 2
 
 
 class ClearanceMonitor:
@@ -49,7 +49,7 @@ class ClearanceMonitor:
             self._pictures = 0
             return ""
         self._pictures += 1
-        if self._pictures < NEAR_PICTURES:
+        if self._pictures < NEAR_IMAGES:
             return ""
         at = clearance.worst_case_obstacle
         near, spread = clearance.nearest[at], float(clearance.uncertainties[at])
@@ -141,9 +141,9 @@ class MultiCameraMonitor:
 
     def _count_disagreement(self, reason: str) -> None:
         self._disagree = self._disagree + 1 if reason else 0
-        if self._disagree == BLIND_PICTURES:
+        if self._disagree == BLIND_IMAGES:
             text = (
-                f"{reason}, {BLIND_PICTURES} times in a row; fused clearance is not measured,"
+                f"{reason}, {BLIND_IMAGES} times in a row; fused clearance is not measured,"
                 " each camera monitors it alone"
             )
             self.news.append(CameraNews("camera_sees_nothing", text))
@@ -315,7 +315,7 @@ class RunCameras:
         if samples:
             return self._common.of(samples)
         reason = next((e.failed.what for e in self._clients if e.failed), "no camera answered")
-        return unseen(frame_set.trigger.frame, frame_set.trigger.time, reason)
+        return sample_without_pose(frame_set.trigger.frame, frame_set.trigger.time, reason)
 
     def _report_trouble(self) -> None:
         troubles = {client.name: client.trouble(self._now) for client in self._clients}
@@ -388,7 +388,7 @@ class CameraWatch:
         if near and self._clearance_stop:
             who = "the cameras" if len(each) > 1 else "the camera"
             less = f"{who} measured less clearance than the scene requires: {near}"
-            self._stop("too near", near, "clearance_low", less)
+            self._stop("clearance too small", near, "clearance_low", less)
         if all_failed:
             self._stop("stopping", all_failed, "camera", all_failed)
 

@@ -15,7 +15,7 @@ from drivers.cameras.live import LiveCamera
 from executor.cameras.client import CameraClient, samples_at_rest, wait_until_ready
 from executor.cameras.live_image import ImageBoard, memory_for
 from executor.cameras.multi_camera import RunCameras
-from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, PictureSource
+from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, ImageSource
 from executor.cameras.sources import SYNTHETIC
 from executor.kernels import ready_for_camera_processes, ready_to_measure
 from executor.realtime.shared_memory import SharedMemory
@@ -35,7 +35,7 @@ if TYPE_CHECKING:  # a real camera loads no simulator
     from simulation.camera.camera import Film
 
 #: Approximate number of a run's images kept for its report.
-KEPT_PICTURES = 12
+KEPT_IMAGES = 12
 
 
 @contextmanager
@@ -69,7 +69,7 @@ def open_cameras(
     if not sources:
         yield None
         return
-    keep_every = max(1, pictures // KEPT_PICTURES)
+    keep_every = max(1, pictures // KEPT_IMAGES)
     ready_for_camera_processes(listener)
     with ExitStack() as stack:
         processes, lives = {}, {}
@@ -140,16 +140,16 @@ def make_worker(
     return CameraWorker(rig, camera, pictures, kept, keep_every, named=named, live=board)
 
 
-def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
+def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> ImageSource:
     if name == SYNTHETIC:  # a real camera loads no simulator
         from simulation.camera.camera import Film
         from simulation.factory import make_synthetic_camera
 
-        return RenderedPictures(Film(make_synthetic_camera(rig, scene, camera)))
-    return LivePictures(LiveCamera(name, camera))
+        return RenderedImages(Film(make_synthetic_camera(rig, scene, camera)))
+    return LiveImages(LiveCamera(name, camera))
 
 
-class RenderedPictures:
+class RenderedImages:
     """The synthetic camera as a source of images."""
 
     def __init__(self, film: Film) -> None:
@@ -165,7 +165,7 @@ class RenderedPictures:
         """Nothing to close."""
 
 
-class LivePictures:
+class LiveImages:
     """A real camera as a source of images."""
 
     def __init__(self, camera: LiveCamera) -> None:

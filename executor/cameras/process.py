@@ -69,12 +69,12 @@ class CameraSample:
     clearance: MeasuredClearance | None = None
 
 
-def unseen(frame: int, time: float, reason: str) -> CameraSample:
+def sample_without_pose(frame: int, time: float, reason: str) -> CameraSample:
     """A sample without a pose, for an image that was never measured."""
     return CameraSample(frame, NoPose(time, reason))
 
 
-class PictureSource(Protocol):
+class ImageSource(Protocol):
     """A camera, real or rendered, that delivers images on request."""
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
@@ -98,7 +98,7 @@ class CameraWorker:
         self,
         rig: Rig,
         camera: Camera,
-        source: PictureSource,
+        source: ImageSource,
         folder: RunFolder | None,
         keep_every: int,
         *,
@@ -277,7 +277,7 @@ class CameraProcess:
             raise Fault(f"the process of camera {self.name} ended without an answer") from None
         if isinstance(answer, _Failure):
             raise answer.error if isinstance(answer.error, CdprError) else Fault(answer.error)
-        return answer  # type: ignore[no-any-return]  # what our own process sends
+        return answer  # type: ignore[no-any-return]  # sent by our own process
 
 
 def _serve(make_worker: MakeWorker, link: Connection) -> None:
@@ -309,6 +309,6 @@ def _send(link: Connection, what: CameraSample | _Ready | _Failure) -> None:
 
 def _next_trigger(link: Connection) -> FrameRequest:
     try:
-        return link.recv()  # type: ignore[no-any-return]  # what our own parent sends
+        return link.recv()  # type: ignore[no-any-return]  # sent by our own parent
     except (EOFError, OSError):
         raise _ParentGone from None

@@ -230,7 +230,7 @@ def is_camera(source: str) -> bool:
     return source.isdecimal() or ("://" in source and not source.startswith("file:"))
 
 
-def require_simulated_pictures(sources: Iterable[str], fast: bool) -> None:
+def require_synthetic_images(sources: Iterable[str], fast: bool) -> None:
     """Requires synthetic cameras in simulated time, where real image times are meaningless.
 
     Raises:

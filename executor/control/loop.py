@@ -16,7 +16,7 @@ from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.factory import stop_alone
 from executor.control.cycle import Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
-from executor.control.sync_master import SyncMaster, left_otherwise
+from executor.control.sync_master import SyncMaster, changed_states
 from executor.safety.gate import Purpose
 from executor.safety.monitor import Alarm, StopReaction
 from executor.state_machine import (
@@ -126,7 +126,7 @@ class Loop:
         try:
             self._take_positions()
             self._require_at_start()
-            self._master.freshen()
+            self._master.refresh()
             self.machine.on(Event.ENABLE)
             while self.machine.state in _ACTIVE:
                 self._one_step()
@@ -219,7 +219,7 @@ class Loop:
             return
         if left.missing.any() or not left.stopped or (held.holding and not left.holding):
             self.holding = left.holding
-            self._fault("not_held", left_otherwise(self._checked.rig, held, left))
+            self._fault("not_held", changed_states(self._checked.rig, held, left))
             return
         self.machine.on(Event.HELD)
         self._report("held", self._held if left.holding else _NEVER_ENABLED)
@@ -380,7 +380,7 @@ class Loop:
         self.holding = not self._taken_over
         rig = self._checked.rig
         held = np.array(stop_alone(rig, before.status_words.tolist())) & ~before.missing
-        if otherwise := left_otherwise(rig, before, left, np.flatnonzero(~held).tolist()):
+        if otherwise := changed_states(rig, before, left, np.flatnonzero(~held).tolist()):
             self._report("not_held", otherwise)
 
     def _one_more_latched(self) -> bool:

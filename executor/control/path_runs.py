@@ -123,7 +123,7 @@ def run_in_real_time(
         check_drives: As for `executor.realtime.process.real_time_process`.
         before_motion: Called when armed, with what the system denied; an exception prevents the
             motion.
-        listener: Receives what the drives cannot do.
+        listener: Receives remarks on missing capabilities of the drives.
 
     Raises:
         CdprError: The bus is latched, or the process could not arm the drives, as stated;

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from executor.control.preconditions import require_capabilities
-from executor.control.sync_master import ReplyTimeout, SyncMaster, late_fault, left_otherwise
+from executor.control.sync_master import ReplyTimeout, SyncMaster, changed_states, late_fault
 from executor.realtime.job import ReadyDrives
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import OperatorRequests
@@ -81,7 +81,7 @@ class Standstill(ABC):
         """
         try:
             done = self._work()
-            otherwise = left_otherwise(self._rig, done, self._master.leave(self._one_more))
+            otherwise = changed_states(self._rig, done, self._master.leave(self._one_more))
             if otherwise:
                 raise Fault(
                     otherwise,
@@ -172,7 +172,7 @@ class Standstill(ABC):
                 self._record(status, 0.0)
                 if status.stopped and not self._group.stopping:
                     break
-        self._master.leave_unmoved()
+        self._master.leave_disabled()
 
 
 class Release(Standstill):

@@ -161,7 +161,7 @@ class SyncMaster:
         self.begin()
         return self.exchange(self.group.targets.tolist())
 
-    def freshen(self) -> None:
+    def refresh(self) -> None:
         """Sends a cycle with unchanged targets if the last SYNC is a whole cycle old.
 
         On a slow computer, work between two cycles may take longer than one.
@@ -237,7 +237,7 @@ class SyncMaster:
         self.status = self.group.look(pace)
         return self.status
 
-    def leave_unmoved(self) -> None:
+    def leave_disabled(self) -> None:
         """Ends the cycle for drives that were never enabled; ignores bus failures."""
 
         def cycle() -> bool:
@@ -248,8 +248,8 @@ class SyncMaster:
             self.leave(cycle)
 
 
-def left_otherwise(
-    rig: Rig, before: CycleStatus, after: CycleStatus, but: Collection[int] = ()
+def changed_states(
+    rig: Rig, before: CycleStatus, after: CycleStatus, excluded: Collection[int] = ()
 ) -> str:
     """Names the drives whose state changed at the end of the cycle; empty if none did.
 
@@ -257,7 +257,7 @@ def left_otherwise(
         rig: The robot.
         before: Status before monitoring was ended.
         after: Status after the last SYNC.
-        but: Drives to leave out, from 0: their state is already reported.
+        excluded: Drives to leave out, from 0: their state is already reported.
     """
     rows = zip(
         rig.drive_names.values(),
@@ -269,7 +269,7 @@ def left_otherwise(
     changed = [
         f"{name} {'does not answer' if silent else f'went from {old} to {new}'}"
         for drive, (name, old, new, silent) in enumerate(rows)
-        if (silent or old != new) and drive not in but
+        if (silent or old != new) and drive not in excluded
     ]
     return f"drives left the state they held in: {', '.join(changed)}" if changed else ""
 

@@ -243,7 +243,7 @@ class PressReader:
     """The loop's side of a `PressBoard`."""
 
     def __init__(self, memory: SharedMemory) -> None:
-        """Reads what `PressBoard` writes."""
+        """Reads the entries of a `PressBoard`."""
         self._memory, self._rule = memory, PressRule()
         self._entry = _ENTRY.pack(0, math.nan, 100, False, 0, False, math.nan)
 

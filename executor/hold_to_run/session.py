@@ -76,7 +76,7 @@ def jog_session(
         speed: Largest jog speed, [m/s].
         realtime: As for `executor.runner.run`, like all up to the supervisor.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
-        listener: Receives what happens.
+        listener: Receives events.
         confirm: Called once, before anything is enabled; False cancels it.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
         on_cycle: Called after every cycle with the board of presses and the checked line, for
@@ -129,7 +129,7 @@ def cable_session(
         speed: Largest winch speed, [m/s].
         realtime: As for `executor.runner.run`, like all up to the supervisor.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
-        listener: Receives what happens.
+        listener: Receives events.
         confirm: Called once, before anything is enabled; False cancels it.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
         on_cycle: Called after every cycle with the board of presses and the cable travel, for

@@ -80,10 +80,10 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
             _send(link, Armed(denied, loop.positions, drives.restarted, drives.remarks))
             message = master.cycle_until(lambda: _poll(link))
         except Exception:
-            master.leave_unmoved()
+            master.leave_disabled()
             raise
         if not isinstance(message, Go):
-            master.leave_unmoved()
+            master.leave_disabled()
             return
         state = loop.run()
     true_pose = drives.true_pose_now()

@@ -257,7 +257,7 @@ def distances(
     A distance fails only if it is too small by more than its uncertainty.
     """
     checks = []
-    for source, source_name in (("tag", _who(cameras)), ("encoder", "the drives")):
+    for source, source_name in (("tag", _camera_phrase(cameras)), ("encoder", "the drives")):
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():
             checks.append(_against_required(rows, required, source_name))
@@ -312,19 +312,19 @@ def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
     error = poses.error[poses.ok] * 1e3
     rms = float(np.sqrt(np.mean(error**2)))
     text = (
-        f"{_who(cameras).capitalize()} measured {seen} of {len(poses)} images,"
+        f"{_camera_phrase(cameras).capitalize()} measured {seen} of {len(poses)} images,"
         f" {rms:.2f} mm RMS from the plan (largest {error.max():.2f} mm)."
     )
     if len(cameras) > 1:
-        text += f" Alone: {', '.join(map(_of_one, cameras))}."
+        text += f" Alone: {', '.join(map(_single_camera_phrase, cameras))}."
     return [Check("camera", True, text)]
 
 
-def _who(cameras: Sequence[CameraRecord]) -> str:
+def _camera_phrase(cameras: Sequence[CameraRecord]) -> str:
     return f"{len(cameras)} cameras together" if len(cameras) > 1 else "the camera"
 
 
-def _of_one(record: CameraRecord) -> str:
+def _single_camera_phrase(record: CameraRecord) -> str:
     """Poses and images of one of several cameras, and why it failed."""
     failed = f" ({record.failed})" if record.failed else ""
     return f"{record.name} {record.poses} of {record.pictures}{failed}"

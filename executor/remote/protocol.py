@@ -138,7 +138,7 @@ class Presses(Protocol):
         ...
 
 
-class NotACommand(ValueError):
+class InvalidCommand(ValueError):
     """The received line is not a command; with the reason."""
 
 
@@ -146,13 +146,13 @@ def parse_command(line: bytes) -> Command:
     """Parses a command.
 
     Raises:
-        NotACommand: The line is not a command.
+        InvalidCommand: The line is not a command.
     """
     try:
         return _COMMANDS.validate_json(line)
     except ValidationError as error:
         problems = error.errors(include_url=False, include_context=False)
-        raise NotACommand("; ".join(str(problem["msg"]) for problem in problems)) from None
+        raise InvalidCommand("; ".join(str(problem["msg"]) for problem in problems)) from None
 
 
 def make_line(command: str, **values: Any) -> bytes:
@@ -189,7 +189,7 @@ def answer_to(
         else:
             _request(command, board)
         return status_answer(status)
-    except NotACommand as error:
+    except InvalidCommand as error:
         return _line({"ok": False, "what": f"not a command: {error}"})
     except Exception as error:
         what = f"the run cannot report its status: {type(error).__name__}: {error}"
@@ -216,7 +216,7 @@ def _request(command: RunCommand | FeedCommand, board: RequestBoard) -> None:
 
 def _jog(command: JogCommand, presses: Presses | None) -> None:
     if presses is None:
-        raise NotACommand("this run takes no jogs")
+        raise InvalidCommand("this run takes no jogs")
     if isinstance(command, EndCommand):
         presses.end()
     elif isinstance(command, LetGoCommand):
@@ -225,9 +225,9 @@ def _jog(command: JogCommand, presses: Presses | None) -> None:
         try:
             is_taken = _hold(command, presses)
         except ValueError as error:
-            raise NotACommand(str(error)) from None
+            raise InvalidCommand(str(error)) from None
         if not is_taken:
-            raise NotACommand(f"press {command.press} is over")
+            raise InvalidCommand(f"press {command.press} is over")
 
 
 def _hold(command: HeldCommand, presses: Presses) -> bool:

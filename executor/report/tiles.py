@@ -168,7 +168,7 @@ def camera_table(run: RunData) -> str:
         )
         for one in run.summary["cameras"]
     ]
-    head = ("Camera", "Source", "Poses", "Left out", "Time per image", "Alone to plan", "Failed")
+    head = ("Camera", "Source", "Poses", "Dropped", "Time per image", "Alone to plan", "Failed")
     return list_table(head, rows) if rows else ""
 
 

@@ -25,7 +25,7 @@ from executor.remote.command_socket import (
     find_runs,
     serving,
 )
-from executor.remote.protocol import NotACommand, answer_to, make_line, parse_command
+from executor.remote.protocol import InvalidCommand, answer_to, make_line, parse_command
 from executor.supervision import LocalRequests, OperatorRequests
 from model.errors import BadInput, Fault
 
@@ -101,7 +101,7 @@ def test_a_speed_travels_as_it_was_said(percent):
 
 @pytest.mark.parametrize("percent", [0, 101])
 def test_a_speed_that_is_none_is_no_command(percent):
-    with pytest.raises(NotACommand):
+    with pytest.raises(InvalidCommand):
         parse_command(make_line("speed", percent=percent))
 
 

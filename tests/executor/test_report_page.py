@@ -75,7 +75,7 @@ def test_the_verdict_comes_first_and_every_section_is_there(page: Page) -> None:
         "Scene and path",
         "Clearance",
         "Position",
-        "Pictures",
+        "Images",
         "Cables",
         "Following and timing",
         "Plan, rig and bus",
@@ -184,7 +184,7 @@ def with_scene(run: fake_run.FakeRun, scene: SceneDocument) -> Plan:
 def test_a_run_without_camera_has_no_camera_section(tmp_path: Path, run: fake_run.FakeRun) -> None:
     only = replace(run, poses=no_poses(), clearance=run.clearance.of("encoder"))
     page = built(only, tmp_path / "run")
-    assert "Pictures" not in page.headings
+    assert "Images" not in page.headings
     assert "Clearance" in page.headings
     assert "no camera" in page.text
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from executor.cameras import multi_camera as run_cameras
 from executor.cameras import process as camera_process
-from executor.cameras.client import BLIND_PICTURES, CameraClient, wait_until_ready
+from executor.cameras.client import BLIND_IMAGES, CameraClient, wait_until_ready
 from executor.cameras.multi_camera import HURRY, PATIENCE, ROUND, RunCameras
 from executor.cameras.process import CameraProcess, CameraSample, FrameRequest
 from executor.remote.client import camera_line
@@ -117,7 +117,7 @@ def test_however_late_cameras_answer_every_moment_is_reported_once_and_nothing_i
 def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
     """The fast camera measures too small a clearance: the stop must not wait for the slow one."""
     cameras: list[Any] = [Scripted("front", [0]), Scripted("side", [late])]
-    limit = 10.0  # everything is too near
+    limit = 10.0  # every clearance is too small
     run = RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE)
     for k in range(5):
         run.trigger(k / RATE, k / RATE, None, None)
@@ -137,7 +137,7 @@ def test_pictures_of_both_make_a_better_pose() -> None:
 def test_cameras_that_disagree_are_reported_once_and_clearance_is_not_measured() -> None:
     run, reported = run_of(25, Scripted("front", [0]), Scripted("side", [0], shift=0.02))
     assert reported == [
-        f"cameras front and side disagree by 20.0 mm, {BLIND_PICTURES} times in a row;"
+        f"cameras front and side disagree by 20.0 mm, {BLIND_IMAGES} times in a row;"
         " fused clearance is not measured, each camera monitors it alone"
     ]
     assert all(look.clearance is None for look in run.finish(never).together)

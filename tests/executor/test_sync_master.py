@@ -14,8 +14,8 @@ from executor.control.sync_master import (
     GIVEN_UP_AFTER,
     ReplyTimeout,
     SyncMaster,
+    changed_states,
     late_fault,
-    left_otherwise,
 )
 from executor.safety.monitor import USUAL_TIMEOUT
 from model.errors import Fault, HardwareMissing
@@ -267,7 +267,7 @@ def test_after_the_end_the_age_of_sync_is_forgotten() -> None:
 
 def test_drives_that_were_never_enabled_are_left_where_they_are() -> None:
     master, group, clock = made(monitored_for=2)
-    master.leave_unmoved()
+    master.leave_disabled()
     assert group.sent == [(tuple(TARGETS), True)] * 2
     assert clock.cycles == 3
     assert master.status == "looked"
@@ -280,7 +280,7 @@ def test_a_bus_that_fails_then_is_left_as_it_is() -> None:
         raise Fault("bus-off")
 
     group.send_cycle = fails
-    master.leave_unmoved()
+    master.leave_disabled()
     assert master.status is None
 
 
@@ -332,7 +332,7 @@ def test_a_cycle_is_kept_where_the_last_one_is_over(age: float, cycles: int) -> 
     clock.now = 0.0
     master.stop_now()
     clock.now = age * CYCLE
-    master.freshen()
+    master.refresh()
     assert len(group.sent) == cycles
 
 
@@ -376,5 +376,5 @@ def reported(words: Sequence[int], silent: Sequence[int] = ()) -> Any:
 def test_drives_that_are_not_as_they_were_left_are_named(
     words: list[int], silent: list[int], but: list[int], expected: str
 ) -> None:
-    said = left_otherwise(THE_RIG, reported([HELD] * 8), reported(words, silent), but)
+    said = changed_states(THE_RIG, reported([HELD] * 8), reported(words, silent), but)
     assert said == (f"drives left the state they held in: {expected}" if expected else "")

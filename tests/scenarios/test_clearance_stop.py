@@ -93,7 +93,7 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     assert answer.code == 1, answer
     assert "below 10 mm, measured by the cameras" in answer.out
     assert "front (synthetic)" in answer.out
-    assert "too near" in answer.said
+    assert "clearance too small" in answer.said
     assert "the scene requires 10 mm" in answer.said
     summary: dict[str, Any] = RunFolder.open(run).summary()
     assert summary["final_state"] == "stopped"
