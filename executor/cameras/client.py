@@ -31,7 +31,7 @@ class CameraHealth:
     """Judges a camera by its requests and answers."""
 
     def __init__(self) -> None:
-        """Without requests."""
+        """Starts without requests."""
         self._asked: float | None = None
         self._blind = 0
 
@@ -67,7 +67,7 @@ class CameraClient:
     """Requests images from one camera and stores its samples."""
 
     def __init__(self, process: CameraProcess, source: str, live_image: int | None = None) -> None:
-        """Without requests.
+        """Starts without requests.
 
         Args:
             process: Takes and measures the images.

@@ -32,7 +32,7 @@ class ClearanceMonitor:
     """
 
     def __init__(self, limit: float) -> None:
-        """Without an image.
+        """Starts without an image.
 
         Args:
             limit: Clearance required by the scene, [m].
@@ -82,7 +82,7 @@ class MultiCameraMonitor:
     def __init__(
         self, names: Sequence[str], model: ClearanceModel, limit: float, rate: float
     ) -> None:
-        """Without samples.
+        """Starts without samples.
 
         Args:
             names: Of the cameras.
@@ -189,7 +189,7 @@ class RunCameras:
     def __init__(
         self, clients: Sequence[CameraClient], model: ClearanceModel, limit: float, rate: float
     ) -> None:
-        """Without requests.
+        """Starts without requests.
 
         Args:
             clients: One or more cameras.
@@ -355,7 +355,7 @@ class CameraWatch:
         clearance_stop: bool,
         listener: Listener = SILENT,
     ) -> None:
-        """Without requests.
+        """Starts without requests.
 
         Args:
             cameras: Of the run.

@@ -172,7 +172,7 @@ class PretensionLaw:
         self, rig: Rig, begin: Sequence[int], *, target: float, limit: float, reach: float,
         speed: float,
     ) -> None:  # fmt: skip
-        """A law at its start.
+        """Prepares the law.
 
         Args:
             rig: The robot.
@@ -252,7 +252,7 @@ class OneCableLaw:
         self, rig: Rig, begin: Sequence[int], *, cable: int, length: float, limit: float,
         speed: float, reserve: TensionReserve | None = None,
     ) -> None:  # fmt: skip
-        """A law at its start.
+        """Prepares the law.
 
         Args:
             rig: The robot.

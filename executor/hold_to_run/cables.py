@@ -254,7 +254,7 @@ class CableTravel:
     """The supervisor's record of a cable session: which cable moves, and how far."""
 
     def __init__(self, rig: Rig, limit: float, longest: float) -> None:
-        """A record without motion.
+        """Starts without motion.
 
         Args:
             rig: The robot.

@@ -76,7 +76,7 @@ class JogLine:
         speed = self._rig.motion.speed
         steady = s_curve(length, (speed, speed), speed, self._rig.motion)
         law = TimeLaw((steady,), (0.0,), np.array([0.0, length / speed]))
-        checked = self._checked(begin, length, law)
+        checked = self._checked_table(begin, length, law)
         even = begin + self._spacing * np.arange(1, rows + 1)
         self._travelled = np.concatenate([self._travelled, even])
         return checked
@@ -95,11 +95,11 @@ class JogLine:
                 why=f"a step lasts {LONGEST_STEP - 1} cycles at most",
                 next_step="hold the control instead, or begin the session with a higher speed",
             )
-        checked = self._checked(0.0, length, law)
+        checked = self._checked_table(0.0, length, law)
         self._travelled = checked.table.travelled
         return checked
 
-    def _checked(self, begin: float, length: float, law: TimeLaw) -> CheckedTrajectory:
+    def _checked_table(self, begin: float, length: float, law: TimeLaw) -> CheckedTrajectory:
         path = self._path(begin, length)
         scene = self._scene.changed(start=self._at(begin), goal=self._at(begin + length), stops=())
         table = build_table(self._rig, scene, [(path, law)], self._cycle)

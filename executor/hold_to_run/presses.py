@@ -28,7 +28,7 @@ class PressRule:
     """Distinguishes held presses from ended ones; a clock that jumps back also ends one."""
 
     def __init__(self) -> None:
-        """Without a press."""
+        """Starts without a press."""
         self._over = 0
 
     def held(self, number: int, heard: float, now: float) -> bool:
@@ -114,7 +114,7 @@ class PressBoard:
     """The supervisor's side: takes reports of presses, from any thread."""
 
     def __init__(self, now: Callable[[], float], cables: int = 0) -> None:
-        """Without a press.
+        """Starts without a press.
 
         Args:
             now: Clock of the loop, [s].

@@ -249,7 +249,7 @@ class SharedRequests:
     """The supervisor's side; a `RequestBoard`. Each request has its own byte."""
 
     def __init__(self) -> None:
-        """Without requests."""
+        """Starts without requests."""
         self.memory = SharedMemory.create(_SIZE)
         self.memory.view[_PERCENT] = 100
         self._beats = 0

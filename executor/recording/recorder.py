@@ -292,7 +292,7 @@ class Recorder:
         on_event: Callable[[RunEvent], None] | None = None,
         own_thread: bool = False,
     ) -> None:
-        """Without cycles and events.
+        """Starts without cycles and events.
 
         Args:
             prepared: The run.

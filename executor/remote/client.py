@@ -66,7 +66,7 @@ class RunLink:
     """
 
     def __init__(self, run: RunConnection) -> None:
-        """Without requests."""
+        """Starts without requests."""
         self._run, self._begun = run, b""
         self.owed = 0
 

@@ -54,7 +54,7 @@ class CyclesSoFar:
     """Status from cycle records, for any kind of motion."""
 
     def __init__(self, rig: Rig, *, simulated_time: bool) -> None:
-        """Without cycles."""
+        """Starts without cycles."""
         self.began = 0.0
         """Time of the first cycle, [s]."""
         self.last: CycleRecord | None = None
