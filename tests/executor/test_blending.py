@@ -133,7 +133,7 @@ def test_only_the_refused_corner_stays_sharp():
     assert [s.straight for s in path.segments] == [True, True, False, True]
 
 
-def test_the_samples_that_are_asked_about_are_dense_and_cover_the_corner():
+def test_the_samples_to_check_are_dense_and_cover_the_corner():
     seen: list[Pose] = []
 
     def looked_at(poses: list[Pose]) -> bool:
@@ -166,7 +166,7 @@ def test_repeats_and_waypoints_in_between_are_left_out():
     assert path.length == pytest.approx(_apart(waypoints[0], waypoints[-1]))
 
 
-def test_a_turn_on_the_spot_is_no_repeat():
+def test_a_rotation_in_place_is_not_a_repeat():
     waypoints = [at_mm(0, 0, 0), at_mm(0, 0, 0, turn_deg=10), at_mm(0, 50, 0, turn_deg=10)]
     assert len(rounded(waypoints, 0.0, WEIGHT, always).segments) == 2
 

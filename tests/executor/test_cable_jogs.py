@@ -91,7 +91,7 @@ def is_moving(records: list[CycleRecord]) -> list[bool]:
 SOFT = 0.002
 
 
-def test_a_cable_is_paid_out_while_held_and_rests_when_let_go() -> None:
+def test_a_cable_is_paid_out_while_held_and_rests_when_released() -> None:
     robot = rig(soft=SOFT)
     script = Script([(0.5, 1.0, hold(1, 3, out=True))], 2.5)
     records = script.run(robot)
@@ -118,7 +118,7 @@ def test_a_step_ends_where_it_should(length: float, out: bool) -> None:
     assert travel == pytest.approx(length if out else -length, abs=2e-6)
 
 
-def test_a_step_that_is_let_go_ends_early() -> None:
+def test_a_step_that_is_released_ends_early() -> None:
     robot = rig(soft=SOFT)
     out = moved(Script([(0.5, 0.7, hold(1, 3, out=True, step=0.010))], 2.0).run(robot), robot)
     assert 0.0 < out[-1, 2] < 0.009
@@ -236,7 +236,7 @@ def test_it_slows_down_on_release_with_limited_acceleration() -> None:
     assert released[-1] == 0.0
 
 
-def test_another_cable_that_goes_slack_all_the_same_ends_in_a_fault(
+def test_another_cable_that_goes_slack_anyway_ends_in_a_fault(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As for `cdpr jog --cable`: the platform pose is unknown afterwards."""
@@ -270,7 +270,7 @@ def test_a_stop_ends_the_session() -> None:
     assert np.abs(np.diff([record.rate for record in script.records])).max() < 0.5
 
 
-def test_a_session_ends_by_itself_when_nothing_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_ends_on_its_own_when_nothing_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sessions, "IDLE", 0.8)
     records = Script([], 99.0).run()
     assert 0.8 < records[-1].at < 2.0
@@ -341,7 +341,7 @@ def cycle(targets: list[int], tension: list[float], index: float, rate: float) -
     )  # fmt: skip
 
 
-def test_what_keeps_a_cable_from_going_on_is_said() -> None:
+def test_what_keeps_a_cable_from_continuing_is_reported() -> None:
     travel = CableTravel(rig(), 62.0, 0.050)
     assert (travel.cable, travel.limit, travel.by_session) == (0, "", [0.0] * 8)
     easy, tight, slack = [20.0] * 8, [20.0] * 8, [20.0] * 8

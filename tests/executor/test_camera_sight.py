@@ -20,7 +20,7 @@ def looked(seen: list[bool]) -> list[str]:
 
 
 @given(seen=st.lists(st.booleans(), max_size=40))
-def test_it_is_in_trouble_exactly_while_the_last_pictures_gave_no_pose(seen: list[bool]) -> None:
+def test_it_is_in_trouble_exactly_while_the_last_images_gave_no_pose(seen: list[bool]) -> None:
     for frame, reported in enumerate(looked(seen)):
         last = seen[max(0, frame + 1 - BLIND_IMAGES) : frame + 1]
         assert bool(reported) is (len(last) == BLIND_IMAGES and not any(last))

@@ -54,7 +54,7 @@ def test_one_that_fails_is_reported_though_another_one_hangs() -> None:
     assert hung.asked == 3
 
 
-def test_a_stop_is_heard_while_a_camera_hangs() -> None:
+def test_a_stop_is_handled_while_a_camera_hangs() -> None:
     hung = Opening("hung", float("inf"))
     with pytest.raises(StoppedByOperator):
         wait(hung, stop_after=4)

@@ -44,7 +44,7 @@ def _answer(line: bytes, board: LocalRequests | None = None) -> dict[str, Any]:
     return json.loads(answer_to(line, board or LocalRequests(), STATUS))
 
 
-def test_each_command_puts_up_its_wish_and_leaves_the_others():
+def test_each_command_posts_its_request_and_leaves_the_others():
     board = LocalRequests()
     assert _answer(make_line("status"), board) == {"ok": True, "status": {"state": "moving"}}
     assert board.read() == OperatorRequests()
@@ -77,7 +77,7 @@ def test_each_command_puts_up_its_wish_and_leaves_the_others():
         b"\xff\xfe",
     ],
 )
-def test_what_is_no_command_changes_nothing_and_is_reported(line):
+def test_what_is_not_a_command_changes_nothing_and_is_reported(line):
     board = LocalRequests()
     answer = _answer(line, board)
     assert answer["ok"] is False
@@ -94,13 +94,13 @@ def test_no_bytes_do_anything_but_a_command(line):
 
 
 @given(percent=st.integers(1, 100))
-def test_a_speed_travels_as_it_was_said(percent):
+def test_a_speed_travels_as_given(percent):
     command = parse_command(make_line("speed", percent=percent))
     assert command.percent == percent  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("percent", [0, 101])
-def test_a_speed_that_is_none_is_no_command(percent):
+def test_a_speed_that_is_invalid_is_not_a_command(percent):
     with pytest.raises(InvalidCommand):
         parse_command(make_line("speed", percent=percent))
 
@@ -149,7 +149,7 @@ def test_a_line_without_end_is_cut_off(board):
             assert link.recv(10) == b""
 
 
-def test_a_client_that_never_reads_or_never_speaks_keeps_nobody_waiting(board):
+def test_a_client_that_never_reads_or_never_speaks_blocks_no_other(board):
     with _connected() as deaf:
         deaf.setblocking(False)
         with suppress(OSError):  # full, or let go
@@ -288,7 +288,7 @@ def _said(presses: _Presses | None, **question: Any) -> dict[str, Any]:
     return answer
 
 
-def test_a_session_of_jogs_takes_what_is_said_of_presses() -> None:
+def test_a_session_of_jogs_takes_what_is_reported_of_presses() -> None:
     presses = _Presses()
     held = {"command": "held", "press": 3, "direction": [0, 0.6, 0.8], "frame": "platform"}
     assert _said(presses, **held, step_mm=0.1, percent=25)["ok"]
@@ -317,7 +317,7 @@ def test_a_session_of_jogs_takes_what_is_said_of_presses() -> None:
         {"more": 1},
     ],
 )
-def test_a_press_that_is_none_is_refused(wrong: dict[str, Any]) -> None:
+def test_a_press_that_is_invalid_is_refused(wrong: dict[str, Any]) -> None:
     presses = _Presses()
     good = {"command": "held", "press": 1, "direction": [1, 0, 0]}
     assert _said(presses, **good)["ok"]

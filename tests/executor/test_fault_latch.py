@@ -74,7 +74,7 @@ def test_an_engaged_latch_is_not_engaged_again(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("state", [State.FINISHED, State.STOPPED])
-def test_a_good_end_disengages_and_lets_go(folder: Path, state: State) -> None:
+def test_a_good_end_disengages_and_releases_the_lock(folder: Path, state: State) -> None:
     mine, other = two()
     mine.engage("a rig", folder)
     mine.settle("a rig", state, "", folder)
@@ -123,7 +123,7 @@ def test_a_latch_that_changed_since_it_was_shown_is_not_reset(folder: Path) -> N
     assert not mine.held_by_another()
 
 
-def test_a_file_that_is_no_latch_counts_as_engaged(folder: Path) -> None:
+def test_a_file_that_is_not_a_latch_counts_as_engaged(folder: Path) -> None:
     mine, _ = two()
     folder.mkdir()
     mine.path.write_text("[]")
@@ -201,7 +201,7 @@ def test_nothing_moves_when_the_lock_or_its_folder_cannot_be_made(
     assert not other.held_by_another()
 
 
-def test_a_motion_that_engages_between_two_looks_keeps_the_other_out(
+def test_a_motion_that_engages_between_two_reads_keeps_the_other_out(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first check is without the lock: changes since then count."""
@@ -223,7 +223,7 @@ def test_a_motion_that_engages_between_two_looks_keeps_the_other_out(
     assert latched.cause == "a drive failed"
 
 
-def test_looks_and_refusals_leave_no_file_open(
+def test_reads_and_refusals_leave_no_file_open(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mine, other = two()

@@ -90,7 +90,7 @@ def test_faults_are_named_once_and_nothing_else_is() -> None:
     "code",
     [*sorted(ORDINARY), *get_args(StopDocument.model_fields["kind"].annotation), "unheard_of"],
 )
-def test_an_event_that_is_no_fault_points_to_no_page(code: str) -> None:
+def test_an_event_that_is_not_a_fault_points_to_no_page(code: str) -> None:
     assert page_of(code) == ""
 
 

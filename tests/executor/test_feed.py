@@ -131,7 +131,7 @@ def _walked(motion: Motion, requests: list[tuple[int, float]], rows: int = 5000)
     motion=motions,
 )
 @settings(max_examples=80)
-def test_whatever_is_asked_for_it_keeps_between_rest_and_full_rate_and_changes_smoothly(
+def test_whatever_is_requested_it_keeps_between_rest_and_full_rate_and_changes_smoothly(
     requests, motion
 ):
     """Also if a change is interrupted by the next."""
@@ -148,14 +148,14 @@ def test_whatever_is_asked_for_it_keeps_between_rest_and_full_rate_and_changes_s
 
 @given(rate=st.floats(0.01, 1.0), motion=motions)
 @settings(max_examples=30)
-def test_it_reaches_the_rate_that_was_asked_for_and_keeps_it(rate, motion):
+def test_it_reaches_the_rate_that_was_requested_and_keeps_it(rate, motion):
     indices = _walked(motion, [(5, 1.0), (1000, rate)])
     assert np.diff(indices[-50:]) == pytest.approx(rate, abs=1e-9)
 
 
 @given(motion=motions, before=st.integers(0, 60), held=st.integers(0, 300))
 @settings(max_examples=30)
-def test_after_a_hold_it_goes_on_to_the_end_without_leaving_a_row_out(motion, before, held):
+def test_after_a_hold_it_continues_to_the_end_without_leaving_a_row_out(motion, before, held):
     feed = Feed(600, CYCLE, motion)
     for _ in range(before):
         feed.advance()
@@ -179,7 +179,7 @@ def test_asking_again_for_the_same_rate_changes_nothing():
 
 
 @pytest.mark.parametrize("rate", [-0.01, 1.01, float("nan")])
-def test_a_rate_the_table_was_not_proved_for_is_refused(rate):
+def test_a_rate_the_table_was_not_checked_for_is_refused(rate):
     with pytest.raises(ValueError, match="not from 0 to 1"):
         Feed(10, CYCLE, GACHON).go_to(rate)
 

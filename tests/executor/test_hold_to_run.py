@@ -94,7 +94,7 @@ def moved(records: list[CycleRecord]) -> list[bool]:
     return [False, *(a != b for a, b in pairwise(targets))]
 
 
-def test_it_goes_straight_while_held_and_stops_when_let_go() -> None:
+def test_it_goes_straight_while_held_and_stops_when_released() -> None:
     x = np.array([1.0, 0.0, 0.0])
     records = Script([(0.5, 1.5, hold(1, x))], 3.0).run(scene())
     path = positions(records) - rig().home.position
@@ -120,7 +120,7 @@ def test_a_step_ends_where_it_should(length: float) -> None:
     assert np.abs(path[:2]).max() < 5e-5
 
 
-def test_a_step_that_is_let_go_ends_early() -> None:
+def test_a_step_that_is_released_ends_early() -> None:
     z = np.array([0.0, 0.0, 1.0])
     records = Script([(0.5, 0.7, hold(1, z, step=0.010))], 3.0).run(scene())
     path = positions(records)[-1, 2] - rig().home.position[2]
@@ -222,13 +222,13 @@ def test_rows_that_changed_in_transit_are_a_fault(monkeypatch: pytest.MonkeyPatc
         Script([(0.5, 1.5, hold(1, x))], 3.0).run(scene())
 
 
-def test_a_session_ends_by_itself_when_nothing_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_ends_on_its_own_when_nothing_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sessions, "IDLE", 0.8)
     records = Script([], 99.0).run(scene())
     assert 0.8 < records[-1].at < 2.0
 
 
-def test_a_line_is_proved_as_a_whole_would_be() -> None:
+def test_a_line_is_checked_as_a_whole_would_be() -> None:
     """Its pieces, end to end, are the set-points of the line, without gaps or repeats."""
     slow = with_speed(rig(), 0.020)
     line = JogLine(slow, scene(), rig().home, np.array([0.0, 1.0, 0.0]))
@@ -243,7 +243,7 @@ def test_a_line_is_proved_as_a_whole_would_be() -> None:
     assert np.abs(np.diff(rows.astype(np.int64), n=2, axis=0)).max() <= 4, "at constant speed"
 
 
-def test_what_cannot_be_proved_is_not_added() -> None:
+def test_what_cannot_be_checked_is_not_added() -> None:
     slow = with_speed(rig(), 0.020)
     line = JogLine(slow, scene(), rig().home, np.array([0.0, 0.0, -1.0]))
     line.extend(FIRST_ROWS)

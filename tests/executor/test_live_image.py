@@ -67,7 +67,7 @@ def test_what_was_seen_arrives_with_what_was_measured(
         assert newest.found == NoPose(2.0, "dark")
 
 
-def test_at_most_five_a_second_are_shown_and_none_when_nobody_looks(
+def test_at_most_five_a_second_are_shown_and_none_when_there_is_no_viewer(
     memory: SharedMemory, now: list[float]
 ) -> None:
     board, shown = ImageBoard(memory), []
@@ -82,7 +82,7 @@ def test_at_most_five_a_second_are_shown_and_none_when_nobody_looks(
     assert min(b - a for a, b in itertools.pairwise(shown)) >= SHOWN_EVERY - 1e-9
 
 
-def test_half_an_image_is_none(memory: SharedMemory, now: list[float]) -> None:
+def test_half_an_image_is_not_shown(memory: SharedMemory, now: list[float]) -> None:
     """The viewer reads while the camera's process writes."""
     board = ImageBoard(memory)
     with closing(ImageReader(os.getpid(), memory.descriptor)) as reader:

@@ -60,7 +60,7 @@ def test_every_state_can_be_reached(state):
 
 
 @pytest.mark.parametrize(("state", "event"), list(product(State, Event)))
-def test_every_event_in_every_state_is_foreseen_or_forbidden(state, event):
+def test_every_event_in_every_state_is_listed_or_forbidden(state, event):
     machine = _after(*EVENTS_TO[state])
     if (state, event) in FORESEEN:
         wanted = FORESEEN[state, event]

@@ -48,7 +48,7 @@ class _Group:
         )
 
 
-def test_a_drive_has_one_name_whoever_speaks_of_it():
+def test_a_drive_has_one_name_in_every_message():
     watch = DriveMonitor(HALL.drive_names, [1e9] * 10)
     watch.take(EMCY_BASE + 13, bytes.fromhex("1023000000000000"))
     group = _Group([*watch.news(), (WHOLE_BUS, "bus-off")])

@@ -147,7 +147,7 @@ def test_a_polyline_goes_through_its_waypoints():
         assert pose.angle_to(waypoint) < 1e-9
 
 
-def test_a_turn_straight_back_is_no_corner():
+def test_a_turn_straight_back_is_not_a_corner():
     """Its curve would stop and reverse at full travelled speed."""
     with pytest.raises(ValueError, match="path reverses"):
         corner(at_mm(0, 0, 0), at_mm(10, 0, 0), at_mm(0, 0, 0), WEIGHT)

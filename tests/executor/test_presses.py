@@ -139,7 +139,7 @@ def test_loop_and_board_never_hold_what_is_not_held(said: list[tuple[str, int, f
     board.close()
 
 
-def test_a_press_is_held_as_long_as_it_is_heard_of(board: PressBoard, time: Time) -> None:
+def test_a_press_is_held_as_long_as_it_is_reported(board: PressBoard, time: Time) -> None:
     reader = PressReader(board.memory)
     for _ in range(50):
         assert hold(board, 1)
@@ -152,7 +152,7 @@ def test_a_press_is_held_as_long_as_it_is_heard_of(board: PressBoard, time: Time
     assert reader.read(time.now).press == 2
 
 
-def test_what_a_press_asked_for_first_stays(board: PressBoard) -> None:
+def test_what_a_press_requested_first_stays(board: PressBoard) -> None:
     hold(board, 1)
     board.hold(1, -UP, in_platform=True, step=0.001, percent=50)
     press = board.held()

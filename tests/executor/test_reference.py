@@ -67,7 +67,7 @@ def test_it_counts_for_its_rig_file_alone() -> None:
 
 
 @pytest.mark.parametrize("encoder", ["absolute", "incremental"])
-def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
+def test_it_is_lost_where_a_cable_was_released(encoder: str) -> None:
     rig = rig_with(encoder)
     if encoder == "incremental":
         MotionInterlock(rig).file.write(reference_of(rig))

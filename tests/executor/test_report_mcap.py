@@ -94,7 +94,7 @@ def test_numbers_are_those_of_the_tables(run: fake_run.FakeRun, messages: Messag
     )
 
 
-def test_a_picture_without_a_pose_says_why_and_has_nulls(
+def test_a_image_without_a_pose_states_why_and_has_nulls(
     run: fake_run.FakeRun, messages: Messages
 ) -> None:
     lost = run.poses.status.index("no tags seen, 2 needed")
@@ -104,7 +104,7 @@ def test_a_picture_without_a_pose_says_why_and_has_nulls(
     assert set(status["covariance"]) == {None}
 
 
-def test_pictures_are_the_jpegs_of_the_folder(folder: RunFolder, messages: Messages) -> None:
+def test_images_are_the_jpegs_of_the_folder(folder: RunFolder, messages: Messages) -> None:
     name = next(name for name in folder.poses().picture if name)
     _, picture = messages["/pictures"][0]
     assert picture.data == folder.picture(name)

@@ -105,7 +105,7 @@ def test_ids_are_unique_and_links_lead_somewhere(page: Page) -> None:
     assert not missing
 
 
-def test_every_picture_says_what_it_shows(page: Page) -> None:
+def test_every_image_says_what_it_shows(page: Page) -> None:
     assert len(page.all("img")) == 5
     assert all(len(image["alt"] or "") > 10 for image in page.all("img"))
     figures = [svg for svg in page.all("svg") if svg.get("role") == "img"]
@@ -189,7 +189,7 @@ def test_a_run_without_camera_has_no_camera_section(tmp_path: Path, run: fake_ru
     assert "no camera" in page.text
 
 
-def test_a_scene_without_obstacles_says_so(tmp_path: Path, run: fake_run.FakeRun) -> None:
+def test_a_scene_without_obstacles_reports_it(tmp_path: Path, run: fake_run.FakeRun) -> None:
     scene = run.context.plan.document.scene.model_copy(update={"obstacles": []})
     context = replace(run.context, plan=with_scene(run, scene))
     empty = replace(run, context=context, poses=no_poses(), clearance=no_clearance())

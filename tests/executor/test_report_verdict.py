@@ -139,7 +139,7 @@ def test_the_following_error_is_held_against_its_limit(
     assert f"{worst_mm:.3f} mm" in check.text
 
 
-def test_no_drive_position_at_all_is_no_pass(run: fake_run.FakeRun) -> None:
+def test_no_drive_position_at_all_does_not_pass(run: fake_run.FakeRun) -> None:
     unknown = replace(run.cycles, following_error=np.full(len(run.cycles), np.nan))
     assert not following(unknown, 0.002).passed
 

@@ -99,7 +99,7 @@ DELAYS = st.lists(st.integers(0, 5), min_size=1, max_size=6)
 
 
 @given(front=DELAYS, side=DELAYS, moments=st.integers(1, 25))
-def test_however_late_cameras_answer_every_moment_is_reported_once_and_nothing_is_lost(
+def test_for_any_delay_of_cameras_every_frame_is_reported_once_and_nothing_is_lost(
     front: list[int], side: list[int], moments: int
 ) -> None:
     run, _ = run_of(moments, Scripted("front", front), Scripted("side", side))
@@ -124,7 +124,7 @@ def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
     assert "the scene requires 10000 mm" in run.near
 
 
-def test_pictures_of_both_make_a_better_pose() -> None:
+def test_images_of_both_make_a_better_pose() -> None:
     run, reported = run_of(5, Scripted("front", [0]), Scripted("side", [0]))
     seen = run.finish(never)
     for look in seen.together:
@@ -184,7 +184,7 @@ def test_one_that_dies_is_reported_and_after_the_last_one_none_is_left() -> None
     assert none_left.all_failed == f"all cameras failed: {'; '.join(each)}"
 
 
-def test_moments_in_which_cameras_were_not_taken_together_are_counted_and_reported() -> None:
+def test_frames_in_which_cameras_were_not_taken_together_are_counted_and_reported() -> None:
     run, reported = run_of(10, Scripted("front", [0]), Scripted("side", [0], late=0.12))
     run.finish(never)
     reported += [news.text for news in run.news()]
@@ -215,7 +215,7 @@ def test_at_the_end_all_that_hang_are_waited_for_together_and_a_stop_cuts_it_sho
     assert seen.cameras[-1].poses == 3
 
 
-def test_live_figures_are_those_of_the_newest_pictures() -> None:
+def test_live_figures_are_those_of_the_newest_images() -> None:
     run, _ = run_of(30, Scripted("front", [0]), Scripted("side", [1]))
     front, side = run.as_dict()
     assert (front["pictures_per_second"], side["pictures_per_second"]) == (10.0, 5.0)
@@ -225,7 +225,7 @@ def test_live_figures_are_those_of_the_newest_pictures() -> None:
     )
 
 
-def test_the_pace_of_a_source_is_that_of_its_newest_pictures() -> None:
+def test_the_pace_of_a_source_is_that_of_its_newest_images() -> None:
     pace = FrameRate()
     assert (pace.pictures_per_second, pace.measuring_ms) == (None, None)
     for k in range(30):
@@ -311,7 +311,7 @@ def wait_for_answers(processes: Sequence[CameraProcess]) -> None:
             assert process._link.poll(20.0)
 
 
-def test_the_names_of_the_pictures_name_the_camera(tmp_path: Path) -> None:
+def test_the_names_of_the_images_name_the_camera(tmp_path: Path) -> None:
     from executor.recording.run_folder import RunFolder
 
     folder = RunFolder.create(tmp_path / "run")

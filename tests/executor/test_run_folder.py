@@ -41,7 +41,7 @@ def same(one: Any, other: Any) -> None:
             assert left == right, field.name
 
 
-def test_a_new_folder_has_room_for_events_and_pictures(tmp_path: Path) -> None:
+def test_a_new_folder_has_room_for_events_and_images(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "a run")
     assert folder.events() == []
     assert (folder.path / "pictures").is_dir()
@@ -176,7 +176,7 @@ def test_a_broken_event_in_the_middle_is_reported_with_its_line(tmp_path: Path) 
     assert caught.value.where.endswith("events.jsonl:1")
 
 
-def test_a_picture_comes_back_as_jpeg(tmp_path: Path) -> None:
+def test_a_image_comes_back_as_jpeg(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run")
     name = folder.write_picture(7, np.full((48, 64), 99, dtype=np.uint8))
     assert name == "pictures/frame_000007.jpg"

@@ -97,7 +97,7 @@ def test_a_course_that_no_run_writes_is_named(tmp_path: Path, key: str, value: A
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"schema_version": 2}', "\0"])
-def test_a_summary_that_is_none_is_refused(folder: RunFolder, text: str) -> None:
+def test_a_summary_that_is_invalid_is_refused(folder: RunFolder, text: str) -> None:
     (folder.path / "summary.json").write_text(text)
     with pytest.raises(BadInput):
         folder.summary()
@@ -114,7 +114,7 @@ def test_a_summary_that_is_none_is_refused(folder: RunFolder, text: str) -> None
         "[" * 100_000,
     ],
 )
-def test_an_event_that_is_none_is_reported_with_its_line(folder: RunFolder, line: str) -> None:
+def test_an_event_that_is_invalid_is_reported_with_its_line(folder: RunFolder, line: str) -> None:
     path = folder.path / "events.jsonl"
     path.write_text(path.read_text() + line + "\n")
     with pytest.raises(BadInput, match="not an event") as caught:

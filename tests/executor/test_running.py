@@ -91,7 +91,7 @@ def test_every_run_is_reached(folders):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_ctrl_c_a_signal_and_a_closed_terminal_are_wishes_not_ends(folders, number):
+def test_ctrl_c_a_signal_and_a_closed_terminal_are_requests_not_ends(folders, number):
     with _run() as process:
         process.send_signal(number)
         assert process.stdout is not None
@@ -215,7 +215,7 @@ def test_a_run_that_no_stop_could_reach_is_refused(folders, tmp_path, monkeypatc
 
 
 @spoilt
-def test_nobody_is_spoken_to_in_a_folder_that_others_control(folders, tmp_path, monkeypatch, how):
+def test_no_connection_is_made_in_a_folder_that_others_control(folders, tmp_path, monkeypatch, how):
     """A stop sent to another user's socket would stop nothing."""
     with socket.socket(socket.AF_UNIX) as listener:
         _spoil(folders[1], how, tmp_path, monkeypatch)

@@ -235,7 +235,7 @@ def _said(name: str, table: Trajectory) -> str:
     "field", ["travelled", "positions", "rotations", "lengths", "tensions", "counts"]
 )
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_value_that_is_no_number_is_refused_wherever_it_is(name, field, value):
+def test_a_value_that_is_not_a_number_is_refused_wherever_it_is(name, field, value):
     assert f"row 3 has {field}" in _refused(name, _spoilt(name, field, 3, 0, value))
 
 

@@ -38,7 +38,7 @@ def memory() -> Iterator[SharedMemory]:
     made.close()
 
 
-def test_sealed_memory_cannot_be_written_to_by_anybody():
+def test_sealed_memory_cannot_be_written_to_by_any_process():
     sealed = SharedMemory.sealed(b"proved" * 1000)
     try:
         assert sealed.view[:6] == b"proved"
@@ -176,7 +176,7 @@ def board() -> Iterator[SharedRequests]:
     made.memory.close()
 
 
-def test_wishes_reach_the_other_side_and_stay(board, clock):
+def test_requests_reach_the_other_side_and_stay(board, clock):
     other = Supervised(board.memory, os.getppid())
     assert other.read() == board.read() == OperatorRequests()
     board.ask_speed(30)
@@ -200,20 +200,20 @@ def test_what_a_stop_is_for_reaches_the_other_side(board, clock, text):
     assert text.startswith(reason.text.rstrip("�"))
 
 
-def test_a_stop_that_was_wished_before_was_for_nothing_else(board, clock):
+def test_a_stop_that_was_requested_before_was_for_nothing_else(board, clock):
     board.ask_stop()
     board.ask_stop(StopReason("camera", "all cameras failed"))
     assert board.read() == OperatorRequests(stop=True)
 
 
-def test_a_process_that_is_asked_to_end_stops(board, clock):
+def test_a_process_that_is_requested_to_end_stops(board, clock):
     other = Supervised(board.memory, os.getppid())
     other.ask_stop()
     assert other.read().stop
     assert not board.read().stop
 
 
-def test_a_supervisor_that_says_nothing_for_too_long_is_lost_until_it_is_heard_again(board, clock):
+def test_a_supervisor_that_says_nothing_for_too_long_is_lost_until_it_is_alive_again(board, clock):
     other = Supervised(board.memory, os.getppid())
     for _ in range(5):
         clock.now += SILENCE
@@ -243,7 +243,7 @@ def test_the_first_trouble_is_reported(board, clock, text):
     assert text.startswith(lost.rstrip("�"))
 
 
-def test_the_layout_leaves_room_for_every_wish(board):
+def test_the_layout_leaves_room_for_every_request(board):
     """Separate bytes: writing one request does not affect reading another."""
     before = bytes(board.memory.view)
     board.ask_stop()

@@ -155,7 +155,7 @@ def test_positions_are_read_in_cycles_that_count() -> None:
     assert master.age == pytest.approx(1.0)
 
 
-def test_the_cycle_goes_on_until_the_word_is_heard() -> None:
+def test_the_cycle_continues_until_the_message_arrives() -> None:
     master, group, clock = made()
     words: list[int | None] = [None, None, None, 0]
     assert master.cycle_until(lambda: words.pop(0)) == 0

@@ -81,7 +81,7 @@ def test_a_step_raises_no_tension_beyond_what_is_left_before_it_is_seen():
 
 
 @pytest.mark.parametrize("wrong", [61.0, float("nan")])
-def test_beyond_the_limit_no_winch_goes_on(wrong):
+def test_beyond_the_limit_no_winch_continues(wrong):
     rig = RIGS[0]
     for law in (
         PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002),
@@ -101,7 +101,7 @@ def test_beyond_the_limit_no_winch_goes_on(wrong):
         ]
 
 
-def test_near_the_limit_all_go_on_more_slowly():
+def test_near_the_limit_all_continue_more_slowly():
     rig, steps = RIGS[0], []
     for tension in (10.0, 35.0, 59.9):
         law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002)
@@ -247,7 +247,7 @@ def test_winding_in_rests_from_the_reserve_on_whichever_cable_is_tight(cable):
     assert share(SLACK, out=False, before=SLACK) == 1.0
 
 
-def test_paying_out_goes_on_as_long_as_no_other_cable_becomes_tighter():
+def test_paying_out_continues_as_long_as_no_other_cable_becomes_tighter():
     assert share(one(2, LIMIT + 30.0), out=True) == 1.0, "its own tension falls by it"
     assert share(CEILING + 3.0, out=True, before=CEILING + 3.0) == 1.0
     assert share(one(6, CEILING + 0.01), out=True) == 0.0
@@ -267,7 +267,7 @@ def test_it_rests_before_another_cable_that_was_taut_is_slack(out):
 
 @pytest.mark.parametrize("out", [True, False])
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
-def test_a_tension_that_is_no_number_leaves_no_room(out, wrong):
+def test_a_tension_that_is_not_a_number_leaves_no_room(out, wrong):
     for cable in (2, 6):
         assert share(one(cable, wrong), out=out) == 0.0
         assert share(20.0, out=out, before=one(cable, wrong)) >= 0.0

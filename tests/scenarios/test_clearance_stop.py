@@ -162,7 +162,7 @@ class Rendered:
         pass
 
 
-def test_one_picture_alone_does_not_stop_a_run(narrow_plan: Path, tmp_path: Path) -> None:
+def test_one_image_alone_does_not_stop_a_run(narrow_plan: Path, tmp_path: Path) -> None:
     rig, scene = load_rig(RIG), load_plan(narrow_plan).scene
     eye = SyntheticCamera(rig, scene, rig.cameras[0])
     near, far = Pose.level([-0.008, 0.02, 0.48]), Pose.level([0.05, 0.02, 0.48])

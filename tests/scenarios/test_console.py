@@ -227,7 +227,7 @@ def taught_and_run(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
     assert list((folder / "runs").glob("*/report.html"))
 
 
-def test_what_moves_goes_on_without_the_console_but_no_press_does(
+def test_what_moves_continues_without_the_console_but_no_press_does(
     on_a_day: Callable[[Day], None],
 ) -> None:
     on_a_day(console_killed)
@@ -304,7 +304,7 @@ def one_cable(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         assert all(target == last[0] for target in last)
 
 
-def test_a_stop_that_nobody_needs_says_so(on_a_day: Callable[[Day], None]) -> None:
+def test_a_stop_without_a_run_reports_it(on_a_day: Callable[[Day], None]) -> None:
     on_a_day(nothing_to_stop)
 
 

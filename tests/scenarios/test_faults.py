@@ -228,7 +228,7 @@ def test_less_clearance_than_the_platform_needs_to_stop_is_refused(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_a_bus_that_fails_leaves_the_drives_stopping_by_themselves(
+def test_a_bus_that_fails_leaves_the_drives_stopping_on_their_own(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     with staged(prepared, tmp_path / "run", at(CRUISING, unplug)) as stage:
@@ -299,7 +299,7 @@ def test_the_first_of_several_causes_is_the_one_that_is_reported(
 
 @pytest.mark.parametrize("lateness", [1.5, 2.0, 3.0, 1371.9])
 @pytest.mark.usefixtures("no_pictures")
-def test_after_the_drives_stopped_by_themselves_no_set_point_follows(
+def test_after_the_drives_stopped_on_their_own_no_set_point_follows(
     prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lateness: float
 ) -> None:
     """Targets stay those of the cycle before the silence; the first one of the stop is late."""
@@ -326,7 +326,7 @@ def test_after_the_drives_stopped_by_themselves_no_set_point_follows(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_a_stop_wish_does_not_hide_a_fault(prepared: PreparedRun, tmp_path: Path) -> None:
+def test_a_stop_request_does_not_hide_a_fault(prepared: PreparedRun, tmp_path: Path) -> None:
     def both(stage: Stage) -> None:
         if stage.cycle == CRUISING:
             stage.board.ask_stop()
@@ -413,7 +413,7 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
     assert folder.report.is_file()
 
 
-def test_a_camera_that_looks_elsewhere_fails_the_run_and_says_why(
+def test_a_camera_that_faces_elsewhere_fails_the_run_and_states_why(
     short_plan: Path, tmp_path: Path
 ) -> None:
     """The motion is good; that it was measured is not true, and is not claimed."""

@@ -145,7 +145,7 @@ def lost(seed: int, slack_mm: float = 3.0, *, on_a_stand: bool) -> PowerLoss:
     return PowerLoss.drawn(load_rig(RIG), seed, slack_mm / 1000.0, on_a_stand=on_a_stand)
 
 
-def test_nobody_else_may_move_the_drives_before_the_reference_is_kept() -> None:
+def test_no_other_program_may_move_the_drives_before_the_reference_is_kept() -> None:
     rig = load_rig(RIG)
     bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can0"})
     kept = rig_from_document(rig.document.model_copy(update={"bus": bus}))
@@ -413,7 +413,7 @@ def test_winches_without_a_platform_move_below_what_would_balance_it() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.0001, 0.0002])
-def test_the_slowest_motion_is_no_jump_of_a_coarse_encoder(speed: float) -> None:
+def test_the_slowest_motion_is_not_a_jump_of_a_coarse_encoder(speed: float) -> None:
     rig = load_rig(HALL)
     loose = PowerLoss(np.zeros(rig.cable_count), np.full(rig.cable_count, 0.02), on_a_stand=True)
     with after_power_loss(loose, rig, limit=400.0, speed=speed) as bench:
@@ -465,7 +465,7 @@ def moved_by_hand(bench: Bench) -> None:
         (fails, "drive 7"),
     ],
 )
-def test_what_happens_while_the_camera_looks_is_noticed(
+def test_what_happens_while_the_camera_measures_is_noticed(
     happens: Callable[[Bench], None], expected: str | None
 ) -> None:
     with after_power_loss(lost(1, on_a_stand=True)) as bench:
@@ -618,7 +618,7 @@ def hangs(stage: Stage) -> None:
     ("happens", "holding"),
     [(stops, True), (hangs, True), (emergency_stop, False), (one_fails, False)],
 )
-def test_a_run_tells_whether_a_cable_was_let_go(
+def test_a_run_tells_whether_a_cable_was_released(
     prepared: PreparedRun, tmp_path: Path, happens: Callable[[Stage], None], holding: bool
 ) -> None:
     """It decides whether the reference stays valid: see `executor.interlock.interlock`."""

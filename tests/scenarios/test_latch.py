@@ -80,7 +80,7 @@ def test_a_run_active_is_distinguished_from_a_fault(tmp_path: Path) -> None:
         FaultLatch(BUS).require_disengaged()
 
 
-def test_nobody_sees_a_latch_that_does_not_say_its_cause_yet(
+def test_no_reader_sees_a_latch_that_does_not_say_its_cause_yet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen, hold = [], FaultLatch._hold

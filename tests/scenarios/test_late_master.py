@@ -174,7 +174,7 @@ def test_a_master_held_up_after_its_last_look_stops_the_drives_at_once(held_up: 
         assert {drive.state for drive in late.rehearsal.drives} == {HOLDING}
 
 
-def test_lateness_that_enables_nothing_is_no_fault() -> None:
+def test_lateness_that_enables_nothing_is_not_a_fault() -> None:
     """Drives that are only read, or hold on their own, are not affected by a late SYNC."""
     with enabled_drives(10.0) as late:
         late.pass_time(2.0 * late.clock.cycle)

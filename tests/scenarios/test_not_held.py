@@ -40,7 +40,7 @@ def fails_once_left(drive: SimulatedDrive) -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_that_lets_go_after_a_run_is_latched_and_reported_with_exit_code_1(
+def test_a_drive_that_releases_after_a_run_is_latched_and_reported_with_exit_code_1(
     slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.41:{20000 + (os.getpid() * 31) % 20000}"
@@ -64,7 +64,7 @@ def test_a_drive_that_lets_go_after_a_run_is_latched_and_reported_with_exit_code
         FaultLatch(BusSettings("udp_multicast", channel)).require_disengaged()
 
 
-def test_a_drive_that_lets_go_after_a_fault_is_reported_beside_its_cause(
+def test_a_drive_that_releases_after_a_fault_is_reported_besides_its_cause(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     def fault(stage: Stage) -> None:
@@ -82,7 +82,7 @@ def test_a_drive_that_lets_go_after_a_fault_is_reported_beside_its_cause(
     assert "cable 4" not in events[-1].text
 
 
-def test_a_second_drive_that_lets_go_after_a_fault_is_reported_although_the_first_does_not_hold(
+def test_a_second_drive_that_releases_after_a_fault_is_reported_although_the_first_does_not_hold(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     def fault(stage: Stage) -> None:

@@ -11,7 +11,7 @@ from model.pose import Pose
 from tests.scenarios.stage import staged
 
 
-def test_each_picture_comes_with_the_drives_pose_of_its_own_time(
+def test_each_image_comes_with_the_drives_pose_of_its_own_time(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     """The table of the whole run is computed differently: all cycles at once, near the plan."""

@@ -130,7 +130,7 @@ def test_the_death_of_the_supervisor_ends_in_a_stop_by_the_real_time_process(
         wait_until_all_hold(rehearsal)
 
 
-def test_the_death_of_the_real_time_process_is_reported_and_the_drives_stop_by_themselves(
+def test_the_death_of_the_real_time_process_is_reported_and_the_drives_stop_on_their_own(
     slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"

@@ -130,7 +130,7 @@ def test_a_run_folder_that_is_removed_meanwhile_is_a_fault_of_the_record_with_a_
     ("end", "error"),
     [("goal", MemoryError()), ("stop", ImportError("no module 'x'")), ("fault", MemoryError())],
 )
-def test_a_run_that_cannot_be_evaluated_has_a_verdict_that_says_so(
+def test_a_run_that_cannot_be_evaluated_has_a_verdict_that_reports_it(
     run: Callable[..., Answer], monkeypatch: pytest.MonkeyPatch, error: Exception, end: str
 ) -> None:
     def fails(*_: object) -> None:

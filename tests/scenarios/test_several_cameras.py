@@ -120,7 +120,7 @@ def test_each_camera_has_its_own_channels(answer_and_folder: tuple[Answer, RunFo
     assert counts["/pictures/side"] == kept["side"] > 0
 
 
-def test_the_kept_pictures_of_each_camera_have_the_drives_poses(
+def test_the_kept_images_of_each_camera_have_the_drives_poses(
     answer_and_folder: tuple[Answer, RunFolder],
 ) -> None:
     """With these `cdpr calibrate extrinsics --camera side --poses RUNDIR` finds its pose."""
@@ -163,7 +163,7 @@ def test_cameras_are_chosen_as_they_are_named(
         (["front=0", "--no-camera"], ["--camera and --no-camera contradict"]),
     ],
 )
-def test_cameras_that_are_not_said_clearly_are_refused(
+def test_cameras_that_are_not_named_clearly_are_refused(
     rig_file: Path, plan: Path, tmp_path: Path, cameras: list[str], parts: list[str]
 ) -> None:
     wanted = [w for c in cameras for w in ((c,) if c.startswith("--") else ("--camera", c))]
@@ -180,7 +180,7 @@ def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_report")
-def test_a_camera_that_looks_away_is_reported_and_the_other_measures(
+def test_a_camera_that_faces_away_is_reported_and_the_other_measures(
     plan: Path, tmp_path: Path
 ) -> None:
     rig = with_two_cameras(tmp_path / "rig.yaml", looks_away=True)
@@ -231,7 +231,7 @@ def events_of(folder: RunFolder, code: str) -> list[dict[str, Any]]:
 
 
 @pytest.mark.usefixtures("no_report")
-def test_a_camera_that_hangs_is_reported_and_the_run_goes_on_with_the_other(
+def test_a_camera_that_hangs_is_reported_and_the_run_continues_with_the_other(
     rig_file: Path, plan: Path, tmp_path: Path, stop_in_motion: Callable[[str], None]
 ) -> None:
     stop_in_motion("side")

@@ -140,7 +140,7 @@ def test_a_drive_that_falls_silent_stops_the_others() -> None:
         assert FOLLOWING not in {drive.state for drive in bench.drives if not drive.silent}
 
 
-def test_a_drive_that_stopped_by_itself_is_not_enabled_again() -> None:
+def test_a_drive_that_stopped_on_its_own_is_not_enabled_again() -> None:
     enabled: list[int] = []
     after: list[DriveState] = []
 

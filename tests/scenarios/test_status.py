@@ -80,7 +80,7 @@ def test_what_is_on_file_is_reported_although_no_drive_answers(
 
 
 @pytest.mark.slow
-def test_drives_that_somebody_sets_up_are_not_asked(slow_run: PreparedRun, slow_rig: Path) -> None:
+def test_drives_in_configuration_are_not_read(slow_run: PreparedRun, slow_rig: Path) -> None:
     channel = f"239.74.163.27:{20000 + (os.getpid() * 23) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
     with (

@@ -165,7 +165,7 @@ def test_a_wrong_number_of_entries_is_denied(field, values, request_):
 @pytest.mark.parametrize(
     "value", [float("nan"), float("inf"), 200.0, True, None, "200", np.int64(200)]
 )
-def test_what_is_no_whole_number_is_denied_wherever_it_is(drive, field, value):
+def test_a_non_integer_is_denied_wherever_it_is(drive, field, value):
     """NaN is neither below nor above a limit, so comparing alone would let it pass."""
     for request in (MOVE, HOLD, FIRST_HOLD):
         if getattr(request, field) is None:

@@ -84,7 +84,7 @@ def test_a_single_step_is_noted_only_where_it_is_larger_than_noise(travel, noted
 
 
 @pytest.mark.parametrize(("least", "found"), [(100, 1), (101, 0)])
-def test_slow_set_points_say_nothing(least, found):
+def test_slow_set_points_are_not_judged(least, found):
     cycles = steps([0, 100, 200, 200], [0, 100, 200, 300])
     assert len(look(cycles, StuckLimits(least, 100))) == found
 
@@ -164,7 +164,7 @@ def test_a_drive_that_crawls_and_then_stalls_is_found():
     assert first_found(crawling, [0, 100, 200, 300, 400, 500, 600]) == 5
 
 
-def test_a_reply_that_is_missing_says_nothing_new():
+def test_a_missing_reply_gives_no_information():
     positions, demands = [0, 100, 200, 200, 200, 200], [0, 100, 200, 300, 400, 500]
     assert look(list(steps(positions, demands, missing={4}))[:5]) == ()
     (stop,) = look(steps(positions, demands, missing={4}))

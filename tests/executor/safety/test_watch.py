@@ -120,7 +120,7 @@ def test_a_following_error_is_reported_in_millimetres():
 
 @each_drive
 @pytest.mark.parametrize("value", [NAN, float("inf"), -float("inf")])
-def test_a_following_error_that_is_no_number_stops(drive, value):
+def test_a_following_error_that_is_not_a_number_stops(drive, value):
     assert _codes(_with("following_errors", drive, value)) == [
         ("following_error", StopReaction.QUICK_STOP)
     ]
@@ -180,7 +180,7 @@ def test_the_limits_of_tension_themselves_are_allowed(drive, tension):
 
 
 @each_drive
-def test_a_tension_that_is_no_number_is_none_and_too_much(drive):
+def test_a_tension_that_of_nan_counts_as_none_and_too_much(drive):
     assert _codes(*[_with("tensions", drive, NAN)] * 5) == [
         ("cable_loose", StopReaction.QUICK_STOP),
         ("over_tension", StopReaction.PATH_STOP),

@@ -58,7 +58,7 @@ def positions(bench: Bench) -> list[float]:
 
 
 @pytest.mark.slow
-def test_f2_a_suspended_master_that_goes_on_enables_nothing(
+def test_f2_a_suspended_master_that_continues_enables_nothing(
     calm_run: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
 ) -> None:
     """Real SIGSTOP; SIGCONT after the drives have stopped on their own."""
@@ -258,7 +258,7 @@ def test_f23_a_step_of_the_clock_changes_nothing(
 
 
 @pytest.mark.slow
-def test_f25_a_master_that_is_asked_to_end_stops_along_the_path(
+def test_f25_a_master_that_is_requested_to_end_stops_along_the_path(
     calm_run: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
 ) -> None:
     for attempt in range(3):
