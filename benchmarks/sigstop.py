@@ -96,7 +96,7 @@ def main() -> int:
             again += len(seen.returned)
             lines.append(
                 f"| {milliseconds:4} | {1e3 * after:6.1f} ms | {late:5.2f} T | {ended:8} |"
-                f" {seen.told:9} | {len(seen.returned):5} | {early:11} |"
+                f" {seen.enabled_after_stop:9} | {len(seen.returned):5} | {early:11} |"
             )
             print(lines[-1], flush=True)
         masters.close()

@@ -1,6 +1,6 @@
-"""Whether this machine, and what a rig names, has what a run needs; nothing is changed.
+"""Checks of this machine and of a rig's hardware before a run; nothing is changed.
 
-Libraries may be missing: whatever needs one is imported where it is used, after `libraries`.
+Libraries may be missing: modules that need one are imported where used, after `libraries`.
 """
 
 from __future__ import annotations
@@ -60,19 +60,19 @@ LIBRARIES = {
 LIMITS = Path("/etc/security/limits.d/cdpr.conf")
 
 
-#: States of a controller in which it takes part in the traffic without restriction.
+#: States of a controller in which it takes full part in the traffic.
 HEALTHY = ("ERROR-ACTIVE", "ERROR-WARNING")
 
 
 @dataclass(frozen=True, slots=True)
 class MachineCheck:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes:
-        name: What.
-        good: Whether it is as a run needs it.
-        text: What was found.
-        fix: The next step where it is not good.
+        name: Of the checked item.
+        good: Whether it meets the needs of a run.
+        text: Finding.
+        fix: Next step if it is not good.
     """
 
     name: str
@@ -87,17 +87,17 @@ def check_machine() -> list[MachineCheck]:
 
 
 def check_rig(rig: Rig, camera: str | None = None) -> list[MachineCheck]:
-    """Whether what a rig names is there: files of its drives, its bus, its first camera.
+    """Checks the rig's drive files, its bus and its first camera.
 
     Args:
         rig: The robot.
-        camera: Index, device or address of a camera that is opened; none is when left out.
+        camera: Index, device or address of a camera to open; None to open none.
     """
     return [*rig_drives(rig), *rig_bus(rig), *rig_cameras(rig, camera)]
 
 
 def python_version() -> MachineCheck:
-    """Python itself."""
+    """The Python version."""
     good = sys.version_info >= (3, 11)
     return MachineCheck("python", good, platform.python_version(), "install Python 3.11 or newer")
 
@@ -129,7 +129,7 @@ def libraries() -> list[MachineCheck]:
 
 
 def machine() -> list[MachineCheck]:
-    """Needs of real time and real buses; only reported, since simulation needs none."""
+    """Processors and kernel; only reported, since simulation needs neither."""
     cores = os.cpu_count() or 1
     kernel = kernel_support()
     text = kernel.text if kernel.good else f"{kernel.text}; other interfaces work"
@@ -140,7 +140,7 @@ def machine() -> list[MachineCheck]:
 
 
 def rig_drives(rig: Rig) -> list[MachineCheck]:
-    """Whether the package and the files are there that the drives of a rig need."""
+    """Whether the files that the drives of a rig need exist and are valid."""
     drives = rig.document.drives
     if not isinstance(drives, OdriveDocument):
         return []
@@ -161,7 +161,7 @@ def rig_drives(rig: Rig) -> list[MachineCheck]:
 
 def rig_bus(rig: Rig) -> list[MachineCheck]:
     """Whether the bus of a rig is fast enough, is set up, and can be opened."""
-    # After the libraries were looked at: it needs python-can.
+    # Imported after the check of libraries: needs python-can.
     from drivers.can_bus import IN_PROCESS, BusSettings, can_interfaces, open_bus
     from drivers.can_load import check_bus_load
 
@@ -208,11 +208,11 @@ def rig_cameras(rig: Rig, source: str | None) -> list[MachineCheck]:
     return [MachineCheck(f"camera {camera.name}", True, text)]
 
 
-# A kernel CAN bus, each thing with the command that puts it right.
+# Kernel CAN bus: each check with the command that fixes it.
 
 
 def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> list[MachineCheck]:
-    """Whether the interface of a rig is there, up, fast enough and healthy.
+    """Whether the interface of a rig exists, is up, fast enough and healthy.
 
     Args:
         settings: The rig's bus.
@@ -236,7 +236,7 @@ def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> 
 
 
 def kernel_support() -> MachineCheck:
-    """Whether sockets of the CAN family open; no privilege is needed for them."""
+    """Whether CAN sockets can be opened; needs no privilege."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except (AttributeError, OSError) as error:
@@ -276,7 +276,7 @@ def _controller(found: KernelInterface, bitrate: int) -> MachineCheck:
     healthy = found.state in HEALTHY
     fix = f"check power, cable and termination (60 ohm), then {_set_again(found.name, bitrate)}"
     text = found.state or "unknown"
-    # Down it has no state worth reporting; that it is down is reported already.
+    # While down it has no state to report; `_up` reports that.
     return MachineCheck(f"controller of {found.name}", healthy or not found.up, text, fix)
 
 
@@ -292,7 +292,7 @@ def _set_again(name: str, bitrate: int) -> str:
 
 
 def real_time_permission() -> list[MachineCheck]:
-    """Priority and locked memory, as `cdpr run` asks for them on a bus with real drives."""
+    """Priority and locked memory, as `cdpr run` requests them for real drives."""
     priority = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     locked = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     return [
@@ -329,14 +329,14 @@ def _allow(item: str, value: int | str) -> str:
 
 
 def examine(rig: Rig) -> Examined:
-    """What the drives of a rig hold; simulated here where its bus is of this process.
+    """Reads the objects of a rig's drives; simulates them here on the interface ``virtual``.
 
     Raises:
-        BadInput: They are no CANopen drives, or their profile is wrong.
+        BadInput: They are not CANopen drives, or their profile is wrong.
         HardwareMissing: The bus cannot be opened.
-        Refused: Another program sets the drives up.
+        Refused: Another program configures the drives.
     """
-    # After the libraries were looked at: it needs python-can and canopen.
+    # Imported after the check of libraries: needs python-can and canopen.
     from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
     from drivers.cia402.inspection import examine_drives
     from executor.interlock.locks import SetUpLock
@@ -362,7 +362,7 @@ def examine(rig: Rig) -> Examined:
 
 
 def stopping_text(rig: Rig) -> str:
-    """How far the platform goes on without the master; plans must keep that clearance."""
+    """Stopping distance after loss of the master, which plans must keep as clearance."""
     from drivers.stopping_distance import lost_master  # needs python-can
 
     lost = lost_master(rig)

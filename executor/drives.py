@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from simulation.ground_truth import PowerLoss
     from simulation.rig import SimulatedRig
 
-#: Within this time drives that lost their master have noticed it and come to rest, [s].
+#: Time for drives that lost their master to notice and come to rest, [s].
 ALONE = 1.0
 
 
@@ -44,10 +44,10 @@ def is_simulated(rig: Rig) -> bool:
 
 
 def require_other_process(rig: Rig) -> None:
-    """The bus reaches drives that outlive this process.
+    """Requires a bus whose drives outlive this process.
 
     Raises:
-        BadInput: It is the interface ``virtual``.
+        BadInput: The interface is ``virtual``.
     """
     if is_simulated(rig):
         raise BadInput(
@@ -59,10 +59,10 @@ def require_other_process(rig: Rig) -> None:
 
 
 def require_own_time(rig: Rig, realtime: bool) -> None:
-    """Only drives that are simulated in this process can go faster than time.
+    """Requires real time for drives that are not simulated in this process.
 
     Raises:
-        BadInput: Others were to.
+        BadInput: Simulated time was requested for them.
     """
     if not (realtime or is_simulated(rig)):
         raise BadInput(
@@ -75,7 +75,7 @@ def require_own_time(rig: Rig, realtime: bool) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Drives:
-    """An open bus, and the drives behind it where they are simulated in this process."""
+    """An open bus, and its drives if simulated in this process."""
 
     bus: BusABC
     rehearsal: SimulatedRig[Any] | None
@@ -86,14 +86,14 @@ class _Drives:
 
 
 @contextmanager
-def _reached(
+def _locked_bus(
     rig: Rig,
     simulated_start: Pose,
     load: Load,
     lost_power: PowerLoss | None = None,
     listener: Listener = SILENT,
 ) -> Iterator[_Drives]:
-    """The bus, with its drives locked; arguments and errors as `open_drives`."""
+    """Opens the bus with its drives locked; arguments and errors as `open_drives`."""
     settings = BusSettings.of(rig)
     with ExitStack() as stack:
         stack.enter_context(SetUpLock(settings).held())
@@ -113,16 +113,16 @@ def _reached(
         yield _Drives(bus, rehearsal)
 
 
-def look_at(rig: Rig, simulated_start: Pose, load: Load) -> DriveSnapshot:
-    """What the drives report; nothing of them is changed. Arguments and errors as `open_drives`."""
-    with _reached(rig, simulated_start, load) as drives:
+def read_snapshot(rig: Rig, simulated_start: Pose, load: Load) -> DriveSnapshot:
+    """Reads the drives without changing them; arguments and errors as `open_drives`."""
+    with _locked_bus(rig, simulated_start, load) as drives:
         return read_drives(rig, drives.bus, drives.pump)
 
 
-def left_alone(document: RigDocument) -> str:
-    """How drives stand whose master is gone; what is wrong with it, empty where all hold.
+def abandoned_drives_fault(document: RigDocument) -> str:
+    """Why drives without a master do not hold; empty if all hold.
 
-    Those that are simulated in the process that is gone are gone, too.
+    Drives simulated in the process that ended are gone as well.
 
     Args:
         document: The rig file.
@@ -132,15 +132,15 @@ def left_alone(document: RigDocument) -> str:
         return ""
     time.sleep(ALONE)
     try:
-        told = look_at(rig, rig.home, empty_scene(rig).load)
+        snapshot = read_snapshot(rig, rig.home, nothing_in_the_way(rig).load)
     except CdprError as error:
-        return f"it is not known whether the drives hold: {error.what}"
-    words = told.status_words.tolist()
+        return f"state of the drives unknown: {error.what}"
+    words = snapshot.status_words.tolist()
     rows = zip(
         rig.drive_names.values(), drive_states(rig, words), stop_alone(rig, words), strict=True
     )
     wrong = [f"{name} is in {state}" for name, state, good in rows if not good]
-    return f"drives do not hold by themselves: {', '.join(wrong)}" if wrong else ""
+    return f"drives do not hold on their own: {', '.join(wrong)}" if wrong else ""
 
 
 @contextmanager
@@ -151,28 +151,27 @@ def open_drives(
     *,
     to_reset: bool = False,
     lost_power: PowerLoss | None = None,
-    set_up_as: Callable[[DriveSnapshot], tuple[Rig, float]] | None = None,
+    configure_as: Callable[[DriveSnapshot], tuple[Rig, float]] | None = None,
     listener: Listener = SILENT,
 ) -> Iterator[ReadyDrives]:
     """Opens the bus and configures the drives; closes both at the end.
 
-    Drives that are found switched on since their last set-up lose their reference here.
+    Drives power-cycled since their last configuration lose their reference here.
 
     Args:
         rig: The robot and its bus.
-        simulated_start: Where the platform stands when the drives are simulated here.
-        load: What it carries then.
-        to_reset: Also takes drives in fault, which are going to be reset.
-        lost_power: What became of drives that are simulated here.
-        set_up_as: For drives that are not referenced, from what they report before anything of
-            them is changed: the rig as they count, and the largest tension [N] that their torque
-            limit allows.
-        listener: Receives what the drives cannot do.
+        simulated_start: Pose of the platform if the drives are simulated here.
+        load: Its load then.
+        to_reset: Also accepts drives in fault, to be reset.
+        lost_power: Effect of a power loss on drives simulated here.
+        configure_as: For unreferenced drives: takes their state before any change, returns the rig
+            as they count and the largest tension [N] for their torque limit.
+        listener: Receives remarks on missing capabilities.
 
     Raises:
         BadInput: python-can has no such interface.
         HardwareMissing: The bus cannot be opened or a drive does not answer.
-        Refused: The bus is too slow, a drive does not keep a setting, or somebody else sets it up.
+        Refused: The bus is too slow, a drive rejects a setting, or another program configures it.
     """
     interlock, counted, max_tension = MotionInterlock(rig), rig, None
     restarted: set[int] = set()
@@ -181,16 +180,16 @@ def open_drives(
         restarted.update(nodes)
         interlock.found_restarted(nodes)
 
-    with _reached(rig, simulated_start, load, lost_power, listener) as reached:
-        if set_up_as is not None:
-            counted, max_tension = set_up_as(read_drives(rig, reached.bus, reached.pump))
+    with _locked_bus(rig, simulated_start, load, lost_power, listener) as reached:
+        if configure_as is not None:
+            counted, max_tension = configure_as(read_drives(rig, reached.bus, reached.pump))
         group = make_drive_group(counted, reached.bus, reached.pump, max_tension=max_tension)
         try:
             remarks = group.configure(to_reset=to_reset, on_restarted=note_restarted)
             for remark in remarks:
                 listener.remark(remark)
             true_pose: Callable[[], Pose] | None = None
-            carry: Callable[[Load], None] = _happens_by_itself
+            carry: Callable[[Load], None] = _no_payload_change
             if (rehearsal := reached.rehearsal) is not None:
                 true_pose, carry = lambda: rehearsal.pose, rehearsal.carry
             yield ReadyDrives(
@@ -200,17 +199,17 @@ def open_drives(
             group.close()
 
 
-def _happens_by_itself(_load: Load) -> None:
-    """What a real gripper takes or leaves is nothing to send."""
+def _no_payload_change(_load: Load) -> None:
+    """A real gripper changes the payload without a message."""
 
 
 def drives_of(
     document: RigDocument, simulated_start: Pose, load: Load, listener: Listener = SILENT
 ) -> AbstractContextManager[ReadyDrives]:
-    """`open_drives` for a process of its own: takes what can be sent there.
+    """`open_drives` with picklable arguments, for another process.
 
-    What the drives cannot do is in `ReadyDrives.remarks`, for the listener of the process that
-    asked for them; the one given here is for a call in this process.
+    Remarks are in `ReadyDrives.remarks`, for the listener of the requesting process; the listener
+    given here is for a call in this process.
     """
     return open_drives(rig_from_document(document), simulated_start, load, listener=listener)
 
@@ -222,47 +221,47 @@ def unreferenced_drives_of(
     lost_power: PowerLoss | None,
     listener: Listener = SILENT,
 ) -> AbstractContextManager[ReadyDrives]:
-    """`open_drives` for a process of its own, for drives that count from anywhere.
+    """`open_drives` with picklable arguments, for unreferenced drives.
 
     Args:
         document: The rig file.
-        about: Where the platform is about, ``world_from_platform``.
-        limit: Largest tension, [N]; none is set up that holds more.
-        lost_power: What became of drives that are simulated there.
-        listener: For a call in this process: receives what the drives cannot do.
+        about: Approximate pose of the platform, ``world_from_platform``.
+        limit: Largest tension, [N]; drives that hold more are refused.
+        lost_power: Effect of a power loss on drives simulated there.
+        listener: For a call in this process: receives remarks.
     """
     rig = rig_from_document(document)
 
-    def set_up_as(told: DriveSnapshot) -> tuple[Rig, float]:
-        require_below(rig, told, limit)
-        return counted_here(rig, told.positions.tolist(), about), limit
+    def configure_as(snapshot: DriveSnapshot) -> tuple[Rig, float]:
+        require_below(rig, snapshot, limit)
+        return counted_here(rig, snapshot.positions.tolist(), about), limit
 
     load = empty_scene(rig).load
     return open_drives(
-        rig, about, load, lost_power=lost_power, set_up_as=set_up_as, listener=listener
+        rig, about, load, lost_power=lost_power, configure_as=configure_as, listener=listener
     )
 
 
 def resting_drives_of(
     document: RigDocument, *, to_reset: bool = False
 ) -> AbstractContextManager[ReadyDrives]:
-    """`open_drives` for a process of its own, for drives that stay where they are.
+    """`open_drives` with picklable arguments, for drives that stay at rest.
 
     Args:
         document: The rig file.
-        to_reset: Also takes drives in fault, which are going to be reset.
+        to_reset: Also accepts drives in fault, to be reset.
     """
     rig = rig_from_document(document)
-    load = empty_scene(rig).load
-    set_up_as = partial(set_up_here, rig)
-    return open_drives(rig, rig.home, load, to_reset=to_reset, set_up_as=set_up_as)
+    load = nothing_in_the_way(rig).load
+    configure_as = partial(set_up_here, rig)
+    return open_drives(rig, rig.home, load, to_reset=to_reset, configure_as=configure_as)
 
 
-# Where the platform stands, from where its drives stand.
+# Forward kinematics from drive positions.
 
 
-#: The stretch of the cables depends on the pose: rounds until the pose changes no more than this,
-#: [m]; soft cables on a large robot need some twenty.
+#: Elastic stretch depends on the pose: iterations until the pose changes by less than this, [m];
+#: soft cables on a large robot need about twenty.
 _SETTLED, _ROUNDS = 1e-8, 200
 
 
@@ -272,12 +271,12 @@ def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
     Args:
         rig: The robot; its drives are referenced.
         counts: Positions of the drives, shape (m,), [counts].
-        load: What the platform carries.
+        load: Carried by the platform.
 
     Raises:
         Refused: No pose of the workspace fits them within the rig's start tolerance.
         TensionInfeasible: The cables cannot hold the platform there.
-        Fault: The search for a pose ended without one.
+        Fault: The solver did not converge.
     """
     winches = WinchMap(rig)
     unstrained = winches.unstrained_from_counts(counts)
@@ -296,10 +295,10 @@ def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
             why="the solver did not converge",
             next_step="report this with the rig file and the positions; nothing has moved",
         )
-    place = found.pose.position
-    inside = np.all((rig.workspace_lower <= place) & (place <= rig.workspace_upper))
+    position = found.pose.position
+    inside = np.all((rig.workspace_lower <= position) & (position <= rig.workspace_upper))
     if not (inside and found.worst <= rig.motion.start_tolerance):
-        x, y, z = place * 1000.0
+        x, y, z = position * 1000.0
         raise Refused(
             f"the drive positions fit no pose in the workspace: the nearest is {x:.1f}, {y:.1f},"
             f" {z:.1f} mm, with a cable {found.worst * 1000:.1f} mm off",

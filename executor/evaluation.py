@@ -1,4 +1,4 @@
-"""What a run leaves: first its verdict, then its tables, its summary and its report."""
+"""Evaluation of a run: verdict, tables, summary and report."""
 
 from __future__ import annotations
 
@@ -57,19 +57,19 @@ from tracking.measurement import NoPose, PoseMeasurement
 CLEARANCE_RATE = 10.0
 
 _File = tuple[str, Callable[[], object]]
-"""A file's name, and what writes it."""
+"""A file's name, and the function that writes it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EvaluatedRun:
-    """A run as it was, before any file of its end is written.
+    """An evaluated run, before its results are written.
 
     Attributes:
-        context: What it was.
+        context: Plan, rig and outcome.
         cycles: Every cycle.
-        poses: What the cameras saw together.
-        alone: What each of several cameras saw.
-        clearance: How near it came.
+        poses: Fused poses of the cameras.
+        alone: Poses of each of several cameras.
+        clearance: Distances to obstacles.
         summary: The content of ``summary.json``.
     """
 
@@ -88,18 +88,18 @@ def evaluate(
     course: RunCourse,
     troubles: Sequence[str] = (),
 ) -> EvaluatedRun:
-    """The verdict over a run and what it rests on; writes nothing.
+    """Computes the verdict of a run and its tables; writes nothing.
 
     Args:
-        prepared: What was run.
-        outcome: What the motion left behind.
-        seen: What the cameras saw.
+        prepared: The run.
+        outcome: Of the motion.
+        seen: Camera records.
         course: Of the run, with its end.
-        troubles: What of it is lost, a sentence each; with any the run does not pass.
+        troubles: Missing data, a sentence each; any of them fails the run.
     """
     cycles = outcome.log.table()
     poses = _pose_table(seen.together, cycles)
-    alone = {name: _pose_table(looks, cycles) for name, looks in seen.alone.items()}
+    alone = {name: _pose_table(samples, cycles) for name, samples in seen.alone.items()}
     clearance = _clearance(prepared.rig, prepared.scene, cycles, seen)
     plan, events = prepared.plan.plan, outcome.log.events
     context = _context_of(plan, prepared.rig, course, cycles, events, seen.cameras, troubles)
@@ -108,7 +108,7 @@ def evaluate(
 
 
 def evaluate_cut_short(folder: RunFolder) -> EvaluatedRun:
-    """The same of a run whose program was killed, from what its folder has.
+    """Evaluates a run whose program was killed, from the files in its folder.
 
     Raises:
         BadInput: A file of it was changed.
@@ -122,8 +122,8 @@ def evaluate_cut_short(folder: RunFolder) -> EvaluatedRun:
         course = _ended_by_events(course, cycles, events)
     lost = course.cycles - len(cycles)
     troubles = [f"Of {course.cycles} cycles the last {lost} are not on record"] if lost > 0 else []
-    looked = any((folder.path / PICTURES).glob("**/*.jpg"))  # the first image of each is kept
-    if looked and not folder.has(POSES):
+    has_images = any((folder.path / PICTURES).glob("**/*.jpg"))  # the first image of each is kept
+    if has_images and not folder.has(POSES):
         troubles.append("What the cameras measured is not on record")
     context = _context_of(plan, rig, course, cycles, events, (), troubles)
     summary = summarize(context, cycles, poses, clearance)
@@ -133,10 +133,10 @@ def evaluate_cut_short(folder: RunFolder) -> EvaluatedRun:
 def _ended_by_events(
     course: RunCourse, cycles: CycleTable, events: Sequence[RunEvent]
 ) -> RunCourse:
-    """How a run ended that was killed after its end, before that was in ``run.json``.
+    """The end of a run whose program was killed after it, before ``run.json`` was written.
 
-    Only what cannot be mistaken counts: the drives held, the cycles reach up to there, and nothing
-    was reported but a run that goes well or the operator's stop.
+    Only unambiguous evidence counts: the drives held, the cycles reach that point, and all events
+    are those of a good run or of the operator's stop.
     """
     codes = {event.code for event in events}
     at_rest = len(cycles) and cycles.state[-1] == State.SECURING.value
@@ -157,7 +157,7 @@ def _context_of(
     cameras: tuple[CameraRecord, ...] = (),
     troubles: Sequence[str] = (),
 ) -> RunContext:
-    """What a run was, beside its tables; on any bus simulated drives say so themselves."""
+    """Context of a run besides its tables; simulated drives on a bus report themselves."""
     simulated = course.simulated or any(event.code == SIMULATED for event in events)
     return RunContext(
         plan=plan,
@@ -179,7 +179,7 @@ def _context_of(
 def not_evaluated(
     prepared: PreparedRun, outcome: Outcome, course: RunCourse, trouble: str
 ) -> dict[str, Any]:
-    """A summary of what is known where the tables of a run could not be made, for any reason."""
+    """A summary without tables, where these could not be computed."""
     verdict = judge_without_tables(course.final_state, course.cause, trouble)
     return {
         "schema_version": 1,
@@ -203,14 +203,14 @@ def write_end(
     events: Sequence[RunEvent],
     given_up: Callable[[], bool] = lambda: False,
 ) -> dict[str, str]:
-    """Writes every file of a run's end, each as far as it can be.
+    """Writes every result file of a run, each as far as possible.
 
     Args:
         folder: Of the run.
         course: With its end.
-        result: What it was; None where it could not be evaluated.
-        events: All of them.
-        given_up: Asked before each file whether the rest shall be left out.
+        result: The evaluation; None if it failed.
+        events: All events.
+        given_up: Called before each file; True leaves out the rest.
 
     Returns:
         Names of the files that could not be written, and why.
@@ -225,14 +225,14 @@ def write_end(
 
 
 def write_results(folder: RunFolder, result: EvaluatedRun) -> None:
-    """Writes what is missing in the folder that a run was evaluated from, and its report.
+    """Writes the missing files of an evaluated run's folder, and its report.
 
     Raises:
-        Fault: Not all could be written.
+        Fault: A file could not be written.
     """
     files = _files(folder, result)
-    lacking = [file for file in files if file[0] == REPORT or not folder.has(file[0])]
-    missing = _written(lacking, lambda: False)
+    todo = [file for file in files if file[0] == REPORT or not folder.has(file[0])]
+    missing = _written(todo, lambda: False)
     if missing:
         name, why = next(iter(missing.items()))
         raise Fault(
@@ -244,7 +244,7 @@ def write_results(folder: RunFolder, result: EvaluatedRun) -> None:
 
 
 def rewrite_report(folder: RunFolder) -> None:
-    """Writes the report again, from the files of a run alone; of one cut short, what is missing.
+    """Rewrites the report from the files of a run; for an interrupted run, all missing files.
 
     Raises:
         BadInput: A file of the run was changed, or the folder cannot be written to.
@@ -256,7 +256,7 @@ def rewrite_report(folder: RunFolder) -> None:
 
 
 def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:
-    """The files and who writes them; the first matter most."""
+    """The files and their writers, most important first."""
     cycles, poses, clearance = result.cycles, result.poses, result.clearance
 
     def write_channels() -> None:
@@ -279,25 +279,25 @@ def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:
 
 
 def _written(files: Sequence[_File], given_up: Callable[[], bool]) -> dict[str, str]:
-    """Writes each; what could not be, and why."""
+    """Writes each; returns those that failed, and why."""
     missing = {}
     for name, write in files:
         try:
             if given_up():
                 missing[name] = "interrupted"
-            elif name == SUMMARY and missing:  # it stands for a folder with all its tables
+            elif name == SUMMARY and missing:  # it marks a folder with all its tables
                 missing[name] = next(iter(missing.values()))
             else:
                 write()
         except CdprError as error:
             missing[name] = error.why or error.what
-        except Exception as error:  # out of memory, or a defect: the other files are written
+        except Exception as error:  # out of memory, or a defect: continue with the other files
             missing[name] = f"{type(error).__name__}: {error}".rstrip(": ")
     return missing
 
 
 def _complete_events(folder: RunFolder, events: Sequence[RunEvent]) -> None:
-    """Those that could not be appended while the run went on are written now."""
+    """Rewrites the events if some could not be appended during the run."""
     try:
         complete = len(folder.events()) == len(events)
     except BadInput:
@@ -307,12 +307,12 @@ def _complete_events(folder: RunFolder, events: Sequence[RunEvent]) -> None:
 
 
 def _duration(cycles: CycleTable, cycle: float) -> float:
-    """From the begin of the first cycle to the end of the last, [s]."""
+    """Time from the beginning of the first cycle to the end of the last, [s]."""
     return float(cycles.time[-1]) + cycle if len(cycles) else 0.0
 
 
-def _pose_table(looks: Sequence[CameraSample], cycles: CycleTable) -> PoseTable:
-    if not looks:
+def _pose_table(samples: Sequence[CameraSample], cycles: CycleTable) -> PoseTable:
+    if not samples:
         return no_poses()
     unknown = PoseMeasurement(
         float("nan"),
@@ -322,34 +322,38 @@ def _pose_table(looks: Sequence[CameraSample], cycles: CycleTable) -> PoseTable:
         float("nan"),
         "",
     )
-    found = [k.found if isinstance(k.found, PoseMeasurement) else unknown for k in looks]
+    found = [
+        sample.found if isinstance(sample.found, PoseMeasurement) else unknown for sample in samples
+    ]
     nothing = np.full(4, np.nan)
     return PoseTable(
-        frame=np.array([look.frame for look in looks], dtype=np.int64),
-        time=np.array([look.found.time for look in looks]),
-        status=tuple(k.found.reason if isinstance(k.found, NoPose) else OK for k in looks),
+        frame=np.array([sample.frame for sample in samples], dtype=np.int64),
+        time=np.array([sample.found.time for sample in samples]),
+        status=tuple(
+            sample.found.reason if isinstance(sample.found, NoPose) else OK for sample in samples
+        ),
         position=np.array([one.pose.position for one in found]),
         rotation=np.array([nothing if one is unknown else one.pose.quaternion for one in found]),
         covariance=np.array([one.covariance for one in found]),
         tags=tuple(" ".join(map(str, one.tags)) for one in found),
         reprojection=np.array([one.reprojection for one in found]),
-        planned=_planned_positions(looks, cycles),
-        picture=tuple(look.picture for look in looks),
+        planned=_planned_positions(samples, cycles),
+        picture=tuple(sample.picture for sample in samples),
     )
 
 
-def _planned(looks: Sequence[CameraSample], cycles: CycleTable) -> list[Pose]:
-    """Where the platform should have been when each image was taken."""
-    times = np.array([look.found.time for look in looks])
+def _planned(samples: Sequence[CameraSample], cycles: CycleTable) -> list[Pose]:
+    """Planned poses at the time of each image."""
+    times = np.array([sample.found.time for sample in samples])
     nearest = np.clip(np.searchsorted(cycles.time, times), 0, len(cycles) - 1)
-    return _poses(_planned_positions(looks, cycles), cycles.planned_rotation[nearest])
+    return _poses(_planned_positions(samples, cycles), cycles.planned_rotation[nearest])
 
 
-def _planned_positions(looks: Sequence[CameraSample], cycles: CycleTable) -> Array:
-    """Shape (n, 3), [m]; NaN when no cycle was ever sent."""
+def _planned_positions(samples: Sequence[CameraSample], cycles: CycleTable) -> Array:
+    """Planned positions at each image, shape (n, 3), [m]; NaN if no cycle was sent."""
     if not len(cycles):
-        return np.full((len(looks), 3), np.nan)
-    times = np.array([look.found.time for look in looks])
+        return np.full((len(samples), 3), np.nan)
+    times = np.array([sample.found.time for sample in samples])
     axes = [np.interp(times, cycles.time, cycles.planned[:, i]) for i in range(3)]
     return np.column_stack(axes)
 
@@ -361,10 +365,10 @@ def _poses(positions: Array, quaternions: Array) -> list[Pose]:
 
 def _clearance(rig: Rig, scene: Scene, cycles: CycleTable, seen: CameraRecords) -> ClearanceTable:
     model = ClearanceModel(rig, scene)
-    rows = _seen_rows(model, cycles, seen.together, "tag")
-    for name, looks in seen.alone.items():
-        measured = [replace(k, clearance=_clearance_at(model, k)) for k in looks]
-        rows += _seen_rows(model, cycles, measured, source_of(name))
+    rows = _measured_rows(model, cycles, seen.together, "tag")
+    for name, samples in seen.alone.items():
+        measured = [replace(sample, clearance=_clearance_at(model, sample)) for sample in samples]
+        rows += _measured_rows(model, cycles, measured, source_of(name))
     if model.obstacle_names and len(cycles):
         every = max(1, round(1000.0 / (CLEARANCE_RATE * rig.document.bus.cycle_ms)))
         chosen = np.arange(0, len(cycles), every)
@@ -379,18 +383,18 @@ def _clearance(rig: Rig, scene: Scene, cycles: CycleTable, seen: CameraRecords) 
     return clearance_table(model.obstacle_names, rows)
 
 
-def _seen_rows(
-    model: ClearanceModel, cycles: CycleTable, looks: Sequence[CameraSample], source: str
+def _measured_rows(
+    model: ClearanceModel, cycles: CycleTable, samples: Sequence[CameraSample], source: str
 ) -> list[ClearanceRow]:
-    """A row for each look with a clearance; none before the first cycle."""
-    if not (looks and len(cycles)):
+    """A row per sample with a clearance; none before the first cycle."""
+    if not (samples and len(cycles)):
         return []
     return [
-        ClearanceRow.at(look.found.time, source, look.clearance, model.obstacles(planned))
-        for look, planned in zip(looks, _planned(looks, cycles), strict=True)
-        if look.clearance is not None
+        ClearanceRow.at(sample.found.time, source, sample.clearance, model.obstacles(planned))
+        for sample, planned in zip(samples, _planned(samples, cycles), strict=True)
+        if sample.clearance is not None
     ]
 
 
-def _clearance_at(model: ClearanceModel, look: CameraSample) -> MeasuredClearance | None:
-    return clearance_of(model, look.found) if isinstance(look.found, PoseMeasurement) else None
+def _clearance_at(model: ClearanceModel, sample: CameraSample) -> MeasuredClearance | None:
+    return clearance_of(model, sample.found) if isinstance(sample.found, PoseMeasurement) else None

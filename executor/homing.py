@@ -1,6 +1,6 @@
-"""Homes a rig: pretensions all cables, then references the drives at a pose that is known.
+"""Homes a rig: pretensions all cables, then references the drives at a known pose.
 
-The pose is stated, where a jig holds the platform, or measured by one camera.
+The pose is stated, with the platform on a jig, or measured by one camera.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from functools import partial
 from pathlib import Path
 
 from executor.cameras.client import static_pose
-from executor.cameras.open import look_at_rest
-from executor.cameras.sources import choose_one_camera, require_simulated_pictures
+from executor.cameras.open import measure_at_rest
+from executor.cameras.sources import choose_one_camera, require_synthetic_images
 from executor.control.winch_laws import PretensionLaw, wind_in_speed
-from executor.control.winch_motion import WinchesStand
+from executor.control.winch_motion import WinchResult
 from executor.drives import is_simulated, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
@@ -26,32 +26,32 @@ from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 
-#: A cable is taken up no further than this, [m], and no faster than that, [m/s].
+#: Largest reach, [m], and speed, [m/s], of winding in.
 FURTHEST, FASTEST = 0.200, 0.010
-#: Defaults: reach [m] and speed [m/s] as above, images, and how slack simulated cables hang, [m].
+#: Defaults: reach [m], speed [m/s], number of images, and slack of simulated cables, [m].
 REACH, SPEED, PICTURES, SLACK = 0.050, 0.002, 20, 0.005
-#: Fewest and most images that measure the pose.
-FEWEST_PICTURES, MOST_PICTURES = 5, 1000
+#: Smallest and largest number of images for the pose.
+FEWEST_IMAGES, MOST_IMAGES = 5, 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HomeResult:
-    """What a homing made.
+    """Result of homing.
 
     Attributes:
-        reference: Of the drives' counts.
-        file: Where it is kept; None with simulated drives, which end with their process.
+        reference: Homing reference of the drives.
+        file: Its file; None with simulated drives, which end with their process.
     """
 
     reference: HomingReference
     file: Path | None
 
     def facts(self) -> Facts:
-        """Pose, its uncertainty, tensions and file, for people."""
+        """Human-readable pose, uncertainty, tensions and file."""
         reference, tensions = self.reference, self.reference.tensions_n
         x, y, z = reference.pose.position_mm
         known = f"{reference.uncertainty_mm:.3f} mm (one standard deviation)"
-        if reference.uncertainty_mm == 0.0:  # it is not measured how well a jig holds it
+        if reference.uncertainty_mm == 0.0:  # the accuracy of a jig is not measured
             known = "that of the jig (not measured)"
         kept = self.file or "not saved: simulated drives end with this process"
         return [
@@ -80,68 +80,68 @@ def home(
     confirm: Callable[[HomingProposal], bool] | None = None,
     supervisor: Supervisor | None = None,
 ) -> HomeResult:
-    """Winds slack cables in until all are taut, then references the drives at a known pose.
+    """Pretensions all cables, then references the drives at a known pose.
 
-    All winches together, slowly, each until its cable carries the pretension; a cable that carries
-    too much, or none after the whole reach, stops all. Exactly one of `at_home`, `pose` and
-    `camera` says how the pose is known.
+    All winches wind in slowly and together, each until its cable carries the pretension. A tension
+    above the limit, or a cable still slack after the full reach, stops all. Give exactly one of
+    `at_home`, `pose` and `camera`.
 
     Args:
         rig: The robot and its bus.
         at_home: A jig holds the platform at the rig's home pose.
-        pose: A jig holds it there, ``world_from_platform``.
-        camera: It hangs free, and this camera measures it: a source or ``NAME=SOURCE``.
+        pose: A jig holds the platform at this pose, ``world_from_platform``.
+        camera: The platform hangs free and this camera measures it: a source or ``NAME=SOURCE``.
         tension: Pretension, [N]; None for twice the rig's smallest tension.
-        limit: No cable may carry more, [N]; None for 60 % of the rig's range.
-        reach: Take up at most this length of a cable, [m].
-        speed: No winch is faster, [m/s].
-        pictures: To measure the pose in.
-        simulated_slack: How slack simulated cables hang at most, [m].
-        realtime: False for simulated time, as fast as the computer can.
+        limit: Largest tension of any cable, [N]; None for 60 % of the rig's range.
+        reach: Largest length of cable wound in, [m].
+        speed: Largest winch speed, [m/s].
+        pictures: Number of images for the pose.
+        simulated_slack: Largest slack of simulated cables, [m].
+        realtime: False for simulated time, as fast as possible.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         listener: Receives progress.
         confirm: Called once, before anything moves; False cancels it. Without it the call itself
-            is the decision to move.
+            confirms the motion.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
 
     Raises:
         BadInput: An argument cannot be used.
-        Refused: The bus is latched, a limit cannot be kept, or the pose is not known well enough.
+        Refused: The bus is latched, a limit cannot be kept, or the pose is too uncertain.
         HardwareMissing: A drive or the camera does not answer.
         Fault: It ended with a fault, which is latched; all drives stopped together and hold.
-        StoppedByOperator: It was cancelled, or stopped; the drives hold.
+        StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     in_process = is_simulated(rig)
     require_own_time(rig, realtime)
     sources = [camera] if isinstance(camera, str) else list(camera or [])
     require_one_pose(at_home, pose, sources)
     _require_slow(reach, speed, pictures)
-    eye = choose_one_camera(rig, sources, in_process) if sources else None
-    if eye is not None:
-        require_simulated_pictures(eye[1:], not realtime)
-    known = None if eye is not None else _stated_pose(rig, pose)
+    source = choose_one_camera(rig, sources, in_process) if sources else None
+    if source is not None:
+        require_synthetic_images(source[1:], not realtime)
+    known = None if source is not None else _stated_pose(rig, pose)
     limit = limit_of(rig, limit)
     target = _target(rig, tension, limit)
     speed = min(speed, rig.motion.speed)
     interlock = MotionInterlock(rig)
     interlock.require_free()
-    if eye is not None:  # it gives images, before anything is moved for it
-        look_at_rest(rig, eye, 1, rig.home, lambda: None, listener)
+    if source is not None:  # check that it delivers images before anything moves
+        measure_at_rest(rig, source, 1, rig.home, lambda: None, listener)
     fastest = float(wind_in_speed(rig, target, limit, speed).max())
-    require_confirmed(confirm, HomingProposal(rig, target, limit, reach, speed, fastest, eye))
+    require_confirmed(confirm, HomingProposal(rig, target, limit, reach, speed, fastest, source))
     made: list[HomingReference] = []
 
     def at_rest(
-        stand: WinchesStand, true_pose: Pose | None, board: RequestBoard
+        result: WinchResult, true_pose: Pose | None, board: RequestBoard
     ) -> HomingReference:
-        made.append(_referenced(rig, stand, true_pose, board, known, eye, pictures))
+        made.append(_referenced(rig, result, true_pose, board, known, source, pictures))
         return made[0]
 
     lost_power = None
     if in_process:
         from simulation.ground_truth import PowerLoss  # a real bus loads no simulator
 
-        lost_power = PowerLoss.drawn(rig, 0, simulated_slack, on_a_stand=eye is None)
+        lost_power = PowerLoss.drawn(rig, 0, simulated_slack, on_a_stand=source is None)
     motion = WinchMotion(
         rig=rig,
         pose=known or rig.home,
@@ -164,22 +164,22 @@ def home(
 def use_rig_file_counts(
     rig: Rig, *, confirm: Callable[[ForgetProposal], bool] | None = None
 ) -> None:
-    """Drops the reference: absolute encoders count what the rig file says. Moves nothing.
+    """Discards the reference: absolute encoders count as in the rig file. Moves nothing.
 
     Raises:
         Refused: The bus is latched, or not all encoders are absolute.
-        StoppedByOperator: It was cancelled.
+        StoppedByOperator: Cancelled.
     """
     interlock = MotionInterlock(rig)
     require_confirmed(confirm, ForgetProposal(interlock))
-    interlock.go_by_the_rig_file()
+    interlock.use_rig_file_counts()
 
 
 def require_one_pose(at_home: bool, pose: Pose | None, cameras: Sequence[str]) -> None:
-    """The pose must be known by exactly one source.
+    """Requires exactly one source of the pose.
 
     Raises:
-        BadInput: It is not.
+        BadInput: None or several are given.
     """
     if (at_home, pose is not None, bool(cameras)).count(True) != 1:
         raise BadInput(
@@ -192,7 +192,7 @@ def require_one_pose(at_home: bool, pose: Pose | None, cameras: Sequence[str]) -
 
 
 def _require_slow(reach: float, speed: float, pictures: int) -> None:
-    """Keeps the bounds of the command line for every caller.
+    """Requires the bounds of the command line for every caller.
 
     Raises:
         BadInput: A bound is exceeded.
@@ -205,19 +205,19 @@ def _require_slow(reach: float, speed: float, pictures: int) -> None:
                 where="home",
                 next_step=f"give a smaller {name}",
             )
-    if not FEWEST_PICTURES <= pictures <= MOST_PICTURES:
+    if not FEWEST_IMAGES <= pictures <= MOST_IMAGES:
         raise BadInput(
-            f"{pictures} images: must be from {FEWEST_PICTURES} to {MOST_PICTURES}",
+            f"{pictures} images: must be from {FEWEST_IMAGES} to {MOST_IMAGES}",
             where="home",
             next_step="give another number of images",
         )
 
 
 def _stated_pose(rig: Rig, pose: Pose | None) -> Pose:
-    """The pose in which a jig holds the platform; the rig's home without one.
+    """The pose at which a jig holds the platform; the rig's home by default.
 
     Raises:
-        BadInput: It is outside the workspace.
+        BadInput: The pose is outside the workspace.
     """
     if pose is None:
         return rig.home
@@ -235,7 +235,7 @@ def _target(rig: Rig, tension: float | None, limit: float) -> float:
     """The pretension, [N].
 
     Raises:
-        Refused: It leaves no room below the limit.
+        Refused: It leaves no headroom below the limit.
     """
     target = 2.0 * rig.min_tension if tension is None else tension
     if not rig.min_tension <= target <= 0.8 * limit:
@@ -251,40 +251,40 @@ def _target(rig: Rig, tension: float | None, limit: float) -> float:
 
 def _referenced(
     rig: Rig,
-    stand: WinchesStand,
+    result: WinchResult,
     true_pose: Pose | None,
     board: RequestBoard,
     known: Pose | None,
-    eye: tuple[Camera, str] | None,
+    source: tuple[Camera, str] | None,
     pictures: int,
 ) -> HomingReference:
-    """The reference at the pose where the platform is held now.
+    """The reference at the present pose of the platform.
 
     Args:
         rig: The robot.
-        stand: Where its winches stand, and the tensions.
-        true_pose: Where the simulated platform is.
-        board: Where a stop is wished.
-        known: The stated pose; None where a camera measures it.
-        eye: That camera, from `choose_one_camera`.
-        pictures: How many it takes.
+        result: Of the winch motion.
+        true_pose: Of the simulated platform.
+        board: Operator requests.
+        known: The stated pose; None if a camera measures it.
+        source: That camera, from `choose_one_camera`.
+        pictures: Number of images.
 
     Raises:
-        StoppedByOperator: The operator stopped it while the camera looked.
-        Refused: The pose is not known well enough.
+        StoppedByOperator: Stopped by the operator during the measurement.
+        Refused: The pose is too uncertain.
     """
     if known is not None:
-        return reference_at(rig, known, stand.counts, stand.tensions, "stated pose", 0.0)
-    assert eye is not None
+        return reference_at(rig, known, result.counts, result.tensions, "stated pose", 0.0)
+    assert source is not None
 
-    def unless_stopped() -> None:
+    def require_no_stop() -> None:
         if board.read().stop:
             raise StoppedByOperator(
                 "stopped before the pose was measured; the cables are taut and held",
                 next_step="home again when ready",
             )
 
-    looks = look_at_rest(rig, eye, pictures, true_pose, unless_stopped, SILENT)
-    found = static_pose(rig, looks)
-    how = f"tags in {found.pictures} of {pictures} images, camera {eye[0].name!r}"
-    return reference_at(rig, found.pose, stand.counts, stand.tensions, how, found.uncertainty)
+    samples = measure_at_rest(rig, source, pictures, true_pose, require_no_stop, SILENT)
+    found = static_pose(rig, samples)
+    how = f"tags in {found.pictures} of {pictures} images, camera {source[0].name!r}"
+    return reference_at(rig, found.pose, result.counts, result.tensions, how, found.uncertainty)

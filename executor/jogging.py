@@ -13,7 +13,7 @@ import numpy as np
 
 from executor.control.preconditions import require_still_referenced
 from executor.control.winch_laws import CableStep
-from executor.drives import current_pose, is_simulated, look_at, require_own_time
+from executor.drives import current_pose, is_simulated, read_snapshot, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.proposals import CableProposal, MotionProposal, require_confirmed
 from executor.recording.record_files import free_folder
@@ -34,11 +34,11 @@ from planner.kernels.jit import KERNELS
 from planner.planning import make_plan
 from planner.settings import OptimalSettings, TurningSettings
 
-#: A jog is no longer than this, [mm], and turns the platform by no more than that, [deg].
+#: Largest length, [mm], and rotation, [deg], of a jog.
 LONGEST_MM, MOST_DEG = 50.0, 10.0
 _ROUNDED = 1.0 + 1e-12
-"""A length that went from mm to m and back may have gained the last bit."""
-#: A jog is no faster than this, [m/s], and without another speed as fast as that, [m/s].
+"""Tolerance for the rounding of a length converted from mm to m and back."""
+#: Largest and default speed of a jog, [m/s].
 FASTEST, SPEED = 0.020, 0.005
 
 
@@ -57,20 +57,19 @@ def jog(
     on_event: Callable[[RunEvent], None] | None = None,
     supervisor: Supervisor | None = None,
 ) -> RunResult:
-    """Moves the platform straight by a few millimetres, slowly, from where it is.
+    """Moves the platform slowly by a few millimetres in a straight line.
 
-    A jog is a run: planned, proved, checked and gated like any other. On the interface ``virtual``
-    the simulated platform is at home.
+    A jog is a run: planned, checked and gated like any other. On the interface ``virtual`` the
+    simulated platform is at home.
 
     Args:
         rig: The robot and its bus.
-        scene: What is in the way, and what the platform carries; its stops are left out. None
-            states that nothing is in the way.
-        by: How far, shape (3,), in the world frame, [m].
-        to_home: Instead: to the rig's home pose, rotated as there.
+        scene: Obstacles and load; its stops are ignored. None states that there are no obstacles.
+        by: Displacement, shape (3,), in the world frame, [m].
+        to_home: Move to the rig's home pose instead, with its orientation.
         speed: At most the rig's own, [m/s].
-        folder: Of the run, which is made; None for ``runs/jog``, ``runs/jog-2`` …
-        realtime: As for `executor.runner.run`, as all that follow.
+        folder: Run folder to create; None for ``runs/jog``, ``runs/jog-2`` …
+        realtime: As for `executor.runner.run`, like all that follow.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         listener: Receives progress.
         confirm: Called once, before anything moves; False cancels it.
@@ -78,7 +77,7 @@ def jog(
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
 
     Raises:
-        CdprError: As for `executor.runner.run`; or the straight path is too long, or not free.
+        CdprError: As for `executor.runner.run`; or the straight path is too long or not free.
     """
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
@@ -91,7 +90,7 @@ def jog(
     ready = interlock.referenced_rig()
     start = ready.home if is_simulated(ready) else measured_pose(ready, around)
     goal = ready.home if by is None else Pose(start.position + by, start.rotation)
-    plan = plan_from_document(straight_way(ready, around, start, goal, listener))
+    plan = plan_from_document(plan_straight_move(ready, around, start, goal, listener))
     options = RunOptions(
         realtime=realtime,
         start=start,
@@ -105,10 +104,10 @@ def jog(
 
 
 def with_speed(rig: Rig, speed: float) -> Rig:
-    """The same rig with a lower speed [m/s]; plans do not rest on it.
+    """The rig with a lower speed [m/s], which plans do not depend on.
 
     Raises:
-        BadInput: It is no speed of a jog.
+        BadInput: The speed is outside the range of a jog.
     """
     if not 0.0 < speed <= FASTEST:
         raise BadInput(
@@ -123,39 +122,39 @@ def with_speed(rig: Rig, speed: float) -> Rig:
 
 
 def measured_pose(rig: Rig, scene: Scene) -> Pose:
-    """Where the drives' positions put the platform; nothing of them is changed for it.
+    """The encoder pose of the platform; reads the drives without changing them.
 
     Raises:
-        Refused: Their reference is lost, or their positions fit no pose.
+        Refused: The reference is lost, or the positions fit no pose.
     """
     reference = MotionInterlock(rig).require_ready()
-    seen = look_at(rig, rig.home, scene.load)
+    seen = read_snapshot(rig, rig.home, scene.load)
     positions = seen.positions.tolist()
     require_still_referenced(rig, reference, seen.restarted, positions)
     return current_pose(rig, np.array(positions, dtype=np.float64), scene.load)
 
 
-def straight_way(
+def plan_straight_move(
     rig: Rig, scene: Scene, start: Pose, goal: Pose, listener: Listener = SILENT
 ) -> PlanDocument:
-    """A plan that goes straight there, rotating on the path where start and goal differ in it.
+    """A plan of the straight move, with rotation where the orientations differ.
 
     Raises:
         CdprError: Start or goal cannot be used.
-        Refused: It is too long, or something is in the straight path.
+        Refused: The move is too long, or the straight path is not free.
     """
     straight, turn = 1000.0 * start.distance_to(goal), float(np.degrees(start.angle_to(goal)))
     _require_jog(straight, turn)
-    way, turns = scene.changed(start=start, goal=goal), turn > 1e-6
+    moving_scene, turns = scene.changed(start=start, goal=goal), turn > 1e-6
     settings = TurningSettings if turns else OptimalSettings
     if turns:
-        way = _free_to_turn(way, (start, goal))
+        moving_scene = _free_to_turn(moving_scene, (start, goal))
     task = KernelSet("turning" if turns else "optimal", KERNELS)
     with (
         compilation(task, "the planner", "one to three minutes", listener) as compiled,
         listener.waiting("planning") if compiled else nullcontext(),
     ):
-        document = make_plan(rig, way, settings(seed=0, rounds=1))
+        document = make_plan(rig, moving_scene, settings(seed=0, rounds=1))
     if document.quality.length_mm > straight + 0.01:
         raise Refused(
             f"the straight path of {straight:.1f} mm is not free; the detour is"
@@ -168,11 +167,11 @@ def straight_way(
 
 
 def require_distance(by: Array | None, *, to_home: bool) -> None:
-    """Exactly one of both is given, and it is neither zero nor long; as for `jog`.
+    """Requires exactly one of both, neither zero nor too long; as for `jog`.
 
     Raises:
-        BadInput: It is not.
-        Refused: It is too long.
+        BadInput: None or both are given, or the distance is zero.
+        Refused: The distance is too long.
     """
     if (by is None) != to_home:
         raise BadInput(
@@ -202,7 +201,7 @@ def _require_jog(length_mm: float, turn_deg: float) -> None:
 
 
 def _free_to_turn(scene: Scene, poses: tuple[Pose, ...]) -> Scene:
-    """The scene, allowing what is between these orientations."""
+    """The scene with rotation limits that include these orientations."""
     first, last = poses[0].quaternion, poses[-1].quaternion
     tilt, turn = np.degrees(largest_rotations(first, last))
     limits = RotationLimitsDocument(
@@ -212,11 +211,11 @@ def _free_to_turn(scene: Scene, poses: tuple[Pose, ...]) -> Scene:
 
 
 def _require_cable(rig: Rig, cable: int, length: float) -> None:
-    """There is such a cable, and it is to move by a little.
+    """Requires an existing cable and an allowed length.
 
     Raises:
-        BadInput: There is not, or the length is zero.
-        Refused: It is too long.
+        BadInput: There is no such cable, or the length is zero.
+        Refused: The length is too long.
     """
     if not 1 <= cable <= rig.cable_count:
         raise BadInput(
@@ -240,11 +239,11 @@ def _require_cable(rig: Rig, cable: int, length: float) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CableJog:
-    """What one cable did.
+    """Result of a cable jog.
 
     Attributes:
         cable: Its number, from 1.
-        moved: Paid out by the drive's count, [m]; negative was wound in.
+        moved: Length paid out from the encoder, [m]; negative for wound in.
         tensions: Of all cables afterwards, shape (m,), [N].
     """
 
@@ -266,18 +265,18 @@ def jog_cable(
     confirm: Callable[[CableProposal], bool] | None = None,
     supervisor: Supervisor | None = None,
 ) -> CableJog:
-    """Moves one winch alone, a little and slowly, for commissioning.
+    """Moves one winch alone slowly by a short length, for commissioning.
 
-    On a taut platform one cable alone moves by hardly more than its stretch before a tension is
-    too large, or another cable slack: both stop it.
+    On a taut platform a single cable moves by little more than its elastic stretch before a tension
+    exceeds the limit or another cable goes slack: either stops it.
 
     Args:
         rig: The robot and its bus.
         cable: Its number, from 1, in the order of the rig file.
         length: To pay out, [m]; negative winds in.
-        limit: No cable may carry more, [N]; None for 60 % of the rig's range.
+        limit: Largest tension of any cable, [N]; None for 60 % of the rig's range.
         speed: At most the rig's own, [m/s].
-        realtime: As for `executor.runner.run`, as all that follow.
+        realtime: As for `executor.runner.run`, like all that follow.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         listener: Receives progress.
         confirm: Called once, before anything moves; False cancels it.
@@ -285,9 +284,9 @@ def jog_cable(
 
     Raises:
         BadInput: There is no such cable, or the length is zero.
-        Refused: The length is too large, or the bus is latched.
-        Fault: A tension left its bounds; all drives stopped together.
-        StoppedByOperator: It was cancelled, or stopped; the drives hold.
+        Refused: The length is too long, or the bus is latched.
+        Fault: A tension left its limits; all drives stopped together.
+        StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
@@ -302,7 +301,7 @@ def jog_cable(
         pose=slow.home,
         limit=limit,
         speed=fastest,
-        make_law=partial(CableStep, cable=cable - 1, way=length, limit=limit, speed=fastest),
+        make_law=partial(CableStep, cable=cable - 1, length=length, limit=limit, speed=fastest),
         lost_power=None,
         realtime=realtime,
         need_real_time_rights=need_real_time_rights,
@@ -311,6 +310,6 @@ def jog_cable(
         listener=listener,
         supervisor=supervisor or Supervisor(),
     )
-    stand = move_by_law(motion, lambda _stand, _true_pose, _board: None)
-    moved = (stand.counts - stand.began)[cable - 1] / winch.counts_per_metre
-    return CableJog(cable, float(moved), stand.tensions)
+    result = move_by_law(motion, lambda _result, _true_pose, _board: None)
+    moved = (result.counts - result.began)[cable - 1] / winch.counts_per_metre
+    return CableJog(cable, float(moved), result.tensions)

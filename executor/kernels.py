@@ -1,6 +1,6 @@
-"""Makes the compiled code of a motion ready before a drive or a camera has to wait for it.
+"""Loads or compiles Numba kernels before a motion, so that no drive or camera waits.
 
-Numba is loaded by these functions alone: a real-time process on a real bus needs none of it.
+Only these functions load Numba: a real-time process on a real bus does not need it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def ready_to_measure(listener: Listener = SILENT) -> None:
-    """Loads what finds the edges of tags, so that no image waits for it."""
+    """Loads the tag edge detector, so that no image waits for it."""
     from model.jit import compilation
     from tracking.edges import refine
 
@@ -26,7 +26,7 @@ def ready_to_measure(listener: Listener = SILENT) -> None:
 
 
 def ready_to_simulate(listener: Listener = SILENT) -> None:
-    """Loads what finds where a simulated platform hangs, so that no drive waits for it."""
+    """Loads the equilibrium solver of the simulated platform, so that no drive waits."""
     from model.jit import compilation
     from simulation import plant
 
@@ -35,7 +35,7 @@ def ready_to_simulate(listener: Listener = SILENT) -> None:
 
 
 def ready_for_camera_processes(listener: Listener = SILENT) -> None:
-    """Compiles what finds the edges of tags once, for processes that then only load it."""
+    """Compiles the tag edge detector once, for processes that then only load it."""
     from model import jit
 
     if not jit.is_compiled(_edges()):

@@ -1,4 +1,4 @@
-"""What is about to happen to a rig: the question to its operator, and the facts to decide by."""
+"""Proposals of motions and resets: the question to the operator, and the facts."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from executor.trajectory.prepare import PreparedRun  # loads the planner's check
 
 Facts = list[tuple[str, str]]
-"""Names and values for people."""
+"""Human-readable names and values."""
 
 
 class Proposal(Protocol):
-    """What is about to happen; a `confirm` callback shows it and answers its question.
+    """An action that needs confirmation; a `confirm` callback shows it and answers.
 
     Attributes:
-        question: Asked of the operator.
-        otherwise: What a no leaves, such as ``nothing was moved``.
+        question: To the operator.
+        otherwise: Outcome after a no, such as ``nothing was moved``.
     """
 
     question: ClassVar[str]
@@ -34,16 +34,16 @@ class Proposal(Protocol):
 
     @property
     def title(self) -> str:
-        """What is about to happen."""
+        """The proposed action."""
         ...
 
     def facts(self) -> Facts:
-        """With what, and within which limits; none where the title says it all."""
+        """Conditions and limits; empty if the title is enough."""
         ...
 
 
 def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal) -> None:
-    """Asks before anything moves or changes; without a callback the caller has decided.
+    """Asks for confirmation; without a callback, the call itself confirms.
 
     Raises:
         StoppedByOperator: The answer was no.
@@ -54,12 +54,12 @@ def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionProposal:
-    """A run that is about to move the platform; see `Proposal`.
+    """Proposal of a run; see `Proposal`.
 
     Attributes:
         prepared: The checked run.
-        cameras: Those that measure it, with their sources.
-        clearance_stop: Whether too little measured clearance stops it.
+        cameras: In use, with their sources.
+        clearance_stop: Whether too small a measured clearance stops the run.
     """
 
     question: ClassVar[str] = "Move the platform now?"
@@ -95,7 +95,7 @@ class MotionProposal:
         ]
 
     def _clearance(self) -> str:
-        """What stops the run when it comes too near to an obstacle, or why nothing does."""
+        """Threshold of the clearance stop, or why it is off."""
         scene = self.prepared.scene
         if not self.clearance_stop:
             return "off (--no-clearance-stop)"
@@ -106,7 +106,7 @@ class MotionProposal:
         return f"below {scene.obstacle_clearance * 1000:g} mm, measured by the cameras"
 
     def _cameras(self) -> str:
-        """Which cameras look, and which of the rig file's do not."""
+        """Cameras in use, and those of the rig file that are not."""
         names = {camera.name for camera in self.cameras}
         unused = [one.name for one in self.prepared.rig.cameras if one.name not in names]
         used = ", ".join(f"{camera.name} ({source})" for camera, source in self.cameras.items())
@@ -115,7 +115,7 @@ class MotionProposal:
         return "; ".join(parts) or "none"
 
     def _reference(self) -> Facts:
-        """Which reference the drives' counts are read by, where it is not the rig file's own."""
+        """The homing reference in use, if it is not the rig file's own."""
         interlock = MotionInterlock(self.prepared.rig)
         reference = interlock.kept_reference()
         if reference is None:
@@ -125,16 +125,16 @@ class MotionProposal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HomingProposal:
-    """A homing that is about to wind cables in; see `Proposal`.
+    """Proposal of a homing; see `Proposal`.
 
     Attributes:
         rig: The robot.
         target: Pretension, [N].
         limit: Largest tension, [N].
-        reach: Largest length of a cable that is taken up, [m].
+        reach: Largest length of cable wound in, [m].
         speed: Fastest winch, [m/s].
-        fastest: Winding in, which is slower where a drive reports late, [m/s].
-        camera: That measures the pose, and its source; None where the pose is stated.
+        fastest: Largest winding-in speed, limited by the reaction time, [m/s].
+        camera: Camera for the pose, and its source; None if the pose is stated.
     """
 
     question: ClassVar[str] = "Wind the cables in now?"
@@ -151,9 +151,13 @@ class HomingProposal:
 
     def facts(self) -> Facts:
         """See `Proposal`."""
-        eye, bus = self.camera, self.rig.document.bus
+        source, bus = self.camera, self.rig.document.bus
         fastest, reach = self.fastest * 1000.0, self.reach * 1000.0
-        measured = f"measured, camera {eye[0].name} ({eye[1]})" if eye else "stated, held by a jig"
+        measured = (
+            f"measured, camera {source[0].name} ({source[1]})"
+            if source
+            else "stated, held by a jig"
+        )
         return [
             ("rig", self.rig.name),
             ("pretension", f"{self.target:g} N per cable, at most {self.limit:g} N"),
@@ -165,10 +169,10 @@ class HomingProposal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForgetProposal:
-    """A reference that is about to be given up; see `Proposal`.
+    """Proposal to discard a homing reference; see `Proposal`.
 
     Attributes:
-        interlock: Of the bus, whose reference it is.
+        interlock: Of its bus.
     """
 
     question: ClassVar[str] = "Do all drive positions match the rig file?"
@@ -198,12 +202,12 @@ def _held_fact(rig: Rig) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CableProposal:
-    """One winch that is about to move; see `Proposal`.
+    """Proposal to move one winch; see `Proposal`.
 
     Attributes:
         rig: The robot.
         cable: Its number, from 1.
-        length: Paid out, [m]; negative is wound in.
+        length: To pay out, [m]; negative winds in.
         limit: Largest tension of any cable, [N].
         speed: Of the winch, [m/s].
     """
@@ -231,12 +235,12 @@ class CableProposal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JogProposal:
-    """A session that is about to enable the drives; see `Proposal`.
+    """Proposal of a jog session; see `Proposal`.
 
     Attributes:
         rig: The robot; its motion has the jog speed.
-        scene: What is in the way.
-        start: Where the platform is, ``world_from_platform``.
+        scene: Obstacles and load.
+        start: Present platform pose, ``world_from_platform``.
     """
 
     question: ClassVar[str] = "Enable the drives for jogging now?"
@@ -260,11 +264,11 @@ class JogProposal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResetProposal:
-    """A fault that is about to be taken off; see `Proposal`.
+    """Proposal to reset a fault; see `Proposal`.
 
     Attributes:
         bus: Interface and channel.
-        latched: What is latched, if anything.
+        latched: The latched fault, if any.
     """
 
     question: ClassVar[str] = "Is the cause removed and the platform safe?"
@@ -287,13 +291,13 @@ class ResetProposal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReleaseProposal:
-    """Drives that are about to lose their torque; see `Proposal`.
+    """Proposal to release the drives; see `Proposal`.
 
     Attributes:
         rig: The robot.
         bus: Interface and channel.
         braked: Whether brakes hold the drums afterwards.
-        reference: Of the drives' counts, which is given up without brakes.
+        reference: Homing reference, which is discarded without brakes.
     """
 
     question: ClassVar[str] = "Is the platform supported, so that no cable carries it?"
@@ -319,7 +323,7 @@ class ReleaseProposal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CablesProposal:
-    """A session of single cables that is about to enable the drives; see `Proposal`.
+    """Proposal of a session of single-cable jogs; see `Proposal`.
 
     Attributes:
         rig: The robot; its motion has the jog speed.

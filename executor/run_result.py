@@ -1,4 +1,4 @@
-"""How a run ended, for the caller: verdict, files, and its tables as columns."""
+"""Result of a run: verdict, files, and its tables as columns."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Columns = dict[str, NDArray[Any]]
-"""A table of a run folder: arrays of one length by column name, with the unit in the name."""
+"""A table of a run folder: arrays of equal length by column name, which includes the unit."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """How a run ended; its tables are read from its folder when they are first asked for.
+    """Result of a run; its tables are read from its folder on first access.
 
     Attributes:
-        folder: Where everything about it is.
+        folder: Run folder.
         summary: The content of ``summary.json``.
         missing: Files of the folder that could not be written, and why.
         report: The page about the run; None where it could not be made.
@@ -62,7 +62,7 @@ class RunResult:
         return 130 if self.verdict == "STOPPED" else 1
 
     def details(self) -> list[str]:
-        """What decided the verdict; after a failure the pages about its faults, and what to do."""
+        """Reasons for the verdict; after a failure also fault pages and the next step."""
         lines = [str(reason) for reason in self.summary["reasons"]]
         if self.verdict == "FAILED":
             codes = faults_among(event["code"] for event in self.summary["events"])
@@ -71,7 +71,7 @@ class RunResult:
         return lines
 
     def _next_step(self) -> str:
-        """What to do after a run that failed."""
+        """Next step after a failed run."""
         if self.summary["final_state"] in ("finished", "stopped"):
             return "check the report for exceeded limits before the next run"
         if self.summary.get("interface") == IN_PROCESS:
@@ -79,7 +79,7 @@ class RunResult:
         return "find the cause and check the platform, then run `cdpr reset RIG`"
 
     def missing_text(self) -> str:
-        """Files of the run that could not be written, why, and what to do; empty where all were."""
+        """Message on files that could not be written; empty if all were."""
         if not self.missing:
             return ""
         lines = [f"{self.folder}: some files of the run could not be written"]
@@ -99,7 +99,7 @@ class RunResult:
 
     @cached_property
     def poses(self) -> Columns:
-        """What the cameras measured together: the columns of ``poses.csv``."""
+        """Fused camera poses: the columns of ``poses.csv``."""
         return self._table(POSES)
 
     @cached_property
@@ -112,7 +112,7 @@ class RunResult:
 
     @property
     def smallest_clearance(self) -> float:
-        """The smallest measured clearance, [m]; NaN where none was measured."""
+        """The smallest measured clearance, [m]; NaN if none was measured."""
         known = self.summary.get("clearance_mm")
         return float("nan") if known is None else float(known["measured_min"]) / 1e3
 
@@ -149,7 +149,7 @@ class RunResult:
 
 
 def load_run(folder: str | Path) -> RunResult:
-    """The result of a run that is over, from its folder.
+    """The result of a finished run, from its folder.
 
     Raises:
         BadInput: There is no such folder, or a file of the run is missing or was changed.

@@ -1,7 +1,7 @@
-"""Runs a plan: proves it, arms the drives, moves, measures, decides the verdict, writes the record.
+"""Runs a plan: checks it, arms the drives, moves, measures, computes the verdict, writes files.
 
-Once something moved, the verdict rests on what the drives did alone. Neither a file that cannot be
-written nor an interrupt while the report is made changes it.
+Once the platform has moved, the verdict depends only on the motion: neither a file that
+cannot be written nor an interrupt while the report is made changes it.
 """
 
 from __future__ import annotations
@@ -16,9 +16,15 @@ from typing import Any
 
 from executor.cameras.multi_camera import CameraRecords, CameraWatch
 from executor.cameras.open import asked_rate, open_cameras, require_no_stop
-from executor.cameras.sources import CameraChoice, require_simulated_pictures, resolve_cameras
+from executor.cameras.sources import CameraChoice, require_synthetic_images, resolve_cameras
 from executor.control.path_runs import Outcome, run_in_process, run_in_real_time
-from executor.drives import drives_of, is_simulated, left_alone, open_drives, require_own_time
+from executor.drives import (
+    abandoned_drives_fault,
+    drives_of,
+    is_simulated,
+    open_drives,
+    require_own_time,
+)
 from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
 from executor.interlock.interlock import MotionInterlock
 from executor.kernels import ready_for_simulating_process
@@ -50,13 +56,13 @@ __all__ = [
     "run_prepared",
 ]
 
-#: Without a camera the progress is reported this often, [Hz].
+#: Rate of progress reports without a camera, [Hz].
 PROGRESS_RATE = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RunOptions:
-    """How a run is done; see `run`."""
+    """Options of a run; see `run`."""
 
     realtime: bool = True
     start: Pose | None = None
@@ -84,42 +90,42 @@ def run(
     supervisor: Supervisor | None = None,
     plan_file: Path | str = "plan",
 ) -> RunResult:
-    """Proves a plan, makes its set-points, arms the drives, moves, measures and reports.
+    """Checks a plan, computes its set-points, arms the drives, moves, measures and reports.
 
     On the interface ``virtual`` drives, platform and camera are simulated in this process. Ctrl-C
     and `cdpr stop` stop all drives together along the path; they then hold.
 
     Args:
-        plan: What to run.
+        plan: The plan.
         rig: The robot, and the bus of its drives.
-        folder: Of the run, which is made; None for a dated one in ``runs``.
-        cameras: Those that measure the platform.
-        realtime: False for simulated time, as fast as the computer can.
-        start: Where the simulated platform is, ``world_from_platform``; None at the plan's start.
-        clearance_stop: Stop along the path when the cameras measure too little clearance.
+        folder: Run folder to create; None for a dated one in ``runs``.
+        cameras: Cameras that measure the platform.
+        realtime: False for simulated time, as fast as possible.
+        start: Pose of the simulated platform, ``world_from_platform``; None for the plan's start.
+        clearance_stop: Stop along the path when the cameras measure too small a clearance.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         listener: Receives progress.
-        confirm: Called once, before anything is opened for the motion; False cancels it. Without
-            it the call itself is the decision to move.
+        confirm: Called once, before any device is opened; False cancels it. Without it the call
+            itself confirms the motion.
         on_event: Receives each event of the run. It is called by the thread that supervises the
-            motion and has to return at once; an error that it raises stops the run.
+            motion and must return at once; an exception stops the run.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
-        plan_file: Names the plan in messages.
+        plan_file: Name of the plan in messages.
 
     Returns:
-        How it ended; a run that was stopped or failed is a result too.
+        The result, also of a run that was stopped or failed.
 
     Raises:
         BadInput: An argument cannot be used, or the plan was made for another rig.
         Refused: The plan does not pass the checks, the bus is latched, or the drives cannot be
             armed; nothing moved.
         HardwareMissing: A drive or a camera does not answer; nothing moved.
-        StoppedByOperator: It was cancelled before anything moved.
+        StoppedByOperator: Cancelled before anything moved.
         KeyboardInterrupt: Ctrl-C, after the drives stopped together and the record was written.
     """
     require_same_rig(plan, rig, plan_file)
     chosen = resolve_cameras(rig, cameras, is_simulated(rig))
-    require_simulated_pictures(chosen.values(), not realtime)
+    require_synthetic_images(chosen.values(), not realtime)
     require_own_time(rig, realtime)
     if plan.scene.obstacles:
         require_stated_errors(rig, list(chosen))
@@ -151,7 +157,7 @@ def prepare_plan(plan: Plan, rig: Rig, listener: Listener = SILENT) -> PreparedR
     """The checked set-points of a plan, for a rig.
 
     Raises:
-        Refused: The plan, or the curve it would be run on, does not pass the checks.
+        Refused: The plan, or its executed curve, does not pass the checks.
     """
     with listener.waiting("checking the plan and its set-points"):
         return prepare(verify(plan, rig), rig)
@@ -160,15 +166,15 @@ def prepare_plan(plan: Plan, rig: Rig, listener: Listener = SILENT) -> PreparedR
 def run_prepared(
     prepared: PreparedRun, output: Path, cameras: Mapping[Camera, str], options: RunOptions
 ) -> RunResult:
-    """Asks, arms, moves, measures, decides the verdict, then writes the files of the run's end.
+    """Confirms, arms, moves, measures, computes the verdict, then writes the result files.
 
-    A run that is refused before anything moved leaves no folder.
+    A run refused before anything moved leaves no folder.
 
     Args:
         prepared: The checked run.
-        output: The run folder to make.
+        output: Run folder to create.
         cameras: From `resolve_cameras`; empty for none.
-        options: How it is done.
+        options: Of the run.
 
     Raises:
         CdprError: As for `run`.
@@ -176,11 +182,11 @@ def run_prepared(
     proposal = MotionProposal(prepared, cameras, options.clearance_stop)
     require_confirmed(options.confirm, proposal)
     with options.listener.waiting("loading the report generator"):
-        _load_what_the_end_needs()
+        _preload_results()
     interface, simulated = prepared.rig.document.bus.interface, is_simulated(prepared.rig)
     course = RunCourse(datetime.now(UTC), interface, simulated, not options.realtime)
     folder = RunFolder.create(output)
-    job, moved = _Job(prepared, folder, cameras, options), _Moved()
+    job, moved = _Job(prepared, folder, cameras, options), _MotionData()
     try:
         folder.write_plan(prepared.plan.plan.document)
         folder.write_rig(prepared.rig.document)
@@ -198,7 +204,7 @@ def run_prepared(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """One run and how it is to be done."""
+    """One run and its options."""
 
     prepared: PreparedRun
     folder: RunFolder
@@ -207,15 +213,15 @@ class _Job:
 
 
 @dataclass(slots=True, eq=False)
-class _Moved:
-    """What the motion left behind, as far as it came.
+class _MotionData:
+    """Data of the motion, as far as it got.
 
     Attributes:
         begun: The platform was about to move.
-        recorder: Took in what happened.
-        outcome: How the motion ended.
-        seen: What the cameras saw.
-        troubles: What of it is lost, a sentence each.
+        recorder: Of cycles and events.
+        outcome: Of the motion.
+        seen: Camera records.
+        troubles: Missing data, a sentence each.
     """
 
     begun: bool = False
@@ -225,10 +231,10 @@ class _Moved:
     troubles: list[str] = field(default_factory=list)
 
     def take_event(self, code: str, text: str, at: float) -> None:
-        """Takes in an event that is not the loop's.
+        """Records an event of another source than the loop.
 
         Raises:
-            CdprError: It cannot be written, which stops a platform that moves.
+            CdprError: It cannot be written, which stops a moving platform.
         """
         assert self.recorder is not None
         try:
@@ -238,13 +244,13 @@ class _Moved:
                 raise
 
     def close(self) -> None:
-        """Waits until the disk has what was recorded."""
+        """Waits until all records are on disk."""
         if self.recorder is not None:
             self.recorder.writer.close()
 
 
-def _load_what_the_end_needs() -> None:
-    """What is loaded now can neither be missing nor want memory once the platform has moved."""
+def _preload_results() -> None:
+    """Loads modules of the result files now, as a failure after the motion would lose data."""
     import cv2  # noqa: F401
     import scipy.spatial  # noqa: F401
 
@@ -252,8 +258,8 @@ def _load_what_the_end_needs() -> None:
     import executor.report.run_data  # noqa: F401
 
 
-def _move_and_measure(job: _Job, moved: _Moved) -> None:
-    """The motion and its images; what fails once something moved is part of how it ended."""
+def _move_and_measure(job: _Job, moved: _MotionData) -> None:
+    """Moves and takes images; a failure after the start of motion becomes part of the outcome."""
     board = SharedRequests() if job.options.realtime else LocalRequests()
     try:
         try:
@@ -273,8 +279,8 @@ def _move_and_measure(job: _Job, moved: _Moved) -> None:
             moved.troubles.append(f"writing the results failed: {text}")
 
 
-def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Moved) -> None:
-    """`cdpr stop` and its like reach the run all the time."""
+def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _MotionData) -> None:
+    """Moves while the command socket accepts requests such as `cdpr stop`."""
     prepared, options = job.prepared, job.options
     listener, fast = options.listener, not options.realtime
     rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
@@ -316,9 +322,9 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
 
 
 def _move(
-    job: _Job, board: LocalRequests | SharedRequests, recorder: Recorder, moved: _Moved
+    job: _Job, board: LocalRequests | SharedRequests, recorder: Recorder, moved: _MotionData
 ) -> Outcome:
-    """Arms the drives and runs the loop: here in simulated time, else in a process of its own."""
+    """Arms the drives and runs the loop: here in simulated time, else in another process."""
 
     def before_motion() -> None:
         moved.begun = True
@@ -327,7 +333,7 @@ def _move(
     if isinstance(board, SharedRequests):
         return _move_in_real_time(job, board, recorder, before_motion)
 
-    def last_chance() -> None:
+    def confirm_motion() -> None:
         require_no_stop(board)
         before_motion()
 
@@ -342,7 +348,7 @@ def _move(
             recorder,
             true_pose=drives.true_pose,
             carry=drives.carry,
-            before_motion=last_chance,
+            before_motion=confirm_motion,
         )
 
 
@@ -368,14 +374,14 @@ def _move_in_real_time(
         recorder,
         pose_every=recorder.every if simulated else 0,
         need_real_time=options.need_real_time_rights and not simulated,
-        look_again=partial(left_alone, prepared.rig.document),
+        check_drives=partial(abandoned_drives_fault, prepared.rig.document),
         before_motion=armed,
         listener=options.listener,
     )
 
 
-def _conclude(job: _Job, moved: _Moved, course: RunCourse) -> RunResult:
-    """Decides the verdict, reports it, then writes the files of the end."""
+def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
+    """Computes the verdict, reports it, then writes the result files."""
     outcome, supervisor = moved.outcome, job.options.supervisor
     assert outcome is not None
     course = replace(
@@ -397,9 +403,9 @@ def _conclude(job: _Job, moved: _Moved, course: RunCourse) -> RunResult:
 
 
 def _evaluated(
-    prepared: PreparedRun, moved: _Moved, outcome: Outcome, course: RunCourse
+    prepared: PreparedRun, moved: _MotionData, outcome: Outcome, course: RunCourse
 ) -> tuple[EvaluatedRun | None, dict[str, Any]]:
-    """The run and its summary; without memory, or after a defect, a summary of what is known."""
+    """The evaluation and its summary; if that fails, a summary without tables."""
     try:
         seen = moved.seen or CameraRecords()
         evaluated = evaluate(prepared, outcome, seen, course, moved.troubles)

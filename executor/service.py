@@ -1,4 +1,4 @@
-"""The service of a rig: its status, the reset of a latched fault, the release of its drives."""
+"""Service of a rig: status, reset of a latched fault, release of the drives."""
 
 from __future__ import annotations
 
@@ -16,7 +16,12 @@ from drivers.can_bus import BusSettings, open_bus
 from drivers.drive_group import CycleStatus
 from drivers.factory import drive_states, read_drives
 from executor.control.standstill import FaultReset, Release, StandstillMotion
-from executor.drives import current_pose, left_alone, require_other_process, resting_drives_of
+from executor.drives import (
+    abandoned_drives_fault,
+    current_pose,
+    require_other_process,
+    resting_drives_of,
+)
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock, ReferenceStatus, reference_status
 from executor.interlock.locks import SetUpLock
@@ -38,14 +43,14 @@ from model.scene import empty_scene
 
 @dataclass(frozen=True, slots=True)
 class DriveStatus:
-    """One drive, as it reports itself.
+    """Status of one drive.
 
     Attributes:
         node: Its node ID.
-        state: Of its state machine, in words.
+        state: Of its state machine, as text.
         position: Of its encoder, [counts].
-        tension: Of its cable, by the drive's torque, [N].
-        set_up: It keeps this program's set-up: it was not switched off since.
+        tension: Of its cable, from the drive's torque, [N].
+        set_up: It has kept this program's configuration: no power cycle since.
     """
 
     node: int
@@ -57,18 +62,18 @@ class DriveStatus:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StatusResult:
-    """The state of a rig; what was not asked or is not known is None.
+    """Status of a rig; None for what was not read or is unknown.
 
     Attributes:
         rig: Its name.
         bus: Interface and channel.
-        run: Number of the process that moves or resets it.
+        run: ID of the process that moves or resets it.
         latched: Cause of a latched fault.
-        being_set_up: Another program sets the drives up or reads them.
-        reference: Of the drives' counts.
-        drives: All of them, in the order of the rig file.
+        being_set_up: Another program configures or reads the drives.
+        reference: Homing reference of the drives.
+        drives: All drives, in the order of the rig file.
         pose: By forward kinematics of the empty platform, ``world_from_platform``.
-        why_no_pose: Why there is none, though the drives were read.
+        why_no_pose: Why there is no pose, though the drives were read.
         missing: Why the drives could not be read.
     """
 
@@ -84,10 +89,10 @@ class StatusResult:
     missing: CdprError | None = None
 
     def facts(self, rig_file: Path) -> Facts:
-        """The state for people, with what has to be done before a run.
+        """Human-readable status, with the next step before a run.
 
         Args:
-            rig_file: For the commands that are named.
+            rig_file: For the suggested commands.
         """
         latched = self.latched or "none"
         if self.run is not None:
@@ -103,27 +108,27 @@ class StatusResult:
             facts.append(("drives", unread))
         if self.pose is not None:
             x, y, z = self.pose.position * 1000.0
-            place = f"{x:z.2f}, {y:z.2f}, {z:z.2f} mm from the encoders, without a load"
-            facts.append(("platform", place))
+            position = f"{x:z.2f}, {y:z.2f}, {z:z.2f} mm from the encoders, without a load"
+            facts.append(("platform", position))
         elif self.why_no_pose is not None:
             facts.append(("platform", self.why_no_pose))
         next_step = self.next_step(rig_file)
         return [*facts, ("next", next_step)] if next_step else facts
 
     def next_step(self, rig_file: Path) -> str:
-        """What has to be done before anything can run; empty where nothing has, or a run is on."""
+        """Next step before a run; empty if none is needed or a run is active."""
         if self.run is not None or self.being_set_up:
             return ""
         file, steps = quote(str(rig_file)), []
         if self.latched is not None:
             steps.append(f"find the cause and check the platform, then run cdpr reset {file}")
         if not self.reference.counts:
-            ways = "--at-home, --pose-mm X Y Z or --camera SOURCE"
-            steps.append(f"cdpr home {file} with {ways}")
+            options = "--at-home, --pose-mm X Y Z or --camera SOURCE"
+            steps.append(f"cdpr home {file} with {options}")
         return "; then ".join(steps)
 
     def drive_lines(self, names: Mapping[int, str]) -> list[str]:
-        """A line a drive.
+        """One line per drive.
 
         Args:
             names: Of the drives, by node (`Rig.drive_names`).
@@ -136,7 +141,7 @@ class StatusResult:
         ]
 
     def as_dict(self) -> dict[str, Any]:
-        """For `--json`: units in the keys, rounded."""
+        """Values for `--json`, rounded, with units in the keys."""
         pose: dict[str, Any] | None = None
         if self.pose is not None:
             pose = PoseDocument.of(self.pose).model_dump(mode="json")
@@ -165,9 +170,9 @@ class StatusResult:
 
 
 def status(rig: Rig) -> StatusResult:
-    """The state of a rig: faults, reference, drives, tensions, pose. Moves and writes nothing.
+    """The status of a rig: faults, reference, drives, tensions, pose. Moves and writes nothing.
 
-    While a run is under way, or being prepared, the drives are not asked.
+    While a run is active or being prepared, the drives are not read.
 
     Args:
         rig: The robot and its bus.
@@ -178,37 +183,37 @@ def status(rig: Rig) -> StatusResult:
     require_other_process(rig)
     settings = BusSettings.of(rig)
     interlock = MotionInterlock(rig)
-    latched, under_way = _latch_of(FaultLatch(settings))
+    latched, in_motion = _latch_of(FaultLatch(settings))
     known = StatusResult(
         rig=rig.name,
         bus=str(settings),
-        run=latched.process if latched and under_way else None,
-        latched=latched.cause if latched and not under_way else None,
+        run=latched.process if latched and in_motion else None,
+        latched=latched.cause if latched and not in_motion else None,
         being_set_up=False,
         reference=reference_status(interlock),
     )
-    if under_way:
+    if in_motion:
         return known
     try:
         with SetUpLock(settings).tried() as alone:
             return _read(rig, interlock, known) if alone else replace(known, being_set_up=True)
-    except CdprError as error:  # what is on file is reported all the same
+    except CdprError as error:  # the state on file is still reported
         return replace(known, missing=error)
 
 
 def _latch_of(latch: FaultLatch) -> tuple[LatchedFault | None, bool]:
-    """What is latched, and whether a motion is under way, both of one moment."""
+    """The latched fault, and whether a motion is active, consistently."""
     latched = latch.read()
     while True:
-        under_way = latch.held_by_another()
+        in_motion = latch.held_by_another()
         again = latch.read()
         if again == latched:
-            return latched, latched is not None and under_way
+            return latched, latched is not None and in_motion
         latched = again
 
 
 def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusResult:
-    """What the drives report, and the pose that follows from it.
+    """Reads the drives and computes the pose.
 
     Raises:
         CdprError: A drive does not answer, or the bus cannot be opened.
@@ -220,9 +225,9 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
         bus.shutdown()
     positions = seen.positions.tolist()
     reference = reference_status(interlock, positions)
-    forgot = [w.node_id for w in rig.winches if not w.absolute and w.node_id in seen.restarted]
-    if reference.counts and forgot:
-        names = ", ".join(rig.drive_names[node] for node in forgot)
+    restarted = [w.node_id for w in rig.winches if not w.absolute and w.node_id in seen.restarted]
+    if reference.counts and restarted:
+        names = ", ".join(rig.drive_names[node] for node in restarted)
         why = f"{names}: power-cycled after homing"
         reference = replace(reference, counts=False, why_not=why)
     columns = zip(
@@ -250,14 +255,14 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
 
 @dataclass(frozen=True, slots=True)
 class ResetResult:
-    """How a rig is after a reset.
+    """State of a rig after a reset.
 
     Attributes:
-        was_latched: Whether a fault was.
+        was_latched: Whether a fault was latched.
         cause: Of that fault.
-        drives: State of each drive, in words.
-        restarted: Nodes that were found switched on since their last set-up.
-        reference: Of the drives' counts.
+        drives: State of each drive, as text.
+        restarted: Nodes power-cycled since their last configuration.
+        reference: Homing reference of the drives.
     """
 
     was_latched: bool
@@ -273,20 +278,20 @@ def reset(
     confirm: Callable[[ResetProposal], bool] | None = None,
     listener: Listener = SILENT,
 ) -> ResetResult:
-    """Takes a latched fault off, after its cause is gone: resets drives in fault; moves nothing.
+    """Clears a latched fault after its cause is removed: resets drives in fault; moves nothing.
 
     Drives that hold keep holding. A drive in fault is not reset while others hold the platform.
-    Afterwards a run starts only from where the platform is.
+    Afterwards a run must start at the platform's present pose.
 
     Args:
         rig: The robot and its bus.
         confirm: Called once, before anything is reset; False cancels it.
-        listener: Receives what the drives cannot do.
+        listener: Receives remarks on missing capabilities of the drives.
 
     Raises:
-        StoppedByOperator: It was cancelled.
-        CdprError: A run is under way; or a drive does not answer, may not be reset now, or stays
-            in fault.
+        StoppedByOperator: Cancelled.
+        CdprError: A run is active; or a drive does not answer, may not be reset now, or stays in
+            fault.
     """
     require_other_process(rig)
     settings = BusSettings.of(rig)
@@ -304,7 +309,7 @@ def reset(
                 make_drives,
                 board,
                 need_real_time=False,
-                look_again=partial(left_alone, rig.document),
+                check_drives=partial(abandoned_drives_fault, rig.document),
                 listener=listener,
             ) as process,
         ):
@@ -320,11 +325,11 @@ def reset(
 
 @dataclass(frozen=True, slots=True)
 class ReleaseResult:
-    """How a rig is after its drives were released.
+    """State of a rig after its drives were released.
 
     Attributes:
-        drives: State of each drive, in words.
-        reference: Of the drives' counts.
+        drives: State of each drive, as text.
+        reference: Homing reference of the drives.
     """
 
     drives: tuple[str, ...]
@@ -339,22 +344,22 @@ def release(
     confirm: Callable[[ReleaseProposal], bool] | None = None,
     supervisor: Supervisor | None = None,
 ) -> ReleaseResult:
-    """With the platform on a support, closes the brakes and takes the torque off all drives.
+    """Closes the brakes and switches off the torque of all drives; the platform must be supported.
 
-    Winches without brakes let their cables go, so that the drives have to be referenced again.
+    Winches without brakes release their cables, so that the drives must be homed again.
 
     Args:
         rig: The robot and its bus.
         need_real_time_rights: Refuse without real-time scheduling.
-        listener: Receives what the system denies and what the drives cannot do.
+        listener: Receives what the system denies, and remarks on the drives.
         confirm: Called once, before anything is released; False cancels it. Without it the call
-            itself is the decision.
+            itself confirms.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
 
     Raises:
-        StoppedByOperator: It was cancelled, or stopped.
-        CdprError: The bus is latched, or the drives could not be set up; or they were not released,
-            and a fault is latched.
+        StoppedByOperator: Cancelled, or stopped.
+        CdprError: The bus is latched, or the drives could not be configured; or they were not
+            released, and a fault is latched.
     """
     require_other_process(rig)
     interlock = MotionInterlock(rig)
@@ -381,7 +386,7 @@ def _released(
     need_real_time_rights: bool,
     listener: Listener,
 ) -> CycleStatus:
-    """The drives' last word, without torque; errors as `release_drives`."""
+    """Releases the drives; returns their last status. Errors as `release_drives`."""
     status = WinchStatus(rig, board, simulated_time=False)
 
     def on_armed(denied: str) -> None:
@@ -397,7 +402,7 @@ def _released(
                 partial(resting_drives_of, rig.document),
                 board,
                 need_real_time=need_real_time_rights,
-                look_again=partial(left_alone, rig.document),
+                check_drives=partial(abandoned_drives_fault, rig.document),
                 listener=listener,
             )
         )

@@ -1,4 +1,4 @@
-"""The states of a run, and the only ways from one to the next."""
+"""State machine of a run, and the records of its loop."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ from executor.safety.monitor import Alarm
 
 
 class State(Enum):
-    """Where a run is."""
+    """State of a run."""
 
     READY = "ready"
     """Drives are configured and answer; nothing is enabled."""
     ENABLING = "enabling"
     """The drives are being enabled together, targets on their actual positions."""
     APPROACHING = "approaching"
-    """The last fraction of a millimetre to the first set-point."""
+    """Moving the last fraction of a millimetre to the first set-point."""
     MOVING = "moving"
-    """Along the path."""
+    """Moving along the path."""
     HOLDING = "holding"
-    """Feed hold: slowing down on the path or at rest there, enabled; a resume goes on."""
+    """Feed hold: slowing down on the path or at rest there, enabled; resume continues."""
     STOPPING = "stopping"
     """Slowing down along the path, all drives together."""
     SECURING = "securing"
-    """At rest; the drives go over to hold by themselves (quick stop active)."""
+    """At rest; the drives change to holding on their own (quick stop active)."""
     FINISHED = "finished"
     """At the goal, held by the drives."""
     STOPPED = "stopped"
     """Stopped by the operator on the path, held by the drives."""
     LATCHED = "latched"
-    """Stopped by a fault; this run is over, and another begins only with a new command."""
+    """Stopped by a fault; this run is over, and a new command is needed for another."""
 
 
 ON_PATH = frozenset({State.MOVING, State.HOLDING, State.STOPPING})
-"""Where the place in the table is the place of the platform."""
+"""States in which the platform is at the current table index."""
 
 
 class Event(Enum):
-    """What may happen to a run."""
+    """Event of a run."""
 
     ENABLE = "enable"
     ENABLED = "enabled"
@@ -54,7 +54,7 @@ class Event(Enum):
 
 
 class ForbiddenTransition(RuntimeError):
-    """A program error: the event is not foreseen in the state."""
+    """A program error: the event is not allowed in the state."""
 
 
 _NEXT = {
@@ -78,24 +78,24 @@ _NEXT = {
 
 
 class Machine:
-    """Where the run is, whether it was stopped and whether a fault is latched."""
+    """State of the run, whether it was stopped and whether a fault is latched."""
 
     def __init__(self) -> None:
-        """Starts ready."""
+        """Starts in READY."""
         self._state = State.READY
         self._stopped = False
         self._faulted = False
 
     @property
     def state(self) -> State:
-        """Where the run is; only events change it."""
+        """Present state; only events change it."""
         return self._state
 
     def on(self, event: Event) -> State:
-        """Takes one step.
+        """Handles an event; returns the new state.
 
         Raises:
-            ForbiddenTransition: The event is not foreseen here; the caller must stop the rig.
+            ForbiddenTransition: The event is not allowed here; the caller must stop the rig.
         """
         if event is Event.FAULT:
             self._faulted = True
@@ -118,31 +118,31 @@ class Machine:
         return State.STOPPED if self._stopped else State.FINISHED
 
 
-# What the loop reports while it runs: a record per cycle, and events.
+# Reports of the loop: a record per cycle, and events.
 
 
-#: Code of the event that the drives say that they are simulated.
+#: Code of the event that the drives report to be simulated.
 SIMULATED = "simulated"
 
 
 @dataclass(frozen=True, slots=True)
 class CycleRecord:
-    """One cycle as it was.
+    """Record of one cycle.
 
     Attributes:
         cycle: Counted from the first one sent.
-        at: When it began, on the loop's clock, [s].
-        state: Where the run was.
-        index: Place in the table; of winches that move without a path how much is done, [%].
-        rate: Rows a cycle that the feed went.
-        targets: What was sent, [counts].
-        actual: What the drives answered, [counts].
-        torques: What they answered, [‰ of rated torque].
-        words: Their status words.
-        missing: How many did not answer.
-        rejected: Frames thrown away since the drives were set up, as they could not be true.
+        at: Start of the cycle, on the loop's clock, [s].
+        state: Of the run.
+        index: Table index; for winches that move without a path the share done, [%].
+        rate: Of the feed, rows per cycle.
+        targets: Set-points sent, [counts].
+        actual: Reported positions, [counts].
+        torques: Reported torques, [‰ of rated torque].
+        words: Status words.
+        missing: Number of drives that did not answer.
+        rejected: Implausible frames rejected since the drives were configured.
         error_frames: Error frames of the bus since then.
-        following_error: Largest over the cables, [m]; NaN while the drives do not follow.
+        following_error: Largest of the cables, [m]; NaN while the drives do not follow.
         lateness: In cycles.
     """
 
@@ -164,12 +164,12 @@ class CycleRecord:
 
 @dataclass(frozen=True, slots=True)
 class LoopEvent:
-    """Something worth reporting.
+    """Event of the loop.
 
     Attributes:
-        cycle: In which cycle.
-        at: When, on the loop's clock, [s].
-        code: Stable name.
+        cycle: Number of the cycle.
+        at: Time on the loop's clock, [s].
+        code: Stable code.
         text: One sentence.
     """
 
@@ -179,40 +179,40 @@ class LoopEvent:
     text: str
 
 
-#: Findings that several drives have at once for one cause.
+#: Alarms that several drives raise at once for a common cause.
 _SHARED = frozenset({"drive_silent", "reply_lost"})
 
 
-def shared_causes(findings: Sequence[Alarm], names: Sequence[str]) -> tuple[Alarm, ...]:
-    """The findings of a cycle, with replies that several drives owe as one finding.
+def shared_causes(alarms: Sequence[Alarm], names: Sequence[str]) -> tuple[Alarm, ...]:
+    """The alarms of a cycle, with missing replies of several drives merged into one.
 
     Args:
-        findings: Of one cycle.
-        names: Of all drives, as the findings name them.
+        alarms: Of one cycle.
+        names: Of all drives, as the alarms name them.
     """
-    told: list[Alarm] = []
-    for finding in findings:
-        rest = _without_name(finding, names)
-        same = [f for f in findings if f.code == finding.code and _without_name(f, names) == rest]
-        if finding.code not in _SHARED or len(same) == 1:
-            told.append(finding)
-        elif finding is same[0]:
-            which, cause = together([names[f.drive - 1] for f in same], len(names))
-            told.append(replace(finding, text=f"{which} {rest}{cause}", drive=0))
-    return tuple(told)
+    merged: list[Alarm] = []
+    for alarm in alarms:
+        rest = _without_name(alarm, names)
+        same = [f for f in alarms if f.code == alarm.code and _without_name(f, names) == rest]
+        if alarm.code not in _SHARED or len(same) == 1:
+            merged.append(alarm)
+        elif alarm is same[0]:
+            which, cause = name_drives([names[f.drive - 1] for f in same], len(names))
+            merged.append(replace(alarm, text=f"{which} {rest}{cause}", drive=0))
+    return tuple(merged)
 
 
-def together(who: Sequence[str], drives: int) -> tuple[str, str]:
-    """Drives that fail in the same way at once, named in a sentence, and the cause to end it with.
+def name_drives(failed: Sequence[str], drives: int) -> tuple[str, str]:
+    """Names of drives that fail alike, as the subject of a sentence, and a cause to append.
 
     Args:
-        who: Their names.
-        drives: How many the rig has.
+        failed: Their names.
+        drives: Number of drives of the rig.
     """
-    if len(who) == drives:
+    if len(failed) == drives:
         return f"all {drives} drives", ": bus or supply"
-    return ", ".join(who), ""
+    return ", ".join(failed), ""
 
 
-def _without_name(finding: Alarm, names: Sequence[str]) -> str:
-    return finding.text.removeprefix(f"{names[finding.drive - 1]} ") if finding.drive else ""
+def _without_name(alarm: Alarm, names: Sequence[str]) -> str:
+    return alarm.text.removeprefix(f"{names[alarm.drive - 1]} ") if alarm.drive else ""

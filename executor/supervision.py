@@ -1,6 +1,6 @@
-"""What links a motion to its operator: a question before, and requests while it moves.
+"""Operator requests during a motion, and the supervisor of a motion.
 
-The loop asks every cycle what the operator wants.
+The loop reads the operator's requests every cycle.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from model.errors import StoppedByOperator
 
 @dataclass(frozen=True, slots=True)
 class StopReason:
-    """Why a run is to end without an operator's stop.
+    """Reason for a stop other than the operator's.
 
     Attributes:
-        code: Of the event that reports it.
-        text: A clause, with numbers.
+        code: Of its event.
+        text: A clause with values.
     """
 
     code: str
@@ -28,12 +28,11 @@ class StopReason:
 
 @dataclass(frozen=True, slots=True)
 class OperatorRequests:
-    """All of it at one moment; each stays until it is changed.
+    """All requests at one time; each stays until it is changed.
 
     Attributes:
         stop: End the run along the path.
-        for_what: The stop is wished for this, which the cameras saw, and with which code; None when
-            the operator wishes it.
+        for_what: Reason of a stop due to the camera measurements; None for the operator's.
         hold: Come to rest on the path and wait there.
         speed: Share of the planned speed along the path, from 0.01 to 1.
         lost: Why the run has lost its supervisor; empty while it has one.
@@ -46,36 +45,36 @@ class OperatorRequests:
     for_what: StopReason | None = None
 
 
-#: Slowest and fastest feed that may be asked for, [% of the planned speed].
+#: Slowest and fastest feed that may be requested, [% of the planned speed].
 SLOWEST, FASTEST = 1, 100
 
 
 class RequestBoard(Protocol):
-    """Where wishes are put up. A stop cannot be taken back."""
+    """Board of requests. A stop cannot be withdrawn."""
 
     def ask_stop(self, for_what: StopReason | None = None) -> None:
-        """The run is to end along the path.
+        """Requests the end of the run along the path.
 
         Args:
-            for_what: What the cameras saw; None when the operator wishes it.
+            for_what: Reason found by the cameras; None for the operator's stop.
         """
 
     def ask_hold(self, hold: bool) -> None:
-        """The run is to wait on the path, or to go on."""
+        """Requests a feed hold, or its end."""
 
     def ask_speed(self, percent: int) -> None:
-        """The run is to go at a share of the planned speed, from `SLOWEST` to `FASTEST`."""
+        """Requests a percentage of the planned speed, from `SLOWEST` to `FASTEST`."""
 
     def read(self) -> OperatorRequests:
-        """What is wished now."""
+        """Present requests."""
 
 
 class LocalRequests:
-    """The board of a loop that runs in this process; others may write to it at any time."""
+    """Board of a loop in this process; other threads may write to it at any time."""
 
     def __init__(self) -> None:
-        """Nothing is wished yet."""
-        # One attribute each: a signal that interrupts one wish cannot undo another.
+        """Starts without requests."""
+        # One attribute each: a signal that interrupts one request cannot undo another.
         self._stop, self._hold, self._speed = False, False, 1.0
         self._for_what: StopReason | None = None
 
@@ -98,7 +97,7 @@ class LocalRequests:
         return OperatorRequests(self._stop, self._hold, self._speed, for_what=self._for_what)
 
 
-# What links a motion to the program that asks for it: a question before, stops while it moves.
+# Supervisor of a motion, for the calling program.
 
 
 _T = TypeVar("_T")
@@ -107,14 +106,14 @@ _T = TypeVar("_T")
 class Supervisor:
     """Turns an interrupt of the calling program into a coordinated stop.
 
-    This one takes no signals, so that the library works from any thread: the motion runs in a
-    thread of its own, and a `KeyboardInterrupt` in the calling thread asks for the stop. It is
-    raised again once the drives hold and the record is written. A program that handles signals
-    itself, as the command line does, overrides the methods.
+    This one handles no signals, so that the library works from any thread: the motion runs in its
+    own thread, and a `KeyboardInterrupt` in the calling thread requests the stop. It is raised
+    again once the drives hold and the record is written. A program that handles signals itself,
+    as the command line does, overrides the methods.
     """
 
     def __init__(self) -> None:
-        """Nothing was interrupted."""
+        """Not interrupted."""
         self.interrupted = False
 
     def during(self, board: RequestBoard, motion: Callable[[], _T]) -> _T:
@@ -125,7 +124,7 @@ class Supervisor:
             motion: Called once.
 
         Raises:
-            KeyboardInterrupt: It was interrupted, and stopped before there was a result.
+            KeyboardInterrupt: Interrupted, and stopped before there was a result.
         """
         thread = _Motion(motion)
         try:
@@ -134,7 +133,7 @@ class Supervisor:
             if thread.cancel():
                 raise
             self._interrupt(board)
-        # An interrupted `join` may take the thread for ended (Python 3.11); the event does not.
+        # An interrupted `join` may regard the thread as ended (Python 3.11); the event does not.
         while not thread.is_done.is_set():
             try:
                 thread.is_done.wait()
@@ -154,21 +153,21 @@ class Supervisor:
         board.ask_stop()
 
     def on_motion(self) -> None:
-        """All is armed: the platform is about to move."""
+        """Called when armed: the platform is about to move."""
 
     def on_verdict(self, result: Any) -> None:
-        """The verdict of a run is known; no file of its end is written yet.
+        """Called with the verdict of a run, before its result files are written.
 
         Args:
             result: `executor.runner.RunResult`.
         """
 
     def leaves_files_out(self) -> bool:
-        """Whether the operator does not want to wait for the files of the end of a run."""
+        """Whether the operator chose not to wait for the result files."""
         return False
 
     def finish(self) -> None:
-        """Everything is done.
+        """Called at the end.
 
         Raises:
             KeyboardInterrupt: The motion was stopped by one.
@@ -202,7 +201,7 @@ class _Motion(threading.Thread):
             self.is_done.set()
 
     def cancel(self) -> bool:
-        """Prevents the function from being called; False where it is being called."""
+        """Prevents the call of the function; False if it has begun."""
         with self._lock:
             self._cancelled = True
             return not self._begun

@@ -40,23 +40,23 @@ from tracking.track import (
 )
 from tracking.tracker import Tracker
 
-#: A live camera that shows no tag for this number of images is given up.
+#: Images without a tag after which tracking with a live camera ends.
 PATIENCE = 50
 
 
 @dataclass(slots=True)
 class TrackResult:
-    """What was measured.
+    """Result of tracking.
 
     Attributes:
-        pictures: Of all cameras together, in order of time.
-        by_camera: Of each of several cameras alone, by its name; empty for one camera.
-        count: How many images were measured, and how long each took.
-        together: Of several cameras, what was not taken together; None for one camera.
+        pictures: Measurements of all cameras, fused, in order of time.
+        by_camera: Measurements of each of several cameras, by its name; empty for one camera.
+        count: Number of measured images, and time per image.
+        together: Images of several cameras without partners; None for one camera.
         unused: Why files were not used, by camera and name.
         with_clearance: Whether obstacles are known.
-        began: [ns since 1970].
-        seconds: How long all of it took, [s].
+        began: Start time, [ns since 1970].
+        seconds: Total time, [s].
     """
 
     pictures: list[LoggedPicture] = field(default_factory=list)
@@ -70,7 +70,7 @@ class TrackResult:
 
     @property
     def poses(self) -> list[PoseMeasurement]:
-        """Those that were found."""
+        """All poses found."""
         found = (logged.observation for logged in self.pictures)
         return [one for one in found if isinstance(one, PoseMeasurement)]
 
@@ -79,7 +79,7 @@ class TrackResult:
         return f"<TrackResult {len(self.poses)} poses in {len(self.pictures)} images>"
 
     def summary(self) -> dict[str, int | float]:
-        """What was measured, in numbers with units in their names."""
+        """Key figures, with units in their names."""
         poses, logged = self.poses, self.pictures
         deviations = np.array([np.linalg.norm(p.position_deviation) for p in poses])
         facts: dict[str, int | float] = {
@@ -103,7 +103,7 @@ class TrackResult:
         return facts
 
     def unused_files(self) -> dict[str, str]:
-        """Why files are not used, by name; of several cameras by ``NAME/FILE``."""
+        """Why files were not used, by name; for several cameras by ``NAME/FILE``."""
         several = len(self.unused) > 1
         return {
             f"{camera}/{name}" if several else name: why
@@ -112,7 +112,7 @@ class TrackResult:
         }
 
     def save(self, path: Path | str, mcap: Path | str | None = None) -> None:
-        """Writes the pose log, one for each of several cameras beside it, and MCAP.
+        """Writes the pose log, one more for each of several cameras, and MCAP.
 
         Raises:
             BadInput: A file cannot be written.
@@ -127,18 +127,18 @@ class TrackResult:
 
 
 def own_file(path: Path, name: str) -> Path:
-    """The file of one of several cameras: ``poses-front.csv`` beside ``poses.csv``."""
+    """File of one of several cameras: ``poses-front.csv`` beside ``poses.csv``."""
     return path.with_name(f"{path.stem}-{name}{path.suffix}")
 
 
 def own_drawing(overlay: Path, name: str) -> Path:
-    """Where one of several cameras' images are drawn: a video like a log, or a folder inside."""
+    """Overlay of one of several cameras: a video beside the given one, or a subfolder."""
     is_folder = overlay.is_dir() or not overlay.suffix
     return overlay / name if is_folder else own_file(overlay, name)
 
 
 def require_plan_used(sources: Iterable[str], plan: object | None) -> None:
-    """Refuses a plan where no source renders images of it.
+    """Refuses a plan if no source renders images of it.
 
     Raises:
         BadInput: No source is ``synthetic``.
@@ -171,19 +171,19 @@ def track_sources(
         rig: The robot.
         sources: A folder, a video file, a camera's index or address, or ``synthetic``, for each
             camera; see `executor.cameras.sources.parse_camera_sources`.
-        scene: Its obstacles, to which the clearance is measured; the plan's when left out.
-        plan: Followed by the platform that synthetic cameras see.
-        pictures: How many of each camera at most.
-        overlay: Folder or video into which the images are drawn with what was measured.
-        replace_overlay: It may exist.
-        stopped: Whether to end; asked before each image.
-        listener: Receives how far it is, and which files are not used.
+        scene: Obstacles for the clearance; None for the plan's.
+        plan: Motion of the platform for synthetic cameras.
+        pictures: Largest number of images per camera.
+        overlay: Folder or video for the images with measurements drawn in.
+        replace_overlay: Whether it may exist.
+        stopped: Called before each image; True ends tracking.
+        listener: Receives progress, and files that are not used.
 
     Raises:
         NoPlatformSeen: No image gave a pose.
         BadInput: A source cannot be used, or an image is of another size.
         HardwareMissing: A camera does not open.
-        CameraMoved: Frame tags are not where they should be.
+        CameraMoved: Frame tags differ from their positions in the rig file.
     """
     require_plan_used(sources.values(), plan)
     the_scene = plan.scene if scene is None and plan is not None else scene
@@ -206,16 +206,16 @@ def track_sources(
     with ExitStack() as drawing, listener.progress("tracking", pictures or total) as advance:
         streams: dict[str, Iterator[LoggedPicture]] = {}
         for camera, (frames, length) in zip(sources, opened, strict=True):
-            place = own_drawing(overlay, camera.name) if overlay and several else overlay
+            target = own_drawing(overlay, camera.name) if overlay and several else overlay
             streams[camera.name] = track(
                 takewhile(lambda _: not stopped(), islice(frames, pictures)),
                 Tracker(rig, camera),
                 result.count,
                 give_up_after=PATIENCE if length is None and not several else None,
                 model=model,
-                on_picture=drawing.enter_context(_overlay(place, rig, camera, replace_overlay)),
+                on_picture=drawing.enter_context(_overlay(target, rig, camera, replace_overlay)),
             )
-        # The fastest camera defines how close in time images belong together.
+        # The fastest camera defines the time window of simultaneous images.
         within = 0.5 / max(camera.rate for camera in sources)
         _measure(_together(streams, within, result.together, model), result, advance)
     result.seconds = (time.time_ns() - result.began) * 1e-9
@@ -227,7 +227,7 @@ def _measure(
     result: TrackResult,
     advance: Callable[[float, str], None],
 ) -> None:
-    """Takes all images into the result."""
+    """Adds all measurements to the result."""
     pace = FrameRate()
     for found, alone in measured:
         result.pictures.append(found)
@@ -246,7 +246,7 @@ def _together(
     count: MultiCameraCount | None,
     model: ClearanceModel | None,
 ) -> Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]]:
-    """What is measured together and by each camera alone."""
+    """Fused measurements, with those of each camera."""
     if count is not None:
         yield from track_cameras(streams, within, count, model)
         return
@@ -257,13 +257,13 @@ def _together(
 
 @contextmanager
 def _overlay(
-    place: Path | None, rig: Rig, camera: Camera, replace: bool
+    target: Path | None, rig: Rig, camera: Camera, replace: bool
 ) -> Iterator[Callable[[Picture, LoggedPicture], None] | None]:
-    """What draws each image's measurement into it; None without a place for it."""
-    if place is None:
+    """A function that writes images with measurements drawn in; None without a target."""
+    if target is None:
         yield None
         return
-    with PictureOutput(place, camera.rate, replace) as out:
+    with PictureOutput(target, camera.rate, replace) as out:
 
         def draw(picture: Picture, logged: LoggedPicture) -> None:
             found = logged.observation
@@ -283,7 +283,7 @@ def _opened(
     unused: dict[str, str],
     listener: Listener,
 ) -> tuple[Iterable[Picture], int | None]:
-    """The images of a source, and how many there are where that is known."""
+    """The images of a source, and their number if known."""
     if source == SYNTHETIC:
         if plan is None or scene is None:
             raise BadInput(
@@ -291,8 +291,8 @@ def _opened(
                 where=f"track, camera {camera.name!r}",
                 next_step="pass --plan plan.json",
             )
-        looks = _poses_in_time(rig, camera, plan)
-        return _rendered(rig, scene, camera, looks), len(looks)
+        timed_poses = _poses_in_time(rig, camera, plan)
+        return _rendered(rig, scene, camera, timed_poses), len(timed_poses)
     path = Path(source)
     if path.is_dir():
 
@@ -310,7 +310,7 @@ def _opened(
 
 
 def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Pose]]:
-    """Times and poses at which the synthetic camera takes images: those of a run of the plan."""
+    """Times and poses of the synthetic camera's images along a run of the plan."""
     require_same_rig(plan, rig, f"plan for {plan.rig.name}")
     table = prepare(verify(plan, rig), rig).checked.table
     poses = table.poses()
@@ -319,8 +319,8 @@ def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Po
 
 
 def _rendered(
-    rig: Rig, scene: Scene, camera: Camera, looks: list[tuple[float, Pose]]
+    rig: Rig, scene: Scene, camera: Camera, timed_poses: list[tuple[float, Pose]]
 ) -> Iterable[Picture]:
-    film = ImageSequence(make_synthetic_camera(rig, scene, camera))
-    for number, (at, pose) in enumerate(looks):
+    film = Film(make_synthetic_camera(rig, scene, camera))
+    for number, (at, pose) in enumerate(timed_poses):
         yield Frame(at, film.picture(at, pose, number), f"rendered {number}")

@@ -1,4 +1,4 @@
-"""Moves winches without a path: what homing and jogging one cable have in common."""
+"""Winch motion without a path: common part of homing and jogging one cable."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from drivers.drive_group import CycleStatus
 from executor.control.winch_loop import LawMotion, MakeLaw, WinchesHere, WinchMover
-from executor.control.winch_motion import WinchesStand, WinchRecord, move_winches, recording
-from executor.drives import is_simulated, left_alone, unreferenced_drives_of
+from executor.control.winch_motion import WinchRecord, WinchResult, move_winches, recording
+from executor.drives import abandoned_drives_fault, is_simulated, unreferenced_drives_of
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.kernels import ready_for_simulating_process
@@ -32,32 +32,31 @@ from model.rig import Rig
 if TYPE_CHECKING:
     from simulation.ground_truth import PowerLoss
 
-#: Where the limit lies between the smallest and the largest tension, unless one is named.
+#: Default tension limit, as a share of the range from smallest to largest tension.
 LIMIT_SHARE = 0.6
-#: Events of every motion, and one for the report of a defect alone.
-_OF_COURSE = frozenset({"enabled", "moving", "held", "traceback"})
+#: Events that are not reported: those of every motion, and one for defect reports.
+_ROUTINE = frozenset({"enabled", "moving", "held", "traceback"})
 
-AtRest = Callable[[WinchesStand, Pose | None, RequestBoard], HomingReference | None]
-"""Called after a motion that finished, with where the simulated platform is and where a stop
-is wished; the drives must have held all the while before the reference that it makes is kept."""
+AtRest = Callable[[WinchResult, Pose | None, RequestBoard], HomingReference | None]
+"""Called after a finished motion with its result, the simulated platform's pose and the requests;
+the reference it returns is kept if the drives held throughout."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class WinchMotion:
-    """A motion that is wished for.
+    """A requested winch motion.
 
     Attributes:
         rig: The robot and its bus.
-        pose: Where its platform is about, ``world_from_platform``.
+        pose: Approximate pose of its platform, ``world_from_platform``.
         limit: Largest tension, [N].
         speed: Fastest winch, [m/s].
-        make_law: From the rig as its drives count, limited, and where they stand, [counts]; it can
-            be sent to another process.
-        lost_power: What became of drives that are simulated in this process.
+        make_law: See `MakeLaw`; picklable.
+        lost_power: Effect of a power loss on simulated drives.
         realtime: False for simulated time.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         rehome: The drives are referenced again afterwards.
-        name: Of the folder below ``runs`` where a motion on a bus is on record.
+        name: Of the record folder in ``runs`` of a motion on a bus.
         listener: Receives progress.
         supervisor: Turns interrupts into stops.
     """
@@ -80,7 +79,7 @@ def limit_of(rig: Rig, limit: float | None) -> float:
     """The largest tension of a motion, [N]; None for `LIMIT_SHARE` of the rig's range.
 
     Raises:
-        Refused: It is more than the rig's own, or nothing.
+        Refused: It is outside the rig's range.
     """
     if limit is None:
         return rig.min_tension + LIMIT_SHARE * (rig.max_tension - rig.min_tension)
@@ -95,18 +94,18 @@ def limit_of(rig: Rig, limit: float | None) -> float:
     return limit
 
 
-def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchesStand:
-    """Moves, in a process of its own or in simulated time; in the end drives hold by themselves.
+def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchResult:
+    """Moves, in the real-time process or in simulated time; ends with the drives holding.
 
     Args:
-        motion: What is wished.
+        motion: The motion.
         at_rest: See `AtRest`.
 
     Raises:
         Fault: It ended with a fault, which is latched; with its cause.
         StoppedByOperator: The operator stopped it.
         KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
-        CdprError: Nothing was enabled, for the reason given.
+        CdprError: Nothing was enabled.
     """
     return with_board(
         motion.rig,
@@ -119,17 +118,17 @@ def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchesStand:
 def with_board(
     rig: Rig,
     supervisor: Supervisor,
-    move: Callable[[LocalRequests | SharedRequests], WinchesStand],
+    move: Callable[[LocalRequests | SharedRequests], WinchResult],
     *,
     realtime: bool,
-) -> WinchesStand:
-    """Moves with a board of wishes that the supervisor can write to.
+) -> WinchResult:
+    """Moves with a board of requests that the supervisor can write to.
 
     Args:
         rig: The robot.
         supervisor: Turns interrupts into stops.
-        move: Moves until the drives hold by themselves.
-        realtime: The board is shared with another process.
+        move: Moves until the drives hold on their own.
+        realtime: Whether the board is shared with another process.
 
     Raises:
         Fault: It ended with a fault, which is latched; with its cause.
@@ -138,52 +137,52 @@ def with_board(
     """
     board = SharedRequests() if realtime else LocalRequests()
     try:
-        stand = supervisor.during(board, lambda: move(board))
+        result = supervisor.during(board, lambda: move(board))
     finally:
         if isinstance(board, SharedRequests):
             board.close()
-    if stand.state in (State.STOPPED, State.FINISHED):
+    if result.state in (State.STOPPED, State.FINISHED):
         supervisor.finish()
-    if stand.state is State.STOPPED:
+    if result.state is State.STOPPED:
         raise StoppedByOperator("stopped; the drives hold", next_step="start again when ready")
-    if stand.state is not State.FINISHED:
+    if result.state is not State.FINISHED:
         raise Fault(
-            stand.cause,
+            result.cause,
             where="winches",
             why="the motion was stopped, all drives together; `cdpr status RIG` shows which hold",
             next_step="find the cause; simulated drives start fresh"
             if is_simulated(rig)
-            else "find the cause and look at the platform, then `cdpr reset RIG`",
+            else "find the cause and check the platform, then run `cdpr reset RIG`",
         )
-    return stand
+    return result
 
 
 def _supervised(
     motion: WinchMotion, board: LocalRequests | SharedRequests, at_rest: AtRest
-) -> WinchesStand:
-    """`cdpr stop` and its like reach the motion all the time."""
+) -> WinchResult:
+    """Moves while the command socket accepts requests such as `cdpr stop`."""
     rig, interlock = motion.rig, MotionInterlock(motion.rig)
     status = WinchStatus(rig, board, simulated_time=not motion.realtime)
     with ExitStack() as stack:
         listeners = stack.enter_context(advertised())
         stack.enter_context(serving(listeners, board, status))
         mover = stack.enter_context(_mover(motion, board))
-        kept = stack.enter_context(
+        log = stack.enter_context(
             nullcontext() if is_simulated(rig) else recording(free_folder(motion.name))
         )
-        status.folder = None if kept is None else kept.folder
+        status.folder = None if log is None else log.folder
         advance = stack.enter_context(motion.listener.progress("moving, %", 100.0))
-        stand = move_winches(
+        result = move_winches(
             mover,
             rig,
             interlock,
-            _EventSink(status, kept, advance, motion.listener),
-            record=kept.folder if kept is not None else interlock.file.path,
+            _EventSink(status, log, advance, motion.listener),
+            record=log.folder if log is not None else interlock.file.path,
             rehome=motion.rehome,
-            at_rest=lambda stand, true_pose: at_rest(stand, true_pose, board),
+            at_rest=lambda result, true_pose: at_rest(result, true_pose, board),
         )
-        status.take_end(stand.state, stand.cause)
-    return stand
+        status.take_end(result.state, result.cause)
+    return result
 
 
 def _mover(
@@ -212,14 +211,14 @@ def winch_mover(
     need_real_time_rights: bool,
     listener: Listener,
 ) -> Iterator[WinchMover]:
-    """What moves winches: in real time the drives are opened and moved in a process of its own.
+    """Makes the mover of winches: the real-time process, or this one in simulated time.
 
     Args:
         rig: The robot and its bus.
-        task: What is done with the drives.
+        task: For the drives.
         make_drives: Opens them; takes a `listener` where it is called in this process.
         board: Of operator requests.
-        clock: In simulated time.
+        clock: For simulated time.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         listener: Receives progress.
     """
@@ -235,7 +234,7 @@ def winch_mover(
         make_drives,
         board,
         need_real_time=need_real_time_rights and not simulated,
-        look_again=partial(left_alone, rig.document),
+        check_drives=partial(abandoned_drives_fault, rig.document),
         listener=listener,
     ) as process:
         yield process
@@ -243,10 +242,10 @@ def winch_mover(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _EventSink:
-    """Forwards what happens to the status, the listener and the record."""
+    """Forwards cycles and events to the status, the listener and the record."""
 
     status: WinchStatus
-    kept: WinchRecord | None
+    log: WinchRecord | None
     advance: Advance
     listener: Listener
 
@@ -254,75 +253,75 @@ class _EventSink:
         self.status.take_cycle(record)
         if record.cycle % 10 == 0:
             self.advance(record.index)
-        if self.kept is not None:
-            self.kept.take_cycle(record)
+        if self.log is not None:
+            self.log.take_cycle(record)
 
     def take_event(self, event: LoopEvent) -> None:
         self.status.take_event(event)
         if event.code == "no_real_time":
             self.listener.remark(event.text)
-        elif event.code not in _OF_COURSE:
+        elif event.code not in _ROUTINE:
             self.listener.note(f"{event.code}: {event.text}")
-        if self.kept is not None:  # last: what a full disk does not take is told all the same
-            self.kept.take_event(event)
+        if self.log is not None:  # last: a full disk must not prevent the report
+            self.log.take_event(event)
 
 
-# Release and reset of drives in the real-time process: what they mean for latch and reference.
+# Release and reset of drives in the real-time process, with their effect on latch and reference.
 
 
-#: By what the reference is lost where no brake holds the drums.
+#: Why the reference is lost where no brake holds the drums.
 _RELEASED = "the drives were released by the operator, and no brake holds the cables"
 _CUT_SHORT = Ended(State.LATCHED, "the program was terminated", holding=False, true_pose=None)
 
 
 class Unrecorded:
-    """Keeps no record of cycles in which nothing moves; see `executor.realtime.job.Records`."""
+    """Discards records of cycles without motion; see `executor.realtime.job.Records`."""
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
-        """Nothing is kept."""
+        """Discards it."""
 
     def take_event(self, event: LoopEvent) -> None:
-        """Nothing is kept."""
+        """Discards it."""
 
 
 def is_braked(rig: Rig) -> bool:
-    """Every winch has a brake that closes when its drive is released."""
+    """Whether every winch has a brake that closes when its drive is released."""
     return all(winch.brake for winch in rig.winches)
 
 
 def release_drives(
     rig: Rig, interlock: MotionInterlock, process: RealTimeProcess, on_armed: Callable[[str], None]
 ) -> CycleStatus:
-    """Takes the torque off; what becomes of the bus and the reference is kept.
+    """Switches off the torque, and updates latch and reference.
 
     Args:
         rig: The robot.
         interlock: Of that rig.
         process: For `executor.control.standstill.Release`.
-        on_armed: Called when all is ready, with what the system did not grant.
+        on_armed: Called when armed, with what the system denied.
 
     Returns:
-        The drives' last word, without torque.
+        The drives' last status, without torque.
 
     Raises:
-        StoppedByOperator: The operator stopped it.
-        CdprError: They could not be set up, or were not released; then a fault is latched.
+        StoppedByOperator: Stopped by the operator.
+        CdprError: They could not be configured, or were not released; then a fault is latched.
     """
     record = interlock.file.path.parent
     armed = process.arm(Unrecorded())
     on_armed(armed.denied)
-    interlock.begin(record, interlock.still_counts(armed.stands_at))
+    interlock.begin(record, interlock.still_counts(armed.positions))
     ended = _CUT_SHORT
     try:
         ended = process.run()
-        left = process.stands_now() if ended.state is State.FINISHED else None
+        left = process.read_status() if ended.state is State.FINISHED else None
     except BaseException:
         ended = _CUT_SHORT
         raise
     finally:
         if ended.state is not State.FINISHED:
             cause = f"while releasing the drives: {ended.cause}"
-            interlock.end(State.LATCHED, cause, record, holding=False, stands_at=None)
+            interlock.end(State.LATCHED, cause, record, holding=False, positions=None)
     if left is None:
         raise ended.error or Fault(ended.cause, where="release")
     interlock.end(
@@ -330,19 +329,19 @@ def release_drives(
         "",
         record,
         holding=is_braked(rig),
-        stands_at=left.positions.tolist(),
-        let_go=_RELEASED,
+        positions=left.positions.tolist(),
+        release_reason=_RELEASED,
     )
     return left
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivesReset:
-    """How drives are after a reset.
+    """State of drives after a reset.
 
     Attributes:
-        left: Their last word.
-        restarted: Nodes that were found without their set-up.
+        left: Their last status.
+        restarted: Nodes found without their configuration.
     """
 
     left: CycleStatus
@@ -352,8 +351,8 @@ class DrivesReset:
 def reset_drives(interlock: MotionInterlock, process: RealTimeProcess) -> DrivesReset:
     """Resets drives in fault; those that hold keep holding.
 
-    Where all held all the while, as after a program that was killed, their reference still counts
-    from where they are.
+    If all held throughout, as after a program was killed, their reference remains valid at their
+    present positions.
 
     Args:
         interlock: Of their rig.
@@ -366,7 +365,7 @@ def reset_drives(interlock: MotionInterlock, process: RealTimeProcess) -> Drives
     ended = process.run()
     if ended.state is not State.FINISHED:
         raise ended.error or Fault(ended.cause, where="reset")
-    left = process.stands_now()
+    left = process.read_status()
     if ended.holding and not armed.restarted:
         interlock.confirm_held(left.positions.tolist())
     return DrivesReset(left, armed.restarted)

@@ -1,1 +1,1 @@
-"""Cameras during a run, each in a process of its own."""
+"""Cameras of a run, each in its own process."""

@@ -1,4 +1,4 @@
-"""One camera of a run: what was asked of it, what came back, how it does."""
+"""Client of one camera of a run: requests, samples, health."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from executor.cameras.process import CameraProcess, CameraSample, FrameRequest, unseen
+from executor.cameras.process import CameraProcess, CameraSample, FrameRequest, sample_without_pose
 from executor.recording.record_files import CameraRecord
 from model.errors import CdprError, Fault, Refused
 from model.kinematics import structure_matrix
@@ -18,77 +18,76 @@ from model.rig import Rig
 from tracking.measurement import Observation, PoseMeasurement
 from tracking.track import FrameRate
 
-# Whether a camera measures the platform now, or has lost it.
+# Health of a camera: whether it still measures the platform.
 
 
-#: This many images in a row without a pose mean that the camera looks elsewhere or the light is
-#: gone.
-BLIND_PICTURES = 10
-#: A camera that answers nothing for so long hangs, [s].
+#: Consecutive images without a pose after which the camera is misaligned or the light is off.
+BLIND_IMAGES = 10
+#: A camera without an answer for this long counts as hung, [s].
 SILENCE = 2.0
 
 
 class CameraHealth:
-    """Knows what was asked of a camera, and what came back."""
+    """Judges a camera by its requests and answers."""
 
     def __init__(self) -> None:
-        """Nothing was asked for yet."""
+        """Starts without requests."""
         self._asked: float | None = None
         self._blind = 0
 
     def ask(self, at: float) -> None:
-        """An image was asked for, at this time, [s]."""
+        """Takes the time of a request, [s]."""
         self._asked = at
 
     def answer(self, seen: bool) -> None:
-        """That image is measured.
+        """Takes an answer.
 
         Args:
-            seen: It gave a pose.
+            seen: Whether the image gave a pose.
         """
         self._asked, self._blind = None, 0 if seen else self._blind + 1
 
     def trouble(self, now: float) -> str:
-        """Why no pose is measured any more, as what the camera does; nothing while all is well.
+        """Why no pose is measured, as a predicate of the camera; empty if healthy.
 
         Args:
             now: On the clock of `ask`, [s].
         """
         if self._asked is not None and now - self._asked > SILENCE:
             return f"did not answer for {SILENCE:g} s"
-        if self._blind >= BLIND_PICTURES:
+        if self._blind >= BLIND_IMAGES:
             return (
-                f"gave no pose in {BLIND_PICTURES} images in a row (is it where the rig file"
+                f"gave no pose in {BLIND_IMAGES} images in a row (is it where the rig file"
                 " says, are tags in view and lit?)"
             )
         return ""
 
 
 class CameraClient:
-    """Asks one camera for images and keeps its answers."""
+    """Requests images from one camera and stores its samples."""
 
     def __init__(self, process: CameraProcess, source: str, live_image: int | None = None) -> None:
-        """Nothing was asked for yet.
+        """Starts without requests.
 
         Args:
             process: Takes and measures the images.
-            source: Where they come from, for messages.
+            source: Of the images, for messages.
             live_image: Descriptor of the memory of `executor.cameras.live_image`; None for none.
         """
         self._live_image = live_image
         self.name, self.source = process.name, source
-        self.looks: list[CameraSample] = []
-        """Its answers, in order."""
+        self.samples: list[CameraSample] = []
+        """Its samples, in order."""
         self.failed: CdprError | None = None
-        """Why there will be no more of them."""
+        """Why there will be no more samples; None while there may be."""
         self.dropped = 0
-        """Images that were due while it was busy."""
+        """Number of images due while it was busy."""
         self._poses = 0
         self._process = process
-        self._sight, self._pace = CameraHealth(), FrameRate()
+        self._health, self._pace = CameraHealth(), FrameRate()
 
     def ask(self, trigger: FrameRequest) -> bool:
-        """Asks for an image unless it is busy or gone; returns whether it did."""
+        """Requests an image unless the camera is busy or failed; returns whether it did."""
         if self.failed is not None:
             return False
         if self._process.unanswered is not None:
@@ -97,58 +96,58 @@ class CameraClient:
         self._try(lambda: self._process.ask(trigger))
         if self.failed is not None:
             return False
-        self._sight.ask(trigger.asked)
+        self._health.ask(trigger.asked)
         return True
 
     def collect(self) -> CameraSample | None:
-        """Its newest answer, if it is there."""
+        """Its next sample, if it has arrived."""
         return self._taken(self._process.answer)
 
     @property
     def busy(self) -> bool:
-        """It was asked, and may still answer."""
+        """Whether an answer may still arrive."""
         return self.failed is None and self._process.unanswered is not None
 
     def wait(self, patience: float) -> CameraSample | None:
-        """Its answer, waited for so long, [s]."""
+        """Its next sample, waited for up to ``patience`` [s]."""
         return self._taken(lambda: self._process.answer_within(patience))
 
     def finish(self) -> CameraSample | None:
-        """What is said in place of an answer that never came; None when there is nothing to say."""
+        """A sample without a pose for an unanswered request; None without one."""
         unanswered = self._process.unanswered
         if unanswered is None:
             return None
         if self.failed is None:
             self.failed = CdprError(f"no answer since {unanswered.time:.2f} s")
-        look = unseen(unanswered.frame, unanswered.time, self.failed.what)
-        self.looks.append(look)
-        return look
+        sample = sample_without_pose(unanswered.frame, unanswered.time, self.failed.what)
+        self.samples.append(sample)
+        return sample
 
     def trouble(self, now: float) -> str:
-        """What keeps it from measuring, as what it does; nothing while all is well."""
+        """Why it does not measure, as a predicate; empty if healthy."""
         if self.failed is not None:
             return f"failed ({self.failed.what})"
-        return self._sight.trouble(now)
+        return self._health.trouble(now)
 
     def record(self) -> CameraRecord:
-        """What became of its images."""
+        """Statistics of its images."""
         return CameraRecord(
             self.name,
             self.source,
-            len(self.looks),
+            len(self.samples),
             self._poses,
             self.dropped,
-            _median_ms(self.looks),
+            _median_ms(self.samples),
             self.failed.what if self.failed is not None else "",
         )
 
     def as_dict(self, now: float) -> dict[str, Any]:
-        """How it does at the moment; see `executor.remote.status`."""
-        found = self.looks[-1].found if self.looks else None
+        """Its present state; see `executor.remote.status`."""
+        found = self.samples[-1].found if self.samples else None
         return {
             "name": self.name,
             "source": self.source,
-            "pictures": len(self.looks),
+            "pictures": len(self.samples),
             "poses": self._poses,
             "dropped": self.dropped,
             "pictures_per_second": self._pace.pictures_per_second,
@@ -159,21 +158,21 @@ class CameraClient:
         }
 
     def _taken(self, answer: Callable[[], CameraSample | None]) -> CameraSample | None:
-        look: CameraSample | None = None
+        sample: CameraSample | None = None
 
         def take() -> None:
-            nonlocal look
-            look = answer()
+            nonlocal sample
+            sample = answer()
 
         if self.failed is None:
             self._try(take)
-        if look is not None:
-            seen = isinstance(look.found, PoseMeasurement)
-            self.looks.append(look)
-            self._pace.take(look.found.time, look.seconds)
-            self._sight.answer(seen)
+        if sample is not None:
+            seen = isinstance(sample.found, PoseMeasurement)
+            self.samples.append(sample)
+            self._pace.take(sample.found.time, sample.seconds)
+            self._health.answer(seen)
             self._poses += seen
-        return look
+        return sample
 
     def _try(self, act: Callable[[], None]) -> None:
         try:
@@ -182,36 +181,34 @@ class CameraClient:
             self.failed = error
 
 
-def _median_ms(looks: list[CameraSample]) -> float | None:
-    seconds = [look.seconds for look in looks if np.isfinite(look.seconds)]
+def _median_ms(samples: list[CameraSample]) -> float | None:
+    seconds = [sample.seconds for sample in samples if np.isfinite(sample.seconds)]
     return round(float(np.median(seconds)) * 1e3, 2) if seconds else None
 
 
-# Waiting until cameras are open, which takes a while, and may be stopped meanwhile.
+# Opening of cameras, which takes a while and may be stopped.
 
 
-#: How long processes may take to import their libraries, to compile what finds tags' edges (once on
-#: a machine) and to open their cameras, all together, [s].
+#: Time for all processes to import their libraries, compile the tag edge detector (once on a
+#: machine) and open their cameras, [s].
 START_TIMEOUT = 180.0
-#: How long a wish to stop may wait to be heard, [s].
+#: Largest delay of a stop request, [s].
 HEARING = 0.1
 
 
-def wait_until_ready(
-    processes: Sequence[CameraProcess], unless_stopped: Callable[[], None]
-) -> None:
-    """Waits until all cameras are open; the first one that fails ends it.
+def wait_until_ready(processes: Sequence[CameraProcess], check_stop: Callable[[], None]) -> None:
+    """Waits until all cameras are open; the first failure ends it.
 
     Args:
-        processes: They open their cameras at the same time.
-        unless_stopped: Asked again and again; what it raises ends the waiting.
+        processes: Open their cameras at the same time.
+        check_stop: Called repeatedly; an exception ends the wait.
 
     Raises:
-        CdprError: A camera cannot be used, for the reason given.
+        CdprError: A camera cannot be used.
     """
     waiting, latest = list(processes), time.monotonic() + START_TIMEOUT
     while waiting:
-        unless_stopped()
+        check_stop()
         step = HEARING / len(waiting)
         waiting = [process for process in waiting if not process.is_ready(step)]
         if waiting and time.monotonic() > latest:
@@ -224,12 +221,12 @@ def wait_until_ready(
             )
 
 
-# Where a platform at rest is, from several images of it.
+# Pose of a platform at rest, from several images.
 
 
 #: At least this share of the images must give a pose.
 SEEN_SHARE = 0.8
-#: The platform moves, or the light flickers, when poses scatter by more, [m].
+#: Largest scatter of poses; more means a moving platform or flickering light, [m].
 MOST_SCATTER = 0.5e-3
 
 
@@ -240,8 +237,8 @@ class RestPose:
     Attributes:
         pose: ``world_from_platform``.
         uncertainty: Of the position along its worst direction, standard deviation, [m].
-        length_uncertainty: Of the cable length known worst, [m].
-        pictures: How many gave a pose.
+        length_uncertainty: Largest of the cable lengths, standard deviation, [m].
+        pictures: Number of images with a pose.
     """
 
     pose: Pose
@@ -250,26 +247,26 @@ class RestPose:
     pictures: int
 
 
-def static_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
-    """The pose in which the platform stood still in all images.
+def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
+    """The pose of a platform at rest, as the mean over its images.
 
-    What is wrong with one image is wrong with all, so the mean is not more certain than each.
+    Systematic errors are the same in all images, so the mean is not more certain than each.
 
     Raises:
-        Refused: Too few images show it, it did not stand still, or it is not known well enough
-            for a run to start: to half the rig's start tolerance, in cable length.
+        Refused: Too few images give a pose, the platform was not at rest, or the uncertainty of a
+            cable length exceeds half the rig's start tolerance.
     """
-    found = [look for look in looks if isinstance(look, PoseMeasurement)]
-    if not found or len(found) < SEEN_SHARE * len(looks):
-        reasons = {getattr(look, "reason", "") for look in looks} - {""}
+    found = [sample for sample in samples if isinstance(sample, PoseMeasurement)]
+    if not found or len(found) < SEEN_SHARE * len(samples):
+        reasons = {getattr(sample, "reason", "") for sample in samples} - {""}
         raise _refusal(
-            f"{len(found)} of {len(looks)} images give a platform pose",
+            f"{len(found)} of {len(samples)} images give a platform pose",
             "; ".join(sorted(reasons)),
         )
     first = found[0].pose
-    positions = np.array([look.pose.position for look in found])
+    positions = np.array([sample.pose.position for sample in found])
     turns = np.array(
-        [rotation_vector_from_matrix(look.pose.rotation @ first.rotation.T) for look in found]
+        [rotation_vector_from_matrix(sample.pose.rotation @ first.rotation.T) for sample in found]
     )
     scatter = float(np.max(np.std(positions, axis=0)))
     if not scatter <= MOST_SCATTER:
@@ -278,9 +275,9 @@ def static_pose(rig: Rig, looks: Sequence[Observation]) -> RestPose:
             f" limit {MOST_SCATTER * 1000:g} mm",
             "it swings, or the light flickers",
         )
-    turned = matrix_from_rotation_vector(turns.mean(axis=0))
-    pose = Pose(positions.mean(axis=0), turned @ first.rotation)
-    covariance = np.mean([look.covariance for look in found], axis=0)
+    rotation = matrix_from_rotation_vector(turns.mean(axis=0))
+    pose = Pose(positions.mean(axis=0), rotation @ first.rotation)
+    covariance = np.mean([sample.covariance for sample in found], axis=0)
     columns = structure_matrix(rig, pose)
     lengths = float(np.sqrt(np.max(np.einsum("im,ij,jm->m", columns, covariance, columns))))
     allowed = rig.motion.start_tolerance / 2.0
@@ -304,51 +301,48 @@ def _refusal(what: str, why: str) -> Refused:
     )
 
 
-# Images of a platform that stands still, and an operator who may end the looking at any time.
+# Images of a platform at rest; the operator may stop at any time.
 
 
-#: An image that has not come after so long will not come, [s].
+#: Time-out of an image, [s].
 PATIENCE = 20.0
 
 
-def looks_at_rest(
+def samples_at_rest(
     process: CameraProcess,
     pictures: int,
     period: float | None,
     true_pose: Pose | None,
-    unless_stopped: Callable[[], None],
+    check_stop: Callable[[], None],
 ) -> list[Observation]:
-    """What a camera measures in some images, one after another.
+    """Measurements of consecutive images.
 
     Args:
         process: Of the camera, which is open.
-        pictures: How many.
-        period: Between images in simulated time, [s]; None where a real camera takes them.
-        true_pose: Where the simulated platform is.
-        unless_stopped: Called before each image and while one is waited for; what it raises ends
-            the looking.
+        pictures: Number of images.
+        period: Of images in simulated time, [s]; None for a real camera.
+        true_pose: Of the simulated platform.
+        check_stop: Called before each image and while waiting; an exception ends it.
 
     Raises:
-        CdprError: The camera failed, for the reason given.
+        CdprError: The camera failed.
     """
-    began, looks = time.monotonic(), []
+    began, samples = time.monotonic(), []
     for frame in range(pictures):
-        unless_stopped()
+        check_stop()
         asked = time.monotonic()
         since = asked - began if period is None else frame * period
         process.ask(FrameRequest(frame, since, asked, true_pose))
-        looks.append(_answer(process, asked + PATIENCE, unless_stopped))
-    return looks
+        samples.append(_answer(process, asked + PATIENCE, check_stop))
+    return samples
 
 
-def _answer(
-    process: CameraProcess, latest: float, unless_stopped: Callable[[], None]
-) -> Observation:
+def _answer(process: CameraProcess, latest: float, check_stop: Callable[[], None]) -> Observation:
     while True:
-        look = process.answer_within(HEARING)
-        if look is not None:
-            return look.found
-        unless_stopped()
+        sample = process.answer_within(HEARING)
+        if sample is not None:
+            return sample.found
+        check_stop()
         if time.monotonic() > latest:
             raise Fault(
                 f"the camera delivered no image for {PATIENCE:g} s",

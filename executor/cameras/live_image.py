@@ -1,8 +1,8 @@
-"""The newest image of a camera, for programs that look on while it measures.
+"""The newest image of a camera, for viewer programs while it measures.
 
-It is in memory that the camera's process writes and never waits for: who looks on says so there,
-copies what is whole, and misses the rest. The memory has no name; who knows the process and its
-descriptor opens it (`ImageReader`), which the system allows the same user and root alone.
+The camera's process writes it to shared memory without waiting: viewers announce themselves there,
+copy complete images, and miss others. The memory has no name; a viewer opens it by process and
+descriptor (`ImageReader`), which the system allows only the same user and root.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from model.pose import Pose
 from model.rig import Camera
 from tracking.measurement import NoPose, Observation, PoseMeasurement
 
-#: An image is shown this long after the one before at the earliest, [s]; the others are left out.
+#: Shortest interval of shown images, [s]; images in between are skipped.
 SHOWN_EVERY = 0.2
-#: Images are shown as long as somebody looked within this, [s].
-LOOKED_WITHIN = 1.0
+#: Images are shown while a viewer has read within this time, [s].
+VIEWER_TIMEOUT = 1.0
 
 _SIGN = b"cdpr-img"
-#: Sign, number of the write (odd while it goes on), last look [s], frame, height, width, note.
+#: Signature, write count (odd during a write), last read [s], frame, height, width, note length.
 _HEAD = struct.Struct("<8sQdQIII")
 _WRITES, _LOOKED = 8, 16
 _NUMBER, _MOMENT = struct.Struct("<Q"), struct.Struct("<d")
-#: Of the note about what was measured, [bytes].
+#: Size of the note with the measurement, [bytes].
 _NOTE = 2048
 _PIXELS = _HEAD.size + _NOTE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveImage:
-    """One image, and what was measured in it.
+    """One image and its measurement.
 
     Attributes:
-        frame: Number of the moment.
+        frame: Frame number.
         image: Grey, shape (height, width).
         found: The pose without its covariance, or why there is none.
     """
@@ -62,19 +62,19 @@ def memory_for(camera: Camera) -> SharedMemory:
 
 
 class ImageBoard:
-    """The side of the camera's process: shows an image now and then, while somebody looks."""
+    """The camera process's side: shows images at a low rate while there is a viewer."""
 
     def __init__(self, memory: SharedMemory) -> None:
-        """Over memory of `memory_for`."""
+        """Uses memory of `memory_for`."""
         self._view = memory.view
         self._pixels = np.frombuffer(memory.view, np.uint8, offset=_PIXELS)
         self._shown, self._writes = float("-inf"), 0
 
     def show(self, frame: int, image: NDArray[np.uint8], found: Observation) -> bool:
-        """Shows an image if one is due and looked for; whether it did."""
+        """Shows an image if one is due and there is a viewer; returns whether it did."""
         now = time.monotonic()
         (looked,) = _MOMENT.unpack_from(self._view, _LOOKED)
-        if now - looked > LOOKED_WITHIN or now - self._shown < SHOWN_EVERY:
+        if now - looked > VIEWER_TIMEOUT or now - self._shown < SHOWN_EVERY:
             return False
         note = json.dumps(_noted(found)).encode()
         if image.size > self._pixels.size or len(note) > _NOTE:
@@ -103,17 +103,17 @@ def _noted(found: Observation) -> dict[str, Any]:
 
 
 class ImageReader:
-    """The side of who looks on, in another process."""
+    """The viewer's side, in another process."""
 
     def __init__(self, process: int, descriptor: int) -> None:
         """Opens the memory of a process.
 
         Args:
-            process: Its number.
+            process: Its ID.
             descriptor: Of the memory there; see ``live_image`` in `executor.remote.status`.
 
         Raises:
-            OSError: It is not there any more, or is something else.
+            OSError: It does not exist any more, or is not such memory.
         """
         path = f"/proc/{int(process)}/fd/{int(descriptor)}"
         opened = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -130,11 +130,11 @@ class ImageReader:
         self._seen = 0
 
     def close(self) -> None:
-        """Lets go of the memory."""
+        """Closes the memory."""
         self._view.close()
 
     def newest(self) -> LiveImage | None:
-        """The newest image; None where it was read before, or is being written."""
+        """The newest image; None if already read, or being written."""
         _MOMENT.pack_into(self._view, _LOOKED, time.monotonic())
         _, writes, _, frame, height, width, length = _HEAD.unpack_from(self._view)
         if writes == self._seen or writes % 2:

@@ -1,4 +1,4 @@
-"""The cameras of a run: asked at the same moments, and measured together as `cdpr track` does."""
+"""The cameras of a run: requested simultaneously, and fused as in `cdpr track`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from executor.cameras.client import BLIND_PICTURES, CameraClient
-from executor.cameras.process import CameraSample, FrameRequest, unseen
+from executor.cameras.client import BLIND_IMAGES, CameraClient
+from executor.cameras.process import CameraSample, FrameRequest, sample_without_pose
 from executor.recording.record_files import CameraRecord
 from executor.remote.status import RunStatus
 from executor.supervision import RequestBoard, StopReason
@@ -18,29 +18,29 @@ from tracking.clearance import INTERVAL, MeasuredClearance, clearance_of
 from tracking.fusion import MultiCameraFusion
 from tracking.measurement import PoseMeasurement, rates
 
-# Watches measured clearance, image by image, for one whose upper bound is below the limit.
+# Monitoring of measured clearance: its upper bound against the limit.
 
 
-#: This many images in a row must show too little clearance before the run is stopped for it.
-NEAR_PICTURES = 2
+#: Consecutive images with too small a clearance that stop the run.
+NEAR_IMAGES = 2
 
 
 class ClearanceMonitor:
     """Detects clearance below a limit in the last images, beyond their uncertainty.
 
-    One image alone may be wrong for a reason that its covariance does not know.
+    A single image may have an error that its covariance does not include.
     """
 
     def __init__(self, limit: float) -> None:
-        """Begins without an image.
+        """Starts without an image.
 
         Args:
-            limit: Clearance that the scene asks for, [m].
+            limit: Clearance required by the scene, [m].
         """
         self._limit, self._pictures = limit, 0
 
     def take(self, clearance: MeasuredClearance | None) -> str:
-        """What is too near, with numbers, when the last images say so; else nothing.
+        """The pair below the limit, with values, if the last images agree; else empty.
 
         Args:
             clearance: Of the newest image with a pose; None in a scene without obstacles.
@@ -49,7 +49,7 @@ class ClearanceMonitor:
             self._pictures = 0
             return ""
         self._pictures += 1
-        if self._pictures < NEAR_PICTURES:
+        if self._pictures < NEAR_IMAGES:
             return ""
         at = clearance.worst_case_obstacle
         near, spread = clearance.nearest[at], float(clearance.uncertainties[at])
@@ -60,12 +60,12 @@ class ClearanceMonitor:
         )
 
 
-# What several cameras say of a moment together, and whether something is too near then.
+# Fusion of several cameras, and their clearance monitors.
 
 
 @dataclass(frozen=True, slots=True)
 class CameraNews:
-    """Something about a camera that the operator must know.
+    """A condition of a camera for the operator.
 
     Attributes:
         code: Of the event, such as ``camera`` or ``camera_sees_nothing``.
@@ -77,40 +77,40 @@ class CameraNews:
 
 
 class MultiCameraMonitor:
-    """Makes one look of those of all cameras, moment after moment."""
+    """Fuses the samples of all cameras, frame by frame."""
 
     def __init__(
         self, names: Sequence[str], model: ClearanceModel, limit: float, rate: float
     ) -> None:
-        """Nothing was seen yet.
+        """Starts without samples.
 
         Args:
             names: Of the cameras.
-            model: Where obstacles are.
-            limit: Clearance that the scene asks for, [m].
-            rate: Moments a second, [Hz].
+            model: Robot and obstacles.
+            limit: Clearance required by the scene, [m].
+            rate: Frame rate, [Hz].
         """
         self.near = ""
-        """Between what the measured clearance fell below the limit, with numbers; else nothing."""
+        """The pair whose measured clearance fell below the limit, with values; else empty."""
         self.news: list[CameraNews] = []
-        """Conditions that began since the reader cleared this."""
+        """New conditions since the reader cleared the list."""
         self._model, self._several = model, len(names) > 1
-        # Each camera has its own: where they disagree, the right one is unknown.
+        # One per camera: if cameras disagree, the correct one is unknown.
         self._watches = {name: ClearanceMonitor(limit) for name in names}
         self._within = 0.5 / rate
         self._common = MultiCameraFusion(self._within)
         self._moments = self._disagree = 0
 
-    def of(self, looks: Mapping[str, CameraSample]) -> CameraSample:
-        """The look of a moment.
+    def of(self, samples: Mapping[str, CameraSample]) -> CameraSample:
+        """The fused sample of a frame.
 
         Args:
-            looks: Of each camera that answered, by its name, in their order; not empty.
+            samples: Of each camera that answered, by its name, in their order; not empty.
         """
         self._moments += 1
-        frame = next(iter(looks.values())).frame
-        picture = next((look.picture for look in looks.values() if look.picture), "")
-        each = {name: look.found for name, look in looks.items()}
+        frame = next(iter(samples.values())).frame
+        picture = next((sample.picture for sample in samples.values() if sample.picture), "")
+        each = {name: sample.found for name, sample in samples.items()}
         found = self._common.of(each) if self._several else next(iter(each.values()))
         if isinstance(found, PoseMeasurement):
             self._count_disagreement("")
@@ -125,7 +125,7 @@ class MultiCameraMonitor:
         return CameraSample(frame, found, picture)
 
     def finish(self) -> None:
-        """Reports how often a camera was left out because its image was too far apart in time."""
+        """Reports how often images were left out because they were too far apart in time."""
         if self._common.apart:
             text = (
                 f"at {self._common.apart} of {self._moments} times not all cameras were used"
@@ -134,35 +134,35 @@ class MultiCameraMonitor:
             )
             self.news.append(CameraNews("pictures_dropped", text))
 
-    def _watch(self, name: str, clearance: MeasuredClearance | None, by_whom: str) -> None:
+    def _watch(self, name: str, clearance: MeasuredClearance | None, suffix: str) -> None:
         near = self._watches[name].take(clearance)
         if near and not self.near:
-            self.near = near + by_whom
+            self.near = near + suffix
 
     def _count_disagreement(self, reason: str) -> None:
         self._disagree = self._disagree + 1 if reason else 0
-        if self._disagree == BLIND_PICTURES:
+        if self._disagree == BLIND_IMAGES:
             text = (
-                f"{reason}, {BLIND_PICTURES} times in a row; fused clearance is not measured,"
+                f"{reason}, {BLIND_IMAGES} times in a row; fused clearance is not measured,"
                 " each camera monitors it alone"
             )
             self.news.append(CameraNews("camera_sees_nothing", text))
 
 
-#: At the end of a run the last images are waited for no longer than this, [s],
+#: Largest wait for the last images at the end of a run, [s].
 PATIENCE = 20.0
-#: and after a stop no longer than this, [s]; whether there is one is asked every so often, [s].
+#: The same after a stop, and the interval of checks for a stop, [s].
 HURRY, ROUND = 2.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraRecords:
-    """What the cameras of a run saw.
+    """Samples of the cameras of a run.
 
     Attributes:
-        together: A look a moment, from all cameras.
-        alone: Each camera's own looks by its name, where there are several.
-        cameras: What became of each.
+        together: Fused samples, one per frame.
+        alone: Samples of each camera by its name, if there are several.
+        cameras: Statistics of each camera.
     """
 
     together: Sequence[CameraSample] = ()
@@ -172,202 +172,210 @@ class CameraRecords:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FrameSet:
-    """What was asked at a moment, and whom; their answers by name."""
+    """A request to several cameras, and their answers by name."""
 
     trigger: FrameRequest
     asked: frozenset[str]
-    looks: dict[str, CameraSample] = field(default_factory=dict)
+    samples: dict[str, CameraSample] = field(default_factory=dict)
 
 
 class RunCameras:
     """All cameras of one run.
 
-    A moment is taken for what it is when all cameras that were asked have answered; one that takes
-    more than another period is not waited for where another has seen it.
+    A frame is complete when all requested cameras have answered, or one frame later with the
+    answers so far.
     """
 
     def __init__(
-        self, eyes: Sequence[CameraClient], model: ClearanceModel, limit: float, rate: float
+        self, clients: Sequence[CameraClient], model: ClearanceModel, limit: float, rate: float
     ) -> None:
-        """Nothing was asked for yet.
+        """Starts without requests.
 
         Args:
-            eyes: One or more cameras.
-            model: Where obstacles are.
-            limit: Clearance that the scene asks for, [m].
-            rate: Moments a second, [Hz].
+            clients: One or more cameras.
+            model: Robot and obstacles.
+            limit: Clearance required by the scene, [m].
+            rate: Frame rate, [Hz].
         """
-        self._eyes = eyes
-        self._common = MultiCameraMonitor([eye.name for eye in eyes], model, limit, rate)
+        self._clients = clients
+        self._common = MultiCameraMonitor([client.name for client in clients], model, limit, rate)
         self._frame, self._now = 0, 0.0
         self._open: list[_FrameSet] = []
         self._together: list[CameraSample] = []
         self.newest: tuple[PoseMeasurement, MeasuredClearance | None] | None = None
-        """The newest pose of all cameras together, and the clearance at it; None before one."""
-        self._told: dict[str, str] = {}
+        """The newest fused pose and its clearance; None at first."""
+        self._reported: dict[str, str] = {}
         self._news: list[CameraNews] = []
 
     @property
     def near(self) -> str:
-        """Between what the measured clearance fell below the limit, with numbers; else nothing."""
+        """The pair whose measured clearance fell below the limit, with values; else empty."""
         return self._common.near
 
     @property
     def all_failed(self) -> str:
-        """Why there is no camera any more, as a clause; nothing while there is one."""
-        failed = {eye.name: eye.failed.what for eye in self._eyes if eye.failed is not None}
-        if len(failed) < len(self._eyes):
+        """Why all cameras failed, as a clause; empty while one works."""
+        failed = {
+            client.name: client.failed.what for client in self._clients if client.failed is not None
+        }
+        if len(failed) < len(self._clients):
             return ""
         return "all cameras failed: " + "; ".join(f"{name}: {why}" for name, why in failed.items())
 
     def trigger(
-        self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
+        self, time: float, asked: float, true_pose: Pose | None, encoder_pose: Pose | None
     ) -> None:
-        """Takes in what the cameras have seen, and asks for an image of this moment.
+        """Collects samples, and requests an image of the present time.
 
         Args:
             time: Since the start of the run, [s].
-            asked: The same moment on the monotonic clock, [s].
-            true_pose: Where the simulated platform is; None with real cameras.
-            by_drives: Where the drives' positions put it; None when they are unknown.
+            asked: The same time on the monotonic clock, [s].
+            true_pose: Of the simulated platform; None with real cameras.
+            encoder_pose: Platform pose from the encoders; None if unknown.
         """
         self._now = asked
-        for eye in self._eyes:
-            self._put(eye, eye.collect())
-        self._judge()
-        trigger = FrameRequest(self._frame, time, asked, true_pose, by_drives)
-        whom = frozenset(eye.name for eye in self._eyes if eye.ask(trigger))
-        if whom:
-            self._open.append(_FrameSet(trigger, whom))
+        for client in self._clients:
+            self._put(client, client.collect())
+        self._process_complete()
+        trigger = FrameRequest(self._frame, time, asked, true_pose, encoder_pose)
+        asked_clients = frozenset(client.name for client in self._clients if client.ask(trigger))
+        if asked_clients:
+            self._open.append(_FrameSet(trigger, asked_clients))
         self._frame += 1
-        self._look_for_trouble()
+        self._report_trouble()
 
     def news(self) -> list[CameraNews]:
-        """What began since this was asked last."""
+        """New conditions since the last call."""
         news = [*self._news, *self._common.news]
         self._news.clear()
         self._common.news.clear()
         return news
 
     def as_dict(self) -> list[dict[str, Any]]:
-        """How each camera does; see `executor.remote.status`."""
-        return [eye.as_dict(self._now) for eye in self._eyes]
+        """State of each camera; see `executor.remote.status`."""
+        return [client.as_dict(self._now) for client in self._clients]
 
     def finish(self, stopped: Callable[[], bool]) -> CameraRecords:
-        """Waits for the last images of all cameras; what is missing then is reported.
+        """Waits for the last images of all cameras; reports missing ones.
 
         Args:
-            stopped: Whether a stop is wished; the wait is a short one then.
+            stopped: Whether a stop is requested, which shortens the wait.
         """
         self._wait_for_all(stopped)
-        for eye in self._eyes:
-            self._put(eye, eye.finish())
-        self._judge(last=True)
+        for client in self._clients:
+            self._put(client, client.finish())
+        self._process_complete(last=True)
         self._common.finish()
-        self._look_for_trouble()
-        several = len(self._eyes) > 1
+        self._report_trouble()
+        several = len(self._clients) > 1
         return CameraRecords(
             tuple(self._together),
-            {eye.name: tuple(eye.looks) for eye in self._eyes} if several else {},
-            tuple(eye.record() for eye in self._eyes),
+            {client.name: tuple(client.samples) for client in self._clients} if several else {},
+            tuple(client.record() for client in self._clients),
         )
 
     def _wait_for_all(self, stopped: Callable[[], bool]) -> None:
-        """In rounds that share one patience, however many cameras hang."""
+        """Waits in rounds with a common time-out for all cameras."""
         rounds = 0
-        while waiting := [eye for eye in self._eyes if eye.busy]:
+        while waiting := [client for client in self._clients if client.busy]:
             if rounds * ROUND >= (HURRY if stopped() else PATIENCE):
                 return
-            for eye in waiting:
-                self._put(eye, eye.wait(ROUND / len(waiting)))
+            for client in waiting:
+                self._put(client, client.wait(ROUND / len(waiting)))
             rounds += 1
 
-    def _put(self, eye: CameraClient, look: CameraSample | None) -> None:
-        for moment in self._open:
-            if look is not None and moment.trigger.frame == look.frame:
-                moment.looks[eye.name] = look
+    def _put(self, client: CameraClient, sample: CameraSample | None) -> None:
+        for frame_set in self._open:
+            if sample is not None and frame_set.trigger.frame == sample.frame:
+                frame_set.samples[client.name] = sample
 
-    def _judge(self, last: bool = False) -> None:
-        """Takes moments, in their order, for what they are."""
-        gone = {eye.name for eye in self._eyes if eye.failed is not None}
+    def _process_complete(self, last: bool = False) -> None:
+        """Fuses complete frames, in order."""
+        gone = {client.name for client in self._clients if client.failed is not None}
         while self._open:
-            moment = self._open[0]
-            answered = moment.asked - gone <= moment.looks.keys()
-            late = bool(moment.looks) and moment.trigger.frame < self._frame - 1
+            frame_set = self._open[0]
+            answered = frame_set.asked - gone <= frame_set.samples.keys()
+            late = bool(frame_set.samples) and frame_set.trigger.frame < self._frame - 1
             if not (answered or late or last):
                 return
-            self._keep(self._joined(self._open.pop(0)))
+            self._keep(self._fused(self._open.pop(0)))
 
     def _keep(self, sample: CameraSample) -> None:
         self._together.append(sample)
         if isinstance(sample.found, PoseMeasurement):
             self.newest = sample.found, sample.clearance
 
-    def _joined(self, moment: _FrameSet) -> CameraSample:
-        """What all cameras say of a moment together."""
-        looks = {eye.name: moment.looks[eye.name] for eye in self._eyes if eye.name in moment.looks}
-        if looks:
-            return self._common.of(looks)
-        reason = next((e.failed.what for e in self._eyes if e.failed), "no camera answered")
-        return unseen(moment.trigger.frame, moment.trigger.time, reason)
+    def _fused(self, frame_set: _FrameSet) -> CameraSample:
+        """The fused sample of a frame."""
+        samples = {
+            client.name: frame_set.samples[client.name]
+            for client in self._clients
+            if client.name in frame_set.samples
+        }
+        if samples:
+            return self._common.of(samples)
+        reason = next((e.failed.what for e in self._clients if e.failed), "no camera answered")
+        return sample_without_pose(frame_set.trigger.frame, frame_set.trigger.time, reason)
 
-    def _look_for_trouble(self) -> None:
-        troubles = {eye.name: eye.trouble(self._now) for eye in self._eyes}
-        well = [name for name, trouble in troubles.items() if not trouble]
+    def _report_trouble(self) -> None:
+        troubles = {client.name: client.trouble(self._now) for client in self._clients}
+        working = [name for name, trouble in troubles.items() if not trouble]
         then = (
-            f"clearance is measured by {', '.join(well)}" if well else "clearance is not measured"
+            f"clearance is measured by {', '.join(working)}"
+            if working
+            else "clearance is not measured"
         )
-        for eye in self._eyes:
-            trouble = troubles[eye.name]
-            if trouble and self._told.get(eye.name) != trouble:
-                text = f"camera {eye.name} {trouble}; {then}"
-                failed = eye.failed is not None
+        for client in self._clients:
+            trouble = troubles[client.name]
+            if trouble and self._reported.get(client.name) != trouble:
+                text = f"camera {client.name} {trouble}; {then}"
+                failed = client.failed is not None
                 self._news.append(
                     CameraNews("camera", text)
                     if failed
                     else CameraNews("camera_sees_nothing", text)
                 )
-            self._told[eye.name] = trouble
+            self._reported[client.name] = trouble
 
 
-#: Takes in an event: its code, its text, and when it was, on the loop's clock [s].
-Tell = Callable[[str, str, float], None]
+#: Takes an event: code, text, and time on the loop's clock [s].
+EventReport = Callable[[str, str, float], None]
 
 
 class CameraWatch:
-    """Asks the cameras for images, and stops the run when they see too little clearance."""
+    """Requests images, and stops the run when the measured clearance is too small."""
 
     def __init__(
         self,
         cameras: RunCameras,
         status: RunStatus,
         board: RequestBoard,
-        report: Tell,
+        report: EventReport,
         *,
         clearance_stop: bool,
         listener: Listener = SILENT,
     ) -> None:
-        """Nothing was asked for yet.
+        """Starts without requests.
 
         Args:
-            cameras: Those of the run.
-            status: Kept up to date for those who ask.
-            board: Where a stop is asked for.
+            cameras: Of the run.
+            status: Updated with their state.
+            board: Takes the stop request.
             report: Called with each event.
-            clearance_stop: Ask for a stop when clearance is too small.
+            clearance_stop: Whether too small a clearance stops the run.
             listener: Receives the same.
         """
         self.rates = ""
-        """How fast each camera is and how many tags it sees, for the progress bar."""
+        """Rate and visible tags of each camera, for the progress bar."""
         self._cameras, self._status, self._board = cameras, status, board
-        self._tell, self._clearance_stop, self._listener = report, clearance_stop, listener
+        self._report, self._clearance_stop, self._listener = report, clearance_stop, listener
 
     def trigger(
-        self, time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None
+        self, time: float, asked: float, true_pose: Pose | None, encoder_pose: Pose | None
     ) -> None:
-        """An image is due; arguments as for `RunCameras.trigger`."""
-        self._cameras.trigger(time, asked, true_pose, by_drives)
-        self._tell_news(asked)
+        """Requests an image; arguments as for `RunCameras.trigger`."""
+        self._cameras.trigger(time, asked, true_pose, encoder_pose)
+        self._report_news(asked)
         each = self._cameras.as_dict()
         self._status.take_cameras(each)
         if self._cameras.newest is not None:
@@ -380,7 +388,7 @@ class CameraWatch:
         if near and self._clearance_stop:
             who = "the cameras" if len(each) > 1 else "the camera"
             less = f"{who} measured less clearance than the scene requires: {near}"
-            self._stop("too near", near, "clearance_low", less)
+            self._stop("clearance too small", near, "clearance_low", less)
         if all_failed:
             self._stop("stopping", all_failed, "camera", all_failed)
 
@@ -392,22 +400,22 @@ class CameraWatch:
         """
         with self._listener.waiting("waiting for the last images"):
             seen = self._cameras.finish(lambda: self._board.read().stop)
-        self._tell_news(at)
+        self._report_news(at)
         for camera in seen.cameras:
             if camera.dropped:
                 what = f"{camera.dropped} of {camera.dropped + camera.pictures} images skipped"
                 text = f"camera {camera.name}: {what}; the previous one was still being processed"
-                self._tell("pictures_dropped", text, at)
+                self._report("pictures_dropped", text, at)
         return seen
 
-    def _stop(self, label: str, told: str, code: str, why: str) -> None:
-        """Asks for a stop, unless one is under way."""
+    def _stop(self, label: str, detail: str, code: str, why: str) -> None:
+        """Requests a stop, unless one was requested before."""
         if self._board.read().stop:
             return
         self._board.ask_stop(StopReason(code, why))
-        self._listener.warning(f"{label}: {told}")
+        self._listener.warning(f"{label}: {detail}")
 
-    def _tell_news(self, at: float) -> None:
+    def _report_news(self, at: float) -> None:
         for news in self._cameras.news():
-            self._tell(news.code, news.text, at)
+            self._report(news.code, news.text, at)
             self._listener.remark(news.text)

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.live import LiveCamera
-from executor.cameras.client import CameraClient, looks_at_rest, wait_until_ready
+from executor.cameras.client import CameraClient, samples_at_rest, wait_until_ready
 from executor.cameras.live_image import ImageBoard, memory_for
 from executor.cameras.multi_camera import RunCameras
-from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, PictureSource
+from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, ImageSource
 from executor.cameras.sources import SYNTHETIC
 from executor.kernels import ready_for_camera_processes, ready_to_measure
 from executor.realtime.shared_memory import SharedMemory
@@ -35,7 +35,7 @@ if TYPE_CHECKING:  # a real camera loads no simulator
     from simulation.camera.camera import ImageSequence
 
 #: Approximate number of a run's images kept for its report.
-KEPT_PICTURES = 12
+KEPT_IMAGES = 12
 
 
 @contextmanager
@@ -54,34 +54,34 @@ def open_cameras(
 
     Args:
         rig: The robot.
-        scene: What the cameras see beside it.
+        scene: What the cameras see besides it.
         sources: From `resolve_cameras`.
         folder: The run folder.
-        pictures: How many are expected of each; some of them are kept.
-        board: A stop that is wished here ends the opening.
-        simulated_time: A late image holds the run up instead of being dropped.
-        listener: Receives that it waits.
+        pictures: Expected number of images per camera; some of them are kept.
+        board: A stop request ends the opening.
+        simulated_time: The run waits for late images instead of dropping them.
+        listener: Receives the wait.
 
     Raises:
-        StoppedByOperator: A stop was wished before all were open.
-        CdprError: A camera cannot be used, for the reason given.
+        StoppedByOperator: A stop was requested before all were open.
+        CdprError: A camera cannot be used.
     """
     if not sources:
         yield None
         return
-    keep_every = max(1, pictures // KEPT_PICTURES)
+    keep_every = max(1, pictures // KEPT_IMAGES)
     ready_for_camera_processes(listener)
     with ExitStack() as stack:
         processes, lives = {}, {}
         for camera, source in sources.items():
             live = lives[camera] = memory_for(camera)
             stack.callback(live.close)
-            place = (camera.name, source, folder, keep_every)
+            arguments = (camera.name, source, folder, keep_every)
             make = partial(
-                make_observer,
+                make_worker,
                 rig.document,
                 scene.document,
-                *place,
+                *arguments,
                 named=len(sources) > 1,
                 live=live,
             )
@@ -103,15 +103,15 @@ def open_cameras(
 
 
 def asked_rate(sources: Mapping[Camera, str]) -> float:
-    """How often all cameras are asked for an image: as often as the slowest takes one, [Hz]."""
+    """Common frame rate of the cameras: that of the slowest, [Hz]."""
     return min(camera.rate for camera in sources)
 
 
 def require_no_stop(board: RequestBoard) -> None:
-    """The last look at the board before something is begun.
+    """Requires that no stop is requested.
 
     Raises:
-        StoppedByOperator: A stop is wished.
+        StoppedByOperator: A stop is requested.
     """
     if board.read().stop:
         raise StoppedByOperator(
@@ -119,7 +119,7 @@ def require_no_stop(board: RequestBoard) -> None:
         )
 
 
-def make_observer(
+def make_worker(
     rig_document: RigDocument,
     scene_document: SceneDocument,
     camera_name: str,
@@ -130,7 +130,7 @@ def make_observer(
     named: bool,
     live: SharedMemory | None = None,
 ) -> CameraWorker:
-    """Builds the observer inside its camera's process."""
+    """Makes the worker, inside its camera's process."""
     rig, scene = rig_from_document(rig_document), scene_from_document(scene_document)
     camera = rig.camera(camera_name)
     ready_to_measure()
@@ -140,72 +140,72 @@ def make_observer(
     return CameraWorker(rig, camera, pictures, kept, keep_every, named=named, live=board)
 
 
-def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> PictureSource:
+def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> ImageSource:
     if name == SYNTHETIC:  # a real camera loads no simulator
         from simulation.camera.camera import ImageSequence
         from simulation.factory import make_synthetic_camera
 
-        return RenderedPictures(ImageSequence(make_synthetic_camera(rig, scene, camera)))
-    return LivePictures(LiveCamera(name, camera))
+        return RenderedImages(Film(make_synthetic_camera(rig, scene, camera)))
+    return LiveImages(LiveCamera(name, camera))
 
 
-class RenderedPictures:
-    """The synthetic camera as the run's source of images."""
+class RenderedImages:
+    """The synthetic camera as a source of images."""
 
     def __init__(self, film: ImageSequence) -> None:
         self._film = film
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
-        """Renders the platform where it truly is."""
+        """Renders the platform at its true pose."""
         if trigger.true_pose is None:
             raise Fault("the synthetic camera has no platform pose")
         return self._film.picture(trigger.time, trigger.true_pose, trigger.frame), 0.0
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Nothing to close."""
 
 
-class LivePictures:
-    """A real camera as the run's source of images."""
+class LiveImages:
+    """A real camera as a source of images."""
 
     def __init__(self, camera: LiveCamera) -> None:
         self._camera = camera
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
-        """The next image, and how long after the trigger it arrived."""
+        """The next image, and its delay after the request, [s]."""
         frame = self._camera.read()
         return frame.image, frame.time - trigger.asked
 
     def close(self) -> None:
-        """Lets go of the camera."""
+        """Closes the camera."""
         self._camera.close()
 
 
-def look_at_rest(
+def measure_at_rest(
     rig: Rig,
-    eye: tuple[Camera, str],
+    camera_source: tuple[Camera, str],
     pictures: int,
     true_pose: Pose | None,
-    unless_stopped: Callable[[], None],
+    check_stop: Callable[[], None],
     listener: Listener,
 ) -> list[Observation]:
-    """Opens the camera, takes images of a platform that stands still, measures each.
+    """Opens a camera, takes images of a platform at rest and measures each.
 
     Args:
         rig: The robot.
-        eye: From `choose_one_camera`.
-        pictures: How many.
-        true_pose: Where the simulated platform is.
-        unless_stopped: Called all the while; what it raises ends the looking.
-        listener: Receives that the camera opens.
+        camera_source: From `choose_one_camera`.
+        pictures: Number of images.
+        true_pose: Of the simulated platform.
+        check_stop: Called repeatedly; an exception ends it.
+        listener: Receives the opening of the camera.
     """
-    camera, source = eye
-    scene = empty_scene(rig).document
+    camera, source = camera_source
+    scene = nothing_in_the_way(rig).document
     make = partial(
-        make_observer, rig.document, scene, camera.name, source, None, pictures, named=False
+        make_worker, rig.document, scene, camera.name, source, None, pictures, named=False
     )
     period = 1.0 / camera.rate if source == SYNTHETIC else None
     with closing(CameraProcess(camera.name, make, may_wait=False)) as process:
         with listener.waiting(f"opening camera {camera.name}"):
-            wait_until_ready([process], unless_stopped)
-        return looks_at_rest(process, pictures, period, true_pose, unless_stopped)
+            wait_until_ready([process], check_stop)
+        return samples_at_rest(process, pictures, period, true_pose, check_stop)

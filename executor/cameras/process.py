@@ -1,7 +1,7 @@
-"""A camera's own process, so that images never delay the loop, nor one camera another.
+"""The process of a camera, so that images never delay the loop or another camera.
 
-It takes (or renders) an image when it is asked, measures the pose, and says so at once. In real
-time it is not asked again before it has answered, and an image that was due is counted as dropped.
+It takes (or renders) an image on request, measures the pose, and answers at once. In real time no
+further request is sent before the answer; images due meanwhile count as dropped.
 """
 
 from __future__ import annotations
@@ -28,37 +28,37 @@ from tracking.clearance import MeasuredClearance
 from tracking.measurement import NoPose, Observation
 from tracking.tracker import EncoderExtrapolator, Tracker
 
-# What a camera's process does with a trigger: an image, and the pose in it.
+# The camera worker: takes an image on request and measures the pose in it.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameRequest:
-    """Asks for one image.
+    """Request for one image.
 
     Attributes:
-        frame: Number of the moment, the same for all cameras.
+        frame: Frame number, the same for all cameras.
         time: Since the start of the run, [s].
-        asked: When, monotonic, [s].
-        true_pose: Where the simulated platform is; None with a real camera.
-        by_drives: Where the drives' positions put the platform; None when they are unknown.
+        asked: The same time, monotonic, [s].
+        true_pose: Of the simulated platform; None with a real camera.
+        encoder_pose: Platform pose from the encoders; None if unknown.
     """
 
     frame: int
     time: float
     asked: float
     true_pose: Pose | None
-    by_drives: Pose | None = None
+    encoder_pose: Pose | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraSample:
-    """What came of one image, or of the images that several cameras took at one moment.
+    """Measurement of one image, or of simultaneous images of several cameras.
 
     Attributes:
-        frame: Number of the moment.
+        frame: Frame number.
         found: The pose, or why there is none; its time is since the start of the run, [s].
-        picture: Name of the kept image in the run folder, or nothing.
-        seconds: How long measuring took, [s]; NaN where nothing was measured.
+        picture: Name of the image kept in the run folder, or empty.
+        seconds: Processing time, [s]; NaN if nothing was measured.
         clearance: Distances at the measured pose, or None.
     """
 
@@ -69,20 +69,20 @@ class CameraSample:
     clearance: MeasuredClearance | None = None
 
 
-def unseen(frame: int, time: float, reason: str) -> CameraSample:
-    """What is known of an image that was asked for and never measured."""
+def sample_without_pose(frame: int, time: float, reason: str) -> CameraSample:
+    """A sample without a pose, for an image that was never measured."""
     return CameraSample(frame, NoPose(time, reason))
 
 
-class PictureSource(Protocol):
-    """A camera, real or rendered, that gives an image when asked."""
+class ImageSource(Protocol):
+    """A camera, real or rendered, that delivers images on request."""
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
-        """A grey image, and how much later than asked for it was taken, [s]."""
+        """A grey image, and its delay after the request, [s]."""
         ...
 
     def close(self) -> None:
-        """Lets go of the camera."""
+        """Closes the camera."""
         ...
 
 
@@ -98,23 +98,23 @@ class CameraWorker:
         self,
         rig: Rig,
         camera: Camera,
-        source: PictureSource,
+        source: ImageSource,
         folder: RunFolder | None,
         keep_every: int,
         *,
         named: bool,
         live: ImageBoard | None = None,
     ) -> None:
-        """Prepares to look.
+        """Prepares the tracker.
 
         Args:
             rig: The robot with its tags.
-            camera: The camera that the source is.
-            source: Where images come from.
-            folder: Where some of them are kept; None to keep none.
-            keep_every: Every how many images one is kept.
-            named: Kept images are in a folder of the camera's name: there are others.
-            live: Where images are shown to who looks on; None to show none.
+            camera: The camera.
+            source: Of its images.
+            folder: For kept images; None to keep none.
+            keep_every: Interval of kept images, in frames.
+            named: Keep images in a folder of the camera's name, as there are several cameras.
+            live: For viewers; None to show no images.
         """
         self._source, self._folder, self._keep_every = source, folder, keep_every
         self._name = camera.name if named else ""
@@ -132,31 +132,31 @@ class CameraWorker:
     ) -> None:
         self._source.close()
 
-    def look(self, trigger: FrameRequest) -> CameraSample:
-        """Takes an image and measures the platform in it."""
+    def measure(self, trigger: FrameRequest) -> CameraSample:
+        """Takes an image and measures the platform pose in it."""
         image, delay = self._source.picture(trigger)
-        kept = ""
+        name = ""
         if self._folder is not None and trigger.frame % self._keep_every == 0:
-            kept = self._folder.write_picture(trigger.frame, image, self._name)
+            name = self._folder.write_picture(trigger.frame, image, self._name)
         taken = trigger.time + delay
-        by_drives = self._drives.at(taken, trigger.time, trigger.by_drives)
+        encoder_pose = self._drives.at(taken, trigger.time, trigger.encoder_pose)
         began = time.monotonic()
-        found = self._tracker.observe(image, taken, by_drives)
+        found = self._tracker.observe(image, taken, encoder_pose)
         self._newest = trigger.frame, image, found
-        return CameraSample(trigger.frame, found, kept, time.monotonic() - began)
+        return CameraSample(trigger.frame, found, name, time.monotonic() - began)
 
     def show(self) -> None:
-        """Shows the newest image to who looks on; called when its answer is on its way."""
+        """Shows the newest image to viewers; called after its answer was sent."""
         if self._live is not None:
             self._live.show(*self._newest)
 
 
-MakeObserver = Callable[[], CameraWorker]
+MakeWorker = Callable[[], CameraWorker]
 
 
-#: In simulated time an answer is waited for no longer than this, [s].
+#: Time-out of an answer in simulated time, [s].
 PATIENCE = 20.0
-#: How long a process may take to end, [s].
+#: Time for a process to end, [s].
 END_TIMEOUT = 2.0
 
 
@@ -167,7 +167,7 @@ class _Ready:
 
 @dataclass(frozen=True, slots=True)
 class _Failure:
-    """An error of the camera's process, as it travels to the parent."""
+    """An error of the camera's process, sent to the parent."""
 
     error: CdprError | str
 
@@ -175,14 +175,13 @@ class _Failure:
 class CameraProcess:
     """Takes images with one camera on request, and measures the platform in them."""
 
-    def __init__(self, name: str, make_observer: MakeObserver, *, may_wait: bool) -> None:
-        """Starts the process; `is_ready` is true once its camera is.
+    def __init__(self, name: str, make_worker: MakeWorker, *, may_wait: bool) -> None:
+        """Starts the process; see `is_ready`.
 
         Args:
             name: Of the camera.
-            make_observer: Called in the process; picklable.
-            may_wait: In simulated time answers are waited for, so that the same run sees the same
-                every time.
+            make_worker: Called in the process; picklable.
+            may_wait: Wait for answers, in simulated time, so that runs are reproducible.
         """
         self.name = name
         self._may_wait = self._waits = may_wait
@@ -191,20 +190,20 @@ class CameraProcess:
         context = multiprocessing.get_context("spawn")
         self._link, far_end = context.Pipe()
         self._process = context.Process(
-            target=_serve, args=(make_observer, far_end), name=f"cdpr-camera-{name}", daemon=True
+            target=_serve, args=(make_worker, far_end), name=f"cdpr-camera-{name}", daemon=True
         )
         with interrupts_blocked():
             self._process.start()
         far_end.close()
 
     def is_ready(self, within: float) -> bool:
-        """Whether the camera is open; asked until it is, and then no more.
+        """Whether the camera is open; to be called until it is, and not again.
 
         Args:
-            within: How long it is waited for, [s].
+            within: Time-out, [s].
 
         Raises:
-            CdprError: It cannot be used, for the reason given.
+            CdprError: It cannot be used.
         """
         if not self._link.poll(within):
             return False
@@ -213,14 +212,14 @@ class CameraProcess:
 
     @property
     def unanswered(self) -> FrameRequest | None:
-        """What was asked for last, while there is no answer to it."""
+        """The last request while it is unanswered, else None."""
         return self._asked
 
     def ask(self, trigger: FrameRequest) -> None:
-        """Asks for an image; the one before must have been answered.
+        """Requests an image; the previous request must have been answered.
 
         Raises:
-            CdprError: The process is gone, for the reason given.
+            CdprError: The process is gone.
         """
         if self._asked is not None:
             raise ValueError(f"camera {self.name} has not answered yet")
@@ -232,32 +231,32 @@ class CameraProcess:
         self._asked = trigger
 
     def answer(self) -> CameraSample | None:
-        """The answer to what was asked, if it is there; waited for in simulated time.
+        """The answer to the request, if it has arrived; waits for it in simulated time.
 
-        One that does not come is waited for only once: the others must go on.
+        After one time-out it does not wait again, so that other cameras can continue.
 
         Raises:
-            CdprError: The process failed, for the reason given.
+            CdprError: The process failed.
         """
         return self.answer_within(PATIENCE if self._waits else 0.0)
 
     def answer_within(self, patience: float) -> CameraSample | None:
-        """The answer to what was asked, if it comes within so long, [s].
+        """The answer to the request, if it arrives within ``patience`` [s].
 
         Raises:
-            CdprError: The process failed, for the reason given.
+            CdprError: The process failed.
         """
         if not self._link.poll(patience if self._asked is not None else 0.0):
             self._waits = self._waits and self._asked is None
             return None
-        look = self._receive()
-        if not isinstance(look, CameraSample):
-            raise TypeError(f"camera {self.name} answered {look!r}")
+        sample = self._receive()
+        if not isinstance(sample, CameraSample):
+            raise TypeError(f"camera {self.name} answered {sample!r}")
         self._asked, self._waits = None, self._may_wait
-        return look
+        return sample
 
     def close(self) -> None:
-        """Ends the process, whatever it does; further calls change nothing."""
+        """Ends the process, if necessary by a signal; further calls have no effect."""
         if self._closed:
             return
         self._closed = True
@@ -266,7 +265,7 @@ class CameraProcess:
         if self._process.is_alive():
             self._process.terminate()
             self._process.join(END_TIMEOUT)
-        if self._process.is_alive():  # a process that is stopped is ended by nothing else
+        if self._process.is_alive():  # a suspended process ends only by SIGKILL
             self._process.kill()
             self._process.join()
         self._process.close()
@@ -278,38 +277,38 @@ class CameraProcess:
             raise Fault(f"the process of camera {self.name} ended without an answer") from None
         if isinstance(answer, _Failure):
             raise answer.error if isinstance(answer.error, CdprError) else Fault(answer.error)
-        return answer  # type: ignore[no-any-return]  # what our own process sends
+        return answer  # type: ignore[no-any-return]  # sent by our own process
 
 
-def _serve(make_observer: MakeObserver, link: Connection) -> None:
-    """The process: an answer a trigger; it ends with its parent."""
-    with suppress(_NobodyThere):
+def _serve(make_worker: MakeWorker, link: Connection) -> None:
+    """Main function of the process: answers requests; ends with its parent."""
+    with suppress(_ParentGone):
         try:
-            with make_observer() as observer:
-                _say(link, _Ready())
+            with make_worker() as worker:
+                _send(link, _Ready())
                 while True:
-                    _say(link, observer.look(_next_trigger(link)))
-                    observer.show()
+                    _send(link, worker.measure(_next_trigger(link)))
+                    worker.show()
         except CdprError as error:
-            _say(link, _Failure(error))
+            _send(link, _Failure(error))
         except Exception as error:
             what = f"the camera process failed: {type(error).__name__}: {error}"
-            _say(link, _Failure(what))
+            _send(link, _Failure(what))
 
 
-class _NobodyThere(BaseException):
-    """The parent is gone; nothing is left to do or to report."""
+class _ParentGone(BaseException):
+    """The parent is gone; nothing remains to be done."""
 
 
-def _say(link: Connection, what: CameraSample | _Ready | _Failure) -> None:
+def _send(link: Connection, what: CameraSample | _Ready | _Failure) -> None:
     try:
         link.send(what)
     except OSError:
-        raise _NobodyThere from None
+        raise _ParentGone from None
 
 
 def _next_trigger(link: Connection) -> FrameRequest:
     try:
-        return link.recv()  # type: ignore[no-any-return]  # what our own parent sends
+        return link.recv()  # type: ignore[no-any-return]  # sent by our own parent
     except (EOFError, OSError):
-        raise _NobodyThere from None
+        raise _ParentGone from None

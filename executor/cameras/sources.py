@@ -1,4 +1,4 @@
-"""Which of the rig's cameras look at it, and where the images of each come from."""
+"""Choice of the rig's cameras, and the image source of each."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ the drives are simulated in this process, an error on a bus."""
 
 
 def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool) -> str | None:
-    """Where images come from: ``synthetic``, a camera's index or address, or None.
+    """The image source: ``synthetic``, a camera's index or address, or None.
 
     Raises:
-        BadInput: The wish cannot be met; nothing is left out silently.
+        BadInput: The request cannot be met; nothing is ignored silently.
     """
     if without:
         if wanted is not None:
@@ -55,7 +55,7 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
 
 
 def _require_live(source: str) -> None:
-    """What was recorded shows nothing of a platform that moves now."""
+    """Refuses recordings, which do not show the moving platform."""
     if not is_camera(source):
         raise BadInput(
             f"{source!r} is not a live camera source",
@@ -68,17 +68,17 @@ def _require_live(source: str) -> None:
 def choose_cameras(
     rig: Rig, wanted: list[str], without: bool, in_process: bool
 ) -> dict[Camera, str]:
-    """Which of the rig's cameras look at a run, and where the images of each come from.
+    """The cameras of a run, and the image source of each.
 
     Args:
-        rig: Its cameras.
-        wanted: One source, or for each of several cameras ``NAME=SOURCE``; ``synthetic`` alone, as
-            nothing at all, stands for all of them.
-        without: No camera is wanted.
+        rig: The robot with its cameras.
+        wanted: One source, or ``NAME=SOURCE`` for each of several cameras; ``synthetic`` or an
+            empty list selects all cameras.
+        without: No camera.
         in_process: The drives are simulated in this process.
 
     Raises:
-        BadInput: The wish cannot be met; nothing is left out silently.
+        BadInput: The request cannot be met; nothing is ignored silently.
     """
     if not wanted:
         source = choose_camera(rig, None, without, in_process)
@@ -87,16 +87,16 @@ def choose_cameras(
         choose_camera(rig, SYNTHETIC, without, in_process)
         return dict.fromkeys(rig.cameras, SYNTHETIC)
     if rig.cameras:
-        eyes = parse_camera_sources(rig, wanted, None, "--camera")
-        for source in eyes.values():
+        chosen = parse_camera_sources(rig, wanted, None, "--camera")
+        for source in chosen.values():
             choose_camera(rig, source, without, in_process)
-        return eyes
+        return chosen
     choose_camera(rig, wanted[0], without, in_process)
     return {}
 
 
 def resolve_cameras(rig: Rig, wanted: CameraChoice, in_process: bool) -> dict[Camera, str]:
-    """The cameras of a run, from what a caller of the library names.
+    """The cameras of a run, from the argument of a library call.
 
     Args:
         rig: Its cameras.
@@ -116,7 +116,7 @@ def resolve_cameras(rig: Rig, wanted: CameraChoice, in_process: bool) -> dict[Ca
 
 
 def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Camera, str]:
-    """The one camera that measures a platform at rest, and where its images come from.
+    """The single camera that measures a platform at rest, and its image source.
 
     Args:
         rig: Its cameras.
@@ -124,7 +124,7 @@ def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Ca
         in_process: The drives are simulated in this process.
 
     Raises:
-        BadInput: There are several, or the wish cannot be met.
+        BadInput: There are several, or the request cannot be met.
     """
     if len(wanted) != 1:
         raise BadInput(
@@ -140,16 +140,16 @@ def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Ca
 def parse_camera_sources(
     rig: Rig, sources: list[str], wanted: str | None, where: str = "track"
 ) -> dict[Camera, str]:
-    """Which camera's images come from where.
+    """The image source of each camera.
 
     Args:
-        rig: Its cameras.
-        sources: One source, or for each of several cameras ``NAME=SOURCE``.
+        rig: The robot with its cameras.
+        sources: One source, or ``NAME=SOURCE`` for each of several cameras.
         wanted: The camera of a single source; None for the rig's first.
-        where: What names the sources, for messages.
+        where: Origin of the sources, for messages.
 
     Raises:
-        BadInput: A camera is not the rig's, is named twice, or not at all.
+        BadInput: A camera is unknown, named twice, or not named.
     """
     names = [camera.name for camera in rig.cameras]
     if len(sources) == 1 and _is_unnamed(sources[0], names):
@@ -160,10 +160,10 @@ def parse_camera_sources(
             where=where,
             next_step="leave it out, or name the camera in the source: NAME=SOURCE",
         )
-    eyes: dict[Camera, str] = {}
+    chosen: dict[Camera, str] = {}
     for source in sources:
-        name, sign, place = source.partition("=")
-        if name in names and not place:
+        name, sign, address = source.partition("=")
+        if name in names and not address:
             raise BadInput(
                 f"camera {name!r} has no source",
                 where=where,
@@ -176,13 +176,13 @@ def parse_camera_sources(
                 next_step=f"write NAME={source}, NAME one of: {', '.join(names)}",
             )
         camera = rig.camera(name)
-        if camera in eyes:
+        if camera in chosen:
             raise BadInput(
                 f"camera {name!r} has two sources", where=where, next_step="name each camera once"
             )
-        _require_own(place, eyes, name, where)
-        eyes[camera] = place
-    return eyes
+        _require_own(address, chosen, name, where)
+        chosen[camera] = address
+    return chosen
 
 
 def _is_unnamed(source: str, names: list[str]) -> bool:
@@ -193,24 +193,24 @@ def _is_unnamed(source: str, names: list[str]) -> bool:
     return "://" in word or (word not in names and Path(source).exists())
 
 
-def _require_own(place: str, eyes: Mapping[Camera, str], name: str, where: str) -> None:
-    """Two cameras cannot take the same images."""
-    for camera, other in eyes.items():
-        if place != SYNTHETIC and _device(place) == _device(other):
+def _require_own(address: str, chosen: Mapping[Camera, str], name: str, where: str) -> None:
+    """Requires different sources for different cameras."""
+    for camera, other in chosen.items():
+        if address != SYNTHETIC and _device(address) == _device(other):
             raise BadInput(
-                f"cameras {camera.name!r} and {name!r} have the same source {place!r}",
+                f"cameras {camera.name!r} and {name!r} have the same source {address!r}",
                 where=where,
                 next_step="give each camera its own source",
             )
 
 
 def _device(source: str) -> str:
-    """A source, the same for both names of a camera of this machine: ``0`` and ``/dev/video0``."""
+    """Canonical name of a source: ``0`` and ``/dev/video0`` are the same camera."""
     return source.removeprefix("/dev/video")
 
 
 def require_camera_source(source: str) -> None:
-    """Refuses what can be no camera.
+    """Requires a source that can be a camera.
 
     Raises:
         BadInput: It is neither a number nor a device nor an address.
@@ -224,14 +224,14 @@ def require_camera_source(source: str) -> None:
 
 
 def is_camera(source: str) -> bool:
-    """Whether it can be a camera: a number, a device or an address, and no file."""
+    """Whether it can be a camera: a number, a device or an address, not a file."""
     if source.startswith("/dev/"):
         return not (Path(source).is_file() or Path(source).is_dir())
     return source.isdecimal() or ("://" in source and not source.startswith("file:"))
 
 
-def require_simulated_pictures(sources: Iterable[str], fast: bool) -> None:
-    """In simulated time a real camera's images would be stamped with times that mean nothing.
+def require_synthetic_images(sources: Iterable[str], fast: bool) -> None:
+    """Requires synthetic cameras in simulated time, where real image times are meaningless.
 
     Raises:
         BadInput: ``--fast`` is given, and a source is a real camera.

@@ -1,1 +1,1 @@
-"""The cycle: what is sent to the drives, and what is done about what they reply."""
+"""The control cycle: set-points to the drives, and reactions to their replies."""

@@ -1,4 +1,4 @@
-"""One cycle with the drives: advance along the table, ask the gate, send, receive, look."""
+"""One control cycle: advance in the table, ask the gate, send, receive, monitor."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from model.rig import Motion
 
 
 class Feed:
-    """A place in the table that advances with every cycle that is sent, never by a clock.
+    """Index into the set-point table; advances with every cycle sent, never by a clock.
 
-    Normal feed is exactly one row a cycle. From one rate to another it goes jerk-limited, so all
-    drives change their speed together along the path. It never runs backwards and never faster
-    than the table was made for.
+    Normal feed is exactly one row per cycle. Changes of rate are jerk-limited, so all
+    drives change speed together along the path. It never runs backwards, nor faster
+    than the table was timed for.
     """
 
     def __init__(self, rows: int, cycle: float, motion: Motion, *, rate: float = 1.0) -> None:
@@ -34,9 +34,9 @@ class Feed:
         Args:
             rows: Length of the table.
             cycle: [s].
-            motion: Limits; at the path's full speed a change of rate keeps its acceleration and
+            motion: Limits; at the path's full speed a change of rate keeps to its acceleration and
                 jerk.
-            rate: At first; the full one for a table that begins at rest.
+            rate: Initial rate; full for a table that begins at rest.
         """
         self.index = 0.0
         self._last = rows - 1
@@ -49,46 +49,46 @@ class Feed:
 
     @property
     def rate(self) -> float:
-        """Rows a cycle, now; from 0 to 1."""
+        """Current rate, rows per cycle; from 0 to 1."""
         return min(max(self._change.at(self._passed)[1], 0.0), 1.0)
 
     @property
     def wanted(self) -> float:
-        """The rate that it goes to."""
+        """Target rate."""
         return self._wanted
 
     @property
     def at_end(self) -> bool:
-        """It has come to the last row."""
+        """Whether the last row is reached."""
         return self.index >= self._last
 
     @property
     def at_rest(self) -> bool:
-        """It will not advance any more, unless another rate is asked for."""
+        """Whether it stays at this row until another rate is requested."""
         return self.at_end or (self._steady and self.rate <= 0.0)
 
     @property
     def rows_to_rest(self) -> float:
-        """How far it advances if it begins to slow down now."""
+        """Rows it still advances if it begins to slow down now."""
         _, *now = self._change.at(self._passed)
         ramp = speed_change((now[0], now[1]), 0.0, self._acceleration, self._jerk)
         return ramp.at(ramp.duration)[0]
 
     def extend(self, rows: int) -> None:
-        """The table has become longer.
+        """Extends to a longer table.
 
         Raises:
-            ValueError: It has not.
+            ValueError: The table is shorter than before.
         """
         if rows - 1 < self._last:
             raise ValueError(f"a table of {self._last + 1} rows cannot become one of {rows}")
         self._last = rows - 1
 
     def go_to(self, rate: float) -> None:
-        """Begins to change to another rate; asking again for the same one changes nothing.
+        """Begins to change to another rate; requesting the same one again has no effect.
 
         Raises:
-            ValueError: It is not from 0 to 1; the table was proved for no faster feed.
+            ValueError: The rate is outside 0 to 1; the table is checked only up to full feed.
         """
         if not 0.0 <= rate <= 1.0:
             raise ValueError(f"a feed of {rate} rows a cycle is not from 0 to 1")
@@ -103,7 +103,7 @@ class Feed:
         self.go_to(0.0)
 
     def advance(self) -> float:
-        """The place of the next cycle."""
+        """Table index of the next cycle."""
         if self.at_rest:
             return self.index
         step = self.rate if self._steady else self._ramped()
@@ -120,7 +120,7 @@ class Feed:
 
 
 def targets_at(setpoints: NDArray[np.int32], index: float) -> tuple[int, ...]:
-    """The set-points at a place in the table; between rows on the straight line of counts."""
+    """Set-points at a table index; linearly interpolated between rows."""
     row = math.floor(index)
     if row >= len(setpoints) - 1:
         return tuple(int(v) for v in setpoints[-1])
@@ -128,53 +128,53 @@ def targets_at(setpoints: NDArray[np.int32], index: float) -> tuple[int, ...]:
     if share == 0.0:
         return tuple(int(v) for v in setpoints[row])
     first, second = setpoints[row].astype(np.int64), setpoints[row + 1].astype(np.int64)
-    # Rounded always the same way: to even, a step of n counts could become n + 1.
+    # Always rounded in the same direction: to even, a step of n counts could become n + 1.
     mixed = np.floor(first + share * (second - first) + 0.5)
     return tuple(int(v) for v in mixed)
 
 
 @dataclass(frozen=True, slots=True)
 class CycleResult:
-    """What came of one cycle.
+    """Result of one cycle.
 
     Attributes:
-        verdict: Of the gate; when it denied, nothing was sent and there is nothing else.
-        status: What the drives reported; None also when it was too late to send anything.
-        following_error: Largest over the cables, [m]; NaN while the drives do not follow.
+        verdict: Decision of the gate; if denied, nothing was sent and the rest is empty.
+        status: What the drives reported; None if nothing was sent.
+        following_error: Largest of the cables, [m]; NaN while the drives do not follow.
         lateness: In cycles.
-        findings: What the watch saw.
+        alarms: What the monitors found.
     """
 
     verdict: GateDecision
     lateness: float
     status: CycleStatus | None = None
     following_error: float = float("nan")
-    findings: tuple[Alarm, ...] = ()
+    alarms: tuple[Alarm, ...] = ()
 
 
 class Cycle:
-    """The way to the drives and back; nothing is sent but what the gate allows.
+    """Sends one cycle to the drives and takes their replies; sends only what the gate allows.
 
     Attributes:
-        armed: The course's hash was confirmed, and the platform stands at its start.
+        armed: The hash of the set-points was confirmed, and the platform is at their start.
         latched: A fault is latched.
-        targets: Sent last; None before the first cycle with targets.
+        targets: Last set-points sent; None before the first.
         actual: Positions as last received, [counts].
     """
 
     def __init__(
-        self, course: CheckedSetpoints, master: SyncMaster, *, slack_counts: bool = True
+        self, checked: CheckedSetpoints, master: SyncMaster, *, slack_counts: bool = True
     ) -> None:
-        """Nothing is sent yet; what slack cables mean is as for `watch_limits`."""
-        rig = course.rig
+        """Sends nothing yet; ``slack_counts`` as for `watch_limits`."""
+        rig = checked.rig
         self._rig, self._master, self._group = rig, master, master.group
         self._per_metre = np.array([w.counts_per_metre for w in rig.winches])
-        self._limits = gate_limits(rig, course.setpoints, course.cycle)
+        self._limits = gate_limits(rig, checked.setpoints, checked.cycle)
         names = tuple(rig.drive_names.values())
         self._numbers = {node: k for k, node in enumerate(rig.drive_names, start=1)}
         limits = watch_limits(rig, master.rule, slack_counts=slack_counts)
         self._watch = Monitor.fresh(limits, names)
-        self._stuck = StuckWatch.fresh(stuck_limits(rig, course.cycle), names)
+        self._stuck = StuckWatch.fresh(stuck_limits(rig, checked.cycle), names)
         self.armed = False
         self.latched = False
         self._unsent = 0.0
@@ -183,19 +183,19 @@ class Cycle:
 
     @property
     def resting_targets(self) -> tuple[int, ...]:
-        """Targets that move nothing."""
+        """Targets that keep the drives still."""
         return self.targets or self.actual
 
     def allow(self, setpoints: NDArray[np.int32]) -> None:
-        """The gate lets the range of other set-points through from now on, shape (n, m)."""
+        """From now on the gate allows the range of these set-points, shape (n, m)."""
         self._limits = gate_limits(self._rig, setpoints, self._rig.cycle)
 
-    def largest_way(self, first: Array, second: Array) -> float:
-        """The longest cable between two sets of drive positions, [m]."""
+    def largest_travel(self, first: Array, second: Array) -> float:
+        """Largest cable travel between two sets of drive positions, [m]."""
         return float(np.max(np.abs((second - first) / self._per_metre)))
 
     def allows(self, purpose: Purpose, targets: tuple[int, ...]) -> GateDecision:
-        """What the gate says to targets now."""
+        """Decision of the gate on targets now."""
         request = Request(
             purpose=purpose,
             targets=targets,
@@ -208,7 +208,7 @@ class Cycle:
         return examine(self._limits, request)
 
     def take_over(self) -> GateDecision:
-        """Goes on from where the group held each drive while it enabled them."""
+        """Continues from the positions at which the group enabled the drives."""
         held = tuple(int(target) for target in self._group.targets)
         first = Request(Purpose.HOLD, held, None, self.actual, self.armed, False, self.latched)
         verdict = examine(self._limits, first)
@@ -220,16 +220,16 @@ class Cycle:
         """One cycle.
 
         Args:
-            purpose: Why the targets are sent.
-            targets: One position a drive, [counts].
-            at_rest: Nothing moves, so that only a cycle that would enable a drive can be late.
+            purpose: Purpose of the targets.
+            targets: One position per drive, [counts].
+            at_rest: Nothing moves: only a cycle that would enable a drive can be late.
         """
-        # The cycle that was not sent has no record: the next one records how late it is.
+        # A cycle that was not sent has no record: the next one records its lateness.
         lateness, self._unsent = max(self._master.begin(), self._unsent), 0.0
         too_late = () if at_rest else self._too_late(lateness)
         if too_late:
             self._unsent = lateness
-            return CycleResult(ALLOWED, lateness, findings=too_late)
+            return CycleResult(ALLOWED, lateness, alarms=too_late)
         verdict = self.allows(purpose, targets)
         if not verdict.allowed:
             return CycleResult(verdict, lateness)
@@ -239,22 +239,22 @@ class Cycle:
         errors = self._following_errors(status)
         overdue = self._master.overdue
         lateness = max(lateness, overdue - 1.0)
-        findings = self._look(status, errors, 0.0 if at_rest and not overdue else lateness)
-        return CycleResult(verdict, lateness, status, _largest(errors), findings)
+        alarms = self._evaluate(status, errors, 0.0 if at_rest and not overdue else lateness)
+        return CycleResult(verdict, lateness, status, _largest(errors), alarms)
 
     def _too_late(self, lateness: float) -> tuple[Alarm, ...]:
-        """Why nothing is sent any more: the drives have stopped by themselves meanwhile."""
+        """Quick-stop alarms of a cycle so late that drives may have stopped on their own."""
         found = self._watch.lateness(lateness)
         return tuple(each for each in found if each.reaction is StopReaction.QUICK_STOP)
 
     def _following_errors(self, status: CycleStatus) -> Array:
-        """Signed, in cable length, shape (m,), [m]; NaN while drives do not follow or answer."""
+        """Signed cable lengths, shape (m,), [m]; NaN where drives do not follow or answer."""
         if status.state is not GroupState.ENABLED:
             return np.full(len(self._per_metre), np.nan)
         errors: Array = (status.positions - status.demands) / self._per_metre
         return np.where(status.missing, np.nan, errors)
 
-    def _look(self, status: CycleStatus, errors: Array, lateness: float) -> tuple[Alarm, ...]:
+    def _evaluate(self, status: CycleStatus, errors: Array, lateness: float) -> tuple[Alarm, ...]:
         following, missing = status.state is GroupState.ENABLED, status.missing.tolist()
         seen = Observation(
             following=following,
@@ -265,14 +265,14 @@ class Cycle:
             lateness=lateness,
             warnings=[(self._numbers.get(w.node, 0), w.text, w.stops) for w in status.warnings],
         )
-        self._watch, findings = self._watch.look(seen)
-        self._stuck, stuck = self._stuck.look(
+        self._watch, alarms = self._watch.update(seen)
+        self._stuck, stuck = self._stuck.update(
             following, status.positions.tolist(), status.demands.tolist(), missing
         )
-        return (*findings, *stuck)
+        return (*alarms, *stuck)
 
 
 def _largest(errors: Array) -> float:
-    """Of those that are known; NaN when none is."""
+    """Largest of the known values; NaN when none is known."""
     known = np.abs(errors[np.isfinite(errors)])
     return float(known.max()) if known.size else float("nan")

@@ -1,4 +1,4 @@
-"""A motion along a checked path as a job of the real-time process."""
+"""Motion along a checked path, as a job of the real-time process."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from model.scene import Load
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathMotion:
-    """See `Motion` in `executor.realtime.job`.
+    """See `MotionTask` in `executor.realtime.job`.
 
     Attributes:
         rig: The rig file.
-        cables: How many.
+        cables: Number of cables.
         cycle: [s].
         hash: Fingerprint of the set-points when they were checked.
         setpoints: The set-points, int32, shape (n, m), sealed.
-        pose_every: Cycles from one true pose of the simulated platform to the next; 0 for none.
-        loads: What the simulated platform carries, by place in the table.
-        reference: Where the drives were referenced, if they were.
+        pose_every: Cycles between true poses of the simulated platform; 0 for none.
+        loads: Payload changes of the simulated platform, by table index.
+        reference: The drives' homing reference, if any.
     """
 
     rig: RigDocument
@@ -50,26 +50,26 @@ class PathMotion:
     @classmethod
     def of(
         cls,
-        course: CheckedSetpoints,
+        checked: CheckedSetpoints,
         *,
         pose_every: int,
         loads: Schedule[Load],
         reference: HomingReference | None,
     ) -> PathMotion:
-        """With set-points in shared memory of its own."""
+        """A motion with its set-points in shared memory."""
         return cls(
-            rig=course.rig.document,
-            cables=course.rig.cable_count,
-            cycle=course.cycle,
-            hash=course.hash,
-            setpoints=SharedMemory.sealed(np.ascontiguousarray(course.setpoints).tobytes()),
+            rig=checked.rig.document,
+            cables=checked.rig.cable_count,
+            cycle=checked.cycle,
+            hash=checked.hash,
+            setpoints=SharedMemory.sealed(np.ascontiguousarray(checked.setpoints).tobytes()),
             pose_every=pose_every,
             loads=loads,
             reference=reference,
         )
 
-    def course(self) -> CheckedSetpoints:
-        """The set-points as this process sees them; arming compares them with what was checked."""
+    def checked_setpoints(self) -> CheckedSetpoints:
+        """The set-points as read by this process; arming compares their fingerprint."""
         rig = rig_from_document(self.rig)
         numbers = np.frombuffer(self.setpoints.view, dtype=np.int32)
         return CheckedSetpoints(rig, self.cycle, numbers.reshape(-1, rig.cable_count), self.hash)
@@ -79,20 +79,26 @@ class PathMotion:
         drives: ReadyDrives,
         master: SyncMaster,
         *,
-        wishes: Callable[[], OperatorRequests],
+        requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
         on_event: Callable[[LoopEvent], None],
     ) -> Loop:
-        """See `Motion`."""
-        return Loop(self.course(), master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)
+        """See `MotionTask`."""
+        return Loop(
+            self.checked_setpoints(),
+            master,
+            requests=requests,
+            on_cycle=on_cycle,
+            on_event=on_event,
+        )
 
     def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
-        """See `Motion`."""
+        """See `MotionTask`."""
         restarted = drives.group.restarted
         require_still_referenced(drives.rig, self.reference, restarted, positions)
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `Motion`."""
+        """See `MotionTask`."""
         if record.state in ON_PATH:
             for load in self.loads.due(record.index):
                 drives.carry(load)
@@ -100,5 +106,5 @@ class PathMotion:
         return drives.true_pose_now() if wanted else None
 
     def close(self) -> None:
-        """See `Motion`."""
+        """See `MotionTask`."""
         self.setpoints.close()

@@ -1,4 +1,4 @@
-"""The motion of a prepared run in this process, in simulated time."""
+"""Motions along a checked path: in this process, or in the real-time process."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from model.scene import Load
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What the motion left behind.
+    """Result of a motion.
 
     Attributes:
-        state: Where the run ended.
+        state: Final state.
         cause: Why it did not finish, if it did not.
-        log: Its cycles.
-        holding: Every cable was held when the drives were last heard.
-        started: When, UTC.
+        log: Recorded cycles and events.
+        holding: Every cable was held at the drives' last reply.
+        started: Start time, UTC.
     """
 
     state: State
@@ -57,23 +57,23 @@ def run_in_process(
     carry: Callable[[Load], None],
     before_motion: Callable[[], None],
 ) -> Outcome:
-    """Moves along the path; ends with the drives holding by themselves.
+    """Moves along the path in simulated time; ends with the drives holding on their own.
 
     Args:
         prepared: The checked run.
         group: Configured drives.
         clock: Simulated time.
-        board: What the operator wants.
-        recorder: Takes in what happens.
-        true_pose: Where the simulated platform is.
-        carry: Gives the simulated platform another load.
-        before_motion: Called when all is armed; what it raises prevents the motion.
+        board: Operator requests.
+        recorder: Records cycles and events.
+        true_pose: Returns the true pose of the simulated platform.
+        carry: Changes the payload of the simulated platform.
+        before_motion: Called when armed; an exception prevents the motion.
 
     Raises:
         Refused: Arming was refused; nothing was enabled.
         HardwareMissing: A drive does not answer.
     """
-    loads = load_changes(prepared.scene, prepared.checked.table.stands)
+    loads = load_changes(prepared.scene, prepared.checked.table.dwells)
 
     def on_cycle(record: CycleRecord) -> None:
         if record.state in ON_PATH:
@@ -85,7 +85,7 @@ def run_in_process(
     loop = Loop(
         checked_setpoints_of(prepared.checked),
         SyncMaster(prepared.rig, group, clock),
-        wishes=board.read,
+        requests=board.read,
         on_cycle=on_cycle,
         on_event=recorder.take_event,
     )
@@ -96,7 +96,7 @@ def run_in_process(
     return Outcome(loop.machine.state, loop.cause, recorder.log, loop.holding, started)
 
 
-# A run along a checked path in the real-time process, from arming to its end.
+# In the real-time process, from arming to the end.
 
 
 def run_in_real_time(
@@ -107,35 +107,35 @@ def run_in_real_time(
     *,
     pose_every: int,
     need_real_time: bool,
-    look_again: Callable[[], str],
+    check_drives: Callable[[], str],
     before_motion: Callable[[str], None],
     listener: Listener = SILENT,
 ) -> Outcome:
-    """Moves along the path in a process of its own; ends with the drives holding by themselves.
+    """Moves along the path in the real-time process; ends with the drives holding.
 
     Args:
         prepared: The checked run.
         make_drives: Opens and configures the drives; called in that process; picklable.
-        board: What the operator wants.
-        recorder: Takes in what happens.
-        pose_every: Cycles from one true pose of the simulated platform to the next; 0 for none.
+        board: Operator requests.
+        recorder: Records cycles and events.
+        pose_every: Cycles between true poses of the simulated platform; 0 for none.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
-        look_again: As for `executor.realtime.process.real_time_process`.
-        before_motion: Called when all is armed, with what was denied; what it raises prevents the
+        check_drives: As for `executor.realtime.process.real_time_process`.
+        before_motion: Called when armed, with what the system denied; an exception prevents the
             motion.
-        listener: Receives what the drives cannot do.
+        listener: Receives remarks on missing capabilities of the drives.
 
     Raises:
         CdprError: The bus is latched, or the process could not arm the drives, as stated;
             nothing was enabled.
-        StoppedByOperator: The operator wanted to stop before anything moved.
+        StoppedByOperator: A stop was requested before anything moved.
     """
     interlock = MotionInterlock(prepared.rig)
     reference = interlock.require_ready()
     motion = PathMotion.of(
         checked_setpoints_of(prepared.checked),
         pose_every=pose_every,
-        loads=load_changes(prepared.scene, prepared.checked.table.stands),
+        loads=load_changes(prepared.scene, prepared.checked.table.dwells),
         reference=reference,
     )
     with real_time_process(
@@ -143,7 +143,7 @@ def run_in_real_time(
         make_drives,
         board,
         need_real_time=need_real_time,
-        look_again=look_again,
+        check_drives=check_drives,
         listener=listener,
     ) as process:
         denied = process.arm(recorder).denied
@@ -161,10 +161,10 @@ def run_in_real_time(
                 ended.cause,
                 recorder.folder.path,
                 holding=ended.holding,
-                stands_at=recorder.log.last_positions,
+                positions=recorder.log.last_positions,
             )
-        except CdprError as error:  # the motion is over: its record is finished all the same
+        except CdprError as error:  # the motion is over: its record is still completed
             text = f"{error.what} ({error.where}: {error.why})"
-            process.tell("recorder", text)
+            process.report_event("recorder", text)
             return Outcome(State.LATCHED, ended.cause or text, recorder.log, ended.holding, started)
         return Outcome(ended.state, ended.cause, recorder.log, ended.holding, started)

@@ -1,4 +1,4 @@
-"""What must hold before drives are enabled."""
+"""Preconditions of enabling the drives."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from model.rig import Rig, rig_from_document
 from model.winches import WinchMap
 
 WATCHDOG_CYCLES = 3
-"""Cycles that a drive's watchdog must last at least: one late cycle is no reason to disarm."""
+"""Shortest watchdog of a drive, in cycles: one late cycle must not disarm it."""
 
 
 def require_capabilities(drives: Capabilities, cycle: float) -> None:
-    """Drives must start, stop and hold together without the master, or have brakes.
+    """Requires drives that start, stop and hold together without the master, or have brakes.
 
-    Drives that no SYNC holds together get their set-points back to back, and when these stay away
-    each is stopped by its own watchdog, which frees its cable: then every winch needs a brake.
+    Drives without a common SYNC get their set-points back to back, and when these cease,
+    each is stopped by its own watchdog, which releases its cable: then every winch needs a brake.
 
     Raises:
-        Refused: They do not, or the cycle is faster than they were tested with.
+        Refused: A capability is missing, or the cycle is faster than tested with these drives.
     """
     watchdog = (drives.watchdog_ms or 0.0) / 1000.0
     braked = drives.has_brake and watchdog > 0.0
@@ -52,17 +52,17 @@ def require_capabilities(drives: Capabilities, cycle: float) -> None:
 
 
 def _declared(drives: Capabilities) -> str:
-    """What the rig file must say of drives that only brakes make fit."""
+    """Keys of the rig file for drives that rely on brakes."""
     return "" if drives.sync else " (winches[].brake of all, and drives.watchdog_ms)"
 
 
-def require_unchanged(course: CheckedSetpoints) -> None:
-    """The set-points are still those that were checked.
+def require_unchanged(checked: CheckedSetpoints) -> None:
+    """Requires the set-points to be those that were checked.
 
     Raises:
-        Refused: They are not.
+        Refused: They differ.
     """
-    if not course.unchanged:
+    if not checked.unchanged:
         raise Refused(
             "the set-points differ from those that were checked",
             where="arming",
@@ -71,19 +71,19 @@ def require_unchanged(course: CheckedSetpoints) -> None:
         )
 
 
-def require_at_start(course: CheckedSetpoints, actual: Array) -> None:
-    """The drives stand where the set-points begin.
+def require_at_start(checked: CheckedSetpoints, actual: Array) -> None:
+    """Requires the drives to be at the first set-points.
 
     Args:
-        course: The set-points.
+        checked: The set-points.
         actual: Positions of the drives, shape (m,), [counts].
 
     Raises:
         Refused: One is farther from its first set-point than the rig's start tolerance.
     """
-    rig = course.rig
+    rig = checked.rig
     per_metre = np.array([w.counts_per_metre for w in rig.winches])
-    off = np.abs((actual - course.setpoints[0]) / per_metre)
+    off = np.abs((actual - checked.setpoints[0]) / per_metre)
     worst = int(off.argmax())
     if not off[worst] <= rig.motion.start_tolerance:
         raise Refused(
@@ -103,19 +103,19 @@ def require_still_referenced(
     restarted: Sequence[int],
     positions: Sequence[int],
 ) -> None:
-    """Drives without absolute encoders still count from where they were referenced.
+    """Requires drives without absolute encoders to have kept their reference.
 
-    Such a drive silently loses its configuration and position with its power. So it
-    must hold the set-up of before, and stand where it was left.
+    Such a drive silently loses its configuration and position with its power. So it must
+    still have its configuration, and be at its last known position.
 
     Args:
         rig: The robot.
-        reference: Of its drives; None where it needs none.
-        restarted: Nodes that were found without this program's set-up.
-        positions: Where the drives are, [counts].
+        reference: Homing reference of its drives; None where it needs none.
+        restarted: Nodes found without this program's configuration.
+        positions: Of the drives, [counts].
 
     Raises:
-        Refused: One of them was switched on since, or was moved; nothing was enabled.
+        Refused: A drive was power-cycled or moved since; nothing was enabled.
     """
     if reference is None:
         return
@@ -140,16 +140,16 @@ def _lost(rig: Rig, drive: int, how: str) -> Refused:
     )
 
 
-# Drives that count from anywhere: as what rig they are set up and watched.
+# Unreferenced drives: the rig they are configured and monitored as.
 
 
 def counted_here(rig: Rig, counts: Sequence[int], pose: Pose) -> Rig:
-    """The rig as drives that were never referenced are set up for: a guess of what they count.
+    """The rig that unreferenced drives are configured for, with counts from a guessed pose.
 
     Args:
         rig: The robot.
-        counts: Where its drives stand, [counts].
-        pose: Where its platform is about, ``world_from_platform``.
+        counts: Positions of its drives, [counts].
+        pose: Approximate pose of its platform, ``world_from_platform``.
 
     Raises:
         TensionInfeasible: The rig cannot hold its platform at home.
@@ -165,10 +165,9 @@ def counted_here(rig: Rig, counts: Sequence[int], pose: Pose) -> Rig:
 
 
 def set_up_here(rig: Rig, snapshot: DriveSnapshot) -> tuple[Rig, float]:
-    """What drives are set up for that move nothing: their limits lie about where they stand.
+    """Configuration of drives that will not move: limits centred on their positions.
 
-    The rig file's counts are no guide: a drive that is enabled beyond its own position limits runs
-    to them.
+    The rig file's counts do not apply: a drive enabled beyond its position limits runs to them.
 
     Args:
         rig: The robot.
@@ -181,9 +180,9 @@ def set_up_here(rig: Rig, snapshot: DriveSnapshot) -> tuple[Rig, float]:
 
 
 def with_reduced_limits(rig: Rig, *, limit: float, speed: float) -> Rig:
-    """The rig as gate and watch see it while winches move by a law; drives are not set up by it.
+    """The rig for gate and monitors while winches move by a law; not for drive configuration.
 
-    With the platform on a jig or not on its cables at all, no tensions need balance it.
+    With the platform on a jig or detached, no tensions need balance it.
 
     Args:
         rig: The robot.
@@ -200,9 +199,9 @@ def with_reduced_limits(rig: Rig, *, limit: float, speed: float) -> Rig:
 
 
 def require_below(rig: Rig, held: DriveSnapshot, limit: float) -> None:
-    """No drive holds more than it may from now on: written to it, the limit would let it slip.
+    """Requires every drive's torque to be below its new limit, which would let it slip.
 
-    What closed brakes hold is not known before the drives are enabled.
+    The load on closed brakes is unknown until the drives are enabled.
 
     Args:
         rig: The robot.
@@ -210,7 +209,7 @@ def require_below(rig: Rig, held: DriveSnapshot, limit: float) -> None:
         limit: Largest tension, [N].
 
     Raises:
-        Refused: One does; with its cable.
+        Refused: A tension exceeds the limit; with its drive.
     """
     tensions = rig.tensions_by(held.torques)
     over = [

@@ -1,7 +1,7 @@
-"""What is done to drives that follow no path: torque off (`cdpr release`) and `cdpr reset`.
+"""Procedures on drives at rest: torque off (`cdpr release`) and fault reset (`cdpr reset`).
 
-Each is done in the real-time process, with the cycle kept from the first reading to the ordered
-end; whatever stops it, all drives are commanded to stop.
+Each runs in the real-time process, cyclically from the first reading to the ordered end;
+if anything interrupts it, all drives are commanded to stop.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from executor.control.preconditions import require_capabilities
-from executor.control.sync_master import ReplyTimeout, SyncMaster, late_fault, left_otherwise
+from executor.control.sync_master import ReplyTimeout, SyncMaster, changed_states, late_fault
 from executor.realtime.job import ReadyDrives
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import OperatorRequests
@@ -21,18 +21,18 @@ from model.errors import CdprError, Fault, StoppedByOperator
 from model.pose import Pose
 from model.rig import Rig
 
-#: All drives must be without torque, or have come to a stop, within this time, [s].
+#: All drives must be without torque, or stopped, within this time, [s].
 WITHIN_S = 3.0
-#: Cycles in which a drive leaves its fault, and the others are seen to hold.
+#: Cycles for a drive to leave its fault, and for the others to be confirmed holding.
 SETTLING_CYCLES = 30
 
 
 class Standstill(ABC):
-    """One procedure on drives that stay where they are; a `Procedure` of the real-time process.
+    """Procedure on drives at rest; a `Procedure` of the real-time process.
 
     Attributes:
         cause: Why it did not finish.
-        error: The same, to be raised where the operator is.
+        error: The same, raised in the supervisor.
         holding: Every cable was held in every cycle.
     """
 
@@ -42,12 +42,12 @@ class Standstill(ABC):
         self,
         rig: Rig,
         master: SyncMaster,
-        wishes: Callable[[], OperatorRequests],
+        requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
     ) -> None:
-        """Nothing is sent yet; arguments as for `executor.control.loop.Loop`."""
+        """Sends nothing yet; arguments as for `executor.control.loop.Loop`."""
         self._rig, self._master, self._group = rig, master, master.group
-        self._wishes, self._on_cycle = wishes, on_cycle
+        self._requests, self._on_cycle = requests, on_cycle
         self._silence = ReplyTimeout(rig)
         self._cycles = 0
         self._longest = round(WITHIN_S / rig.cycle)
@@ -57,31 +57,31 @@ class Standstill(ABC):
     error: CdprError | None
 
     def arm(self, require: Callable[[Sequence[int]], None] = lambda _positions: None) -> None:
-        """Reads where the drives are; see `executor.control.loop.Loop.arm`.
+        """Reads the drive positions; see `executor.control.loop.Loop.arm`.
 
         Raises:
-            Refused: They are not to be worked on so; nothing was changed.
+            Refused: The procedure is not allowed on these drives; nothing was changed.
             HardwareMissing: A drive does not answer.
         """
         require_capabilities(self._group.capabilities, self._rig.cycle)
         self._master.read_positions()
-        require(self.stands_at)
+        require(self.positions)
 
     @property
-    def stands_at(self) -> tuple[int, ...]:
-        """Where the drives were when they were last heard, [counts]."""
+    def positions(self) -> tuple[int, ...]:
+        """Last reported positions of the drives, [counts]."""
         status = self._master.status
         return () if status is None else tuple(int(position) for position in status.positions)
 
     def run(self) -> State:
-        """Does it; drives that hold are commanded to stop when anything is wrong.
+        """Runs the procedure; on any fault all drives are commanded to stop.
 
         Returns:
             FINISHED, or LATCHED with `cause` and `error`.
         """
         try:
             done = self._work()
-            otherwise = left_otherwise(self._rig, done, self._master.leave(self._one_more))
+            otherwise = changed_states(self._rig, done, self._master.leave(self._one_more))
             if otherwise:
                 raise Fault(
                     otherwise,
@@ -99,17 +99,17 @@ class Standstill(ABC):
 
     @abstractmethod
     def _work(self) -> CycleStatus:
-        """The procedure itself; how it leaves the drives.
+        """Runs the procedure itself; returns the final drive status.
 
         Raises:
             CdprError: It did not finish.
         """
 
     def _cycle(self) -> CycleStatus:
-        """One cycle in which drives stay where they are.
+        """One cycle with unchanged targets.
 
         Raises:
-            Fault: It came too late, or the bus failed.
+            Fault: The cycle was too late, or the bus failed.
             HardwareMissing: Drives fell silent.
         """
         lateness = self._master.begin()
@@ -123,7 +123,7 @@ class Standstill(ABC):
         return status
 
     def _require_in_time(self, lateness: float) -> None:
-        """Drives that may be under command must not have stopped by themselves meanwhile."""
+        """Refuses a cycle so late that following drives may have stopped on their own."""
         status = self._master.status
         following = status is not None and not status.stopped
         if following and not self._master.rule.may_enable(1.0 + lateness):
@@ -131,7 +131,7 @@ class Standstill(ABC):
 
     @abstractmethod
     def _require_heard(self, silence: ReplyTimeout) -> None:
-        """Raises HardwareMissing where drives fell silent."""
+        """Raises HardwareMissing if drives fell silent."""
 
     def _record(self, status: CycleStatus, lateness: float) -> None:
         self.holding = self.holding and status.holding
@@ -159,9 +159,9 @@ class Standstill(ABC):
         return True
 
     def _stop(self) -> None:
-        """Commands all to stop until every one reports that it follows nothing, or time is over.
+        """Commands a stop until every drive reports that it is stopped, or times out.
 
-        A bus that does not take the stop is no reason to leave off: the next cycle repeats it.
+        If the bus does not accept the stop, the next cycle repeats it.
         """
         with suppress(CdprError):
             self._master.stop_now()
@@ -172,11 +172,11 @@ class Standstill(ABC):
                 self._record(status, 0.0)
                 if status.stopped and not self._group.stopping:
                     break
-        self._master.leave_unmoved()
+        self._master.leave_disabled()
 
 
 class Release(Standstill):
-    """Takes the torque of all drives off, together; they stay where they are."""
+    """Switches off the torque of all drives together, without motion."""
 
     where = "release"
 
@@ -188,7 +188,7 @@ class Release(Standstill):
     def _work(self) -> CycleStatus:
         self._group.command(GroupCommand.RELEASE)
         for _ in range(self._longest):
-            if self._wishes().stop:
+            if self._requests().stop:
                 raise StoppedByOperator(
                     "stopped while releasing the drives; those under torque hold, a"
                     " fault is latched, and the drives must be homed again",
@@ -221,7 +221,7 @@ def _not_released(what: str) -> Fault:
 
 
 class FaultReset(Standstill):
-    """Resets drives in fault; those that hold keep holding."""
+    """Resets drives in fault; drives that hold keep holding."""
 
     where = "reset"
 
@@ -250,11 +250,11 @@ class FaultReset(Standstill):
 
 @dataclass(frozen=True, slots=True)
 class StandstillMotion:
-    """A procedure as a job of the real-time process; see `Motion` there.
+    """A procedure as a job of the real-time process; see `MotionTask` there.
 
     Attributes:
-        kind: Which.
-        cables: How many.
+        kind: Class of the procedure.
+        cables: Number of cables.
         cycle: [s].
     """
 
@@ -264,7 +264,7 @@ class StandstillMotion:
 
     @classmethod
     def of(cls, kind: type[Release] | type[FaultReset], rig: Rig) -> StandstillMotion:
-        """A procedure on the drives of a rig."""
+        """The procedure for the drives of a rig."""
         return cls(kind, rig.cable_count, rig.cycle)
 
     def loop(
@@ -272,19 +272,19 @@ class StandstillMotion:
         drives: ReadyDrives,
         master: SyncMaster,
         *,
-        wishes: Callable[[], OperatorRequests],
+        requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
         on_event: Callable[[LoopEvent], None],
     ) -> Standstill:
-        """See `Motion`."""
-        return self.kind(drives.rig, master, wishes, on_cycle)
+        """See `MotionTask`."""
+        return self.kind(drives.rig, master, requests, on_cycle)
 
     def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
-        """See `Motion`; the drives stay wherever they are."""
+        """See `MotionTask`; any positions are allowed."""
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `Motion`; nothing moves."""
+        """See `MotionTask`; nothing moves."""
         return None
 
     def close(self) -> None:
-        """See `Motion`; it shares no memory."""
+        """See `MotionTask`; no memory is shared."""

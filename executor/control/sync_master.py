@@ -1,10 +1,10 @@
-"""The one sender of SYNC: it keeps the cycle from the first reading of positions to the last SYNC.
+"""The only sender of SYNC, from the first reading of positions to the last SYNC.
 
-Whatever else is waited for (the operator's word, a file on disk, a camera), the cycle goes on, so
-that no drive loses its master. No drive is commanded to follow set-points when the SYNC before is
-too old (`executor.safety.monitor`): that is decided when a cycle begins and once more between its
-set-points and its SYNC, since this process may be suspended in between. Where it was suspended
-between that decision and the SYNC, a quick stop follows at once.
+While the program waits for anything else (an answer of the operator, a file, a camera), the
+cycle continues, so that no drive loses its master. No drive is commanded to follow set-points
+when the previous SYNC is too old (`executor.safety.monitor`): that is decided when a cycle begins
+and again between its set-points and its SYNC, since this process may be suspended in between. If
+it was suspended between that decision and the SYNC, a quick stop follows at once.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand
 from drivers.factory import drive_states
 from executor.realtime.scheduling import Clock
 from executor.safety.monitor import MISSING_CYCLES, USUAL_TIMEOUT, SyncAge
-from executor.state_machine import together
+from executor.state_machine import name_drives
 from model.errors import CdprError, Fault, HardwareMissing
 from model.rig import Rig
 
-# Which drives fell silent where no watch looks at them: around a motion, not in it.
+# Detection of silent drives where no monitor runs: before and after a motion.
 
 
 class ReplyTimeout:
-    """Counts, for each drive, the cycles in a row without an answer; too many stay too many."""
+    """Counts consecutive cycles without an answer per drive; a time-out latches."""
 
     def __init__(self, rig: Rig) -> None:
-        """Of the drives of a rig, before the first cycle."""
+        """A counter for the drives of a rig, before the first cycle."""
         self._names = tuple(rig.drive_names.values())
         self._cycles = [0] * rig.cable_count
 
@@ -43,13 +43,13 @@ class ReplyTimeout:
         ]
 
     def require_none(self, doing: str, *, where: str, why: str, next_step: str) -> None:
-        """All drives were heard.
+        """Requires that no drive is silent.
 
         Args:
-            doing: What was going on, as in "while the drives settled".
-            where: As of every error.
-            why: Likewise.
-            next_step: Likewise.
+            doing: Phase for the message, as in "while the drives settled".
+            where: As for every error.
+            why: As for every error.
+            next_step: As for every error.
 
         Raises:
             HardwareMissing: Drives fell silent; with their names.
@@ -58,29 +58,29 @@ class ReplyTimeout:
             name for name, n in zip(self._names, self._cycles, strict=True) if n >= MISSING_CYCLES
         ]
         if gone:
-            which, cause = together(gone, len(self._cycles))
+            which, cause = name_drives(gone, len(self._cycles))
             what = f"{which} stopped answering {doing}{cause}"
             raise HardwareMissing(what, where=where, why=why, next_step=next_step)
 
 
-#: Without any answer to SYNC for so long a drive is not waited for at the end, [s].
+#: A drive that has not answered SYNC for this long is not waited for at the end, [s].
 GIVEN_UP_AFTER = 0.5
 
-Word = TypeVar("Word")
+Message = TypeVar("Message")
 
 
 class SyncMaster:
-    """Keeps the cycle of one drive group.
+    """Sends the cycles of one drive group.
 
     Attributes:
-        group: The drives; others read from it and command it, and only this sends its cycles.
+        group: The drives; others read and command it, only this class sends its cycles.
         clock: Real or simulated.
-        rule: How old the last SYNC may be.
-        status: What the drives reported last; None before the first reading.
+        rule: Limit on the age of the last SYNC.
+        status: Last report of the drives; None before the first reading.
     """
 
     def __init__(self, rig: Rig, group: DriveGroup, clock: Clock) -> None:
-        """Takes configured drives; nothing is sent yet."""
+        """Takes configured drives; sends nothing yet."""
         self.group, self.clock = group, clock
         timeout = group.capabilities.sync_timeout
         self.rule = SyncAge(USUAL_TIMEOUT if timeout is None else timeout)
@@ -88,19 +88,19 @@ class SyncMaster:
         self._rig, self._cycle = rig, rig.cycle
         self._synced: float | None = None
         self._overdue = 0.0
-        self._enabled_after: float | None = None  # SYNC before one that enables, [s] of the clock
+        self._enabled_after: float | None = None  # time of the SYNC before one that enables, [s]
 
     @property
     def age(self) -> float:
-        """Of the last SYNC, in cycles; 0 before the first one."""
+        """Age of the last SYNC, in cycles; 0 before the first."""
         return 0.0 if self._synced is None else (self.clock.now - self._synced) / self._cycle
 
     def begin(self) -> float:
-        """Waits for the next cycle; how late it begins, in cycles."""
+        """Waits for the next cycle; returns its lateness, in cycles."""
         return self.clock.next_cycle()
 
     def exchange(self, targets: Sequence[int]) -> CycleStatus:
-        """Sends this cycle's frames and takes the replies; the cycle has begun.
+        """Sends the frames of the current cycle and takes the replies.
 
         Raises:
             Fault: The bus failed.
@@ -117,11 +117,11 @@ class SyncMaster:
 
     @property
     def overdue(self) -> float:
-        """Age of the last SYNC [cycles] that made this cycle a stop; 0 when it is none."""
+        """Age of the last SYNC [cycles] that turned this cycle into a stop; 0 otherwise."""
         return self._overdue
 
     def _may_send_now(self, enables: bool) -> bool:
-        """Asked just before every SYNC."""
+        """Whether the SYNC may be sent now; called just before each one."""
         before, age, self._synced = self._synced, self.age, self.clock.now
         if not enables:
             return True
@@ -153,7 +153,7 @@ class SyncMaster:
         return self.status
 
     def rest(self) -> CycleStatus:
-        """One cycle in which drives stay as they are.
+        """One cycle with unchanged targets.
 
         Raises:
             Fault: The bus failed.
@@ -161,10 +161,10 @@ class SyncMaster:
         self.begin()
         return self.exchange(self.group.targets.tolist())
 
-    def freshen(self) -> None:
-        """A cycle in which drives stay as they are, where the last SYNC is a whole cycle old.
+    def refresh(self) -> None:
+        """Sends a cycle with unchanged targets if the last SYNC is a whole cycle old.
 
-        What has to be done between two cycles may take longer than one on a slow computer.
+        On a slow computer, work between two cycles may take longer than one.
 
         Raises:
             Fault: The bus failed.
@@ -172,18 +172,18 @@ class SyncMaster:
         if self.age >= 1.0:
             self.rest()
 
-    def keep_until(self, heard: Callable[[], Word | None]) -> Word:
-        """Cycles, with the drives as they are, until something is heard.
+    def cycle_until(self, poll: Callable[[], Message | None]) -> Message:
+        """Sends cycles with unchanged targets until a message arrives; returns it.
 
         Args:
-            heard: Asked every cycle; None as long as there is nothing.
+            poll: Called every cycle; returns None while there is no message.
 
         Raises:
             HardwareMissing: A drive fell silent.
             Fault: The bus failed.
         """
         silence = ReplyTimeout(self._rig)
-        while (word := heard()) is None:
+        while (message := poll()) is None:
             silence.take(self.rest())
             silence.require_none(
                 "before the motion began",
@@ -191,17 +191,17 @@ class SyncMaster:
                 why="it lost power or the bus",
                 next_step="check power and wiring, then start again; nothing was enabled",
             )
-        return word
+        return message
 
     def leave(self, cycle: Callable[[], bool]) -> CycleStatus:
-        """The ordered end, with drives that hold on their own or by command.
+        """Ends the cycle in order; the drives hold on their own or by command.
 
-        Their monitoring of this master is switched off while SYNC goes on, heartbeat first and SYNC
-        last. Then SYNC and heartbeat cease, and every drive is asked for its state once more; where
-        a monitoring could not be switched off, only after its time-out is over.
+        Their monitoring of this master is switched off while SYNC continues, heartbeat first, SYNC
+        last. Then SYNC and heartbeat cease, and the state of every drive is read once more; where
+        monitoring could not be switched off, only after its time-out.
 
         Args:
-            cycle: Does one cycle; false when no further one is wanted.
+            cycle: Sends one cycle; returns False to send no more.
 
         Returns:
             What the drives report after the last SYNC.
@@ -220,10 +220,10 @@ class SyncMaster:
         if self.group.is_monitored:
             for _ in range(math.ceil(self.group.capabilities.master_timeout / self._cycle) + 1):
                 self.clock.next_cycle()
-        return self.look()
+        return self.read_state()
 
-    def look(self) -> CycleStatus:
-        """Asks every drive how it stands, without SYNC; see `DriveGroup.read_state`.
+    def read_state(self) -> CycleStatus:
+        """Reads the state of every drive without SYNC; see `DriveGroup.look`.
 
         Raises:
             Fault: The bus failed.
@@ -237,8 +237,8 @@ class SyncMaster:
         self.status = self.group.read_state(pace)
         return self.status
 
-    def leave_unmoved(self) -> None:
-        """The ordered end of drives that were never enabled; a bus that fails is left as it is."""
+    def leave_disabled(self) -> None:
+        """Ends the cycle for drives that were never enabled; ignores bus failures."""
 
         def cycle() -> bool:
             self.rest()
@@ -248,16 +248,16 @@ class SyncMaster:
             self.leave(cycle)
 
 
-def left_otherwise(
-    rig: Rig, before: CycleStatus, after: CycleStatus, but: Collection[int] = ()
+def changed_states(
+    rig: Rig, before: CycleStatus, after: CycleStatus, excluded: Collection[int] = ()
 ) -> str:
-    """Which drives report another state after the last SYNC than before it; empty when none does.
+    """Names the drives whose state changed at the end of the cycle; empty if none did.
 
     Args:
         rig: The robot.
-        before: What the drives reported before they were left.
-        after: What they reported after the last SYNC.
-        but: Drives, from 0, that are left out: what became of them is known.
+        before: Status before monitoring was ended.
+        after: Status after the last SYNC.
+        excluded: Drives to leave out, from 0: their state is already reported.
     """
     rows = zip(
         rig.drive_names.values(),
@@ -269,13 +269,13 @@ def left_otherwise(
     changed = [
         f"{name} {'does not answer' if silent else f'went from {old} to {new}'}"
         for drive, (name, old, new, silent) in enumerate(rows)
-        if (silent or old != new) and drive not in but
+        if (silent or old != new) and drive not in excluded
     ]
     return f"drives left the state they held in: {', '.join(changed)}" if changed else ""
 
 
 def late_fault(age: float) -> Fault:
-    """A cycle that could not be sent in time, outside a motion along a path."""
+    """Fault of a late cycle outside a motion along a path."""
     return Fault(
         f"a cycle began {age - 1.0:.1f} cycles late",
         where="executor",

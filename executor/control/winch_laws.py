@@ -1,7 +1,7 @@
 """Laws of winch motion without a path: the next set-point of each winch. Pure.
 
-Drives stay in their position mode: a tension is reached by winding cable in by less, each cycle,
-than could overstretch it before its tension is seen. No law pays cable out to cure a tension.
+Drives stay in position mode: a tension is reached by winding in, each cycle, less cable than
+could overload it before the tension is measured. No law pays out cable to reduce a tension.
 """
 
 from __future__ import annotations
@@ -17,39 +17,39 @@ from model.kinematics import cable_lengths
 from model.pose import Array
 from model.rig import Rig
 
-# How much tension is left while winches move without a path: they slow down, and stop. Pure.
+# Tension limits while winches move without a path: they slow down, and stop.
 
 
-#: Cycles in a row beyond the limit, all winches at rest, that end the motion.
+#: Consecutive cycles over the limit, all winches at rest, that end the motion.
 OVER_CYCLES = 5
-#: Near the limit all go on more slowly, down to this share of their speed; beyond it none goes on.
+#: Near the limit all winches slow down, to no less than this share of their speed; beyond it, 0.
 CREEP = 0.05
 
 
 class TensionHeadroom:
-    """What is left to the limit of the tension, and whether it is used up."""
+    """Slows winches down near the tension limit, and reports cables that stay over it."""
 
     def __init__(self, target: float, limit: float) -> None:
-        """All of it is left.
+        """Headroom between two tensions.
 
         Args:
-            target: Up to this tension winches go on at their speed, [N].
-            limit: Beyond this one none goes on, [N].
+            target: Tension up to which winches run at full speed, [N].
+            limit: Tension beyond which none moves, [N].
         """
         self._target, self._limit = target, limit
         self._cycles = 0
 
     def share(self, tensions: Sequence[float]) -> float:
-        """Of their speed at which winches go on, by the tensions [N] now; asked once a cycle."""
+        """Share of the winches' speed allowed at these tensions [N]; call once per cycle."""
         most = float(np.max(tensions))
-        # "Not at most", so that a tension that is no number counts as too large.
+        # "not ... <=", so that NaN counts as too large.
         over = not most <= self._limit
         self._cycles = self._cycles + 1 if over else 0
         room = (self._limit - most) / (self._limit - self._target)
         return 0.0 if over else min(1.0, max(CREEP, room))
 
     def used_up(self, tensions: Sequence[float]) -> list[Alarm]:
-        """Cables that carry more than the limit, and did so for too long."""
+        """Alarms of cables that were over the limit for too long."""
         if self._cycles < OVER_CYCLES:
             return []
         return [
@@ -64,31 +64,31 @@ class TensionHeadroom:
         ]
 
 
-#: Of what lies between slack and the limit a held control leaves this share unused, at least as
-#: much as a drive's whole counts may raise a tension, and at most half, [N].
+#: Share of the range from slack to the limit that a jog leaves unused; at least the tension of this
+#: many counts of a drive, at most half the range.
 RESERVE, RESERVE_COUNTS, MOST_RESERVE = 0.1, 2.0, 0.5
-#: Another cable that was taut is let become no slacker than this share of the least tension.
+#: No other taut cable may drop below this share of the least tension.
 LEAST_SHARE = 0.75
-#: By less than this share of the reserve a tension may change without having changed.
+#: Changes of a tension below this share of the reserve are noise.
 UNCHANGED = 0.25
 
 
 class TensionReserve:
-    """Brings a jog of one cable to rest before a tension is at its limit: that is no fault.
+    """Brings a jog of one cable to rest, without a fault, before a tension reaches its limit.
 
-    Winding in ends where any cable comes near the limit. Paying out slackens the cable itself, so
-    that only others count, and only those that become tighter: else nothing could slacken a
-    platform that is too taut. Either ends before another cable that was taut goes slack.
+    Winding in ends when any cable nears the limit. Paying out slackens the cable itself, so
+    only others count, and only those whose tension rises: otherwise an overtightened platform could
+    not be slackened. Either ends before another taut cable goes slack.
     """
 
     def __init__(self, rig: Rig, cable: int, *, limit: float, pays_out: bool) -> None:
-        """Nothing moves yet.
+        """A reserve at the start of a jog.
 
         Args:
             rig: The robot.
-            cable: Which, from 0.
-            limit: Tension that no cable may have, [N].
-            pays_out: The cable is paid out, otherwise wound in.
+            cable: Index, from 0.
+            limit: Largest tension of any cable, [N].
+            pays_out: Whether the cable is paid out, otherwise wound in.
         """
         reserve = tension_reserve(rig, limit)
         self._slack, self._floor = rig.min_tension / 2.0, LEAST_SHARE * rig.min_tension
@@ -98,7 +98,7 @@ class TensionReserve:
         self._before: Array | None = None
 
     def share(self, tensions: Sequence[float]) -> float:
-        """Of its speed at which it goes on, by the tensions [N] now; 0 where it must not."""
+        """Share of the speed allowed at these tensions [N]; 0 to stop."""
         now = np.asarray(tensions, dtype=np.float64)
         if not np.isfinite(now).all():
             return 0.0
@@ -115,20 +115,20 @@ class TensionReserve:
 
 
 def tension_reserve(rig: Rig, limit: float) -> float:
-    """How far below a limit [N] of the tension a jog of one cable comes to rest, [N]."""
+    """Distance below a tension limit [N] at which a jog of one cable comes to rest, [N]."""
     room = limit - rig.min_tension / 2.0
     per_metre = np.abs([winch.counts_per_metre for winch in rig.winches])
     count = RESERVE_COUNTS * float(np.max(_stiffness(rig) / per_metre))
     return min(max(RESERVE * room, count), MOST_RESERVE * room)
 
 
-#: A cable that was taut stays so while its tension is above this share of what was asked for.
+#: A taut cable counts as taut while its tension is above this share of the target.
 STAYS_TAUT = 0.8
-#: Cycles in which all cables must be taut, and in which one that was taut must not be slack.
+#: Cycles for which all cables must be taut; cycles after which a taut cable counts as slack.
 TAUT_CYCLES, SLACK_CYCLES = 20, 5
-#: A step may raise a tension by this share of what is left to the limit: its effect is seen only
-#: two cycles later, three where torques are a cycle late, and the cables opposite may be wound
-#: in meanwhile, too.
+#: A step may raise a tension by this share of the distance to the limit: its effect is measured
+#: only two cycles later, three where torques are a cycle late, and opposite cables may be wound
+#: in meanwhile.
 SHARE_OF_ROOM = 0.125
 
 Targets = tuple[int, ...]
@@ -139,48 +139,48 @@ class WinchLaw(Protocol):
 
     @property
     def reach(self) -> tuple[Targets, Targets]:
-        """Where it begins, and how far it may go, [counts]."""
+        """First and farthest targets, [counts]."""
         ...
 
     @property
     def done(self) -> bool:
-        """It has nothing left to do."""
+        """Whether the law has finished."""
         ...
 
     @property
     def progress(self) -> float:
-        """How much of it is done, from 0 to 1."""
+        """Share done, from 0 to 1."""
         ...
 
     def next(self, pace: float, tensions: Sequence[float]) -> tuple[Targets, tuple[Alarm, ...]]:
-        """One more cycle.
+        """Computes the next cycle.
 
         Args:
-            pace: Share of a cycle that passes for the law; less than 1 while the feed is slowed.
-            tensions: Of the cables now, shape (m,), [N].
+            pace: Time step in cycles; less than 1 while the feed is slowed.
+            tensions: Present cable tensions, shape (m,), [N].
 
         Returns:
-            Targets of all winches, [counts], and what makes going on wrong.
+            Targets of all winches, [counts], and alarms that end the motion.
         """
         ...
 
 
 class PretensionLaw:
-    """Winds all cables in, slowly and together, each until it is taut."""
+    """Winds in all cables slowly and together, each until it is taut."""
 
     def __init__(
         self, rig: Rig, begin: Sequence[int], *, target: float, limit: float, reach: float,
         speed: float,
     ) -> None:  # fmt: skip
-        """Nothing is wound in yet.
+        """Prepares the law.
 
         Args:
             rig: The robot.
             begin: Positions of the drives, [counts].
             target: Tension at which a cable is taut, [N].
-            limit: Tension that none may have, [N].
-            reach: Longest way that one cable is wound in, [m].
-            speed: At most so fast, [m/s].
+            limit: Largest tension of any cable, [N].
+            reach: Largest length of a cable wound in, [m].
+            speed: Largest cable speed, [m/s].
         """
         self._rig, self._begin = rig, np.array(begin, dtype=np.float64)
         self._target, self._reach = target, reach
@@ -198,7 +198,7 @@ class PretensionLaw:
 
     @property
     def done(self) -> bool:
-        """Every cable has been taut for a while."""
+        """Whether all cables have been taut for `TAUT_CYCLES`."""
         return self._cycles >= TAUT_CYCLES
 
     @property
@@ -235,44 +235,44 @@ class PretensionLaw:
 
 
 class OneCableLaw:
-    """Moves one winch while all others stand: what is common to a step and a held jog.
+    """Moves one winch while all others hold; base of a step and a held jog.
 
-    A cable that is taut is moved as carefully as it would be wound in. Other cables that were taut
-    must not go slack meanwhile; those that hung slack before may go on so.
+    A taut cable moves no faster than it may be wound in. Other taut cables must not go slack
+    meanwhile; slack ones may stay slack.
 
     Attributes:
-        stretch: How much longer it takes than at an even speed.
-        shortest: It takes no less, [cycles].
+        stretch: Ratio of the duration to that at constant speed.
+        shortest: Shortest duration, [cycles].
     """
 
     stretch: ClassVar[float] = 1.0
     shortest: ClassVar[float] = 0.0
 
     def __init__(
-        self, rig: Rig, begin: Sequence[int], *, cable: int, way: float, limit: float, speed: float,
-        reserve: TensionReserve | None = None,
+        self, rig: Rig, begin: Sequence[int], *, cable: int, length: float, limit: float,
+        speed: float, reserve: TensionReserve | None = None,
     ) -> None:  # fmt: skip
-        """Nothing moves yet.
+        """Prepares the law.
 
         Args:
             rig: The robot.
             begin: Positions of the drives, [counts].
-            cable: Which, from 0.
-            way: Cable to pay out at most, [m]; negative to wind in.
-            limit: Tension that no cable may have, [N].
-            speed: At most so fast, [m/s].
-            reserve: Where it comes to rest before the limit; None where that is a fault.
+            cable: Index, from 0.
+            length: Largest length to pay out, [m]; negative to wind in.
+            limit: Largest tension of any cable, [N].
+            speed: Largest cable speed, [m/s].
+            reserve: Brings it to rest before the limit; None where the limit is a fault.
         """
         self._begin = tuple(begin)
         self._speed = float(_fastest(rig, speed)[cable])
-        self._cable, self._counts = cable, way * rig.winches[cable].counts_per_metre
+        self._cable, self._counts = cable, length * rig.winches[cable].counts_per_metre
         self._least = rig.min_tension / 2.0
         self._room, self._reserve = TensionHeadroom(self._least, limit), reserve
         careful = wind_in_speed(rig, self._least, limit, speed)[cable]
         self._pace_if_taut = float(careful) / self._speed
-        # A cable that goes slack is moved faster again, but not with a jerk.
+        # A cable that goes slack speeds up again, at limited acceleration.
         self._share, self._rise = 1.0, rig.motion.acceleration / rig.motion.speed * rig.cycle
-        at_speed = self.stretch * abs(way) / (self._speed * rig.cycle)
+        at_speed = self.stretch * abs(length) / (self._speed * rig.cycle)
         self._duration, self._passed = max(self.shortest, at_speed), 0.0
         self._was_taut: list[bool] | None = None
         self._slack = [0] * rig.cable_count
@@ -284,16 +284,16 @@ class OneCableLaw:
 
     @property
     def done(self) -> bool:
-        """The winch is where it was to go."""
+        """Whether the winch has arrived."""
         return self.progress >= 1.0
 
     @property
     def progress(self) -> float:
-        """Share of the time that it takes."""
+        """Elapsed share of the duration."""
         return self._passed / self._duration if self._duration else 1.0
 
-    def _share_of_way(self) -> float:
-        """Share of the way that is done by now."""
+    def _share_done(self) -> float:
+        """Share of the length done so far."""
         return self.progress
 
     def next(self, pace: float, tensions: Sequence[float]) -> tuple[Targets, tuple[Alarm, ...]]:
@@ -304,7 +304,7 @@ class OneCableLaw:
             share *= self._reserve.share(tensions)
         self._share = min(share, self._share + self._rise)
         self._passed = min(self._passed + pace * self._share, self._duration)
-        targets = self._at(self._share_of_way())
+        targets = self._at(self._share_done())
         return targets, (*self._room.used_up(tensions), *self._made_slack(tensions))
 
     def _at(self, share: float) -> Targets:
@@ -313,7 +313,7 @@ class OneCableLaw:
         return tuple(targets)
 
     def _made_slack(self, tensions: Sequence[float]) -> list[Alarm]:
-        """Other cables that were taut and are slack."""
+        """Alarms of other cables that went slack."""
         if self._was_taut is None:
             self._was_taut = [tension >= self._least for tension in tensions]
         found = []
@@ -330,38 +330,38 @@ class OneCableLaw:
 
 
 class CableStep(OneCableLaw):
-    """Moves one winch by a length of cable, smoothly, from rest to rest."""
+    """Moves one winch smoothly by a cable length, from rest to rest."""
 
     stretch, shortest = PEAK, 1.0
 
-    def _share_of_way(self) -> float:
+    def _share_done(self) -> float:
         return smooth_step(self.progress)
 
 
 class CableFeed(OneCableLaw):
-    """Moves one winch at an even speed up to a longest way; its feed speeds up and slows down."""
+    """Moves one winch at constant speed up to a largest length; the feed ramps it."""
 
     @property
     def cycles_left(self) -> float:
-        """To the end of the longest way, at its speed."""
+        """Cycles to the end of the largest length at full speed."""
         return self._duration - self._passed
 
 
 def wind_in_speed(rig: Rig, target: float, limit: float, speed: float) -> Array:
-    """How fast each cable may be wound in while its tension is looked at, shape (m,), [m/s].
+    """Speed at which each cable may be wound in under tension control, shape (m,), [m/s].
 
-    Never faster than its winch; cables are taken to be as stiff as they are at home.
+    Never faster than its winch; cable stiffness is that at home.
     """
     careful = SHARE_OF_ROOM * (limit - target) / _stiffness(rig) / rig.cycle
     return np.minimum(_fastest(rig, speed), careful)
 
 
 def _stiffness(rig: Rig) -> Array:
-    """Of each cable at home, shape (m,), [N/m]."""
+    """Cable stiffness at home, shape (m,), [N/m]."""
     lengths = cable_lengths(rig, rig.home) + [winch.drum_to_outlet for winch in rig.winches]
     return rig.cable_stiffness / lengths
 
 
 def _fastest(rig: Rig, speed: float) -> Array:
-    """The speed that is wished for, where the winch has it, shape (m,), [m/s]."""
+    """The requested speed, limited by each winch, shape (m,), [m/s]."""
     return np.minimum(speed, [winch.max_speed for winch in rig.winches])

@@ -1,7 +1,7 @@
-"""Moves winches without a path: pretension, and one cable alone. The rest is the loop of a run.
+"""Winch motion without a path, in the control loop: pretension, and one cable alone.
 
-Enabled together, stopped together, gated and watched as a run is. Slack is no fault here: cables
-that hang slack are what these motions are for; what must not become slack is the law's to say.
+Drives are enabled, stopped, gated and monitored as in a run. Slack is not a fault here: these
+motions are for slack cables; the law decides which cables must not go slack.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _ENDLESS = 10**9
 
 
 class WinchLoop(Loop):
-    """One motion by a law on one drive group; the gate allows what lies in the law's reach."""
+    """One motion by a law on one drive group; the gate allows the law's reach."""
 
-    way = "together"
+    motion_phrase = "together"
     slack_counts = False
 
     def __init__(
@@ -44,76 +44,76 @@ class WinchLoop(Loop):
         law: WinchLaw,
         master: SyncMaster,
         *,
-        wishes: Callable[[], OperatorRequests],
+        requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
         on_event: Callable[[LoopEvent], None],
     ) -> None:
-        """Prepares the motion; arguments as for `Loop`, with a law in place of a course."""
+        """Prepares the motion; arguments as for `Loop`, with a law instead of set-points."""
         cycle = rig.cycle
         reach = np.array(law.reach, dtype=np.int32)
-        course = CheckedSetpoints(rig, cycle, reach, fingerprint(cycle, reach))
-        super().__init__(course, master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)
+        checked = CheckedSetpoints(rig, cycle, reach, fingerprint(cycle, reach))
+        super().__init__(checked, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
         self._law = law
         self._feed = Feed(_ENDLESS, cycle, rig.motion)
         self._status: CycleStatus | None = None
 
     def _follow(self) -> None:
-        """One cycle by the law, or at rest where it is; a stop has no way on which to slow down."""
+        """One cycle by the law, or at rest; a stop has no path to slow down along."""
         state = self.machine.state
         if self._status is None or (self._feed.at_rest and state is State.HOLDING):
-            self._status = self._send(Purpose.HOLD, self._exchange.resting_targets)
+            self._status = self._send(Purpose.HOLD, self._sender.resting_targets)
         elif state is State.STOPPING or (self._law.done and state is State.MOVING):
             self.machine.on(Event.AT_REST)
         else:
             before = self._feed.index
             pace = self._feed.advance() - before
-            tensions = self._course.rig.tensions_by(self._status.torques)
-            targets, findings = self._law.next(pace, tensions.tolist())
-            if findings:
-                self._judge(findings)
+            tensions = self._checked.rig.tensions_by(self._status.torques)
+            targets, alarms = self._law.next(pace, tensions.tolist())
+            if alarms:
+                self._handle_alarms(alarms)
             if self.machine.state is state:
                 self._status = self._send(Purpose.MOVE, targets)
 
-    def _place(self) -> float:
-        """How much is done, [%]."""
+    def _index(self) -> float:
+        """Share done, [%]."""
         return 100.0 * self._law.progress
 
 
-# Who moves winches by a law: the real-time process, or in simulated time this one.
+# Winch motion in the real-time process, or in simulated time in this one.
 
 
-#: From the rig as its drives count, limited, and where they stand, [counts].
+#: Makes a law from the referenced rig with reduced limits and the drive positions [counts].
 MakeLaw = Callable[[Rig, Sequence[int]], WinchLaw]
 
 
 class WinchMover(Protocol):
-    """Arms the drives, moves them, and can be asked afterwards where they stand."""
+    """Arms the drives, moves them, and reads their status afterwards."""
 
     def arm(self, records: Records) -> Armed:
         """Prepares the motion; events from now on go to the records.
 
         Raises:
-            CdprError: It cannot be; nothing was enabled.
+            CdprError: Arming failed; nothing was enabled.
         """
         ...
 
     def run(self) -> Ended:
-        """Moves; the drives hold by themselves in the end."""
+        """Moves; the drives hold on their own at the end."""
         ...
 
-    def stands_now(self) -> CycleStatus:
-        """State of the drives after the motion."""
+    def read_status(self) -> CycleStatus:
+        """Status of the drives after the motion."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LawMotion:
-    """A motion by a law as a job of the real-time process; see `Motion` there.
+    """A motion by a law as a job of the real-time process; see `MotionTask` there.
 
     Attributes:
-        cables: How many.
+        cables: Number of cables.
         cycle: [s].
-        make_law: Makes the winches' law; it can be sent to a process.
+        make_law: Makes the winch law; picklable.
         limit: Largest tension, [N].
         speed: Fastest winch, [m/s].
     """
@@ -129,24 +129,24 @@ class LawMotion:
         drives: ReadyDrives,
         master: SyncMaster,
         *,
-        wishes: Callable[[], OperatorRequests],
+        requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
         on_event: Callable[[LoopEvent], None],
     ) -> Loop:
-        """See `Motion`."""
+        """See `MotionTask`."""
         rig = with_reduced_limits(drives.rig, limit=self.limit, speed=self.speed)
         law = self.make_law(rig, master.read_positions().positions.tolist())
-        return WinchLoop(rig, law, master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)
+        return WinchLoop(rig, law, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
 
     def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
-        """See `Motion`; winches move by a law from wherever they are."""
+        """See `MotionTask`; any positions are allowed."""
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `Motion`; no pose is needed while winches move without a path."""
+        """See `MotionTask`; no pose is needed without a path."""
         return None
 
     def close(self) -> None:
-        """See `Motion`; it shares no memory."""
+        """See `MotionTask`; no memory is shared."""
 
 
 class WinchesHere:
@@ -155,7 +155,7 @@ class WinchesHere:
     def __init__(
         self, motion: MotionTask, drives: ReadyDrives, clock: Clock, board: RequestBoard
     ) -> None:
-        """Nothing is sent yet."""
+        """Sends nothing yet."""
         self._motion, self._drives, self._board = motion, drives, board
         self._master = SyncMaster(drives.rig, drives.group, clock)
         self._loop: Procedure | None = None
@@ -165,19 +165,19 @@ class WinchesHere:
 
         Raises:
             CdprError: The drives cannot be armed.
-            StoppedByOperator: The operator wanted to stop before anything moved.
+            StoppedByOperator: A stop was requested before anything moved.
         """
         self._loop = self._motion.loop(
             self._drives,
             self._master,
-            wishes=self._board.read,
+            requests=self._board.read,
             on_cycle=lambda record: records.take_cycle(record, None),
             on_event=records.take_event,
         )
         self._loop.arm(partial(self._motion.require, self._drives))
         if self._board.read().stop:
             raise StoppedByOperator("stopped before anything moved")
-        return Armed("", self._loop.stands_at)
+        return Armed("", self._loop.positions)
 
     def run(self) -> Ended:
         """See `WinchMover`.
@@ -190,6 +190,6 @@ class WinchesHere:
         state = self._loop.run()
         return Ended(state, self._loop.cause, self._loop.holding, self._drives.true_pose_now())
 
-    def stands_now(self) -> CycleStatus:
+    def read_status(self) -> CycleStatus:
         """See `WinchMover`."""
-        return self._master.look()
+        return self._master.read_state()

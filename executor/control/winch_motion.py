@@ -1,4 +1,4 @@
-"""One motion of winches without a path, from its first cycle to its record."""
+"""One winch motion without a path, from the first cycle to its record."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ _CUT_SHORT = Ended(State.LATCHED, "the program was terminated", holding=True, tr
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WinchesStand:
-    """Where winches stand after a motion.
+class WinchResult:
+    """Result of a winch motion.
 
     Attributes:
-        state: How it ended.
+        state: Final state.
         cause: Why it did not finish, if it did not.
-        began: Positions of the drives before it, shape (m,), [counts].
-        counts: Positions of the drives, at rest, shape (m,), [counts]; NaN when unknown.
-        tensions: By their torques, at rest, shape (m,), [N]; NaN when unknown.
+        began: Drive positions before it, shape (m,), [counts].
+        counts: Drive positions at rest, shape (m,), [counts]; NaN if unknown.
+        tensions: From the drive torques at rest, shape (m,), [N]; NaN if unknown.
     """
 
     state: State
@@ -52,19 +52,19 @@ class WinchesStand:
     tensions: Array
 
 
-def require_held(rig: Rig, stand: WinchesStand, found: CycleStatus) -> None:
-    """The drives hold at the positions where the motion ended, without new commands.
+def require_held(rig: Rig, result: WinchResult, found: CycleStatus) -> None:
+    """Requires the drives to hold at the positions where the motion ended.
 
     Args:
         rig: The robot.
-        stand: Where the motion ended.
-        found: Present state of the drives.
+        result: Of the motion.
+        found: Present status of the drives.
 
     Raises:
-        Fault: One moved, or does not hold.
+        Fault: A drive moved, or does not hold.
     """
     per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
-    moved = np.abs((found.positions - stand.counts) / per_metre)
+    moved = np.abs((found.positions - result.counts) / per_metre)
     worst = int(moved.argmax())
     name = list(rig.drive_names.values())[worst]
     if not moved[worst] <= HELD_SHARE * rig.motion.start_tolerance:
@@ -87,7 +87,7 @@ def require_held(rig: Rig, stand: WinchesStand, found: CycleStatus) -> None:
 
 
 class _LastCycles:
-    """Hands records on, and keeps the cycles in which the winches stood at the end."""
+    """Forwards records, and keeps the last cycles with the winches at rest."""
 
     def __init__(self, records: Records) -> None:
         self._records = records
@@ -102,10 +102,10 @@ class _LastCycles:
     def take_event(self, event: LoopEvent) -> None:
         self._records.take_event(event)
 
-    def tell(self, code: str, text: str) -> None:
-        """Records an event after the last cycle; the caller raises or returns it in any case."""
+    def report_event(self, code: str, text: str) -> None:
+        """Records an event after the last cycle; the caller raises or returns it as well."""
         cycle, at = (self.cycles[-1].cycle, self.cycles[-1].at) if self.cycles else (0, 0.0)
-        with suppress(CdprError):  # a disk that is full then changes nothing of how it ended
+        with suppress(CdprError):  # a full disk must not change the outcome
             self._records.take_event(LoopEvent(cycle, at, code, text))
 
 
@@ -117,115 +117,114 @@ def move_winches(
     *,
     record: Path,
     rehome: bool,
-    at_rest: Callable[[WinchesStand, Pose | None], HomingReference | None],
-) -> WinchesStand:
-    """Moves by a law and ends with the drives holding by themselves, whatever happens.
+    at_rest: Callable[[WinchResult, Pose | None], HomingReference | None],
+) -> WinchResult:
+    """Moves by a law; always ends with the drives holding on their own.
 
     Args:
-        mover: Moves them, here or in a process of its own.
-        rig: The robot as its file is.
+        mover: Moves the winches, in this process or in its own.
+        rig: The robot as in its file.
         interlock: Of that rig.
-        records: Takes in what happens.
-        record: What the latch names, should this not finish.
-        rehome: The drives are to be homed again afterwards.
-        at_rest: Called after a motion that finished, while the drives are locked,
-            with where the simulated platform is; the reference that it makes is kept if the drives
-            held all the while.
+        records: Takes cycles and events.
+        record: Path that the latch names if the motion does not finish.
+        rehome: The drives must be homed again afterwards.
+        at_rest: Called after a finished motion, while the drives are locked, with the true pose of
+            the simulated platform; the reference it returns is kept if the drives held throughout.
 
     Raises:
-        Refused: The bus is latched, or the drives do not stand where the law begins; nothing was
+        Refused: The bus is latched, or the drives are not where the law begins; nothing was
             enabled.
         HardwareMissing: A drive does not answer.
-        StoppedByOperator: The operator wanted to stop before anything moved.
-        CdprError: The drives did not hold after the motion, or did not answer; it is latched.
+        StoppedByOperator: A stop was requested before anything moved.
+        CdprError: The drives did not hold or answer after the motion; the fault is latched.
     """
     interlock.require_free()
     last = _LastCycles(records)
     armed = mover.arm(last)
     if armed.denied:
         last.take_event(LoopEvent(0, 0.0, "no_real_time", armed.denied))
-    interlock.begin(record, interlock.still_counts(armed.stands_at), rehome=rehome)
+    interlock.begin(record, interlock.still_counts(armed.positions), rehome=rehome)
     ended, found = _CUT_SHORT, None
     try:
         ended = mover.run()
-        stand = _stand(rig, armed.stands_at, ended, last.cycles)
-        if stand.state is State.FINISHED:
-            reference = at_rest(stand, ended.true_pose)
+        result = _result(rig, armed.positions, ended, last.cycles)
+        if result.state is State.FINISHED:
+            reference = at_rest(result, ended.true_pose)
             try:
-                found = mover.stands_now()
-                require_held(rig, stand, found)
+                found = mover.read_status()
+                require_held(rig, result, found)
             except CdprError as error:
                 ended = _not_held(ended, found, error.what)
-                last.tell("not_held", error.what)
+                last.report_event("not_held", error.what)
                 raise
             if reference is not None:
                 interlock.take(reference)
     finally:
-        not_kept = _kept(interlock, ended, record, _stands_at(last.cycles, found))
-    if not_kept:
-        last.tell("recorder", not_kept)
-        stand = replace(stand, state=State.LATCHED, cause=stand.cause or not_kept)
-    return stand
+        not_recorded = _record_end(interlock, ended, record, _last_positions(last.cycles, found))
+    if not_recorded:
+        last.report_event("recorder", not_recorded)
+        result = replace(result, state=State.LATCHED, cause=result.cause or not_recorded)
+    return result
 
 
-def _stand(
+def _result(
     rig: Rig, began: Sequence[int], ended: Ended, last: Sequence[CycleRecord]
-) -> WinchesStand:
+) -> WinchResult:
     unknown = [np.full(rig.cable_count, np.nan)]
     torques = np.array([cycle.torques for cycle in last] or unknown, dtype=np.float64)
     counts = np.array([cycle.actual for cycle in last] or unknown, dtype=np.float64)
     tensions = rig.tensions_by(torques.mean(axis=0))
     before = np.array(began, dtype=np.float64)
-    return WinchesStand(ended.state, ended.cause, before, counts.mean(axis=0), tensions)
+    return WinchResult(ended.state, ended.cause, before, counts.mean(axis=0), tensions)
 
 
 def _not_held(ended: Ended, found: CycleStatus | None, cause: str) -> Ended:
-    """A motion that finished, with what was found wrong with the drives afterwards."""
-    # Drives that are silent held when they last answered.
+    """The end of a finished motion after which drives were found faulty."""
+    # Silent drives held when they last answered.
     holding = ended.holding if found is None else found.holding
     return replace(ended, state=State.LATCHED, cause=cause, holding=holding)
 
 
-def _stands_at(last: Sequence[CycleRecord], found: CycleStatus | None) -> Sequence[int] | None:
-    """Last known positions of the drives, [counts]; None when there are none."""
+def _last_positions(last: Sequence[CycleRecord], found: CycleStatus | None) -> Sequence[int] | None:
+    """Last known positions of the drives, [counts]; None if unknown."""
     if found is not None:
         return [int(position) for position in found.positions]
     return last[-1].actual if last else None
 
 
-def _kept(
-    interlock: MotionInterlock, ended: Ended, record: Path, stands_at: Sequence[int] | None
+def _record_end(
+    interlock: MotionInterlock, ended: Ended, record: Path, positions: Sequence[int] | None
 ) -> str:
-    """Keeps how it ended; an error of keeping is reported as well."""
+    """Records the end in the interlock; returns why that failed, else nothing."""
     try:
-        interlock.end(ended.state, ended.cause, record, holding=ended.holding, stands_at=stands_at)
+        interlock.end(ended.state, ended.cause, record, holding=ended.holding, positions=positions)
     except CdprError as error:
         return f"{error.what} ({error.where}: {error.why})"
     return ""
 
 
-# What a motion of winches without a path leaves: a folder with its events and its cycles.
+# Record of a winch motion without a path: a folder with its events and cycles.
 #
 # ``events.jsonl`` is as in a run folder. ``winches.csv`` has one row a cycle: ``cycle``,
 # ``time_s``, ``state``, and per cable ``set_counts_K``, ``counts_K`` and ``torque_per_mille_K`` (of
-# rated torque, positive where it pulls the cable in). Both are written while the winches move: what
-# a killed program had written is there, and of a power cut what is older than about a second.
+# rated torque, positive where it pulls the cable in). Both are written during the motion: they
+# survive a killed program, and a power cut except for about the last second.
 
 
 WINCHES = "winches.csv"
 FSYNC_EVERY = 1.0
-"""Both files are forced to disk at most this often, [s]; a thread waits for that."""
+"""Interval at which a thread forces both files to disk, [s]."""
 
 
 class _RecordFile:
-    """A file that lines are added to, without a buffer: closing it has nothing left to write."""
+    """An unbuffered file of lines: closing it has nothing left to write."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._failed = path, ""
         self._stream = path.open("wb", buffering=0)
 
     def add(self, line: str) -> None:
-        """Adds one; after one that failed, none: it may be there in part.
+        """Appends a line; after a failure, which may leave a partial line, none.
 
         Raises:
             Fault: The disk is full or gone.
@@ -244,30 +243,30 @@ class _RecordFile:
             )
 
     def fsync(self) -> None:
-        """What was added is on disk when this returns, unless the disk fails."""
+        """Forces the content to disk."""
         try:
             os.fsync(self._stream.fileno())
         except OSError as error:
             self._failed = self._failed or error.strerror or str(error)
 
     def close(self) -> None:
-        """Ends it; never raises."""
+        """Closes the file; never raises."""
         with suppress(OSError):
             self._stream.close()
 
 
 class WinchRecord:
-    """Of one motion; make one with `recording`.
+    """Record of one motion; make one with `recording`.
 
     Attributes:
-        folder: Where it is.
-        cycles: How many were taken in.
+        folder: Its path.
+        cycles: Number of recorded cycles.
     """
 
     def __init__(
         self, folder: Path, events: _RecordFile, winches: _RecordFile, flusher: ThreadPoolExecutor
     ) -> None:
-        """Takes open files and a thread that waits for the disk; they stay the caller's."""
+        """Uses open files and a flushing thread, which the caller closes."""
         self.folder, self.cycles = folder, 0
         self._events, self._winches, self._flusher = events, winches, flusher
         self._began = float("inf")  # until there is a cycle
@@ -275,7 +274,7 @@ class WinchRecord:
         self._flushing.set_result(None)
 
     def take_cycle(self, record: CycleRecord) -> None:
-        """A cycle is over.
+        """Records a cycle.
 
         Raises:
             Fault: The disk is full or gone.
@@ -295,26 +294,26 @@ class WinchRecord:
             self._flushing = self._flusher.submit(self._flush)
 
     def take_event(self, event: LoopEvent) -> None:
-        """Something happened.
+        """Records an event.
 
         Raises:
             Fault: The disk is full or gone.
         """
-        told = {"time_s": round(self._time(event.at), 6), "code": event.code, "text": event.text}
-        self._events.add(json.dumps(told, ensure_ascii=False))
+        row = {"time_s": round(self._time(event.at), 6), "code": event.code, "text": event.text}
+        self._events.add(json.dumps(row, ensure_ascii=False))
 
     def _flush(self) -> None:
         self._winches.fsync()
         self._events.fsync()
 
     def _time(self, at: float) -> float:
-        """Since the first cycle, [s]; 0 before it."""
+        """Time since the first cycle, [s]; 0 before it."""
         return max(0.0, at - self._began)
 
 
 @contextmanager
 def recording(folder: Path) -> Iterator[WinchRecord]:
-    """Makes the folder; removes it if no cycle came of it.
+    """Makes the folder; removes it again if no cycle was recorded.
 
     Raises:
         BadInput: It cannot be made.

@@ -1,7 +1,7 @@
-"""Moves one winch at a time as long as a press is held; a task of the real-time process.
+"""Moves one winch at a time while a press is held; a task of the real-time process.
 
-It differs from `cdpr jog --cable` in this: the way is not fixed before it begins. The loop itself
-reads what is held, so that neither network nor supervisor lie between a release and the ramp.
+Unlike with `cdpr jog --cable`, the travel is not fixed in advance. The loop itself reads the
+presses, so that neither network nor supervisor delay the ramp after a release.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ from model.pose import Pose
 from model.rig import Rig
 from model.winches import WinchMap
 
-#: It slows down where what is left of the longest way lasts no longer than this, [cycles].
+#: It slows down when this much of the largest travel is left beyond the ramp, [cycles].
 MARGIN = 4.0
-#: Less than this many reserves below the limit a tension is called near it.
+#: A tension closer to the limit than this many reserves is reported as near it.
 NEAR = 1.5
 _ENDLESS = 10**9
 
 
 @dataclass(frozen=True, slots=True)
 class CableLimits:
-    """How far and how fast one cable is jogged.
+    """Limits of a cable jog.
 
     Attributes:
-        tension: That no cable may have, [N].
+        tension: Largest tension of any cable, [N].
         speed: Of a winch, [m/s].
-        longest: Of one press, [m].
+        longest: Largest travel of one press, [m].
         positions: Smallest and largest of each drive, [counts].
     """
 
@@ -60,8 +60,8 @@ class CableLimits:
     longest: float
     positions: tuple[tuple[int, int], ...]
 
-    def way(self, rig: Rig, here: Sequence[int], held: PressState) -> float:
-        """How far a press may move its cable from here, [m]; negative winds in.
+    def travel(self, rig: Rig, here: Sequence[int], held: PressState) -> float:
+        """Travel that a press may move its cable from here, [m]; negative winds in.
 
         Args:
             rig: The robot.
@@ -79,7 +79,7 @@ class CableLimits:
 class CableLoop(Loop):
     """One session of jogs of single cables on one drive group; at rest the drives stay enabled."""
 
-    way = "together"
+    motion_phrase = "together"
     slack_counts = False
 
     def __init__(
@@ -90,26 +90,26 @@ class CableLoop(Loop):
         master: SyncMaster,
         *,
         held: Callable[[float], PressState],
-        wishes: Callable[[], OperatorRequests],
+        requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
         on_event: Callable[[LoopEvent], None],
     ) -> None:
-        """Prepares the session; nothing is sent yet.
+        """Prepares the session; sends nothing yet.
 
         Args:
             rig: The robot, with the limits of the session.
             begin: Positions of the drives, [counts].
             limits: Of each press.
-            master: As for `Loop`, as all but the next two.
-            held: What is held at a moment of the clock [s]; asked every cycle.
-            wishes: Only its stop counts.
+            master: See `Loop`.
+            held: Returns the press held at a time of the clock [s]; called every cycle.
+            requests: See `Loop`; only a stop counts.
             on_cycle: See `Loop`.
             on_event: See `Loop`.
         """
         cycle = rig.cycle
         here = np.array([begin], dtype=np.int32)
-        course = CheckedSetpoints(rig, cycle, here, fingerprint(cycle, here))
-        super().__init__(course, master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)
+        checked = CheckedSetpoints(rig, cycle, here, fingerprint(cycle, here))
+        super().__init__(checked, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
         self._rig, self._limits, self._held_now = rig, limits, held
         self._feed = self._feed_at(0.0)
         self._status: CycleStatus | None = None
@@ -121,18 +121,18 @@ class CableLoop(Loop):
     def _follow(self) -> None:
         """One cycle of a press, or at rest."""
         if self._status is None:  # no tension is known yet
-            self._status = self._send(Purpose.HOLD, self._exchange.resting_targets)
+            self._status = self._send(Purpose.HOLD, self._sender.resting_targets)
             return
         held = self._held_now(self._clock.now)
         self._steer(held)
         if self._feed.at_rest and (self.machine.state is State.STOPPING or held.ends):
             self.machine.on(Event.AT_REST)
         elif (targets := self._next_targets(self._status)) is not None:
-            rests = targets == self._exchange.resting_targets
+            rests = targets == self._sender.resting_targets
             self._status = self._send(Purpose.HOLD if rests else Purpose.MOVE, targets)
 
     def _steer(self, held: PressState) -> None:
-        """Begins a press where nothing moves, goes on with it, and slows down where it ended."""
+        """Begins a press at rest, continues it, and slows down after its end."""
         is_moving = self.machine.state is State.MOVING
         is_new = held.press not in (0, self._press) and held.cable > 0
         if is_moving and is_new and self._feed.at_rest:
@@ -148,52 +148,52 @@ class CableLoop(Loop):
             self._feed.stop()
 
     def _begin(self, held: PressState) -> None:
-        """A press begins where the drives rest; the gate lets through what lies in its reach."""
-        here, cable = self._exchange.resting_targets, held.cable - 1
-        way = self._limits.way(self._rig, here, held)
+        """Begins a press at the present positions; the gate allows its reach."""
+        here, cable = self._sender.resting_targets, held.cable - 1
+        travel = self._limits.travel(self._rig, here, held)
         make: type[CableFeed | CableStep] = CableFeed if held.step is None else CableStep
         limit, speed = self._limits.tension, self._limits.speed
         reserve = TensionReserve(self._rig, cable, limit=limit, pays_out=held.pays_out)
         self._law = make(
-            self._rig, here, cable=cable, way=way, limit=limit, speed=speed, reserve=reserve
+            self._rig, here, cable=cable, length=travel, limit=limit, speed=speed, reserve=reserve
         )
         # A step speeds up and slows down by itself.
         self._feed = self._feed_at(0.0 if held.step is None else held.share)
-        self._exchange.allow(np.array(self._law.reach, dtype=np.int32))
+        self._sender.allow(np.array(self._law.reach, dtype=np.int32))
         self._press, self._cable, self._from = held.press, cable, here[cable]
         self._at_end, self._rested = False, 0
 
     def _next_targets(self, status: CycleStatus) -> Targets | None:
-        """Of the next cycle; None where what the tensions say ends the session."""
-        resting = self._exchange.resting_targets
+        """Targets of the next cycle; None if the tensions end the session."""
+        resting = self._sender.resting_targets
         if self._law is None:
             return resting
         before = self._feed.index
         pace = self._feed.advance() - before
-        # Tensions follow a little later: the law looks at them for as long as winches settle.
+        # Tensions follow with a delay: the law monitors them while the winches settle.
         self._rested = self._rested + 1 if self._feed.at_rest else 0
         if self._rested > SETTLING:
             self._law = None
             return resting
         tensions = self._rig.tensions_by(status.torques).tolist()
-        targets, findings = self._law.next(pace, tensions)
-        if not findings:
+        targets, alarms = self._law.next(pace, tensions)
+        if not alarms:
             return targets
-        self._judge(findings)
-        self._law, self._feed = None, self._feed_at(0.0)  # no way on which to slow down
+        self._handle_alarms(alarms)
+        self._law, self._feed = None, self._feed_at(0.0)  # stop without a ramp
         return None
 
     def _feed_at(self, rate: float) -> Feed:
-        return Feed(_ENDLESS, self._course.cycle, self._rig.motion, rate=rate)
+        return Feed(_ENDLESS, self._checked.cycle, self._rig.motion, rate=rate)
 
-    def _place(self) -> float:
-        """Cable that the newest press paid out, [mm]; negative was wound in."""
-        moved = self._exchange.resting_targets[self._cable] - self._from
+    def _index(self) -> float:
+        """Length paid out by the latest press, [mm]; negative for wound in."""
+        moved = self._sender.resting_targets[self._cable] - self._from
         return 1000.0 * moved / self._rig.winches[self._cable].counts_per_metre
 
-    def _obey(self, wishes: OperatorRequests) -> None:
-        """Holding and speed are the held control's."""
-        self._obey_stop(wishes)
+    def _apply_requests(self, requests: OperatorRequests) -> None:
+        """Applies only a stop: the held control sets hold and speed."""
+        self._apply_stop(requests)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,11 +201,11 @@ class CableMotion:
     """A session of jogs of single cables; see `MotionTask` in `executor.realtime.job`.
 
     Attributes:
-        cables: How many.
+        cables: Number of cables.
         cycle: [s].
         limit: Largest tension, [N].
         speed: Fastest winch, [m/s].
-        longest: Way of one press, [m].
+        longest: Largest travel of one press, [m].
         presses: See `PressBoard`.
     """
 
@@ -221,7 +221,7 @@ class CableMotion:
         drives: ReadyDrives,
         master: SyncMaster,
         *,
-        wishes: Callable[[], OperatorRequests],
+        requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
         on_event: Callable[[LoopEvent], None],
     ) -> Loop:
@@ -234,32 +234,32 @@ class CableMotion:
             CableLimits(self.limit, self.speed, self.longest, positions),
             master,
             held=PressReader(self.presses).read,
-            wishes=wishes,
+            requests=requests,
             on_cycle=on_cycle,
             on_event=on_event,
         )
 
     def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
-        """See `MotionTask`; single cables are jogged from wherever they are."""
+        """See `MotionTask`; any positions are allowed."""
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `MotionTask`; no pose is needed while winches move without a path."""
+        """See `MotionTask`; no pose is needed without a path."""
         return None
 
     def close(self) -> None:
-        """See `MotionTask`; the memory is the session's."""
+        """See `MotionTask`; the session owns the memory."""
 
 
 class CableTravel:
-    """What the supervisor knows of a session of single cables: which moves, and how far."""
+    """The supervisor's record of a cable session: which cable moves, and how far."""
 
     def __init__(self, rig: Rig, limit: float, longest: float) -> None:
-        """Nothing has moved.
+        """Starts without motion.
 
         Args:
             rig: The robot.
             limit: Largest tension, [N].
-            longest: Way of one press, [m].
+            longest: Largest travel of one press, [m].
         """
         self._rig, self._longest = rig, longest
         self._near = limit - NEAR * tension_reserve(rig, limit)
@@ -268,15 +268,15 @@ class CableTravel:
         self._targets: tuple[int, ...] = ()
         self._tensions: list[float] = []
         self.tension_limit = limit
-        """That no cable may have, [N]."""
+        """Largest tension of any cable, [N]."""
         self.cable = 0
-        """That moved last, from 1; 0 for none yet."""
+        """Number of the cable that moved last, from 1; 0 for none yet."""
         self.by_press = 0.0
-        """What the newest press paid out, [m]; negative was wound in."""
+        """Length paid out by the latest press, [m]; negative for wound in."""
 
     @property
     def by_session(self) -> list[float]:
-        """What was paid out of each cable since the session began, [m]."""
+        """Length paid out of each cable since the session began, [m]."""
         if self._begin is None:
             return [0.0] * self._rig.cable_count
         moved = np.subtract(self._targets, self._begin) / self._per_metre
@@ -284,7 +284,7 @@ class CableTravel:
 
     @property
     def limit(self) -> str:
-        """Why the cable goes on more slowly, or no further; empty while nothing is near."""
+        """Why the cable slows down or stops; empty without a limit nearby."""
         if not self._tensions or not self.cable:
             return ""
         tightest = int(np.argmax(self._tensions))
@@ -301,7 +301,7 @@ class CableTravel:
         return ""
 
     def take_cycle(self, record: CycleRecord, press: Press | None) -> None:
-        """A cycle is over, and that press was held then."""
+        """Takes a cycle, and the press held in it."""
         if record.state not in (State.MOVING, State.STOPPING):
             return
         if self._begin is None:

@@ -1,4 +1,4 @@
-"""A straight line from a pose, proved piece by piece, each as its drives will be sent it."""
+"""A straight line from a pose, checked piece by piece as set-points before they are sent."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from model.rig import Rig
 from model.scene import Scene
 from model.statics.wrench_sets import rms_anchor_radius
 
-#: Rows of a piece: of the first, which must be proved at once, and of a later one at most.
+#: Rows of the first piece, which must be checked quickly, and largest number of a later one.
 FIRST_ROWS, MOST_ROWS = 10, 40
-#: Short of a whole row: rounding then never makes one row more of a piece, [rows].
+#: Subtracted from a piece's length, so that rounding never adds a row, [rows].
 _SHORT = 1e-6
 
 
 class JogLine:
-    """Where a jog goes, at even distances of one row, and what of it is proved."""
+    """The line of a jog, sampled at equal distances per row, as far as it is checked."""
 
     def __init__(self, rig: Rig, scene: Scene, start: Pose, direction: Array) -> None:
-        """Nothing is proved yet.
+        """A line of which nothing is checked yet.
 
         Args:
             rig: The robot; its motion has the jog speed.
-            scene: What is in the way, and the load.
-            start: Where the platform is at rest, ``world_from_platform``.
+            scene: Obstacles and load.
+            start: Pose of the platform at rest, ``world_from_platform``.
             direction: Unit vector in the world frame, shape (3,).
         """
         self._rig, self._scene, self._start = rig, scene, start
@@ -54,38 +54,38 @@ class JogLine:
 
     @property
     def rows(self) -> int:
-        """Of what is proved; 1 while nothing is."""
+        """Number of checked rows; 1 at first."""
         return len(self._travelled)
 
     def pose(self, row: float) -> Pose:
-        """The pose at a place of what is proved."""
+        """The pose at a row of the checked line."""
         return self._at(self.travelled(row))
 
     def travelled(self, row: float) -> float:
-        """Length up to a place of what is proved, [m]."""
+        """Travelled length at a row of the checked line, [m]."""
         return float(np.interp(row, np.arange(self.rows), self._travelled))
 
-    def go_on(self, rows: int) -> CheckedTrajectory:
-        """Proves the next rows, at the jog speed; the first of them is the last of what was proved.
+    def extend(self, rows: int) -> CheckedTrajectory:
+        """Checks further rows, at the jog speed, from the last checked row on.
 
         Raises:
-            CdprError: They do not keep what scene and rig ask for; nothing is added.
+            CdprError: They violate the scene or the rig; nothing is added.
         """
         begin = float(self._travelled[-1])
         length = (rows - _SHORT) * self._spacing
         speed = self._rig.motion.speed
         steady = s_curve(length, (speed, speed), speed, self._rig.motion)
         law = TimeLaw((steady,), (0.0,), np.array([0.0, length / speed]))
-        checked = self._proved(begin, length, law)
+        checked = self._checked_table(begin, length, law)
         even = begin + self._spacing * np.arange(1, rows + 1)
         self._travelled = np.concatenate([self._travelled, even])
         return checked
 
     def step(self, length: float) -> CheckedTrajectory:
-        """Proves a whole step, from rest to rest, [m]; the line has nothing else.
+        """Checks a whole step [m] from rest to rest; the line has nothing else.
 
         Raises:
-            CdprError: As for `go_on`.
+            CdprError: As for `extend`.
         """
         law = time_law(self._path(0.0, length), self._rig.motion)
         if law.duration > (LONGEST_STEP - 1) * self._cycle:
@@ -95,11 +95,11 @@ class JogLine:
                 why=f"a step lasts {LONGEST_STEP - 1} cycles at most",
                 next_step="hold the control instead, or begin the session with a higher speed",
             )
-        checked = self._proved(0.0, length, law)
+        checked = self._checked_table(0.0, length, law)
         self._travelled = checked.table.travelled
         return checked
 
-    def _proved(self, begin: float, length: float, law: TimeLaw) -> CheckedTrajectory:
+    def _checked_table(self, begin: float, length: float, law: TimeLaw) -> CheckedTrajectory:
         path = self._path(begin, length)
         scene = self._scene.changed(start=self._at(begin), goal=self._at(begin + length), stops=())
         table = build_table(self._rig, scene, [(path, law)], self._cycle)
@@ -114,13 +114,13 @@ class JogLine:
         return Pose(self._start.position + travelled * self._direction, self._start.rotation)
 
 
-# Proved pieces on their way to the process that moves the drives.
+# Transfer of checked pieces to the real-time process.
 
 
 _HEAD = struct.Struct("<QQ?71s")
-#: Pieces that may be under way.
+#: Pieces in transit at most.
 SLOTS = 64
-#: A step is no longer than this, [rows].
+#: Largest step, [rows].
 LONGEST_STEP = 1024
 
 
@@ -130,10 +130,10 @@ class Piece:
 
     Attributes:
         press: Its number.
-        first: Place of the first row on the line; the row before it was sent already.
-        from_rest: The rows speed up and slow down by themselves; others are at the jog speed.
+        first: Index of the first row on the line.
+        from_rest: Whether the rows include the ramps; others are at the jog speed.
         rows: Set-points, int32, shape (n, m), [counts].
-        hash: Their fingerprint when they were checked.
+        hash: Their fingerprint when checked.
     """
 
     press: int
@@ -143,24 +143,24 @@ class Piece:
     hash: str
 
     def is_unchanged(self, cycle: float) -> bool:
-        """The rows are those that were checked, for that cycle [s]."""
+        """Whether the rows are those that were checked, for that cycle [s]."""
         return fingerprint(cycle, self.rows) == self.hash
 
 
 class PieceRing:
-    """Pieces in shared memory; one process puts them in, the other takes them out."""
+    """Queue of pieces in shared memory, from one process to another."""
 
     def __init__(self, memory: SharedMemory, cables: int) -> None:
-        """Both sides over memory of `size`."""
+        """Uses memory of `size`, on both sides."""
         self._ring, self._cables = Ring(memory, SLOTS), cables
 
     @staticmethod
     def size(cables: int) -> int:
-        """Of the memory, [bytes]."""
+        """Size of the memory, [bytes]."""
         return Ring.size(_HEAD.size + 4 * cables * (LONGEST_STEP + 1), SLOTS)
 
     def put(self, piece: Piece) -> None:
-        """Sends one.
+        """Sends a piece.
 
         Raises:
             ValueError: It is too long.
@@ -169,29 +169,29 @@ class PieceRing:
         self._ring.put(head + np.ascontiguousarray(piece.rows).tobytes())
 
     def take(self) -> Iterator[Piece]:
-        """Those that came since the last call, in order."""
+        """Pieces that arrived since the last call, in order."""
         for content in self._ring.take():
             press, first, from_rest, digest = _HEAD.unpack_from(content)
             rows = np.frombuffer(content, dtype=np.int32, offset=_HEAD.size)
             yield Piece(press, first, from_rest, rows.reshape(-1, self._cables), digest.decode())
 
 
-# Who keeps the line proved ahead of the platform, in the supervisor.
+# Look-ahead check of the line, in the supervisor.
 
 
-#: Rows are proved ahead for so long beyond the way to rest, [s].
+#: Time for which rows are checked ahead beyond the stopping distance, [s].
 AHEAD = 0.4
-#: Cycles after the end of a press until what the loop reports is certainly not of it any more.
+#: Cycles after the end of a press until the loop's reports no longer belong to it.
 CERTAIN = 2.0
 
 
 class JogProver:
-    """Keeps what is proved ahead of the platform as long as a press is held."""
+    """Checks the line ahead of the platform while a press is held."""
 
     def __init__(
         self, rig: Rig, scene: Scene, start: Pose, board: PressBoard, send: Callable[[Piece], None]
     ) -> None:
-        """The platform is at rest at the start, ``world_from_platform``."""
+        """Begins with the platform at rest at ``start``, ``world_from_platform``."""
         self._rig, self._scene, self._board, self._send = rig, scene, board, send
         self._cycle = rig.cycle
         motion = rig.motion
@@ -201,20 +201,20 @@ class JogProver:
         self._press, self._size, self._narrows, self._is_whole = 0, FIRST_ROWS, False, True
         self._row = 0.0
         self.limit = ""
-        """Why the line ends where it does; empty while it may go on."""
+        """Why the line ends; empty while it may continue."""
 
     @property
     def pose(self) -> Pose:
-        """Where the platform was sent last, ``world_from_platform``."""
+        """Last commanded pose, ``world_from_platform``."""
         return self._line.pose(self._row)
 
     @property
     def room(self) -> float:
-        """How far the platform may still go on this line, [m]."""
+        """Checked length ahead of the platform, [m]."""
         return self._line.travelled(self._line.rows - 1) - self._line.travelled(self._row)
 
     def take_cycle(self, record: CycleRecord) -> None:
-        """A cycle is over; proves at most one piece."""
+        """Takes a cycle; checks at most one piece."""
         if record.state is not State.MOVING:
             return
         press = self._board.held()
@@ -226,12 +226,12 @@ class JogProver:
             return
         if press.number != self._press:
             rests = record.rate == 0.0 or record.index >= self._line.rows - 1
-            # What this cycle did was decided up to a cycle before it began.
+            # The motion of this cycle was decided up to one cycle before it began.
             if rests and record.at - press.free_since > CERTAIN * self._cycle:
                 self._row = record.index
                 self._begin(press)
         elif not self._is_whole and self._line.rows - 1 - record.index < self._wanted_rows:
-            self._prove(press)
+            self._check(press)
 
     def _begin(self, press: PlatformPress) -> None:
         start = self.pose
@@ -239,14 +239,14 @@ class JogProver:
         self._line = JogLine(self._rig, self._scene, start, rotation @ press.direction)
         self._press, self._row, self.limit = press.number, 0.0, ""
         self._size, self._narrows, self._is_whole = FIRST_ROWS, False, False
-        self._prove(press)
+        self._check(press)
 
-    def _prove(self, press: PlatformPress) -> None:
-        """Proves the next piece; half of one that is refused, until not one row is left."""
+    def _check(self, press: PlatformPress) -> None:
+        """Checks the next piece; halves it when refused, until no row is left."""
         first = self._line.rows - 1
         try:
             if press.step is None:
-                checked = self._line.go_on(self._size)
+                checked = self._line.extend(self._size)
             else:
                 checked = self._line.step(press.step)
         except CdprError as error:

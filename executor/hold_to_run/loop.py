@@ -1,7 +1,7 @@
-"""Follows a proved line as long as a press is held; a task of the real-time process.
+"""Follows a checked line while a press is held; a task of the real-time process.
 
-It differs from a run in this alone: rows arrive while it goes on, it begins to slow down where no
-more are proved, and it does so at once when the press ends. At rest the drives stay enabled.
+It differs from a run only in this: rows arrive during the motion; it slows down before the end of
+the checked rows, or at once when the press ends; and the drives stay enabled at rest.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from model.files.rig_file import RigDocument
 from model.pose import Pose
 from model.rig import rig_from_document
 
-#: It slows down where what is proved then lasts no longer than this beyond its rest, [rows].
+#: Checked rows to keep beyond the point of rest, [rows].
 MARGIN = 4.0
-#: Two counts of the same pose may be rounded to neighbours, [counts].
+#: Set-points of the same pose may differ by rounding, [counts].
 ROUNDED = 1
 
 
 class JogLoop(Loop):
     """One session of jogs on one drive group."""
 
-    way = "along the jog"
+    motion_phrase = "along the jog"
 
     def __init__(
         self,
@@ -47,22 +47,22 @@ class JogLoop(Loop):
         *,
         held: Callable[[float], PressState],
         pieces: Callable[[], Iterable[Piece]],
-        wishes: Callable[[], OperatorRequests],
+        requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
         on_event: Callable[[LoopEvent], None],
     ) -> None:
-        """Prepares the session; nothing is sent yet.
+        """Prepares the session; sends nothing yet.
 
         Args:
-            here: One row: where the platform is at rest.
-            master: As for `Loop`, as all but the next two.
-            held: What is held at a moment of the clock [s]; asked every cycle.
-            pieces: Those that arrived since it was asked last; asked every cycle.
-            wishes: Only its stop counts.
+            here: One row: the positions at rest.
+            master: See `Loop`.
+            held: Returns the press held at a time of the clock [s]; called every cycle.
+            pieces: Returns pieces that arrived since the last call; called every cycle.
+            requests: See `Loop`; only a stop counts.
             on_cycle: See `Loop`.
             on_event: See `Loop`.
         """
-        super().__init__(here, master, wishes=wishes, on_cycle=on_cycle, on_event=on_event)
+        super().__init__(here, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
         self._held_now, self._pieces = held, pieces
         self._feed = Feed(1, here.cycle, here.rig.motion, rate=0.0)
         self._rows: Setpoints = here.setpoints
@@ -84,18 +84,18 @@ class JogLoop(Loop):
         elif not moving or held.ends:
             self.machine.on(Event.AT_REST)
         else:
-            self._send(Purpose.HOLD, self._exchange.resting_targets)
+            self._send(Purpose.HOLD, self._sender.resting_targets)
 
     def _has_room(self) -> bool:
         return self._feed.index + self._feed.rows_to_rest + MARGIN < len(self._rows) - 1
 
     def _take(self, piece: Piece) -> None:
-        """Begins a line where the platform rests, or goes on with the one under way.
+        """Begins a line at the platform's rest position, or extends the present one.
 
         Raises:
             Fault: The rows are not those that were checked.
         """
-        if not piece.is_unchanged(self._course.cycle):
+        if not piece.is_unchanged(self._checked.cycle):
             raise Fault(
                 "the set-points of a jog differ from those that were checked",
                 where="jog",
@@ -103,11 +103,11 @@ class JogLoop(Loop):
                 next_step="test the computer's memory",
             )
         if piece.first == 0:
-            if self._feed.at_rest and _meet(piece.rows[0], self._exchange.resting_targets):
+            if self._feed.at_rest and _meet(piece.rows[0], self._sender.resting_targets):
                 self._begin(piece)
             else:
                 text = f"press {piece.press}: its line does not begin where the platform rests"
-                self._tell("jog_not_begun", text)
+                self._report("jog_not_begun", text)
         elif (
             piece.press == self._press
             and piece.first == len(self._rows) - 1
@@ -115,18 +115,18 @@ class JogLoop(Loop):
         ):
             self._rows = np.concatenate([self._rows, piece.rows[1:]])
             self._feed.extend(len(self._rows))
-            self._exchange.allow(self._rows)
+            self._sender.allow(self._rows)
 
     def _begin(self, piece: Piece) -> None:
         self._press, self._from_rest, self._rows = piece.press, piece.from_rest, piece.rows
         rate = 1.0 if piece.from_rest else 0.0
-        motion = self._course.rig.motion
-        self._feed = Feed(len(self._rows), self._course.cycle, motion, rate=rate)
-        self._exchange.allow(self._rows)
+        motion = self._checked.rig.motion
+        self._feed = Feed(len(self._rows), self._checked.cycle, motion, rate=rate)
+        self._sender.allow(self._rows)
 
-    def _obey(self, wishes: OperatorRequests) -> None:
-        """Holding and speed are the held control's."""
-        self._obey_stop(wishes)
+    def _apply_requests(self, requests: OperatorRequests) -> None:
+        """Applies only a stop: the held control sets hold and speed."""
+        self._apply_stop(requests)
 
 
 def _meet(row: Setpoints, others: Sequence[int]) -> bool:
@@ -139,12 +139,12 @@ class JogMotion:
 
     Attributes:
         rig: The rig file, with the jog speed.
-        cables: How many.
+        cables: Number of cables.
         cycle: [s].
-        begin: Where the drives are to stand, [counts].
+        begin: Required positions of the drives, [counts].
         presses: See `PressBoard`.
         pieces: See `PieceRing`.
-        reference: Where the drives were referenced, if they were.
+        reference: The drives' homing reference, if any.
     """
 
     rig: RigDocument
@@ -160,7 +160,7 @@ class JogMotion:
         drives: ReadyDrives,
         master: SyncMaster,
         *,
-        wishes: Callable[[], OperatorRequests],
+        requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
         on_event: Callable[[LoopEvent], None],
     ) -> Loop:
@@ -173,7 +173,7 @@ class JogMotion:
             master,
             held=PressReader(self.presses).read,
             pieces=PieceRing(self.pieces, self.cables).take,
-            wishes=wishes,
+            requests=requests,
             on_cycle=on_cycle,
             on_event=on_event,
         )
@@ -184,8 +184,8 @@ class JogMotion:
         require_still_referenced(drives.rig, self.reference, restarted, positions)
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `MotionTask`; the simulated platform is not looked at."""
+        """See `MotionTask`; no true pose is needed."""
         return None
 
     def close(self) -> None:
-        """See `MotionTask`; the memory is the session's."""
+        """See `MotionTask`; the session owns the memory."""

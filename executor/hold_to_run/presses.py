@@ -1,8 +1,8 @@
-"""Which press of a jog control is held. One that ended is over for good, whatever arrives later.
+"""Presses of jog controls. A press that ended never resumes, whatever arrives later.
 
-Every press has a number, which rises. A held control is reported again and again; a press of which
-nothing is heard for `TIMEOUT` has ended. Both processes judge by the same rule, each for
-itself: the one that hears the operator and the one that moves the drives.
+Press numbers rise. A held control is reported repeatedly; a press without a report for `TIMEOUT`
+has ended. The process that hears the operator and the one that moves the drives apply the same
+rule independently.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from executor.realtime.shared_memory import SharedMemory
 from model.pose import Array
 
-#: A press of which nothing is heard for so long has ended, [s].
+#: A press without a report for this long has ended, [s].
 TIMEOUT = 0.150
 
 _ENTRY, _CHECK = struct.Struct("<QdB?B?d"), struct.Struct("<I")
@@ -25,18 +25,18 @@ _SIZE = _ENTRY.size + _CHECK.size
 
 
 class PressRule:
-    """Separates held presses from those that are over; a clock that jumps back ends one, too."""
+    """Distinguishes held presses from ended ones; a clock that jumps back also ends one."""
 
     def __init__(self) -> None:
-        """No press has been seen."""
+        """Starts without a press."""
         self._over = 0
 
     def held(self, number: int, heard: float, now: float) -> bool:
-        """Whether the press is held; asked of an earlier one, or once it was not, it is over.
+        """Whether the press is held; ends earlier presses, and this one if it is not held.
 
         Args:
             number: Of the press, from 1.
-            heard: When it was last said to be held, [s]; NaN for one that was let go.
+            heard: Time of its last report, [s]; NaN after its release.
             now: On the same clock, [s].
         """
         if number <= self._over:
@@ -50,15 +50,15 @@ class PressRule:
 
 @dataclass(frozen=True, slots=True)
 class PressState:
-    """What the loop is given.
+    """Input of the loop.
 
     Attributes:
-        press: Number of the press that is held; 0 for none.
+        press: Number of the held press; 0 for none.
         share: Of the jog speed, from 0.01 to 1.
         ends: The session is to end.
-        cable: That the press moves, from 1; 0 where it moves the platform.
-        pays_out: The cable is paid out, otherwise wound in.
-        step: Length of cable after which the jog ends by itself, [m]; None as long as it is held.
+        cable: Number of the cable to move, from 1; 0 for the platform.
+        pays_out: Whether the cable is paid out, otherwise wound in.
+        step: Cable length of a jog that ends by itself, [m]; None to move while it is held.
     """
 
     press: int
@@ -71,12 +71,12 @@ class PressState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Press:
-    """What the operator asked for with a press; it does not change while the press lasts.
+    """Command of a press; constant while it lasts.
 
     Attributes:
         number: From 1, rising.
-        step: Length after which the jog ends by itself, [m]; None as long as it is held.
-        free_since: From when on no earlier press was held, [s].
+        step: Length of a jog that ends by itself, [m]; None to move while it is held.
+        free_since: Time since which no earlier press was held, [s].
     """
 
     number: int
@@ -86,11 +86,11 @@ class Press:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlatformPress(Press):
-    """Moves the platform straight.
+    """Moves the platform in a straight line.
 
     Attributes:
         direction: Unit vector, shape (3,).
-        in_platform: It is given in the platform frame, otherwise in the world frame.
+        in_platform: Whether it is in the platform frame, otherwise in the world frame.
     """
 
     direction: Array
@@ -102,8 +102,8 @@ class CablePress(Press):
     """Moves one winch alone.
 
     Attributes:
-        cable: Which, from 1.
-        pays_out: Otherwise it winds in.
+        cable: Its number, from 1.
+        pays_out: Whether it is paid out, otherwise wound in.
     """
 
     cable: int
@@ -111,14 +111,14 @@ class CablePress(Press):
 
 
 class PressBoard:
-    """The supervisor's side: takes in what is said of presses, from any thread."""
+    """The supervisor's side: takes reports of presses, from any thread."""
 
     def __init__(self, now: Callable[[], float], cables: int = 0) -> None:
-        """Nothing is held.
+        """Starts without a press.
 
         Args:
-            now: The clock of the loop, [s].
-            cables: How many there are to move, one at a time; 0 where the platform is moved.
+            now: Clock of the loop, [s].
+            cables: Number of cables, moved one at a time; 0 to move the platform.
         """
         self.memory, self._cables = SharedMemory.create(_SIZE), cables
         self._now, self._rule, self._lock = now, PressRule(), threading.Lock()
@@ -126,19 +126,19 @@ class PressBoard:
         self._heard, self._percent, self._ends = math.nan, 100, False
         self._free_since = -math.inf
         self.last_heard = now()
-        """When anything was last said of a press, [s]."""
+        """Time of the last report of a press, [s]."""
         self._write()
 
     def hold(
         self, number: int, direction: Array, *, in_platform: bool, step: float | None, percent: int
     ) -> bool:
-        """A control that moves the platform is held; False when that press is over.
+        """Reports a held control that moves the platform; returns False if that press is over.
 
         Args:
             number: Of the press.
-            direction: Unit vector, shape (3,); counts at the begin of a press.
-            in_platform: See `PlatformPress`, as the next one.
-            step: [m].
+            direction: Unit vector, shape (3,); taken at the beginning of a press.
+            in_platform: See `PlatformPress`.
+            step: See `Press`, [m].
             percent: Of the jog speed, from 1 to 100.
 
         Raises:
@@ -155,13 +155,13 @@ class PressBoard:
     def hold_cable(
         self, number: int, cable: int, *, pays_out: bool, step: float | None, percent: int
     ) -> bool:
-        """A control that moves one winch is held; False when that press is over.
+        """Reports a held control that moves one winch; returns False if that press is over.
 
         Args:
             number: Of the press.
-            cable: Which, from 1; counts at the begin of a press, as the next two.
+            cable: Its number, from 1; taken at the beginning of a press, like the next two.
             pays_out: See `CablePress`.
-            step: Length of cable, [m].
+            step: See `Press`, [m].
             percent: Of the jog speed, from 1 to 100.
 
         Raises:
@@ -178,7 +178,7 @@ class PressBoard:
         )
 
     def _hold(self, number: int, percent: int, begin: Callable[[float], Press]) -> bool:
-        """The press goes on, or begins where it is a new one; False when it is over."""
+        """Continues a press, or begins a new one; returns False if it is over."""
         with self._lock:
             now = self._now()
             known = self._press is not None and self._press.number == number
@@ -194,20 +194,20 @@ class PressBoard:
             return True
 
     def let_go(self, number: int) -> None:
-        """A control is no longer held, nor will be with this number or an earlier one."""
+        """Ends the press of this number and all earlier ones."""
         with self._lock:
             self._rule.held(number, math.nan, self._now())
             if self._press is not None and self._press.number <= number:
                 self._let_go()
 
     def end(self) -> None:
-        """The session is to end when the platform is at rest; nothing is held any more."""
+        """Requests the end of the session, and ends all presses."""
         with self._lock:
             self._ends = True
             self._let_go()
 
     def held(self) -> Press | None:
-        """The press that is held now."""
+        """The press held now."""
         with self._lock:
             press, now = self._press, self._now()
             if press is None or not self._rule.held(press.number, self._heard, now):
@@ -215,7 +215,7 @@ class PressBoard:
             return press
 
     def close(self) -> None:
-        """Lets go of the memory; who still has it open keeps it."""
+        """Closes the memory; other processes keep theirs."""
         self.memory.close()
 
     def _let_go(self) -> None:
@@ -223,7 +223,7 @@ class PressBoard:
         self._write()
 
     def _end_press(self, now: float) -> None:
-        """No press is held from now on; one that fell silent ended before."""
+        """Ends the press; a silent one ended earlier."""
         if not math.isnan(self._heard):
             self._free_since = min(now, self._heard + TIMEOUT)
         self._heard = math.nan
@@ -240,15 +240,15 @@ class PressBoard:
 
 
 class PressReader:
-    """The loop's side."""
+    """The loop's side of a `PressBoard`."""
 
     def __init__(self, memory: SharedMemory) -> None:
-        """Reads what `PressBoard` writes."""
+        """Reads the entries of a `PressBoard`."""
         self._memory, self._rule = memory, PressRule()
         self._entry = _ENTRY.pack(0, math.nan, 100, False, 0, False, math.nan)
 
     def read(self, now: float) -> PressState:
-        """What is held now, on the loop's clock [s]; of a half-written entry, what was before."""
+        """State at a time of the loop's clock [s]; a half-written entry is ignored."""
         content = bytes(self._memory.view[:_SIZE])
         entry, check = content[: _ENTRY.size], content[_ENTRY.size :]
         if check == _CHECK.pack(zlib.crc32(entry)):

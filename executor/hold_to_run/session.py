@@ -1,7 +1,7 @@
-"""A session of jogs: enables the drives once, moves while a control is held, ends in order.
+"""Jog sessions: enable the drives once, move while a control is held, end in order.
 
-Controls are held over the command socket (`executor.remote.protocol`): the session itself has no
-keys and no screen.
+Controls are reported over the command socket (`executor.remote.protocol`): the session itself has
+no keys and no screen.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from executor.control.winch_motion import WinchesStand, WinchRecord, move_winches, recording
+from executor.control.winch_motion import WinchRecord, WinchResult, move_winches, recording
 from executor.drives import (
     drives_of,
     is_simulated,
@@ -46,7 +46,7 @@ from model.scene import Load, Scene, empty_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
-#: A session in which nothing is held for so long ends by itself, [s]: cables relax.
+#: A session without a held control ends after this time, [s]: cables relax.
 IDLE = 300.0
 
 
@@ -62,30 +62,29 @@ def jog_session(
     supervisor: Supervisor | None = None,
     on_cycle: Callable[[CycleRecord, PressBoard, JogProver], None] | None = None,
 ) -> None:
-    """Enables the drives where the platform is, and moves it straight while a control is held.
+    """Enables the drives, and moves the platform in a straight line while a control is held.
 
-    A press is said to be held over the command socket (``held``, every 50 ms) and ends with
-    ``let_go``, or when nothing is heard of it for 150 ms. What is ahead of the platform is proved
-    while it moves, against the scene, the workspace, tensions and winches, and it slows down where
-    no more can be proved. The session ends with ``end``, with a stop, or after five minutes in
-    which nothing is held.
+    A press is reported over the command socket (``held``, every 50 ms) and ends with ``let_go``, or
+    after 150 ms without a report. The line ahead of the platform is checked during the motion
+    against the scene, the workspace, tensions and winches, and the platform slows down before the
+    end of the checked line. The session ends with ``end``, with a stop, or after five minutes
+    without a held control.
 
     Args:
         rig: The robot and its bus.
-        scene: What is in the way, and what the platform carries; its stops are left out. None
-            states that nothing is in the way.
-        speed: Of a jog at most, [m/s].
-        realtime: As for `executor.runner.run`, as all up to the supervisor.
+        scene: Obstacles and load; its stops are ignored. None states that there are no obstacles.
+        speed: Largest jog speed, [m/s].
+        realtime: As for `executor.runner.run`, like all up to the supervisor.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
-        listener: Receives what happens.
+        listener: Receives events.
         confirm: Called once, before anything is enabled; False cancels it.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
-        on_cycle: Called after every cycle, with the board of presses and what is proved, by a
-            program that holds controls itself.
+        on_cycle: Called after every cycle with the board of presses and the checked line, for
+            programs that hold controls themselves.
 
     Raises:
         CdprError: As for `executor.jogging.jog`; a fault is latched.
-        StoppedByOperator: It was cancelled, or stopped; the drives hold.
+        StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
@@ -117,28 +116,28 @@ def cable_session(
     supervisor: Supervisor | None = None,
     on_cycle: Callable[[CycleRecord, PressBoard, CableTravel], None] | None = None,
 ) -> None:
-    """Enables the drives where they are, homed or not, and moves one winch while a control is held.
+    """Enables the drives, homed or not, and moves one winch while a control is held.
 
-    As `executor.jogging.jog_cable`, but for its length: the winch slows down when the control is
-    let go, near the limit of the tension, where it comes to rest, and after 50 mm of a press. A
-    press is held, and the session ends, as for `jog_session`. What the homing reference was before
-    it stays; where the drive positions fit no pose afterwards, no run begins.
+    As `executor.jogging.jog_cable`, except for the length: the winch slows down and comes to rest
+    when the control is released, near the tension limit, and after 50 mm of a press. Presses and
+    the end of the session are as for `jog_session`. The homing reference is kept; if the drive
+    positions fit no pose afterwards, no run begins.
 
     Args:
         rig: The robot and its bus.
-        limit: No cable may carry more, [N]; None for 60 % of the rig's range.
-        speed: Of a winch at most, [m/s].
-        realtime: As for `executor.runner.run`, as all up to the supervisor.
+        limit: Largest tension of any cable, [N]; None for 60 % of the rig's range.
+        speed: Largest winch speed, [m/s].
+        realtime: As for `executor.runner.run`, like all up to the supervisor.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
-        listener: Receives what happens.
+        listener: Receives events.
         confirm: Called once, before anything is enabled; False cancels it.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
-        on_cycle: Called after every cycle, with the board of presses and how far cables moved, by
-            a program that holds controls itself.
+        on_cycle: Called after every cycle with the board of presses and the cable travel, for
+            programs that hold controls themselves.
 
     Raises:
         CdprError: As for `executor.jogging.jog_cable`; a fault is latched.
-        StoppedByOperator: It was cancelled, or stopped; the drives hold.
+        StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
@@ -157,14 +156,14 @@ def cable_session(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Parts:
-    """What one kind of session puts into it.
+    """Parts of one kind of session.
 
     Attributes:
-        task: Of the process that moves the drives.
+        task: For the real-time process.
         make_drives: See `winch_mover`.
-        status: What is reported.
-        take_cycle: Called after every cycle, before the status hears of it.
-        on_cycle: Called after that.
+        status: Reported status.
+        take_cycle: Called after every cycle, before the status.
+        on_cycle: Called after the status.
     """
 
     task: MotionTask
@@ -175,11 +174,11 @@ class _Parts:
 
 
 class _Kind(Protocol):
-    """What is moved in a session."""
+    """Kind of session."""
 
     @property
     def folder(self) -> str:
-        """Of its record, below ``runs``."""
+        """Name of its record folder in ``runs``."""
         ...
 
     @property
@@ -190,13 +189,13 @@ class _Kind(Protocol):
     def parts(
         self, board: RequestBoard, presses: PressBoard, stack: ExitStack, *, realtime: bool
     ) -> _Parts:
-        """Makes them; what must be closed is left to the stack."""
+        """Makes the parts; resources to close go to the stack."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PlatformJogs:
-    """The platform, straight, along what is proved."""
+    """Moves the platform along a checked straight line."""
 
     folder: ClassVar[str] = "jog-session"
     cables: ClassVar[int] = 0
@@ -236,7 +235,7 @@ class _PlatformJogs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CableJogs:
-    """One cable at a time."""
+    """Moves one cable at a time."""
 
     folder: ClassVar[str] = "jog-cables"
 
@@ -268,12 +267,12 @@ class _CableJogs:
 
 
 def _nothing(_record: CycleRecord, _presses: PressBoard, _moved: object) -> None:
-    """No program looks on."""
+    """Default for `on_cycle`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Session:
-    """One session and how it is to be done."""
+    """One session and its options."""
 
     rig: Rig
     kind: _Kind
@@ -281,8 +280,8 @@ class _Session:
     need_real_time_rights: bool
     listener: Listener
 
-    def run(self, board: LocalRequests | SharedRequests) -> WinchesStand:
-        """Moves until it ends; the command socket takes what is said of presses."""
+    def run(self, board: LocalRequests | SharedRequests) -> WinchResult:
+        """Runs the session; the command socket takes the presses."""
         rig, interlock = self.rig, MotionInterlock(self.rig)
         clock = SimulatedClock(rig.cycle)
         now = time.monotonic if self.realtime else lambda: clock.now
@@ -304,30 +303,30 @@ class _Session:
                     listener=self.listener,
                 )
             )
-            kept = stack.enter_context(
+            log = stack.enter_context(
                 nullcontext() if is_simulated(rig) else recording(free_folder(self.kind.folder))
             )
-            status.folder = None if kept is None else kept.folder
-            stand = move_winches(
+            status.folder = None if log is None else log.folder
+            result = move_winches(
                 mover,
                 rig,
                 interlock,
-                _Sink(parts, presses, kept, self.listener),
-                record=kept.folder if kept is not None else interlock.file.path,
+                _Sink(parts, presses, log, self.listener),
+                record=log.folder if log is not None else interlock.file.path,
                 rehome=False,
-                at_rest=lambda _stand, _true_pose: None,
+                at_rest=lambda result, _true_pose: None,
             )
-            status.take_end(stand.state, stand.cause)
-        return stand
+            status.take_end(result.state, result.cause)
+        return result
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sink:
-    """Forwards what happens to the parts of the session and the record."""
+    """Forwards cycles and events to the parts of the session and the record."""
 
     parts: _Parts
     presses: PressBoard
-    kept: WinchRecord | None
+    log: WinchRecord | None
     listener: Listener
 
     def take_cycle(self, record: CycleRecord, _true_pose: Pose | None) -> None:
@@ -336,19 +335,19 @@ class _Sink:
         if record.at - self.presses.last_heard > IDLE:
             self.presses.end()
         self.parts.on_cycle(record)
-        if self.kept is not None:
-            self.kept.take_cycle(record)
+        if self.log is not None:
+            self.log.take_cycle(record)
 
     def take_event(self, event: LoopEvent) -> None:
         self.parts.status.take_event(event)
         if event.code not in ("moving", "traceback"):
             self.listener.note(f"{event.code}: {event.text}")
-        if self.kept is not None:  # last: what a full disk does not take is told all the same
-            self.kept.take_event(event)
+        if self.log is not None:  # last: a full disk must not prevent the report
+            self.log.take_event(event)
 
 
 def _counts_at(rig: Rig, pose: Pose, load: Load) -> tuple[int, ...]:
-    """Where the drives stand at a pose, as a set-point there has it."""
+    """Set-points of the drives at a pose."""
     winches, tensions = WinchMap(rig), working_tensions(rig, pose, load).tensions
     counts = winches.counts(winches.unstrained(cable_lengths(rig, pose), tensions))
     return tuple(int(count) for count in np.rint(counts))

@@ -1,1 +1,1 @@
-"""What forbids motion: the fault latch, a missing encoder reference, another program."""
+"""Motion interlock: the fault latch, the homing reference, locks against other programs."""

@@ -1,12 +1,12 @@
-"""The latch of a bus: while it is engaged nothing moves the drives there, in no process.
+"""Fault latch of a bus: while it is engaged, no process moves the drives.
 
 It is a file in this computer's state folder (`executor.interlock.locks`). It is engaged before
 anything moves and disengaged when the motion ended well; a fault leaves it engaged with its cause,
 and a program that died or a computer that lost power leaves it engaged too. Only `cdpr reset`
 disengages it then.
 
-A program that moves or resets the drives holds a lock on a file beside it. The system frees it
-when that program ends, however it ends; so a run differs from what a run left behind.
+A program that moves or resets the drives also holds a file lock, which the system releases when
+that program ends in any manner; this distinguishes an active run from the latch of an earlier one.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from executor.state_machine import State
 from model.errors import CdprError, Refused
 from model.files.documents import write_atomic
 
-#: Who looks at the lock lets it go within this, [s].
-LOOKS_WITHIN = 0.5
+#: Readers of the lock release it within this time, [s].
+LOCK_TIMEOUT = 0.5
 
 _CUT_SHORT = "a run did not finish: its program was killed, or the computer stopped"
 
@@ -39,11 +39,11 @@ class LatchedFault:
 
     Attributes:
         bus: Interface and channel.
-        rig: Name of the rig that was run.
+        rig: Name of the rig.
         cause: One sentence.
-        since: When, ISO 8601, UTC.
+        since: Time, ISO 8601, UTC.
         folder: Run folder.
-        process: Number of the process that ran it.
+        process: ID of the process that ran it.
     """
 
     bus: str
@@ -55,17 +55,17 @@ class LatchedFault:
 
 
 class FaultLatch:
-    """Of one bus."""
+    """Fault latch of one bus."""
 
     def __init__(self, settings: BusSettings) -> None:
-        """Looks at nothing yet."""
+        """Reads nothing yet."""
         self._bus = str(settings)
         self.path = state_file("latched", settings)
         self._lock = self.path.with_suffix(".lock")
         self._held: weakref.finalize[[int], FaultLatch] | None = None
 
     def read(self) -> LatchedFault | None:
-        """Why it is engaged; None when it is not. A file that cannot be read counts as engaged."""
+        """The latched fault, or None. A file that cannot be read counts as engaged."""
         try:
             return LatchedFault(**json.loads(read_state_file(self.path)))
         except FileNotFoundError:
@@ -76,17 +76,17 @@ class FaultLatch:
             return LatchedFault(self._bus, "unknown", cause, "unknown", "unknown", 0)
 
     def require_disengaged(self) -> None:
-        """Nothing may move while it is engaged.
+        """Requires the latch to be disengaged.
 
         Raises:
-            Refused: With the cause.
+            Refused: It is engaged; with the cause.
         """
         latched = self.read()
         if latched is not None:
             raise self._refusal(latched)
 
     def require_no_run(self) -> None:
-        """No run is under way on this bus; its mark is not a fault.
+        """Requires that no run is active on this bus.
 
         Raises:
             Refused: One is.
@@ -97,16 +97,16 @@ class FaultLatch:
 
     @contextmanager
     def held_for_reset(self, rig: str, shown: LatchedFault | None) -> Iterator[None]:
-        """Keeps runs off the bus while the block resets its drives; then it is off.
+        """Blocks runs while the block resets the drives, then disengages the latch.
 
-        When the block fails, the latch is as it was.
+        If the block fails, the latch stays as it was.
 
         Args:
             rig: Name of the rig.
-            shown: What the operator was shown and said yes to.
+            shown: The fault that the operator confirmed.
 
         Raises:
-            Refused: It is not what is latched now.
+            Refused: Another fault is latched now.
         """
         if shown is None:
             self.engage(rig, self.path.parent, "a reset did not finish")
@@ -124,20 +124,20 @@ class FaultLatch:
         except BaseException:
             if shown is None:
                 self.disengage()
-            self._let_go()
+            self._release()
             raise
         self.disengage()
 
     def engage(self, rig: str, folder: Path, cause: str = _CUT_SHORT) -> None:
-        """A run is about to move; if it does not finish, this is the only trace of it.
+        """Engages the latch before a run; it stays if the run does not finish.
 
         Args:
             rig: Name of the rig.
-            folder: Where the record of the run is.
-            cause: The cause reported then.
+            folder: Record of the run.
+            cause: Reported then.
 
         Raises:
-            Refused: It is engaged already, or cannot be.
+            Refused: It is already engaged, or cannot be written.
         """
         self.require_disengaged()
         try:
@@ -149,30 +149,30 @@ class FaultLatch:
             self.require_disengaged()  # no other program engages it from here on
             self._write(self._latched(rig, cause, folder))
         except BaseException:
-            self._let_go()
+            self._release()
             raise
 
     def settle(self, rig: str, state: State, cause: str, folder: Path) -> None:
-        """The motion is over: disengaged when it ended well, else engaged with its cause."""
+        """Disengages after a motion that ended well, else engages with its cause."""
         if state in (State.FINISHED, State.STOPPED):
             self.disengage()
         else:
             self._write(self._latched(rig, cause, folder))
-            self._let_go()
+            self._release()
 
     def disengage(self) -> None:
-        """Drives may be moved again."""
+        """Disengages the latch: drives may be moved again."""
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:
             raise self._not_kept(error.strerror) from None
-        self._let_go()
+        self._release()
 
     def _hold(self) -> None:
-        """Until it is let go, or this program ends; waits for those who only look.
+        """Takes the lock until it is released or this program ends; waits for readers.
 
         Raises:
-            Refused: Somebody moves or resets the drives, or the lock cannot be made.
+            Refused: Another program moves or resets the drives, or the lock cannot be made.
         """
         if self._held is not None:
             return
@@ -180,18 +180,18 @@ class FaultLatch:
             lock = open_state_file(self._lock, create=True)
         except OSError as error:
             raise self._not_kept(error.strerror) from None
-        if not locked_within(lock, LOOKS_WITHIN):
+        if not locked_within(lock, LOCK_TIMEOUT):
             os.close(lock)
             raise self._refusal(self.read())
         self._held = weakref.finalize(self, os.close, lock)
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         if self._held is not None:
             self._held()
             self._held = None
 
     def held_by_another(self) -> bool:
-        """Somebody moves or resets the drives at this moment."""
+        """Whether another program is moving or resetting the drives now."""
         if self._held is not None:
             return False
         try:

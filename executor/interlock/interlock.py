@@ -1,7 +1,7 @@
-"""Who may move what hangs on a bus: every motion there begins and ends here.
+"""Motion interlock of a bus: every motion begins and ends here.
 
-On a bus of this process alone (``virtual``) nothing is kept: its drives end with the process, and
-begin where the rig file says.
+On the interface ``virtual`` nothing is stored: its drives end with the process, and start as in
+the rig file.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from model.rig import Rig
 
 
 class MotionInterlock:
-    """Of the bus of one rig."""
+    """Motion interlock of the bus of one rig."""
 
     def __init__(self, rig: Rig) -> None:
-        """Looks at nothing yet."""
+        """Reads nothing yet."""
         self._rig = rig
         settings = BusSettings.of(rig)
         self._is_kept = settings.interface != IN_PROCESS
@@ -38,19 +38,19 @@ class MotionInterlock:
         self._counted_from: HomingReference | None = None
 
     def require_free(self) -> None:
-        """Nothing moves on a bus on which a fault is latched, or a run is under way.
+        """Requires a bus without a latched fault or an active run.
 
         Raises:
-            Refused: So it is; with the cause.
+            Refused: The bus is not free; with the cause.
         """
         if self._is_kept:
             self._latch.require_disengaged()
 
     def reference(self) -> HomingReference | None:
-        """The reference that counts for this rig file; None where it needs none and has none.
+        """The valid reference for this rig file; None if it needs none and has none.
 
         Raises:
-            Refused: There must be one and is none, it is lost, or it is another rig file's.
+            Refused: It is required but missing, lost, or made for another rig file.
         """
         reference = self.kept_reference()
         if reference is None:
@@ -64,19 +64,19 @@ class MotionInterlock:
             raise self._refusal("the drives were homed for another rig file", why)
         return reference
 
-    def why_unreferenced(self, stands: Sequence[int] | None = None) -> str:
-        """Why the drives do not count from their reference; nothing where they do.
+    def why_unreferenced(self, positions: Sequence[int] | None = None) -> str:
+        """Why the homing reference is not valid; empty if it is.
 
         Args:
-            stands: Where they stand, [counts]; where it is left out, only the file is looked at.
+            positions: Of the drives, [counts]; None to check only the file.
         """
         try:
             reference = self.reference()
         except Refused as error:
             return f"{error.what}: {error.why}"
-        if reference is None or stands is None:
+        if reference is None or positions is None:
             return ""
-        moved = moved_since(self._rig, reference, stands)
+        moved = moved_since(self._rig, reference, positions)
         worst = max(range(len(moved)), key=moved.__getitem__)
         if moved[worst] <= self._rig.motion.start_tolerance:
             return ""
@@ -84,7 +84,7 @@ class MotionInterlock:
         return f"{name} is {moved[worst] * 1000:.1f} mm of cable from its last known position"
 
     def kept_reference(self) -> HomingReference | None:
-        """What is on file for this bus, whatever it says; None where nothing is."""
+        """The reference on file for this bus, valid or not; None without a file."""
         return self.file.read() if self._is_kept else None
 
     def referenced_rig(self) -> Rig:
@@ -93,10 +93,10 @@ class MotionInterlock:
         return self._rig if reference is None else referenced(self._rig, reference)
 
     def require_ready(self) -> HomingReference | None:
-        """The bus is free, and the rig is the one that its drives were referenced for.
+        """Requires a free bus, and drives referenced for this rig.
 
         Raises:
-            Refused: They are not so.
+            Refused: One of both does not hold.
         """
         self.require_free()
         reference = self.kept_reference()
@@ -109,50 +109,53 @@ class MotionInterlock:
             raise self._refusal(what, f"the drives were homed {reference.made}")
         return reference
 
-    def still_counts(self, stands: Sequence[int]) -> HomingReference | None:
-        """The reference, if drives that stand there [counts] still count from it; else None."""
+    def still_counts(self, positions: Sequence[int]) -> HomingReference | None:
+        """The reference, if it is valid for drives at these positions [counts]; else None."""
         reference = self._readable()
-        if reference is None or reference.lost or len(reference.stands_at) != len(stands):
+        if reference is None or reference.lost or len(reference.stands_at) != len(positions):
             return None
-        moved = max(moved_since(self._rig, reference, stands))
+        moved = max(moved_since(self._rig, reference, positions))
         return reference if moved <= self._rig.motion.start_tolerance else None
 
     def found_restarted(self, nodes: Iterable[int]) -> None:
-        """Drives were switched on since they were set up: their reference is lost for good.
+        """Marks the reference of power-cycled drives as lost.
 
-        It is kept at once, whatever happens next: nothing else records it
-        once they are set up again.
+        This is written at once, as nothing else records it after the next configuration.
 
         Raises:
-            Refused: It cannot be kept.
+            Refused: It cannot be written.
         """
-        forgot = {winch.node_id for winch in self._rig.winches if not winch.absolute} & {*nodes}
-        if forgot:
-            names = [name for node, name in self._rig.drive_names.items() if node in forgot]
+        restarted = {winch.node_id for winch in self._rig.winches if not winch.absolute} & {*nodes}
+        if restarted:
+            names = [name for node, name in self._rig.drive_names.items() if node in restarted]
             self._lose(f"{', '.join(names)}: power-cycled after homing")
 
-    def confirm_held(self, stands: Sequence[int]) -> None:
-        """All drives held since they were last heard: they still count, and stand there [counts].
+    def confirm_held(self, positions: Sequence[int]) -> None:
+        """Stores the positions [counts] of drives that held throughout: the reference stays valid.
 
         Raises:
-            Refused: It cannot be kept.
+            Refused: It cannot be written.
         """
         reference = self._readable()
-        if reference is not None and not reference.lost and len(reference.stands_at) == len(stands):
-            self.file.write(reference.model_copy(update={"stands_at": list(stands)}))
+        if (
+            reference is not None
+            and not reference.lost
+            and len(reference.stands_at) == len(positions)
+        ):
+            self.file.write(reference.model_copy(update={"stands_at": list(positions)}))
 
     def begin(
         self, record: Path, reference: HomingReference | None, *, rehome: bool = False
     ) -> None:
-        """The drives are about to move; if that does not finish, the latch records it.
+        """Engages the latch before a motion; it stays if the motion does not finish.
 
         Args:
-            record: Where the motion is on record.
-            reference: From which the drives count, found to do so; None where it is not known.
-            rehome: They are to be homed again; the present reference is given up.
+            record: Path of the motion's record.
+            reference: The drives' valid reference; None if unknown.
+            rehome: The drives will be homed again; the present reference is discarded.
 
         Raises:
-            Refused: The bus is latched, or cannot be.
+            Refused: The bus is latched, or the latch cannot be written.
         """
         if not self._is_kept:
             return
@@ -166,16 +169,16 @@ class MotionInterlock:
             raise
 
     def take(self, reference: HomingReference) -> None:
-        """A new reference, made between `begin` and `end`.
+        """Stores a new reference, made between `begin` and `end`.
 
         Raises:
-            Refused: It cannot be kept.
+            Refused: It cannot be written.
         """
         if self._is_kept:
             self.file.write(reference)
 
     def cancel(self) -> None:
-        """Nothing moved after all."""
+        """Disengages the latch when nothing moved after all."""
         if self._is_kept:
             self._latch.disengage()
 
@@ -186,57 +189,57 @@ class MotionInterlock:
         record: Path,
         *,
         holding: bool,
-        stands_at: Sequence[int] | None,
-        let_go: str = "",
+        positions: Sequence[int] | None,
+        release_reason: str = "",
     ) -> None:
-        """The motion is over: the bus is free when it ended well, else latched.
+        """Ends a motion: frees the bus if it ended well, else latches the fault.
 
         Args:
-            state: Where it ended.
+            state: Final state.
             cause: Why it did not end well.
-            record: Where it is on record.
+            record: Path of its record.
             holding: Every cable was held to the end.
-            stands_at: Positions of the drives, [counts]; None when unknown.
-            let_go: Why cables are not held any more where that was wished; what the reference was
-                lost by.
+            positions: Positions of the drives, [counts]; None when unknown.
+            release_reason: Why cables were released on purpose; recorded as loss of the reference.
 
         Raises:
-            Refused: The reference cannot be kept, then the bus stays latched; or the latch cannot.
+            Refused: The reference cannot be written, so that the bus stays latched; or the latch
+                cannot.
         """
         if not self._is_kept:
             return
         try:
-            lost = let_go or f"drives released cables under tension ({cause})"
-            self._note_end(lost, holding, stands_at)
+            lost = release_reason or f"drives released cables under tension ({cause})"
+            self._note_end(lost, holding, positions)
         except Refused as error:
             self._latch.settle(self._rig.name, State.LATCHED, cause or error.what, record)
             raise
         self._latch.settle(self._rig.name, state, cause, record)
 
-    def _note_end(self, lost: str, holding: bool, stands_at: Sequence[int] | None) -> None:
-        """What the end of a motion means for the reference."""
+    def _note_end(self, lost: str, holding: bool, positions: Sequence[int] | None) -> None:
+        """Updates the reference after a motion."""
         if not holding:
             reference = self._readable() or as_in_the_file(self._rig)
             self.file.write(reference.model_copy(update={"lost": reference.lost or lost}))
-        elif self._counted_from is not None and stands_at is not None:
-            stand = {"stands_at": list(stands_at)}
-            self.file.write(self._counted_from.model_copy(update=stand))
+        elif self._counted_from is not None and positions is not None:
+            update = {"stands_at": list(positions)}
+            self.file.write(self._counted_from.model_copy(update=update))
 
     def _lose(self, why: str) -> None:
-        """The reference on file, if any, counts no more; the first reason is kept."""
+        """Marks any reference on file as lost; the first reason is kept."""
         reference = self._readable()
         if reference is not None and not reference.lost:
             self.file.write(reference.model_copy(update={"lost": why}))
 
     def _readable(self) -> HomingReference | None:
-        """What is on file, where it can be read; what cannot is no reference that counts."""
+        """The reference on file; None if it cannot be read."""
         try:
             return self.kept_reference()
         except Refused:
             return None
 
-    def go_by_the_rig_file(self) -> None:
-        """From now on the drives count what the rig file says; no reference is kept.
+    def use_rig_file_counts(self) -> None:
+        """Removes the reference: the drives count as in the rig file.
 
         Raises:
             Refused: A drive without absolute encoder cannot do so; or a fault is latched.
@@ -261,7 +264,7 @@ class MotionInterlock:
         return Refused(what, where=f"reference {self.file.path}", why=why, next_step=AGAIN)
 
 
-# The reference of a bus, for people and programs.
+# Status of a bus's reference.
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,11 +272,11 @@ class ReferenceStatus:
     """The homing reference of a bus.
 
     Attributes:
-        counts: Whether the drives still count from it.
-        why_not: Why they do not.
-        made: When it was made; None where none is kept.
-        how: The pose was known.
-        file: Where it is kept.
+        counts: Whether it is valid.
+        why_not: Why it is not.
+        made: Time of homing; None if there is none.
+        how: How the pose was known.
+        file: Its path.
     """
 
     counts: bool
@@ -298,12 +301,12 @@ def reference_status(
 
     Args:
         interlock: Of the bus.
-        positions: Of its drives, [counts]; None where they were not asked.
+        positions: Of its drives, [counts]; None if not read.
     """
     why = interlock.why_unreferenced(positions)
     try:
         kept = interlock.kept_reference()
-    except Refused:  # the reason says so
+    except Refused:  # reported in `why`
         kept = None
     path = interlock.file.path
     return ReferenceStatus(

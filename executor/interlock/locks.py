@@ -1,7 +1,7 @@
-"""Where is kept, from one program to the next, what is known of a bus: its latch, its reference.
+"""State folder with the latch and reference of each bus, and locks on its files.
 
-One folder for all users where an administrator made it, else the user's own: a fault that one user
-saw is then unknown to another one. A file is named after the bus, however its name is spelled.
+One folder for all users if an administrator created it, else one per user: a fault of one user's
+run is then unknown to others. Files are named after the canonical name of the bus.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pathlib import Path
 from drivers.can_bus import IN_PROCESS, BusSettings
 from model.errors import Refused
 
-#: Used by everybody once it exists: ``sudo install -d -m 2775 -g GROUP /var/lib/cdpr``.
+#: Used by all users if it exists: ``sudo install -d -m 2775 -g GROUP /var/lib/cdpr``.
 SHARED = Path("/var/lib/cdpr")
-#: A latch or a reference of many cables has a few kilobytes.
+#: A latch, or a reference of many cables, has a few kilobytes.
 LARGEST_FILE = 65_536
 
 _KINDS = {
@@ -34,7 +34,7 @@ _KINDS = {
 
 
 def state_folder() -> Path:
-    """The folder, which may not exist yet."""
+    """The state folder, which may not exist yet."""
     if SHARED.is_dir():
         return SHARED
     base = os.environ.get("XDG_STATE_HOME")
@@ -51,14 +51,14 @@ def open_state_file(path: Path, *, create: bool = False) -> int:
     """Opens a file of the state folder for reading; the caller closes it.
 
     The folder may be shared: any user with write access could put a link to another file there, or
-    a FIFO, which would keep a program waiting for ever. Neither is followed or waited for.
+    a FIFO that blocks forever. Links are not followed, and FIFOs do not block.
 
     Args:
         path: The file.
-        create: Make an empty one where there is none.
+        create: Create an empty file if there is none.
 
     Raises:
-        Refused: It is no regular file.
+        Refused: It is not a regular file.
         OSError: It cannot be opened.
     """
     flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -81,7 +81,7 @@ def read_state_file(path: Path) -> str:
     """The text of a file of the state folder.
 
     Raises:
-        Refused: It is no regular file, or too large for what is kept there.
+        Refused: It is not a regular file, or too large.
         OSError: It cannot be read.
         UnicodeDecodeError: It is not UTF-8.
     """
@@ -107,15 +107,15 @@ def _refusal(path: Path, what: str) -> Refused:
     )
 
 
-# Locks on files, which the system gives back when a program ends, however it ends.
+# File locks, which the system releases when a program ends in any manner.
 
 
-#: Looked at again this often, [s].
-_AGAIN = 0.01
+#: Interval of attempts, [s].
+_POLL_INTERVAL = 0.01
 
 
 def locked_within(handle: int, seconds: float) -> bool:
-    """Locks an open file for this program alone; waits so long for those who have it, [s]."""
+    """Locks an open file exclusively; waits up to a time [s]; returns whether it succeeded."""
     until = time.monotonic() + seconds
     while True:
         try:
@@ -123,35 +123,35 @@ def locked_within(handle: int, seconds: float) -> bool:
         except BlockingIOError:
             if time.monotonic() >= until:
                 return False
-            time.sleep(_AGAIN)
+            time.sleep(_POLL_INTERVAL)
         else:
             return True
 
 
-# Who sets the drives of a bus up, or asks them for objects, does so alone.
+# Only one program at a time configures the drives of a bus or reads their objects.
 #
-# A drive answers one such request at a time and does not say to whom: the answer to somebody else's
-# would be taken for one's own. A bus of this process alone (``virtual``) has no other user.
+# A drive answers one SDO request at a time without an addressee: a program would take the answer to
+# another one's request for its own. The interface ``virtual`` has no other user.
 
 
-#: Who only asks how the drives stand is done within this, unless one does not answer, [s].
-ASKED_WITHIN = 5.0
+#: Reading the drives' state takes no longer than this, unless one does not answer, [s].
+READ_TIMEOUT = 5.0
 
 
 class SetUpLock:
-    """Of one bus."""
+    """Lock for configuring the drives of one bus."""
 
     def __init__(self, settings: BusSettings) -> None:
-        """Looks at nothing yet."""
+        """Opens nothing yet."""
         self._bus, self._is_shared = str(settings), settings.interface != IN_PROCESS
         self._path = state_file("set-up", settings).with_suffix(".lock")
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """For who sets the drives up, until they are done with; waits for those who only ask.
+        """Holds the lock while drives are configured and moved; waits for readers.
 
         Raises:
-            Refused: Somebody else has it, or the lock cannot be made.
+            Refused: Another program has it, or the lock cannot be made.
         """
         if not self._is_shared:
             yield
@@ -167,7 +167,7 @@ class SetUpLock:
                 next_step="make the folder writable for the operators of the rig",
             ) from None
         try:
-            if not locked_within(lock, ASKED_WITHIN):
+            if not locked_within(lock, READ_TIMEOUT):
                 raise Refused(
                     "another program is configuring or reading these drives",
                     where=f"bus {self._bus}",
@@ -180,10 +180,10 @@ class SetUpLock:
 
     @contextmanager
     def tried(self) -> Iterator[bool]:
-        """For readers: takes it if it is free, and returns whether it was. Makes no file.
+        """For readers: takes it if free; yields whether it was. Creates no file.
 
         Raises:
-            Refused: The lock is no regular file.
+            Refused: The lock is not a regular file.
         """
         try:
             lock = open_state_file(self._path)

@@ -1,8 +1,7 @@
-"""Where the drums' counts were referenced: a dated file of its own, never the rig file.
+"""Homing reference of the drives: a separate dated file, never the rig file.
 
-It lies beside the latch of the bus (`executor.interlock.locks`). `cdpr home` writes it; every
-motion ends by noting in it where the drives stand, and by declaring it lost when cables were let
-go.
+It is stored beside the latch of the bus (`executor.interlock.locks`). `cdpr home` writes it; every
+motion ends by updating the drive positions in it, or by marking it lost if cables were released.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ AGAIN = "home the drives with `cdpr home RIG`; nothing was moved"
 
 
 class HomingReference(Document):
-    """What the drives of one rig count at home, and how that came to be known."""
+    """Drive counts of a rig at home, and how they were determined."""
 
     schema_version: Literal[1]
     rig: str
@@ -75,20 +74,20 @@ def reference_at(
 
 
 def as_in_the_file(rig: Rig) -> HomingReference:
-    """What the rig file itself says that absolute encoders count at home."""
+    """The reference of absolute encoders as in the rig file."""
     home = np.array([winch.home_counts for winch in rig.winches], dtype=np.float64)
     tensions = working_tensions(rig, rig.home).tensions
     return reference_at(rig, rig.home, home, tensions, "as in the rig file", 0.0)
 
 
 def counting_hash(rig: Rig) -> str:
-    """Of everything that decides what drives count at a pose."""
+    """Hash of all rig data that determine the drive counts at a pose."""
     winches = [document_hash(winch) for winch in rig.document.winches]
     return content_hash({"rig": rig.plan_hash, "winches": winches})
 
 
 def referenced(rig: Rig, reference: HomingReference) -> Rig:
-    """The rig with the counts of a reference in place of its file's."""
+    """The rig with the home counts of a reference."""
     winches = [
         winch.model_copy(update={"home_counts": home})
         for winch, home in zip(rig.document.winches, reference.home_counts, strict=True)
@@ -96,17 +95,17 @@ def referenced(rig: Rig, reference: HomingReference) -> Rig:
     return rig_from_document(rig.document.model_copy(update={"winches": winches}))
 
 
-def moved_since(rig: Rig, reference: HomingReference, stands: Sequence[int]) -> list[float]:
-    """How far drives were moved since the last motion, of cable, [m], one a drive.
+def moved_since(rig: Rig, reference: HomingReference, positions: Sequence[int]) -> list[float]:
+    """Cable travel of each drive since the last motion, [m].
 
-    None of those with absolute encoders, which keep counting when moved.
+    Zero for absolute encoders, which keep counting when moved.
 
     Args:
         rig: The robot.
         reference: Of its drives.
-        stands: Where they stand now, [counts].
+        positions: Of the drives now, [counts].
     """
-    rows = zip(rig.winches, stands, reference.stands_at, strict=True)
+    rows = zip(rig.winches, positions, reference.stands_at, strict=True)
     return [
         0.0 if winch.absolute else abs((at - left) / winch.counts_per_metre)
         for winch, at, left in rows
@@ -114,17 +113,17 @@ def moved_since(rig: Rig, reference: HomingReference, stands: Sequence[int]) -> 
 
 
 class ReferenceFile:
-    """The reference of one bus."""
+    """The reference file of one bus."""
 
     def __init__(self, settings: BusSettings) -> None:
-        """Looks at nothing yet."""
+        """Reads nothing yet."""
         self.path = state_file("reference", settings)
 
     def read(self) -> HomingReference | None:
         """The reference; None where there is none.
 
         Raises:
-            Refused: The file cannot be read: what it said cannot be ignored.
+            Refused: The file cannot be read, so that its content is unknown.
         """
         try:
             return HomingReference.model_validate_json(read_state_file(self.path))
@@ -139,7 +138,7 @@ class ReferenceFile:
             ) from None
 
     def remove(self) -> None:
-        """Nothing is on file any more.
+        """Removes the file.
 
         Raises:
             Refused: It cannot be removed.
@@ -155,10 +154,10 @@ class ReferenceFile:
             ) from None
 
     def write(self, reference: HomingReference) -> None:
-        """Keeps it.
+        """Writes the reference.
 
         Raises:
-            Refused: It cannot be kept.
+            Refused: It cannot be written.
         """
         try:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

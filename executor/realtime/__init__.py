@@ -1,1 +1,1 @@
-"""The process that keeps the cycle: scheduling, clock, and memory shared with its supervisor."""
+"""The real-time process: scheduling, clock, and memory shared with its supervisor."""

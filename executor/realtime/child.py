@@ -1,4 +1,4 @@
-"""The real-time process: one thread that opens the drives, arms them and runs the loop."""
+"""Main function of the real-time process: opens the drives, arms them, runs the loop."""
 
 from __future__ import annotations
 
@@ -26,32 +26,32 @@ from executor.realtime.shared_memory import CycleRecordCodec, Ring, Supervised, 
 from executor.state_machine import SIMULATED, CycleRecord, LoopEvent, State
 from model.errors import CdprError, Fault
 
-_FROM_A_TERMINAL = (
+_TERMINAL_SIGNALS = (
     signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU
 )  # fmt: skip
 
 
 def serve(job: Job, link: Connection, supervisor: int) -> None:
-    """What the process does; it ends with the drives holding by themselves, whatever happens.
+    """Runs a job; always ends with the drives holding on their own.
 
     Args:
-        job: What to do.
+        job: The job.
         link: To the supervisor.
-        supervisor: Number of its process.
+        supervisor: Its process ID.
     """
     supervised = Supervised(job.board, supervisor)
-    # What a terminal sends is the supervisor's to decide on; it uses the board, and where it is
-    # suspended or killed its silence does.
-    for number in _FROM_A_TERMINAL:
+    # The supervisor handles signals of the terminal, through the board; if it is suspended or
+    # killed, its silence is detected.
+    for number in _TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: supervised.ask_stop())
     try:
         with job.make_drives() as drives:
             _arm_and_run(job, drives, link, supervised)
     except CdprError as error:
-        _say(link, Failed(error))
+        _send(link, Failed(error))
     except Exception as error:
-        _say(link, Failed(Fault(f"the real-time process failed: {type(error).__name__}: {error}")))
+        _send(link, Failed(Fault(f"the real-time process failed: {type(error).__name__}: {error}")))
 
 
 def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Supervised) -> None:
@@ -72,40 +72,40 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
         )
         try:
             loop = motion.loop(
-                drives, master, wishes=supervised.read, on_cycle=on_cycle, on_event=on_event
+                drives, master, requests=supervised.read, on_cycle=on_cycle, on_event=on_event
             )
             loop.arm(partial(motion.require, drives))
             if drives.group.capabilities.simulated and drives.true_pose is None:  # on a real bus
                 on_event(LoopEvent(0, 0.0, SIMULATED, "the drives report that they are simulated"))
-            _say(link, Armed(denied, loop.stands_at, drives.restarted, drives.remarks))
-            said = master.keep_until(lambda: _word(link))
+            _send(link, Armed(denied, loop.positions, drives.restarted, drives.remarks))
+            message = master.cycle_until(lambda: _poll(link))
         except Exception:
-            master.leave_unmoved()
+            master.leave_disabled()
             raise
-        if not isinstance(said, Go):
-            master.leave_unmoved()
+        if not isinstance(message, Go):
+            master.leave_disabled()
             return
         state = loop.run()
     true_pose = drives.true_pose_now()
-    _say(link, Ended(state, loop.cause, loop.holding, true_pose, loop.error))
-    # After any other end the supervisor may hang, and nothing is requested.
-    while state is State.FINISHED and isinstance(_heard(link), ReadDrives):
-        _say(link, master.look())
+    _send(link, Ended(state, loop.cause, loop.holding, true_pose, loop.error))
+    # After any other end the supervisor may hang, and requests nothing.
+    while state is State.FINISHED and isinstance(_receive(link), ReadDrives):
+        _send(link, master.read_state())
 
 
-def _word(link: Connection) -> object:
-    """The supervisor's word, or that none can come any more; None as long as there is nothing."""
-    return (_heard(link) or Gone()) if link.poll() else None
+def _poll(link: Connection) -> object:
+    """Next message of the supervisor, Gone if its link is closed, None if there is none."""
+    return (_receive(link) or Gone()) if link.poll() else None
 
 
-def _heard(link: Connection) -> object:
-    """The supervisor's next word; None when it changed its mind, is done, or is gone."""
+def _receive(link: Connection) -> object:
+    """Next message of the supervisor; None when it closed the link."""
     try:
         return link.recv()
     except (EOFError, OSError):
         return None
 
 
-def _say(link: Connection, what: Armed | Ended | Failed | CycleStatus) -> None:
-    with suppress(OSError):  # the supervisor is gone; the drives hold all the same
+def _send(link: Connection, what: Armed | Ended | Failed | CycleStatus) -> None:
+    with suppress(OSError):  # the supervisor is gone; the drives still hold
         link.send(what)

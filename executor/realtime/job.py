@@ -1,4 +1,4 @@
-"""What the real-time process is given when it starts, and what it says to its supervisor."""
+"""Jobs of the real-time process, and the messages between it and its supervisor."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from model.pose import Pose
 from model.rig import Rig
 from model.scene import Load
 
-#: Slots for cycles: longer than a supervisor may be silent, at the fastest rate.
+#: Slots for cycles: more than a supervisor may be silent for, at the fastest rate.
 CYCLE_SLOTS = 4096
-#: Slots for events, and what fits into one, [bytes].
+#: Slots for events, and the size of one, [bytes].
 EVENT_SLOTS, EVENT_SIZE = 256, 4096
 
 
@@ -28,12 +28,12 @@ class ReadyDrives:
     """Configured drives.
 
     Attributes:
-        rig: The robot as the drives were set up for it.
+        rig: The robot that the drives are configured for.
         group: All of them.
-        true_pose: Where the simulated platform is; None on a real bus.
-        carry: Gives the simulated platform another load; on a real bus it happens by itself.
-        restarted: Nodes that were found without this program's set-up when they were opened.
-        remarks: What the drives cannot do, a sentence each.
+        true_pose: Returns the true pose of the simulated platform; None on a real bus.
+        carry: Changes the payload of the simulated platform; no effect on a real bus.
+        restarted: Nodes found without this program's configuration when opened.
+        remarks: Missing capabilities of the drives, a sentence each.
     """
 
     rig: Rig
@@ -44,7 +44,7 @@ class ReadyDrives:
     remarks: tuple[str, ...] = ()
 
     def true_pose_now(self) -> Pose | None:
-        """Where the simulated platform is at this moment; None on a real bus."""
+        """Present true pose of the simulated platform; None on a real bus."""
         return None if self.true_pose is None else self.true_pose()
 
 
@@ -53,12 +53,12 @@ MakeDrives = Callable[[], AbstractContextManager[ReadyDrives]]
 
 
 class Procedure(Protocol):
-    """What is done with the drives of a motion, cycle by cycle.
+    """Cyclic procedure on the drives of a motion.
 
     Attributes:
         cause: Why it did not finish.
-        error: The same where the operator is to see it as an error of its own; else None.
-        holding: Every cable was held when the drives were last heard.
+        error: The same, where it is to be raised as an error; else None.
+        holding: Every cable was held at the drives' last reply.
     """
 
     cause: str
@@ -66,34 +66,34 @@ class Procedure(Protocol):
     holding: bool
 
     @property
-    def stands_at(self) -> tuple[int, ...]:
-        """Where the drives were when they were last heard, from arming on, [counts]."""
+    def positions(self) -> tuple[int, ...]:
+        """Last reported positions of the drives, from arming on, [counts]."""
         ...
 
     def arm(self, require: Callable[[Sequence[int]], None]) -> None:
-        """Makes all ready; see `executor.control.loop.Loop.arm`.
+        """Arms the drives; see `executor.control.loop.Loop.arm`.
 
         Raises:
-            CdprError: It cannot be; nothing was enabled.
+            CdprError: Arming failed; nothing was enabled.
         """
         ...
 
     def run(self) -> State:
-        """Does it; in the end the drives hold by themselves, or were released."""
+        """Runs to the end, where the drives hold on their own, or are released."""
         ...
 
 
 class MotionTask(Protocol):
-    """What is done with ready drives; it can be sent to a process that is being started."""
+    """A task for ready drives; picklable, to be passed to a new process."""
 
     @property
     def cables(self) -> int:
-        """How many."""
+        """Number of cables."""
         ...
 
     @property
     def cycle(self) -> float:
-        """Time from one SYNC to the next, [s]."""
+        """SYNC period, [s]."""
         ...
 
     def loop(
@@ -101,54 +101,54 @@ class MotionTask(Protocol):
         drives: ReadyDrives,
         master: SyncMaster,
         *,
-        wishes: Callable[[], OperatorRequests],
+        requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
         on_event: Callable[[LoopEvent], None],
     ) -> Procedure:
-        """What does it; arguments as for `executor.control.loop.Loop`.
+        """The procedure; arguments as for `executor.control.loop.Loop`.
 
         Raises:
-            CdprError: It cannot begin where the drives stand; nothing was enabled.
+            CdprError: It cannot begin at the present positions; nothing was enabled.
         """
         ...
 
     def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
-        """What must hold of the drives' positions [counts] when they are armed.
+        """Checks the drive positions [counts] when arming.
 
         Raises:
-            Refused: It does not; nothing was enabled.
+            Refused: The check failed; nothing was enabled.
         """
         ...
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """A cycle is over; where the simulated platform is, if somebody wants to know that now."""
+        """Called after a cycle; the simulated platform's true pose if due, else None."""
         ...
 
     def close(self) -> None:
-        """Lets go of the shared memory that it made."""
+        """Releases the shared memory that it made."""
         ...
 
 
 class Records(Protocol):
-    """Takes in what happens during a motion."""
+    """Takes the cycles and events of a motion."""
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
-        """A cycle is over; where the simulated platform is then, if that was wanted."""
+        """Takes a cycle, and the simulated platform's true pose if known."""
         ...
 
     def take_event(self, event: LoopEvent) -> None:
-        """Something happened."""
+        """Takes an event."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Job:
-    """Everything for one motion; it can be sent to a process that is being started.
+    """Everything for one motion; picklable, to be passed to a new process.
 
     Attributes:
-        motion: What to do.
-        board: Wishes and sign of life.
-        cycles: Status ring.
+        motion: The motion.
+        board: Operator requests and heartbeats.
+        cycles: Ring of cycle records.
         events: Ring of events.
         make_drives: Called in the process.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
@@ -170,7 +170,7 @@ class Job:
         *,
         need_real_time: bool,
     ) -> Job:
-        """A job with rings of its own."""
+        """A job with its own rings."""
         return cls(
             motion=motion,
             board=board,
@@ -183,7 +183,7 @@ class Job:
         )
 
     def close(self) -> None:
-        """Lets go of the shared memory that it and its motion made."""
+        """Releases the shared memory that it and its motion made."""
         self.motion.close()
         for memory in (self.cycles, self.events):
             memory.close()
@@ -191,17 +191,17 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Armed:
-    """All is ready to move; nothing is enabled.
+    """Ready to move; nothing is enabled.
 
     Attributes:
-        denied: What the system did not grant; nothing when it granted all.
-        stands_at: Where the drives stand, [counts].
-        restarted: Nodes that were found without this program's set-up.
-        remarks: What the drives cannot do, a sentence each.
+        denied: What the system denied; empty if nothing.
+        positions: Of the drives, [counts].
+        restarted: Nodes found without this program's configuration.
+        remarks: Missing capabilities of the drives, a sentence each.
     """
 
     denied: str
-    stands_at: tuple[int, ...]
+    positions: tuple[int, ...]
     restarted: tuple[int, ...] = ()
     remarks: tuple[str, ...] = ()
 
@@ -211,11 +211,11 @@ class Ended:
     """The motion is over.
 
     Attributes:
-        state: How it ended.
+        state: Final state.
         cause: Why it did not finish, if it did not.
-        holding: Every cable was held when the drives were last heard.
-        true_pose: Where the simulated platform is; None on a real bus.
-        error: The cause as an error of its own, where it is to be raised.
+        holding: Every cable was held at the drives' last reply.
+        true_pose: Of the simulated platform; None on a real bus.
+        error: The cause, where it is to be raised as an error.
     """
 
     state: State
@@ -227,18 +227,18 @@ class Ended:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """It came to an end before the motion, or after it."""
+    """The process failed before or after the motion."""
 
     error: CdprError
 
 
 class Go:
-    """The supervisor's word to move."""
+    """Command of the supervisor to move."""
 
 
 class Gone:
-    """The supervisor changed its mind, or is gone."""
+    """The supervisor withdrew, or is gone."""
 
 
 class ReadDrives:
-    """The supervisor asks for the drives' state after the motion; a `CycleStatus` answers it."""
+    """Request for the drives' status after the motion; answered by a `CycleStatus`."""

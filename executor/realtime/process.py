@@ -30,13 +30,12 @@ from executor.state_machine import CycleRecord, LoopEvent, State
 from model.errors import CdprError, Fault, Refused, StoppedByOperator
 from model.progress import SILENT, Listener
 
-#: The rings are looked into, and a sign of life is given, this often, [s].
-LOOK = 0.01
-#: Looks in a row without a cycle begun, about 3 s, after which a process that moves drives hangs.
-#: Looks are counted, not time, so that a supervisor that was suspended itself first reads what it
-#: missed.
-SILENT_LOOKS = 300
-#: A process without a command to move ends within this, [s]; drives may still be asked for a time.
+#: Interval of reading the rings and of the heartbeat, [s].
+POLL_INTERVAL = 0.01
+#: Consecutive polls without a new cycle, about 3 s, after which the process counts as hung. Polls
+#: are counted, not time, so that a supervisor that was itself suspended first reads what it missed.
+SILENT_POLLS = 300
+#: A process without a command to move ends within this time, [s]; it may still read the drives.
 END_TIMEOUT = 10.0
 
 
@@ -47,23 +46,23 @@ def real_time_process(
     board: SharedRequests,
     *,
     need_real_time: bool,
-    look_again: Callable[[], str],
+    check_drives: Callable[[], str],
     listener: Listener = SILENT,
 ) -> Iterator[RealTimeProcess]:
-    """A process for one motion; it has ended when the block is left.
+    """A process for one motion; ends when the block is left.
 
     Args:
-        motion: What to do.
+        motion: The motion.
         make_drives: Opens and configures the drives; called in that process; picklable.
-        board: What the operator wants.
+        board: Operator requests.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
-        look_again: Asks drives whose process is gone how they stand; what is wrong with it, empty
-            where they hold.
-        listener: Receives what the drives cannot do.
+        check_drives: Reads the state of drives whose process is gone; returns what is wrong, empty
+            if they hold.
+        listener: Receives remarks on missing capabilities of the drives.
     """
     job = Job.of(motion, board.memory, make_drives, need_real_time=need_real_time)
     try:
-        process = RealTimeProcess(job, board, look_again, listener)
+        process = RealTimeProcess(job, board, check_drives, listener)
         try:
             yield process
         finally:
@@ -76,10 +75,10 @@ class RealTimeProcess:
     """One motion in a process of its own; a `WinchMover`."""
 
     def __init__(
-        self, job: Job, board: SharedRequests, look_again: Callable[[], str], listener: Listener
+        self, job: Job, board: SharedRequests, check_drives: Callable[[], str], listener: Listener
     ) -> None:
-        """Starts it; it opens the drives."""
-        self._board, self._look_again, self._listener = board, look_again, listener
+        """Starts the process, which opens the drives."""
+        self._board, self._look_again, self._listener = board, check_drives, listener
         self._wire = CycleRecordCodec(job.motion.cables)
         self._cycles, self._events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)
         self._records: Records | None = None
@@ -98,26 +97,26 @@ class RealTimeProcess:
         """Waits until the drives are armed.
 
         Args:
-            records: Takes in what happens from now on.
+            records: Takes cycles and events from now on.
 
         Raises:
-            CdprError: They could not be, or the operator wants to stop.
+            CdprError: Arming failed, or the operator requested a stop.
         """
         self._records = records
         while True:
             self._board.beat()
             if self._board.read().stop:
                 raise StoppedByOperator("stopped before anything moved")
-            if wait([self._link, self._process.sentinel], LOOK):
-                said = self._heard()
-                if isinstance(said, Armed):
-                    for remark in said.remarks:
+            if wait([self._link, self._process.sentinel], POLL_INTERVAL):
+                message = self._receive()
+                if isinstance(message, Armed):
+                    for remark in message.remarks:
                         self._listener.remark(remark)
-                    return said
-                raise said.error if isinstance(said, Failed) else self._died()
+                    return message
+                raise message.error if isinstance(message, Failed) else self._died()
 
     def run(self) -> Ended:
-        """Says go, and takes in what happens until the motion is over.
+        """Starts the motion, and takes its records until it is over.
 
         Raises:
             Refused: It was not armed.
@@ -127,52 +126,54 @@ class RealTimeProcess:
         self._board.beat()
         with suppress(OSError):  # it died since it was armed, which is reported below
             self._link.send(Go())
-        said: object = None
+        message: object = None
         over, silent, cycles = False, 0, 0
-        while not over and silent < SILENT_LOOKS:
-            over = bool(wait([self._link, self._process.sentinel], LOOK))
+        while not over and silent < SILENT_POLLS:
+            over = bool(wait([self._link, self._process.sentinel], POLL_INTERVAL))
             self._board.beat()
             if over:
-                said = self._heard()
+                message = self._receive()
             self._take_in(self._records)
             before, cycles = cycles, self._board.cycles
             silent = 0 if cycles != before else silent + 1
-        if isinstance(said, Ended):
+        if isinstance(message, Ended):
             self._ended = True
-            return said
-        error = said.error if isinstance(said, Failed) else self._died() if over else self._hung()
+            return message
+        error = (
+            message.error if isinstance(message, Failed) else self._died() if over else self._hung()
+        )
         self._take_in(self._records)
-        self.tell("real_time_lost", error.what)
-        doubt = self._look_again()  # they should hold by themselves, as SYNC stays away
+        self.report_event("real_time_lost", error.what)
+        doubt = self._look_again()  # they should hold on their own without SYNC
         if doubt:
-            self.tell("not_held", doubt)
+            self.report_event("not_held", doubt)
         cause = f"{error.what}; {doubt}" if doubt else error.what
         return Ended(State.LATCHED, cause, holding=not doubt, true_pose=None)
 
-    def stands_now(self) -> CycleStatus:
-        """State of the drives after the motion.
+    def read_status(self) -> CycleStatus:
+        """Status of the drives after the motion.
 
         Raises:
-            CdprError: One does not answer, or the process is gone.
+            CdprError: A drive does not answer, or the process is gone.
         """
         with suppress(OSError):  # reported below
             self._link.send(ReadDrives())
         if not self._link.poll(END_TIMEOUT):
             raise self._hung()
-        said = self._heard()
-        if isinstance(said, CycleStatus):
-            return said
-        raise said.error if isinstance(said, Failed) else self._died()
+        message = self._receive()
+        if isinstance(message, CycleStatus):
+            return message
+        raise message.error if isinstance(message, Failed) else self._died()
 
-    def tell(self, code: str, text: str) -> None:
+    def report_event(self, code: str, text: str) -> None:
         """Records an event that happened after the last cycle."""
         cycle, at = (self._last.cycle + 1, self._last.at) if self._last else (0, 0.0)
         if self._records is not None:
             self._record(partial(self._records.take_event, LoopEvent(cycle, at, code, text)))
 
     def close(self) -> None:
-        """Waits for the process; whatever it does, it comes to rest and ends."""
-        if not self._ended:  # a stop that is wished from now on is the operator's
+        """Waits for the process to come to rest and end; kills it after a time-out."""
+        if not self._ended:  # after the end only the operator requests a stop
             self._board.ask_stop()
         self._link.close()
         self._process.join(END_TIMEOUT)
@@ -181,8 +182,8 @@ class RealTimeProcess:
             self._process.join()
         self._process.close()
 
-    def _heard(self) -> object:
-        """What the process said; None when it died without a word."""
+    def _receive(self) -> object:
+        """Next message of the process; None when it died."""
         try:
             return self._link.recv()
         except (EOFError, OSError):
@@ -201,8 +202,8 @@ class RealTimeProcess:
         )
 
     def _hung(self) -> Fault:
-        """Ends a process that hangs: nothing of it may reach the drives any more."""
-        self._process.kill()  # a process that is suspended hears no milder signal
+        """Kills a hung process, so that it can no longer send to the drives."""
+        self._process.kill()  # a suspended process ignores SIGTERM
         self._process.join()
         return Fault(
             "the real-time process hung and was killed; the drives stop and hold on their own"
@@ -213,7 +214,7 @@ class RealTimeProcess:
         )
 
     def _take_in(self, records: Records) -> None:
-        """Everything received since the last call; cycles first, as they carry the time."""
+        """Takes everything received since the last call; cycles first, as they carry the time."""
         for content in self._cycles.take():
             self._last, true_pose = self._wire.unpack(content)
             self._record(partial(records.take_cycle, self._last, true_pose))
@@ -224,7 +225,7 @@ class RealTimeProcess:
             self._board.complain(f"{lost} records of the run were lost: they arrived too fast")
 
     def _record(self, take: Callable[[], None]) -> None:
-        """A record that cannot be kept leads to a stop along the path, not to an end of care."""
+        """A record that cannot be kept causes a path stop; supervision continues."""
         try:
             take()
         except CdprError as error:

@@ -1,4 +1,4 @@
-"""Real-time scheduling of this process while it moves a rig, and a plain word when it is denied."""
+"""Clocks of the control loop, and real-time scheduling of this process."""
 
 from __future__ import annotations
 
@@ -19,71 +19,71 @@ from model.errors import Refused
 
 
 class Clock(Protocol):
-    """Gives the loop its rhythm."""
+    """Clock of the control loop."""
 
     @property
     def time(self) -> float:
-        """When the cycle under way began, [s]; only differences have a meaning."""
+        """Start of the current cycle, [s]; only differences are meaningful."""
 
     @property
     def now(self) -> float:
-        """This moment, on the same scale as `time`, [s]."""
+        """Present time, on the same scale as `time`, [s]."""
 
     def next_cycle(self) -> float:
-        """Waits until the next cycle begins; returns how late it is, in cycles."""
+        """Waits until the next cycle begins; returns its lateness, in cycles."""
 
     def time_left(self) -> float:
-        """What is left of this cycle to wait for replies, [s]."""
+        """Time left in this cycle to wait for replies, [s]."""
 
     def wait_to_decide(self) -> None:
-        """Waits until just enough of this cycle is left to decide on the next one."""
+        """Waits until just enough of this cycle is left for the next decision."""
 
 
 class SimulatedClock:
-    """Time that advances by one cycle a call and costs nothing."""
+    """Simulated time, which advances by one cycle per call without waiting."""
 
     def __init__(self, cycle: float) -> None:
-        """Begins at 0 with the first call of `next_cycle`."""
+        """Starts at 0 with the first call of `next_cycle`."""
         self._cycle, self._cycles = cycle, -1
 
     @property
     def time(self) -> float:
-        """Cycles times their length, [s]."""
+        """Cycles times their period, [s]."""
         return max(0, self._cycles) * self._cycle
 
     @property
     def now(self) -> float:
-        """Within a cycle no time passes, [s]."""
+        """Same as `time`: no time passes within a cycle, [s]."""
         return self.time
 
     def next_cycle(self) -> float:
-        """The next cycle begins at once."""
+        """Begins the next cycle at once."""
         self._cycles += 1
         return 0.0
 
     def time_left(self) -> float:
-        """Replies are there already or will not come."""
+        """None: replies have already arrived or will not come."""
         return 0.0
 
     def wait_to_decide(self) -> None:
-        """Within a cycle no time passes."""
+        """Returns at once: no time passes within a cycle."""
 
 
 class RealClock:
     """Absolute deadlines on the monotonic clock.
 
-    A late cycle moves all later ones: the path is delayed, cycles are never skipped or bunched.
-    Only the scheduler's small delays are caught up with, so that they do not add up.
+    A late cycle delays all later ones: cycles are never skipped or bunched. Only small scheduling
+    delays are caught up, so that they do not accumulate.
     """
 
-    #: Of each cycle, kept free for deciding and sending, [s].
+    #: Part of each cycle reserved for deciding and sending, [s].
     RESERVE = 0.0005
 
-    #: A cycle that is later than this is not caught up with, [cycles]: the drives would get two
-    #: set-points closer to each other than the time in which they interpolate between them.
+    #: A larger delay is not caught up, [cycles]: the drives would get two set-points closer
+    #: together than their interpolation time.
     CAUGHT_UP = 0.1
 
-    #: What the operator and a held control say counts until so much is left, [cycles].
+    #: Operator requests and held controls count until this much of a cycle is left, [cycles].
     DECIDING = 0.2
 
     def __init__(self, cycle: float, on_cycle: Callable[[], None] = lambda: None) -> None:
@@ -91,7 +91,7 @@ class RealClock:
 
         Args:
             cycle: [s].
-            on_cycle: Called whenever one begins.
+            on_cycle: Called at the beginning of each cycle.
         """
         self._on_cycle = on_cycle
         self._cycle_ns = round(cycle * 1e9)
@@ -124,14 +124,14 @@ class RealClock:
         return late
 
     def time_left(self) -> float:
-        """Until the reserve of this cycle begins."""
+        """Time until the reserve of this cycle begins, [s]."""
         if self._begin_ns is None:
             return 0.0
         end = self._begin_ns + self._cycle_ns - round(self.RESERVE * 1e9)
         return max(0.0, (end - time.monotonic_ns()) / 1e9)
 
     def wait_to_decide(self) -> None:
-        """Sleeps; not at all where too little is left already."""
+        """Sleeps until then; returns at once if too little is left."""
         if self._begin_ns is None:
             return
         latest = self._begin_ns + round((1.0 - self.DECIDING) * self._cycle_ns)
@@ -148,10 +148,10 @@ _TIMER_ABSTIME = 1
 
 
 def sleep_until(deadline_ns: int) -> None:
-    """Sleeps until a moment of the monotonic clock, whatever happens before the call or in it.
+    """Sleeps until a time of the monotonic clock; resumes after interrupts.
 
     Raises:
-        OSError: The system refuses to.
+        OSError: The system call failed.
     """
     moment = _Timespec(*divmod(deadline_ns, 1_000_000_000))
     while True:
@@ -174,7 +174,7 @@ CAP_SYS_NICE = 23
 
 
 def has_capability(number: int) -> bool:
-    """Whether the kernel grants this process a privilege (linux/capability.h) now."""
+    """Whether this process has a capability (linux/capability.h)."""
     lines = Path("/proc/self/status").read_bytes().splitlines()
     granted = next(line.split()[1] for line in lines if line.startswith(b"CapEff:"))
     return bool(int(granted, 16) >> number & 1)
@@ -185,7 +185,7 @@ def real_time() -> Iterator[str]:
     """Runs the block with SCHED_FIFO, memory locked and garbage collection off.
 
     Yields:
-        Nothing when all of it was granted, otherwise one sentence that says what was denied.
+        A sentence that names what was denied; empty if all was granted.
     """
     gc.collect()
     gc.freeze()
@@ -213,7 +213,7 @@ def _enter() -> str:
 
 
 def _lock_memory() -> bool:
-    # A lock within a small limit would make later allocations fail instead of being slow.
+    # Locking under a small limit would make later allocations fail instead of being slow.
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     if not (unlimited or has_capability(CAP_IPC_LOCK)):
         return False
@@ -222,14 +222,14 @@ def _lock_memory() -> bool:
 
 
 def require_real_time(denied: str, *, needed: bool) -> None:
-    """Nothing on a bus is moved without real-time scheduling, unless the operator accepts that.
+    """Requires real-time scheduling for drives on a bus, unless the operator waived it.
 
     Args:
-        denied: What the system did not grant; nothing when it granted all.
-        needed: The drives are on a bus, and the operator did not accept it.
+        denied: What the system denied; empty if nothing.
+        needed: Whether the drives are on a bus and the operator did not waive it.
 
     Raises:
-        Refused: It is needed and was denied.
+        Refused: Needed and denied.
     """
     if denied and needed:
         raise Refused(
@@ -241,7 +241,7 @@ def require_real_time(denied: str, *, needed: bool) -> None:
         )
 
 
-# Starting processes beside a run: they are not ended by Ctrl-C, and compute in one thread.
+# Child processes of a run: not ended by Ctrl-C, and single-threaded.
 
 
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -249,7 +249,7 @@ _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Libraries of a process that is started in the block start no threads of their own."""
+    """Keeps libraries of processes started in the block to one thread."""
     before = {name: os.environ.get(name) for name in _THREAD_COUNTS}
     os.environ.update(dict.fromkeys(_THREAD_COUNTS, "1"))
     try:
@@ -264,12 +264,12 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def interrupts_blocked() -> Iterator[None]:
-    """Ctrl-C reaches every process of a terminal; when to end is the starting process's decision.
+    """Blocks Ctrl-C in processes started in the block: their parent decides when to end.
 
-    A blocked signal stays blocked in a process that is started in the block, also while it still
-    loads its libraries.
+    Ctrl-C reaches every process of a terminal. A blocked signal stays blocked in the new process,
+    even while it loads its libraries.
     """
-    resource_tracker.ensure_running()  # on its own first start it would unblock the signal
+    resource_tracker.ensure_running()  # its own first start would unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -1,4 +1,4 @@
-"""Memory that two processes share. It has no name, so nothing is left when a process is killed."""
+"""Memory shared by two processes; unnamed, so that nothing is left when one is killed."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from model.pose import Pose
 
 
 class _Sent(Protocol):
-    """A descriptor on its way to a process that is being started."""
+    """A descriptor in transit to a new process."""
 
     def detach(self) -> int:
-        """The same file here."""
+        """Returns the file descriptor in this process."""
         ...
 
 
 class SharedMemory:
-    """A piece of memory; given to a process that is being started, it is the same piece there.
+    """A block of memory that can be passed to a new process.
 
     Attributes:
         view: Its content.
@@ -38,7 +38,7 @@ class SharedMemory:
     """
 
     def __init__(self, descriptor: int, size: int, *, writable: bool) -> None:
-        """Takes over an open memory file; `create` and `sealed` make one."""
+        """Takes ownership of an open memory file; `create` and `sealed` make one."""
         self.descriptor, self._writable = descriptor, writable
         self.size = size
         protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
@@ -46,14 +46,14 @@ class SharedMemory:
 
     @classmethod
     def create(cls, size: int) -> SharedMemory:
-        """Empty memory that both sides may write to."""
+        """Zeroed memory that both sides may write."""
         descriptor = os.memfd_create("cdpr", os.MFD_CLOEXEC)
         os.ftruncate(descriptor, size)
         return cls(descriptor, size, writable=True)
 
     @classmethod
     def sealed(cls, content: bytes) -> SharedMemory:
-        """Memory that no process can write to any longer."""
+        """Memory that no process can write any more."""
         descriptor = os.memfd_create("cdpr", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         left = memoryview(content)
         while left:
@@ -63,11 +63,11 @@ class SharedMemory:
         return cls(descriptor, len(content), writable=False)
 
     def close(self) -> None:
-        """Lets go of it; what NumPy still looks at stays until that is gone."""
+        """Closes the descriptor; memory in use by NumPy stays mapped."""
         os.close(self.descriptor)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Only while a process is being started: the descriptor goes along."""
+        """Pickles the descriptor; only while a process is being started."""
         return _received, (DupFd(self.descriptor), self.size, self._writable)
 
 
@@ -75,7 +75,7 @@ def _received(descriptor: _Sent, size: int, writable: bool) -> SharedMemory:
     return SharedMemory(descriptor.detach(), size, writable=writable)
 
 
-# A ring of slots in shared memory: one process writes, one reads, and neither waits.
+# Lock-free ring buffer in shared memory: one process writes, one reads.
 
 
 _HEAD = struct.Struct("<QII")  # number from 1, length, checksum over both and the content
@@ -83,17 +83,17 @@ _CHECKED = struct.Struct("<QI")
 
 
 class Ring:
-    """Slots that are written round and round.
+    """Ring buffer of slots.
 
-    A slot counts when its checksum is right, so that a reader on another core never takes half a
-    slot for a whole one, whatever the order in which writes become visible there.
+    A slot is valid when its checksum is right: a reader on another core never takes a half-written
+    slot, in whatever order writes become visible.
 
     Attributes:
-        lost: Slots that were written over before they were read.
+        lost: Slots that were overwritten before they were read.
     """
 
     def __init__(self, memory: SharedMemory, slots: int) -> None:
-        """Lays a ring over memory that was empty at first; both sides with the same count."""
+        """Uses initially zeroed memory; both sides give the same number of slots."""
         self._view = memory.view
         self._slots, self._slot_size = slots, memory.size // slots
         self._number = 0  # last one written or read, on this side
@@ -101,45 +101,45 @@ class Ring:
 
     @staticmethod
     def size(content: int, slots: int) -> int:
-        """Memory for slots of a content size, [bytes]."""
+        """Memory for slots of this content size, [bytes]."""
         return slots * (content + _HEAD.size)
 
     @property
     def largest_content(self) -> int:
-        """What fits into a slot, [bytes]."""
+        """Capacity of a slot, [bytes]."""
         return self._slot_size - _HEAD.size
 
     def put(self, content: bytes) -> None:
         """Writes the next slot.
 
         Raises:
-            ValueError: It does not fit.
+            ValueError: The content does not fit.
         """
         if len(content) > self.largest_content:
             raise ValueError(f"{len(content)} bytes do not fit into a slot")
         self._number += 1
-        at = self._place(self._number)
+        at = self._offset(self._number)
         begin = at + _HEAD.size
         self._view[begin : begin + len(content)] = content
         checksum = _checksum(self._number, content)
         _HEAD.pack_into(self._view, at, self._number, len(content), checksum)
 
     def take(self) -> Iterator[bytes]:
-        """What was written since the last call, in order."""
+        """Contents written since the last call, in order."""
         while True:
-            at = self._place(self._number + 1)
+            at = self._offset(self._number + 1)
             number, length, checksum = _HEAD.unpack_from(self._view, at)
             if number <= self._number or length > self.largest_content:
                 return
             begin = at + _HEAD.size
             content = bytes(self._view[begin : begin + length])
             if checksum != _checksum(number, content):
-                return  # being written just now
+                return  # still being written
             self.lost += number - self._number - 1
             self._number = number
             yield content
 
-    def _place(self, number: int) -> int:
+    def _offset(self, number: int) -> int:
         return (number - 1) % self._slots * self._slot_size
 
 
@@ -147,7 +147,7 @@ def _checksum(number: int, content: bytes) -> int:
     return zlib.crc32(content, zlib.crc32(_CHECKED.pack(number, len(content))))
 
 
-# Records and events as bytes in the status ring.
+# Encoding of records and events in the rings.
 
 
 _STATES = tuple(State)
@@ -156,21 +156,21 @@ _NO_POSE = (math.nan,) * 7
 
 
 class CycleRecordCodec:
-    """How a record of a rig with m cables is laid out.
+    """Binary layout of a cycle record of a rig with m cables.
 
     Attributes:
         size: [bytes].
     """
 
     def __init__(self, cables: int) -> None:
-        """For a number of cables."""
+        """A codec for this number of cables."""
         self._cables = cables
         self._layout = struct.Struct(f"<Qd B dd HQQ dd {4 * cables}i 7d")
         self.size = self._layout.size
 
     def pack(self, record: CycleRecord, pose: Pose | None) -> bytes:
-        """A record, and where the simulated platform is if that is known."""
-        place = (*pose.position, *pose.quaternion) if pose is not None else _NO_POSE
+        """Encodes a record, and the simulated platform's pose if known."""
+        pose_values = (*pose.position, *pose.quaternion) if pose is not None else _NO_POSE
         return self._layout.pack(
             record.cycle,
             record.at,
@@ -186,7 +186,7 @@ class CycleRecordCodec:
             *record.actual,
             *record.torques,
             *record.words,
-            *place,
+            *pose_values,
         )
 
     def unpack(self, content: bytes) -> tuple[CycleRecord, Pose | None]:
@@ -196,7 +196,7 @@ class CycleRecordCodec:
         error, lateness = values[8:10]
         m = self._cables
         targets, actual, torques, words = (values[10 + k * m : 10 + (k + 1) * m] for k in range(4))
-        place = values[10 + 4 * m :]
+        pose_values = values[10 + 4 * m :]
         record = CycleRecord(
             cycle=cycle,
             at=at,
@@ -213,13 +213,13 @@ class CycleRecordCodec:
             following_error=error,
             lateness=lateness,
         )
-        if math.isnan(place[0]):
+        if math.isnan(pose_values[0]):
             return record, None
-        return record, Pose.from_quaternion(place[:3], place[3:])
+        return record, Pose.from_quaternion(pose_values[:3], pose_values[3:])
 
 
 def pack_event(event: LoopEvent, most: int) -> bytes:
-    """An event within a number of bytes; a text that is too long loses its middle."""
+    """Encodes an event within a number of bytes; cuts the middle of a long text."""
     text = event.text
     while len(content := json.dumps({**asdict(event), "text": text}).encode()) > most:
         keep = len(text) * 2 // 5
@@ -232,10 +232,10 @@ def unpack_event(content: bytes) -> LoopEvent:
     return LoopEvent(**json.loads(content))
 
 
-# The operator's wishes and both sides' signs of life, in memory that they share.
+# Operator requests and both sides' heartbeats, in shared memory.
 
 
-#: The supervisor has hung if nothing is heard of it for so long, [s].
+#: The supervisor counts as hung after this time without a heartbeat, [s].
 SILENCE = 2.0
 
 _BEATS, _LENGTH = struct.Struct("<Q"), struct.Struct("<H")
@@ -246,10 +246,10 @@ _SIZE = _REASON + _LENGTH.size + _LONGEST_TEXT
 
 
 class SharedRequests:
-    """The supervisor's side; a `RequestBoard`. Each wish has a byte of its own."""
+    """The supervisor's side; a `RequestBoard`. Each request has its own byte."""
 
     def __init__(self) -> None:
-        """Nothing is wished yet."""
+        """Starts without requests."""
         self.memory = SharedMemory.create(_SIZE)
         self.memory.view[_PERCENT] = 100
         self._beats = 0
@@ -257,7 +257,7 @@ class SharedRequests:
     def ask_stop(self, for_what: StopReason | None = None) -> None:
         """See `RequestBoard`."""
         if for_what is not None and not self.memory.view[_STOP]:
-            # Before the stop: its reader then knows why.
+            # Written before the stop, so that its reader has the reason.
             _write(self.memory, _REASON, f"{for_what.code} {for_what.text}")
         self.memory.view[_STOP] = 1
 
@@ -274,47 +274,47 @@ class SharedRequests:
         return _read(self.memory)
 
     def close(self) -> None:
-        """Lets go of the memory; who still has it open keeps it."""
+        """Closes the memory; other processes keep theirs."""
         self.memory.close()
 
     def beat(self) -> None:
-        """A sign of life."""
+        """Gives a heartbeat."""
         self._beats += 1
         _BEATS.pack_into(self.memory.view, _BEAT, self._beats)
 
     @property
     def cycles(self) -> int:
-        """Cycles that the other process has begun, with or without a record of them."""
+        """Cycles begun by the other process, recorded or not."""
         return int(_BEATS.unpack_from(self.memory.view, _CYCLES)[0])
 
     def complain(self, trouble: str) -> None:
-        """The run cannot be supervised any more, for this reason; the first one is kept."""
+        """Reports why the run can no longer be supervised; the first reason is kept."""
         if not _text(self.memory, _TROUBLE):
             _write(self.memory, _TROUBLE, trouble)
 
 
 class Supervised:
-    """The side of the process that moves the drives: wishes, and whether somebody supervises."""
+    """The real-time process's side: requests, and whether the supervisor is alive."""
 
     def __init__(self, memory: SharedMemory, supervisor: int) -> None:
-        """Listens to the process with this number, this process's parent."""
+        """Monitors the process with this ID, this process's parent."""
         self._memory, self._supervisor = memory, supervisor
         self._stopped = False
         self._beats, self._heard, self._cycles = 0, time.monotonic(), 0
 
     def ask_stop(self) -> None:
-        """This process itself was asked to end."""
+        """Requests a stop on behalf of this process."""
         self._stopped = True
 
     def note_cycle(self) -> None:
-        """A cycle has begun: this process's sign of life."""
+        """Counts a cycle: this process's heartbeat."""
         self._cycles += 1
         _BEATS.pack_into(self._memory.view, _CYCLES, self._cycles)
 
     def read(self) -> OperatorRequests:
-        """What is wished now, and whether anybody is there to wish."""
-        wishes = _read(self._memory)
-        return replace(wishes, stop=wishes.stop or self._stopped, lost=self._lost())
+        """Present requests, with `lost` if the supervisor is gone."""
+        requests = _read(self._memory)
+        return replace(requests, stop=requests.stop or self._stopped, lost=self._lost())
 
     def _lost(self) -> str:
         beats = _BEATS.unpack_from(self._memory.view, _BEAT)[0]
@@ -336,14 +336,14 @@ def _read(memory: SharedMemory) -> OperatorRequests:
     return OperatorRequests(stop, hold, view[_PERCENT] / 100.0, for_what=for_what)
 
 
-def _write(memory: SharedMemory, place: int, text: str) -> None:
+def _write(memory: SharedMemory, offset: int, text: str) -> None:
     content = text.encode()[:_LONGEST_TEXT]
-    begin = place + _LENGTH.size
+    begin = offset + _LENGTH.size
     memory.view[begin : begin + len(content)] = content
-    _LENGTH.pack_into(memory.view, place, len(content))  # last: no text is read half-written
+    _LENGTH.pack_into(memory.view, offset, len(content))  # last: no text is read half-written
 
 
-def _text(memory: SharedMemory, place: int) -> str:
-    length = _LENGTH.unpack_from(memory.view, place)[0]
-    begin = place + _LENGTH.size
+def _text(memory: SharedMemory, offset: int) -> str:
+    length = _LENGTH.unpack_from(memory.view, offset)[0]
+    begin = offset + _LENGTH.size
     return bytes(memory.view[begin : begin + length]).decode(errors="replace")

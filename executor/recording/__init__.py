@@ -1,1 +1,1 @@
-"""The run folder: what a run writes, and what is computed from it."""
+"""The run folder: records of a run, and results computed from them."""

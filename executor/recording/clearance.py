@@ -1,4 +1,4 @@
-"""How far cables and platform stayed from the obstacles during a run."""
+"""Distances of cables and platform from the obstacles during a run."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from tracking.clearance import MeasuredClearance, clearance_at
 
 _MM = 1e3
 _FACTS = 8
-"""Columns before those of the obstacles, which are known by place: one may be called ``planned_x``
-and another ``x``."""
+"""Columns before those of the obstacles, which are read by index: obstacles may be named
+``planned_x`` and ``x``."""
 
 
 def source_of(camera: str) -> str:
-    """The source of what one of several cameras measured alone."""
+    """Source name of the measurements of one of several cameras."""
     return f"tag:{camera}"
 
 
 def camera_of(source: str) -> str:
-    """The camera that a source is of alone; nothing for all cameras and for the drives."""
+    """The single camera of a source; empty for all cameras and for the encoders."""
     return source.partition(":")[2]
 
 
@@ -38,13 +38,13 @@ class ClearanceTable:
 
     Attributes:
         time: Since the start of the run, shape (n,), [s].
-        source: Where each pose came from, n texts: ``tag`` (all cameras), ``encoder``, or one of
-            several cameras alone (`source_of`).
+        source: Of each pose, n texts: ``tag`` (all cameras), ``encoder``, or one of several cameras
+            alone (`source_of`).
         distance: Smallest distance, shape (n,), [m].
-        uncertainty: How much less than that the smallest true one may be, shape (n,), [m].
-        at_most: The smallest true one is no more than this, shape (n,), [m].
-        body: Which part of the robot is nearest, n texts.
-        obstacle: Which obstacle it is nearest to, n texts.
+        uncertainty: Distance minus the lower bound of the smallest true one, shape (n,), [m].
+        at_most: Upper bound of the smallest true one, shape (n,), [m].
+        body: Nearest part of the robot, n texts.
+        obstacle: Nearest obstacle, n texts.
         planned_distance: Smallest distance of the planned pose at that time, shape (n,), [m].
         obstacles: Names of the scene's obstacles, k texts.
         distances: To each obstacle, shape (n, k), [m].
@@ -150,17 +150,17 @@ def no_clearance(obstacles: tuple[str, ...] = ()) -> ClearanceTable:
     )
 
 
-# How accurate the encoder pose is: whole counts, and stretch by noisy torques.
+# Accuracy of the encoder pose: resolution of the counts, and stretch from noisy torques.
 
 
-#: Standard deviation of a normal distribution by the median of its absolute values.
+#: Ratio of the standard deviation of a normal distribution to the median of its absolute values.
 _BY_MEDIAN = 1.4826
 
 
 def tension_noise(rig: Rig, tensions: Array) -> Array:
-    """Standard deviation of tensions computed from torques, by what changes between two cycles.
+    """Standard deviation of tensions from torques, from changes between cycles.
 
-    What the platform's motion changes in a cycle counts as noise, too: a torque may be a cycle old.
+    Changes by the platform's motion in a cycle count as noise as well: a torque may be a cycle old.
 
     Args:
         rig: The robot.
@@ -169,18 +169,18 @@ def tension_noise(rig: Rig, tensions: Array) -> Array:
     Returns:
         Shape (m,), [N].
     """
-    # One is the smallest step of a torque: drives report whole per mille of the rated one.
+    # Drives report torques in whole per mille of the rated torque.
     rounding: Array = np.abs(rig.tensions_by(np.ones(rig.cable_count))) / np.sqrt(12.0)
     steps = np.abs(np.diff(tensions, axis=0))
     known = np.isfinite(steps).all(axis=1)
     if not known.any():
         return rounding
-    told = _BY_MEDIAN * np.median(steps[known], axis=0) / np.sqrt(2.0)
-    noise: Array = np.hypot(told, rounding)
+    measured = _BY_MEDIAN * np.median(steps[known], axis=0) / np.sqrt(2.0)
+    noise: Array = np.hypot(measured, rounding)
     return noise
 
 
-def covariance_by_drives(winches: WinchMap, rig: Rig, pose: Pose, noise: Array) -> Array:
+def encoder_covariance(winches: WinchMap, rig: Rig, pose: Pose, noise: Array) -> Array:
     """Covariance of a pose that fits the cable lengths from the encoders.
 
     Args:
@@ -200,24 +200,24 @@ def covariance_by_drives(winches: WinchMap, rig: Rig, pose: Pose, noise: Array) 
     return covariance
 
 
-# Clearance along a run: from the drives' positions and, with a camera, from the tags.
+# Clearance along a run: from the encoders and, with a camera, from the tags.
 
 
-#: What the covariance of a pose by the drives does not know, [m]: forward kinematics takes cables
-#: for straight and weightless, and the rig for as it was calibrated.
+#: Errors that the covariance of an encoder pose does not include, [m]: forward kinematics assumes
+#: straight, massless cables and the calibrated rig.
 ALLOWANCE = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClearanceRow:
-    """Distances at one measured pose, one entry an obstacle.
+    """Distances at one measured pose, one entry per obstacle.
 
     Attributes:
         time: [s].
-        source: As `ClearanceTable` has it.
+        source: See `ClearanceTable`.
         measured: At the measured pose.
-        uncertainty: How much less than the smallest of them the smallest true one may be, [m].
-        at_most: The smallest true one is no more than this, [m].
+        uncertainty: Smallest distance minus the lower bound of the smallest true one, [m].
+        at_most: Upper bound of the smallest true one, [m].
         planned: At the planned pose of the same time.
     """
 
@@ -245,19 +245,19 @@ def encoder_rows(
     planned: Sequence[Pose],
     noise: Array,
 ) -> list[ClearanceRow]:
-    """A row for each pose that follows from the drives' positions; none without an obstacle.
+    """A row for each encoder pose; none without an obstacle.
 
     Args:
         model: Robot and scene.
         winches: Of the robot.
         times: Of n poses, shape (n,), [s].
-        measured: By the drives, ``world_from_platform``.
+        measured: From the encoders, ``world_from_platform``.
         planned: At the same times.
-        noise: Of the tensions that the drives report, shape (m,), [N].
+        noise: Of the reported tensions, shape (m,), [N].
     """
     rows = []
     for time, at, due in zip(times.tolist(), measured, planned, strict=True):
-        covariance = covariance_by_drives(winches, model.rig, at, noise)
+        covariance = encoder_covariance(winches, model.rig, at, noise)
         clearance = clearance_at(model, at, covariance, ALLOWANCE)
         if clearance is not None:
             rows.append(ClearanceRow.at(time, "encoder", clearance, model.obstacles(due)))

@@ -1,4 +1,4 @@
-"""Tables of a run as CSV files: named columns with the unit in the name, all of one length."""
+"""Tables of a run as CSV files: columns of equal length, with the unit in the name."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def integers(name: str, values: Integers) -> Column:
 
 
 def texts(name: str, values: Sequence[str]) -> Column:
-    """A column of texts, quoted where CSV asks for it."""
+    """A column of texts, quoted where CSV requires it."""
     return Column(name, [_quoted(value) for value in values], "%s")
 
 
@@ -62,7 +62,7 @@ def require_equal_lengths(table: Any) -> None:
 
 
 def write_table(path: Path, columns: Sequence[Column]) -> None:
-    """Writes a whole table or nothing.
+    """Writes a table atomically.
 
     Raises:
         BadInput: The folder cannot be written to.
@@ -76,8 +76,8 @@ def header(columns: Sequence[Column]) -> str:
 
 
 def rows(columns: Sequence[Column]) -> str:
-    """All lines of a table but the first."""
-    # One format for the whole row: twenty times faster than csv.writer with a format a value.
+    """All lines of a table except the first."""
+    # One format for the whole row: twenty times faster than csv.writer with a format per value.
     form = ",".join(column.form for column in columns) + "\n"
     values = [
         column.values.tolist() if isinstance(column.values, np.ndarray) else column.values
@@ -93,11 +93,11 @@ def _quoted(text: str) -> str:
 
 
 class TableFile:
-    """A CSV file that was read, column by column.
+    """The columns of a CSV file.
 
     Args:
         path: The file.
-        text: Its content, where the caller has read it already.
+        text: Its content, if already read.
 
     Raises:
         BadInput: It cannot be read, or a row has more or fewer values than the header.
@@ -119,14 +119,14 @@ class TableFile:
         self._columns = columns or [()] * len(self.names)
 
     def count(self, pattern: str) -> int:
-        """How many columns have a name that fully matches a regular expression."""
+        """Number of columns whose name fully matches a regular expression."""
         return sum(1 for name in self.names if re.fullmatch(pattern, name))
 
     def pairs_from(self, first: int) -> range:
-        """Places of the first columns of pairs that begin at the place ``first``.
+        """Indices of the first columns of pairs, from the index ``first`` on.
 
         Raises:
-            BadInput: The last column is alone.
+            BadInput: The last column has no partner.
         """
         if (len(self.names) - first) % 2:
             raise self._bad(f"the last column {self.names[-1]!r} lacks its partner")
@@ -146,7 +146,7 @@ class TableFile:
         """A column of numbers divided by ``scale``, shape (n,).
 
         Raises:
-            BadInput: The column is missing or holds something that is no number.
+            BadInput: The column is missing or has a value that is not a number.
         """
         return self._numbers(name, self.texts(name)) / scale
 
@@ -154,7 +154,7 @@ class TableFile:
         """A column of whole numbers, shape (n,).
 
         Raises:
-            BadInput: The column is missing or holds something that is no whole number.
+            BadInput: The column is missing or has a value that is not a whole number.
         """
         values = self.texts(name)
         try:
@@ -168,35 +168,35 @@ class TableFile:
         """Columns side by side, shape (n, len(names)), divided by ``scale``.
 
         Raises:
-            BadInput: A column is missing or holds something that is no number.
+            BadInput: A column is missing or has a value that is not a number.
         """
         if not names:
             return np.empty((len(self._columns[0]), 0))
         return np.column_stack([self.floats(name, scale) for name in names])
 
-    def matrix_at(self, places: range, scale: float = 1.0) -> Array:
-        """As `matrix`, with columns chosen by their place, for names that may appear twice.
+    def matrix_at(self, indices: range, scale: float = 1.0) -> Array:
+        """As `matrix`, with columns selected by index, as names may appear twice.
 
         Raises:
-            BadInput: A column holds something that is no number.
+            BadInput: A column has a value that is not a number.
         """
-        if not places:
+        if not indices:
             return np.empty((len(self._columns[0]), 0))
-        columns = [self._numbers(self.names[i], self._columns[i]) for i in places]
+        columns = [self._numbers(self.names[i], self._columns[i]) for i in indices]
         return np.column_stack(columns) / scale
 
     def int_matrix(self, names: Sequence[str]) -> Integers:
         """Columns of whole numbers side by side, shape (n, len(names)).
 
         Raises:
-            BadInput: A column is missing or holds something that is no whole number.
+            BadInput: A column is missing or has a value that is not a whole number.
         """
         return np.column_stack([self.ints(name) for name in names])
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """All columns by name: whole numbers, numbers or texts, each shape (n,).
 
-        Of columns with the same name the first counts.
+        Of columns with the same name the first is returned.
         """
         found: dict[str, NDArray[Any]] = {}
         for name, values in zip(self.names, self._columns, strict=True):

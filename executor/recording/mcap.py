@@ -36,7 +36,7 @@ from tracking.clearance import COVERAGE, MeasuredClearance
 from tracking.measurement import NoPose
 from tracking.pose_log import LoggedPicture
 
-# What cameras saw, as messages of ``run.mcap``: poses, why there is none, kept images.
+# Camera messages of ``run.mcap``: poses, reasons for missing poses, kept images.
 
 
 def camera_messages(
@@ -46,8 +46,8 @@ def camera_messages(
 
     Args:
         folder: Holds the kept images.
-        poses: What all cameras measured together.
-        alone: What each of several measured, by its name; nothing for a single one.
+        poses: Fused poses of all cameras.
+        alone: Poses of each of several cameras, by name; empty for a single camera.
         start: [ns since 1970].
     """
     yield from _tags(poses, start)
@@ -105,19 +105,19 @@ def write_mcap(
     fused: FusedTable,
     alone: Mapping[str, PoseTable],
 ) -> Path:
-    """Writes ``run.mcap``; times in it are the start of the run plus run time.
+    """Writes ``run.mcap``; its times are the start of the run plus run time.
 
     Args:
-        folder: The run's folder; its images go into the file too.
-        context: What the run was.
-        cycles: Every cycle is logged.
-        poses: Every image's pose, or why there is none.
-        clearance: Every row.
-        fused: Every row.
-        alone: What each of several cameras measured, by its name; nothing for a single one.
+        folder: Run folder; its images are included.
+        context: Of the run.
+        cycles: All cycles.
+        poses: Pose of every image, or why there is none.
+        clearance: All rows.
+        fused: All rows.
+        alone: Poses of each of several cameras, by name; empty for a single camera.
 
     Raises:
-        Fault: The disk is full or gone; no part of the file is left.
+            Fault: The disk is full or gone; no partial file is left.
     """
     start = int(context.started.timestamp() * 1e6) * 1000
     messages = [
@@ -137,17 +137,17 @@ def write_mcap(
 def write_messages(
     path: Path, messages: Sequence[Message], start: int, attached: Sequence[Path] = ()
 ) -> None:
-    """Writes messages in the order of their times, or no file.
+    """Writes messages in order of time, atomically.
 
     Args:
         path: The file.
         messages: Of the channels in `executor.recording.mcap_channels`, or of one of them for a
-            camera alone (`executor.recording.mcap_channels.topic_of`).
-        start: What their times count from, [ns since 1970].
-        attached: JSON files that go into the file as they are.
+            single camera (`executor.recording.mcap_channels.topic_of`).
+        start: Origin of their times, [ns since 1970].
+        attached: JSON files to attach.
 
     Raises:
-        Fault: The disk is full or gone; no part of the file is left.
+        Fault: The disk is full or gone; no partial file is left.
     """
     unfinished = path.with_name(f".{path.name[:40]}.{os.getpid()}")
     try:
@@ -268,16 +268,16 @@ def write_track_mcap(
     alone: Mapping[str, Sequence[LoggedPicture]],
     start: int,
 ) -> None:
-    """Writes ``/tag_pose``, ``/tag_status`` and ``/clearance``, of each of several cameras too.
+    """Writes ``/tag_pose``, ``/tag_status`` and ``/clearance``, also for each of several cameras.
 
     Args:
         path: The file.
-        pictures: What was measured; their times count from ``start``.
-        alone: What each of several cameras measured, by its name; nothing for a single one.
+        pictures: Measurements; their times count from ``start``.
+        alone: Measurements of each of several cameras, by name; empty for a single camera.
         start: [ns since 1970].
 
     Raises:
-        Fault: The disk is full or gone; no part of the file is left.
+        Fault: The disk is full or gone; no partial file is left.
     """
     messages = list(_messages(pictures, start, ""))
     for name, own in alone.items():

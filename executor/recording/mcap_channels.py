@@ -1,4 +1,4 @@
-"""Channels of ``run.mcap``: Foxglove's Protobuf messages where one fits, else our own as JSON.
+"""Channels of ``run.mcap``: Foxglove's Protobuf messages where one fits, else JSON.
 
 Source: the Foxglove schemas, https://docs.foxglove.dev/docs/sdk/schemas (well-known names).
 """
@@ -22,7 +22,7 @@ from model.rig import Rig
 from model.shapes import Obstacle, solid_of
 
 Schema = dict[str, Any]
-#: A message of Foxglove's.
+#: A Foxglove message.
 Typed = (
     fox.CameraCalibration
     | fox.CompressedImage
@@ -31,10 +31,10 @@ Typed = (
     | fox.PoseInFrame
     | fox.SceneUpdate
 )
-#: One message: topic, time since the start of the run [s], content; ours are dicts.
+#: One message: topic, time since the start of the run [s], content; dicts for JSON.
 Message = tuple[str, float, Typed | dict[str, Any]]
 
-#: Topic → its message, for those that are Foxglove's.
+#: Topic → message type, for Foxglove messages.
 TYPED: dict[str, type[Typed]] = {
     "/planned_pose": fox.PoseInFrame,
     "/encoder_pose": fox.PoseInFrame,
@@ -103,7 +103,7 @@ CLEARANCE = _object(
     obstacles=_list(_object(name=_TEXT, distance_mm=_NUMBER, planned_distance_mm=_NUMBER)),
 )
 
-#: Topic → (name of the schema, JSON schema), for those that are ours.
+#: Topic → (name of the schema, JSON schema), for JSON messages.
 OWN: dict[str, tuple[str, Schema]] = {
     "/tag_status": ("cdpr.TagStatus", TAG_STATUS),
     "/drives": ("cdpr.Drives", DRIVES),
@@ -115,17 +115,17 @@ STILL = fox.Pose(position=fox.Vector3(), orientation=fox.Quaternion(w=1.0))
 
 
 def topic_of(channel: str, camera: str) -> str:
-    """The channel of all cameras together, or that of one of several alone."""
+    """The topic of all cameras together, or of one of several."""
     return f"{channel}/{camera}" if camera else channel
 
 
 def channel_of(topic: str) -> str:
-    """The channel that a topic is of, whichever camera it is for."""
+    """The channel of a topic, for any camera."""
     return "/" + topic.split("/")[1]
 
 
 def schema_of(topic: str) -> tuple[str, str, str, bytes]:
-    """How messages are encoded, and of their schema its name, its own encoding and its text."""
+    """Encoding of messages, and name, encoding and text of their schema."""
     kind = TYPED.get(channel_of(topic))
     if kind is None:
         name, described = OWN[channel_of(topic)]
@@ -135,7 +135,7 @@ def schema_of(topic: str) -> tuple[str, str, str, bytes]:
 
 
 def encoded(content: Typed | dict[str, Any]) -> bytes:
-    """A message as it is written or sent."""
+    """Encodes a message."""
     if isinstance(content, dict):
         return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
     return content.encode()
@@ -147,7 +147,7 @@ def nanoseconds(time: float) -> int:
 
 
 def stamp_of(start: int, time: float) -> fox.Timestamp:
-    """The moment ``time`` [s] after ``start`` [ns since 1970]."""
+    """The time stamp ``time`` [s] after ``start`` [ns since 1970]."""
     seconds, rest = divmod(start + nanoseconds(time), 1_000_000_000)
     return fox.Timestamp(sec=seconds, nsec=rest)
 
@@ -171,7 +171,7 @@ def pose_message(
 
 
 def rows_of(values: Array) -> list[list[float | None]]:
-    """Rows as JSON can say them: null for what is not known."""
+    """Rows for JSON: null for unknown values."""
     if np.isfinite(values).all():
         rows: list[list[float | None]] = values.tolist()
         return rows
@@ -179,14 +179,14 @@ def rows_of(values: Array) -> list[list[float | None]]:
 
 
 def column_of(values: Array) -> list[float | None]:
-    """A column as JSON can say it."""
+    """A column for JSON: null for unknown values."""
     return [v if np.isfinite(v) else None for v in values.tolist()]
 
 
 def poses_of(
     topic: str, times: Array, positions: Array, quaternions: Array, start: int
 ) -> Iterator[Message]:
-    """A message a pose that is known.
+    """A message per known pose.
 
     Args:
         topic: Of the messages.
@@ -203,10 +203,10 @@ def poses_of(
         yield topic, time, pose_message(stamp_of(start, time), position, quaternion)
 
 
-# The drawn scene: obstacles, path and cameras once, the robot often enough to watch.
+# Scene for 3-D views: obstacles, path and cameras once, the robot at a low rate.
 
 ROBOT_RATE = 20.0
-"""How often the drawn robot is logged, [Hz]; the numbers are logged every cycle."""
+"""Rate of the robot's geometry, [Hz]; values are logged every cycle."""
 _OBSTACLE = fox.Color(r=0.35, g=0.39, b=0.45, a=0.75)
 _PLATFORM = fox.Color(r=0.0, g=0.45, b=0.70, a=0.9)
 _CABLE = fox.Color(r=0.1, g=0.1, b=0.1, a=1.0)
@@ -221,8 +221,8 @@ def scene_messages(context: RunContext, start: int) -> Iterator[Message]:
     cameras = context.rig.cameras
     for camera in cameras:
         alone = camera.name if len(cameras) > 1 else ""
-        place = camera.world_from_camera
-        yield "/tf", 0.0, _transform(stamp, frame_of(alone), place.position, place.quaternion)
+        mounting = camera.world_from_camera
+        yield "/tf", 0.0, _transform(stamp, frame_of(alone), mounting.position, mounting.quaternion)
         calibration = _calibration(camera, stamp, frame_of(alone))
         if calibration is not None:
             yield topic_of("/camera_calibration", alone), 0.0, calibration
@@ -231,7 +231,7 @@ def scene_messages(context: RunContext, start: int) -> Iterator[Message]:
 def scene_at(
     obstacles: Sequence[Obstacle], waypoints: Sequence[Pose], stamp: fox.Timestamp
 ) -> fox.SceneUpdate:
-    """Obstacles, and the path through waypoints, if there is one."""
+    """Obstacles, and the path through waypoints, if any."""
     entities = []
     for obstacle in obstacles:
         corners = _points(solid_of(obstacle).triangles().reshape(-1, 3))
@@ -249,7 +249,7 @@ def frame_of(camera: str) -> str:
 
 
 def robot_messages(rig: Rig, cycles: CycleTable, start: int) -> Iterator[Message]:
-    """Platform and cables where the encoders place them, often enough to watch."""
+    """Platform and cables at the encoder pose, at `ROBOT_RATE`."""
     known = np.isfinite(cycles.encoder).all(axis=1) & np.isfinite(cycles.encoder_rotation).all(
         axis=1
     )
@@ -278,18 +278,18 @@ def robot_at(rig: Rig, pose: Pose, stamp: fox.Timestamp) -> Iterator[tuple[str, 
 def _transform(
     stamp: fox.Timestamp, frame: str, position: Array, quaternion: Array
 ) -> fox.FrameTransforms:
-    place = fox.FrameTransform(
+    transform = fox.FrameTransform(
         timestamp=stamp,
         parent_frame_id=WORLD,
         child_frame_id=frame,
         translation=vector(position),
         rotation=_quaternion(quaternion),
     )
-    return fox.FrameTransforms(transforms=[place])
+    return fox.FrameTransforms(transforms=[transform])
 
 
 def _calibration(camera: Camera, stamp: fox.Timestamp, frame: str) -> fox.CameraCalibration | None:
-    """None for lenses that Foxglove cannot describe: those with a thin prism or a tilt."""
+    """Camera calibration; None for lenses that Foxglove cannot describe: thin prism or tilt."""
     count = len(camera.distortion)
     if camera.lens == FISHEYE:
         model = "kannala_brandt"

@@ -1,12 +1,11 @@
-"""Small files of a run folder: ``run.json``, what all must hold to be read, and lines added whole.
+"""Small files of a run folder: ``run.json``, schemas for reading, and appended lines.
 
-Keys that nothing reads are not looked at: a later version may add some. What else is written is
-`executor.recording.summary`'s; a damaged or edited run folder ends in one message that names the
-key.
+Unknown keys are ignored: a later version may add some. `executor.recording.summary` describes all
+keys; a damaged or edited run folder causes one message that names the key.
 
 ``run.json`` (``schema_version`` 1) has ``started`` (ISO 8601, UTC), ``interface``, ``simulated``,
-``fast``, ``final_state``, ``cause`` and ``cycles``. Until the motion is over the last three are
-empty or 0: so they stay when the program is killed.
+``fast``, ``final_state``, ``cause`` and ``cycles``. Until the motion is over, and if the program is
+killed, the last three are empty or 0.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ class EventRecord(BaseModel):
 
 
 class CheckRecord(_Record):
-    """One question about the run."""
+    """One check of the run."""
 
     name: str
     passed: bool
@@ -65,7 +64,7 @@ class CheckRecord(_Record):
 
 
 class StopRecord(_Record):
-    """When a stop was reached and left."""
+    """Times at which a stop was reached and left."""
 
     name: str
     kind: str
@@ -74,7 +73,7 @@ class StopRecord(_Record):
 
 
 class SizeRecord(_Record):
-    """Of an error over the run."""
+    """Size of an error over the run."""
 
     max: Maybe
     rms: Maybe
@@ -87,20 +86,20 @@ class SizeRecord(_Record):
 
 
 class LimitedSizeRecord(SizeRecord):
-    """With the limit that it kept to."""
+    """Size of an error, with its limit."""
 
     limit: Number
 
 
 class TagErrorRecord(SizeRecord):
-    """With the images behind it."""
+    """Size of an error, with the number of images."""
 
     frames: Count
     frames_without_pose: Count
 
 
 class CameraRecordDocument(_Record):
-    """What became of a camera's images."""
+    """Statistics of a camera's images."""
 
     name: str
     source: str
@@ -150,7 +149,7 @@ class TensionRecord(_Record):
 
 
 class LatenessRecord(_Record):
-    """How late cycles began."""
+    """Lateness of cycles."""
 
     p50: Maybe
     p99: Maybe
@@ -211,11 +210,11 @@ class CourseDocument(_Record):
 
 
 def read_course(path: Path) -> CourseDocument:
-    """What ``run.json`` holds.
+    """Reads ``run.json``.
 
     Raises:
         BadInput: It cannot be read.
-        InvalidFile: With every key that cannot be used.
+        InvalidFile: It has invalid keys; all are named.
     """
     data = read_json(path, AGAIN)
     try:
@@ -226,11 +225,11 @@ def read_course(path: Path) -> CourseDocument:
 
 
 def read_summary(path: Path) -> dict[str, Any]:
-    """What ``summary.json`` holds, as it stands there.
+    """Reads ``summary.json``, unchanged.
 
     Raises:
         BadInput: It cannot be read, or is of another version.
-        InvalidFile: With every key that cannot be used.
+        InvalidFile: It has invalid keys; all are named.
     """
     data = read_json(path, AGAIN)
     if not isinstance(data, dict) or data.get("schema_version") != 1:
@@ -248,7 +247,7 @@ def read_summary(path: Path) -> dict[str, Any]:
 
 
 def read_events(path: Path, lines: Sequence[str]) -> list[EventRecord]:
-    """The events in whole lines of ``events.jsonl``.
+    """The events in complete lines of ``events.jsonl``.
 
     Raises:
         BadInput: A line cannot be read.
@@ -264,7 +263,7 @@ def read_events(path: Path, lines: Sequence[str]) -> list[EventRecord]:
 
 
 def append_lines(path: Path, text: str, *, fsync: bool) -> None:
-    """Adds whole lines or nothing; with ``fsync`` they are on disk when this returns.
+    """Appends complete lines or nothing; with ``fsync`` they are on disk when this returns.
 
     Raises:
         OSError: The disk is full or gone.
@@ -281,39 +280,39 @@ def append_lines(path: Path, text: str, *, fsync: bool) -> None:
                     keep_names(path.parent)
         except OSError:
             with suppress(OSError):
-                stream.truncate(before)  # the next line would be added to half a line
+                stream.truncate(before)  # the next line would follow a partial line
             raise
 
 
 def whole_lines(path: Path) -> list[str]:
-    """The lines of a file that was appended to; a last one that was cut is left out.
+    """The complete lines of an appended file; a truncated last line is left out.
 
     Raises:
-        BadInput: It cannot be read, or is no text.
+        BadInput: It cannot be read, or is not text.
     """
     data = read_bytes(path)
     try:
         return data[: data.rfind(b"\n") + 1].decode().split("\n")[:-1]
     except UnicodeDecodeError:
-        return read_text(path).split("\n")  # says what is wrong with it
+        return read_text(path).split("\n")  # raises with the reason
 
 
-#: Of the file, [bytes]: it is written so long at first, so that its end has room on a full disk.
+#: Initial size of the file, [bytes], so that the end of the run fits on a full disk.
 SIZE = 2048
 
 
 @dataclass(frozen=True, slots=True)
 class RunCourse:
-    """How a run began and ended.
+    """Start and end of a run.
 
     Attributes:
-        started: When, UTC.
+        started: Start time, UTC.
         interface: Of the bus.
         simulated: The drives are simulated in the run's own process.
         fast: Simulated time.
-        final_state: Where the motion ended; nothing until then.
+        final_state: Of the motion; empty until its end.
         cause: Why it did not finish, if it did not.
-        cycles: How many there were; 0 until then.
+        cycles: Number of cycles; 0 until the end.
     """
 
     started: datetime
@@ -330,7 +329,7 @@ class RunCourse:
 
         Raises:
             BadInput: It cannot be read.
-            InvalidFile: With every key that cannot be used.
+            InvalidFile: It has invalid keys; all are named.
         """
         kept = read_course(path)
         return cls(
@@ -344,15 +343,15 @@ class RunCourse:
         )
 
     def save(self, path: Path) -> None:
-        """Writes the whole file or nothing.
+        """Writes the file atomically.
 
         Raises:
             BadInput: The folder cannot be written to.
         """
         write_atomic(path, self._text().ljust(SIZE) + "\n")
 
-    def save_where_it_was(self, path: Path) -> None:
-        """As `save`; on a full disk in the room of the file, the cause cut to fit.
+    def overwrite(self, path: Path) -> None:
+        """As `save`; on a full disk overwrites the file, with the cause cut to fit.
 
         Raises:
             BadInput: The file is gone, or cannot be written to.
@@ -379,7 +378,7 @@ class RunCourse:
         return json.dumps(data, indent=1, ensure_ascii=False)
 
 
-# Which programs took part in a run.
+# Versions of programs, and statistics of cameras.
 
 
 LIBRARIES = (
@@ -394,16 +393,16 @@ LIBRARIES = (
 
 @dataclass(frozen=True, slots=True)
 class CameraRecord:
-    """What became of one camera's images in a run.
+    """Statistics of one camera's images in a run.
 
     Attributes:
         name: Of the camera in the rig file.
-        source: Where its images came from.
-        pictures: How many it was asked for.
-        poses: How many of them gave a pose.
-        dropped: How many were due while it was busy, and not asked for.
-        measuring_ms: Median time that measuring one took; None where none was measured.
-        failed: Why it gave no images any more, or nothing.
+        source: Of its images.
+        pictures: Number of requested images.
+        poses: Number of images with a pose.
+        dropped: Number of images due while it was busy, and not requested.
+        measuring_ms: Median processing time; None if no image was measured.
+        failed: Why it failed, or empty.
     """
 
     name: str
@@ -416,7 +415,7 @@ class CameraRecord:
 
 
 def versions() -> dict[str, str]:
-    """Name and version of Python and of the libraries that matter."""
+    """Versions of Python and of the main libraries, by name."""
     found = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:
@@ -426,18 +425,18 @@ def versions() -> dict[str, str]:
     return found
 
 
-# Where runs are kept for which no folder was named.
+# Default run folders.
 
 
 RUNS = Path("runs")
 
 
 def free_folder(name: str) -> Path:
-    """``runs/NAME``, or with the first free number; the caller makes it."""
+    """``runs/NAME``, with the first free number if it exists; the caller creates it."""
     names = (RUNS / (name if n == 1 else f"{name}-{n}") for n in count(1))
     return next(path for path in names if not path.exists())
 
 
 def dated_folder() -> Path:
-    """``runs/`` with date and local time; as `free_folder`."""
+    """``runs/`` with date and local time; see `free_folder`."""
     return free_folder(datetime.now().strftime("%Y-%m-%d_%H%M%S"))

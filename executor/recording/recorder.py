@@ -1,4 +1,4 @@
-"""Records cycles and events of the loop to log and disk; requests images."""
+"""Recorder of cycles and events in memory and on disk; requests images."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
 
-# Collects the cycles of a run in memory and makes their table afterwards.
+# Log of a run's cycles in memory, and their table.
 
 
 class RunLog:
     """The cycles of one run, in the order in which they were sent."""
 
     def __init__(self, rig: Rig, scene: Scene, checked: CheckedTrajectory) -> None:
-        """An empty log of a run of a checked table on a rig in a scene."""
+        """An empty log for a run of a checked table."""
         self._rig, self._scene, self._checked = rig, scene, checked
         self._records: list[CycleRecord] = []
         self.events: list[RunEvent] = []
-        """What happened, in order."""
+        """All events, in order."""
 
     def add(self, record: CycleRecord) -> None:
-        """Takes in a cycle; costs next to nothing."""
+        """Adds a cycle; takes almost no time."""
         self._records.append(record)
 
     def __len__(self) -> int:
@@ -48,11 +48,11 @@ class RunLog:
 
     @property
     def last_positions(self) -> tuple[int, ...] | None:
-        """Where the drives last said that they stand, [counts]; None before the first cycle."""
+        """Last reported positions of the drives, [counts]; None before the first cycle."""
         return self._records[-1].actual if self._records else None
 
-    def pose_by_drives(self, record: CycleRecord) -> Pose | None:
-        """Where the drives' positions put the platform in a cycle; None when they fit no pose."""
+    def encoder_pose(self, record: CycleRecord) -> Pose | None:
+        """Platform pose from the encoders in a cycle; None if the positions fit no pose."""
         planned, row = self._checked.table, round(record.index)
         lengths, _ = self._lengths([record], np.array([row]))
         try:
@@ -62,21 +62,23 @@ class RunLog:
             return None
 
     def table(self, first: int = 0, end: int | None = None) -> CycleTable:
-        """Everything that is known of the run's cycles, or of those from ``first`` up to ``end``.
+        """The table of the run's cycles, or of those from ``first`` up to ``end``.
 
-        It may be called from another thread while cycles are added.
+        May be called from another thread while cycles are added.
         """
         rig, planned = self._rig, self._checked.table
         records = self._records[first:end]
         began = self._records[0].at if records else 0.0
-        # A drive answers a SYNC with where it is then: at its target of one cycle before.
+        # A drive answers a SYNC with its position then: its target of the previous cycle.
         before = self._records[first - 1].index if first else 0.0
         index = np.array([before, *(r.index for r in records[:-1])])[: len(records)]
         rows = np.rint(index).astype(np.int64)
         actual = _matrix([r.actual for r in records], rig.cable_count)
         lengths, tensions = self._lengths(records, rows)
-        encoder, turned = poses_near(rig, lengths, planned.positions[rows], planned.rotations[rows])
-        legs = legs_at(planned.stands, index)
+        encoder, rotations = poses_near(
+            rig, lengths, planned.positions[rows], planned.rotations[rows]
+        )
+        legs = legs_at(planned.dwells, index)
         return CycleTable(
             time=np.array([r.at - began for r in records]),
             state=tuple(r.state.value for r in records),
@@ -91,7 +93,7 @@ class RunLog:
             planned=between(planned.positions, index),
             planned_rotation=quaternions_of(planned.rotations[rows]),
             encoder=encoder,
-            encoder_rotation=quaternions_of(turned),
+            encoder_rotation=quaternions_of(rotations),
             following_error=np.array([r.following_error for r in records]),
             set_counts=_matrix([r.targets for r in records], rig.cable_count),
             actual_counts=actual,
@@ -101,17 +103,17 @@ class RunLog:
         )
 
     def _lengths(self, records: list[CycleRecord], rows: Integers) -> tuple[Array, Array]:
-        """Cable lengths [m] by the drives' positions, and tensions [N] where torques give them.
+        """Cable lengths [m] from the encoders, and tensions [N] where torques give them.
 
         Args:
             records: n cycles.
-            rows: The set-points that the drives were sent, shape (n,).
+            rows: Table rows of the set-points sent, shape (n,).
         """
         actual = _matrix([r.actual for r in records], self._rig.cable_count)
         tensions = self._rig.tensions_by(
             _matrix([r.torques for r in records], self._rig.cable_count)
         )
-        # Only drives that follow their set-points give the cables' tensions by their torques.
+        # Only the torques of drives that follow their set-points give cable tensions.
         taut = np.isfinite([r.following_error for r in records])[:, None]
         stretch = np.where(taut, tensions, self._checked.table.tensions[rows])
         winches = self._checked.winches
@@ -121,9 +123,9 @@ class RunLog:
         return lengths, np.where(taut, tensions, np.nan)
 
     def _stop_at(self, row: int) -> str:
-        """Name of the stop at which the platform stands; nothing on the way."""
-        for stop, stand in zip(self._scene.stops, self._checked.table.stands, strict=True):
-            if stand.first <= row <= stand.last:
+        """Name of the stop at which the platform dwells; empty between stops."""
+        for stop, dwell in zip(self._scene.stops, self._checked.table.dwells, strict=True):
+            if dwell.first <= row <= dwell.last:
                 return stop.name
         return ""
 
@@ -135,7 +137,7 @@ def _matrix(
 
 
 def between(values: Array, index: ArrayLike) -> Array:
-    """Rows of a table at one fractional place or several."""
+    """Rows of a table at one or several fractional indices."""
     index = np.asarray(index, dtype=np.float64)
     low = np.floor(index).astype(np.int64)
     high = np.minimum(low + 1, len(values) - 1)
@@ -146,28 +148,27 @@ def between(values: Array, index: ArrayLike) -> Array:
     return mixed
 
 
-# Writes the record of a run while it goes on, so that a killed program leaves it behind.
+# Writing of the record during a run, so that it survives a killed program.
 #
-# In real time a thread of its own writes: neither the loop, which is another process, nor the
-# reading of what it reports waits for the disk. What is to be written queues up; a disk that is
-# `BEHIND` seconds behind, or full, or gone, is a fault of the record, for which the run stops along
-# the path. In simulated time the run waits for the disk.
+# In real time a separate thread writes: neither the loop, which is another process, nor the reading
+# of its reports waits for the disk. Writes are queued; a disk that is `BEHIND` seconds behind, full
+# or gone causes a path stop. In simulated time the run waits for the disk.
 
 
-#: Cycles are appended this often, [s]: what is lost with a killed program is at most twice that.
+#: Interval of appending cycles, [s]; a killed program loses at most twice that.
 EVERY = 0.4
-#: A disk may hang for so long, [s]: SD cards do so for a second or two.
+#: Largest delay of the disk, [s]: SD cards hang for a second or two.
 BEHIND = 5.0
-#: Things that may wait to be written: the cycles of `BEHIND` seconds, and many events.
+#: Largest number of queued writes: the cycles of `BEHIND` seconds, and many events.
 _MOST_WAITING = 512
 
 
 class RecordWriter:
-    """Of one run; its thread, if it has one, ends with the block.
+    """Writer of one run's record; its thread, if any, ends with the block.
 
     Args:
-        folder: Where it writes.
-        log: Holds the cycles that are written.
+        folder: Run folder.
+        log: Of the cycles.
         own_thread: Write in a thread, and fsync.
     """
 
@@ -183,7 +184,7 @@ class RecordWriter:
             self._thread.start()
 
     def __enter__(self) -> RecordWriter:
-        """Nothing more."""
+        """Returns itself."""
         return self
 
     def __exit__(
@@ -196,7 +197,7 @@ class RecordWriter:
         self.close()
 
     def take_cycles(self, at: float) -> None:
-        """Cycles were added to the log, the last of them at this time, [s].
+        """Queues new cycles of the log, the last of which began at this time, [s].
 
         Raises:
             CdprError: The record cannot be written, or the disk is far behind.
@@ -207,7 +208,7 @@ class RecordWriter:
             self._queue_cycles(at)
 
     def take_event(self, event: RunEvent) -> None:
-        """Something happened.
+        """Queues an event.
 
         Raises:
             CdprError: As for `take_cycles`.
@@ -215,7 +216,7 @@ class RecordWriter:
         self._put(partial(self._folder.append_event, event))
 
     def close(self) -> None:
-        """Writes what is left, and waits for it; never raises."""
+        """Writes the rest, and waits for it; never raises."""
         try:
             self._queue_cycles(self._queued_until)
         except CdprError as error:
@@ -233,7 +234,7 @@ class RecordWriter:
         self._put(partial(self._append, first, end, at))
 
     def _append(self, first: int, end: int, at: float) -> None:
-        if first != self._written:  # cycles before them could not be written: no gap
+        if first != self._written:  # earlier cycles could not be written: leave no gap
             return
         table = self._log.table(first, end)
         text = table.csv_rows(first)
@@ -270,13 +271,13 @@ class RecordWriter:
                 self._trouble = self._trouble or Fault(what, where=str(self._folder.path))
 
 
-#: Asks for an image: time since the start of the run [s], the same moment on the monotonic clock
-#: [s], where the simulated platform is then, and where the drives' positions put it.
+#: Requests an image: time since the start of the run [s], the same time on the monotonic clock
+#: [s], true pose of the simulated platform, and encoder pose.
 FrameTrigger = Callable[[float, float, Pose | None, Pose | None], None]
 
 
 class Recorder:
-    """The record of one run while it goes on."""
+    """Records one run."""
 
     def __init__(
         self,
@@ -291,49 +292,49 @@ class Recorder:
         on_event: Callable[[RunEvent], None] | None = None,
         own_thread: bool = False,
     ) -> None:
-        """Nothing happened yet.
+        """Starts without cycles and events.
 
         Args:
-            prepared: What is run.
-            folder: Where cycles and events are written as they happen.
-            status: Kept up to date for those who ask.
+            prepared: The run.
+            folder: Takes cycles and events as they happen.
+            status: Updated with cycles and events.
             trigger: Called for every image.
-            every: Cycles from one image to the next.
-            progress: Called now and then with the number of rows that are done.
+            every: Cycles between images.
+            progress: Called regularly with the number of completed rows.
             announce: Called with a sentence when a stop is reached and left.
-            on_event: Called with each event, after it is on record.
-            own_thread: The disk is waited for in a thread, which `writer` ends.
+            on_event: Called with each event, after it is recorded.
+            own_thread: Write to disk in a thread, which `writer` ends.
         """
         self.log = RunLog(prepared.rig, prepared.scene, prepared.checked)
-        self._announcements = stop_events(prepared.scene, prepared.checked.table.stands)
+        self._announcements = stop_events(prepared.scene, prepared.checked.table.dwells)
         self._announce, self._on_event = announce, on_event
         self.folder = folder
-        """Where events are written."""
+        """Run folder."""
         self.writer = RecordWriter(folder, self.log, own_thread=own_thread)
-        """Writes them; the caller closes it."""
+        """Writes the record; the caller closes it."""
         self._status = status
         self._trigger, self._progress = trigger, progress
         self.every = every
-        """Cycles from one image to the next."""
+        """Cycles between images."""
         self._began: float | None = None
         self.last = 0.0
-        """When the last cycle began, on the loop's clock, [s]."""
+        """Start of the last cycle, on the loop's clock, [s]."""
         self.state = State.READY
-        """Where the run was then."""
+        """State of the run then."""
 
     def wants_pose(self, cycle: int) -> bool:
-        """Whether an image will be asked for in this cycle."""
+        """Whether an image will be requested in this cycle."""
         return self._trigger is not None and cycle % self.every == 0
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
-        """A cycle is over.
+        """Records a cycle.
 
         Args:
-            record: What happened in it.
-            true_pose: Where the simulated platform is, in cycles with an image.
+            record: Of the cycle.
+            true_pose: Of the simulated platform, in cycles with an image.
 
         Raises:
-            CdprError: The record cannot be written; all else is done.
+            CdprError: The record cannot be written; everything else is done.
         """
         if self._began is None:
             self._began = record.at
@@ -347,20 +348,20 @@ class Recorder:
         if record.cycle % self.every == 0:
             self._progress(record.index)
             if self._trigger is not None:
-                by_drives = self.log.pose_by_drives(record)
-                self._trigger(record.at - self._began, record.at, true_pose, by_drives)
+                encoder_pose = self.log.encoder_pose(record)
+                self._trigger(record.at - self._began, record.at, true_pose, encoder_pose)
         self.writer.take_cycles(record.at)
 
     def take_event(self, event: LoopEvent) -> None:
-        """Something happened.
+        """Records an event.
 
         Raises:
-            CdprError: The record cannot be written; the event is known all the same.
+            CdprError: The record cannot be written; the event is still in log and status.
         """
         time = 0.0 if self._began is None else event.at - self._began
-        told = RunEvent(round(time, 6), event.code, event.text)
-        self.log.events.append(told)
-        self._status.take_event(told)
-        self.writer.take_event(told)
+        run_event = RunEvent(round(time, 6), event.code, event.text)
+        self.log.events.append(run_event)
+        self._status.take_event(run_event)
+        self.writer.take_event(run_event)
         if self._on_event is not None:
-            self._on_event(told)
+            self._on_event(run_event)

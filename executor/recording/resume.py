@@ -1,4 +1,4 @@
-"""Where a run ended and what was left to do, from its folder alone."""
+"""End of a run and its remaining task, from its folder."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class RunEnd:
 
     Attributes:
         rig: The rig that was run.
-        pose: Of the platform, ``world_from_platform``: the position by the drives, turned as
-            commanded.
-        payload: What was planned to hang on it.
-        done: Stops that were visited, by this run and by those that it went on from.
-        waiting_at: Name of the stop whose dwell was cut short; nothing otherwise.
+        pose: Of the platform, ``world_from_platform``: position from the encoders, commanded
+            orientation.
+        payload: Planned payload.
+        done: Stops visited by this run and by those it continued.
+        waiting_at: Name of the stop whose dwell was interrupted; else empty.
         finished: Whether the goal was reached.
     """
 
@@ -45,12 +45,12 @@ class RunEnd:
     finished: bool
 
     def facts(self, folder: Path, done: int, left: int) -> list[tuple[str, str]]:
-        """Where a plan begins that continues the run, for people.
+        """Human-readable start of a plan that continues the run.
 
         Args:
             folder: Of the run.
-            done: How many of the scene's stops are behind it.
-            left: How many stops are left.
+            done: Number of the scene's visited stops.
+            left: Number of remaining stops.
         """
         x, y, z = self.pose.position * 1000.0
         text = (
@@ -93,10 +93,10 @@ def run_end(folder: RunFolder) -> RunEnd:
 
 
 def remaining_scene(scene: Scene, end: RunEnd) -> tuple[Scene, tuple[StopDocument, ...]]:
-    """A scene from where a run ended, with what was carried and the stops not yet visited.
+    """A scene from the end of a run, with its payload and the stops not yet visited.
 
     Returns:
-        The scene, and those of its stops that are behind it.
+        The scene, and its visited stops.
 
     Raises:
         BadInput: A stop of the scene was visited as another one, or out of order.
@@ -118,7 +118,7 @@ def remaining_scene(scene: Scene, end: RunEnd) -> tuple[Scene, tuple[StopDocumen
 
 
 def _pose(rig: Rig, cycles: CycleTable, where: str) -> Pose:
-    """By forward kinematics of the drives' last positions; believed where the plan agrees."""
+    """The encoder pose in the last cycle, if it agrees with the plan."""
     if cycles.missing[-1]:
         raise _unknown(f"{cycles.missing[-1]} drives did not answer in the last cycle", where)
     winches = WinchMap(rig)
@@ -157,20 +157,20 @@ def _unknown(what: str, where: str) -> Refused:
     )
 
 
-# A scene that begins where a run ended.
+# Scene from the end of a run.
 
 
-SAME_PLACE_M, SAME_WAY_RAD = 1e-3, 1e-3
-"""Nearer to the goal than this, and turned from it by less, there is nothing left to do."""
+AT_GOAL_M, AT_GOAL_RAD = 1e-3, 1e-3
+"""Distance and angle to the goal below which nothing remains to be done."""
 
 
 def scene_after(
     scene: Scene, rig: Rig, folder: Path
 ) -> tuple[Scene, tuple[StopDocument, ...], RunEnd]:
-    """The scene from where a run ended, its stops that are done, and that end.
+    """The scene from the end of a run, its visited stops, and that end.
 
     Raises:
-        BadInput: The folder is no whole run, or of another rig or task; or nothing is left to do.
+        BadInput: The folder is incomplete, or of another rig or task; or nothing remains to do.
         Refused: The platform pose is unknown.
     """
     opened = RunFolder.open(folder)
@@ -188,14 +188,14 @@ def scene_after(
 
 def _is_there(scene: Scene) -> bool:
     start, goal = scene.start, scene.goal
-    return start.distance_to(goal) <= SAME_PLACE_M and start.angle_to(goal) <= SAME_WAY_RAD
+    return start.distance_to(goal) <= AT_GOAL_M and start.angle_to(goal) <= AT_GOAL_RAD
 
 
 def require_room(scene: Scene, rig: Rig) -> None:
-    """Says what to do where the platform stopped nearer to something than a plan may begin.
+    """Requires enough clearance at the start for a plan.
 
     Raises:
-        BadInput: With the clearance to ask for.
+        BadInput: The clearance is too small; with the one to request.
     """
     model = ClearanceModel(rig, scene)
     near, own = model.smallest(scene.start), model.self_clearance(scene.start)

@@ -1,4 +1,4 @@
-"""The folder that a run leaves: made once, written while the run goes on, read by the report."""
+"""The run folder: created once, written during the run, read by the report."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ JPEG_QUALITY = 88
 
 @dataclass(frozen=True, slots=True)
 class RunEvent:
-    """Something that happened during a run.
+    """Event of a run.
 
     Attributes:
         time_s: Since the start of the run.
-        code: Stable short name, such as ``finished`` or ``following_error``.
+        code: Stable code, such as ``finished`` or ``following_error``.
         text: One sentence.
     """
 
@@ -61,12 +61,12 @@ class RunEvent:
 
     @property
     def line(self) -> str:
-        """In the file of events."""
+        """Its line in the file of events."""
         return json.dumps(asdict(self), ensure_ascii=False) + "\n"
 
 
 class RunFolder:
-    """A run's folder; make one with `create` or `open`.
+    """A run folder; make one with `create` or `open`.
 
     Args:
         path: The folder, which exists.
@@ -77,10 +77,10 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path) -> RunFolder:
-        """Makes a new folder, empty but for its folder of images, and its missing parents.
+        """Creates a new folder with its subfolder of images, and missing parents.
 
         Raises:
-            BadInput: The path exists, or it cannot be made or written to.
+            BadInput: The path exists, or it cannot be created or written to.
         """
         cls.require_free(path)
         try:
@@ -98,10 +98,10 @@ class RunFolder:
 
     @staticmethod
     def require_free(path: Path) -> None:
-        """Says before a long preparation that a folder cannot be made there.
+        """Requires that a folder can be created there, before a long preparation.
 
         Raises:
-            BadInput: The path exists, or the folder above it is no folder or read-only.
+            BadInput: The path exists, or its parent is not a folder or is read-only.
         """
         if path.exists() or path.is_symlink():
             raise BadInput(
@@ -142,13 +142,15 @@ class RunFolder:
         """The folder of a run that ended, or of one whose program was killed.
 
         Raises:
-            BadInput: There is no such folder, it is no run's, or the run is still under way.
+            BadInput: There is no such folder, it is not a run folder, or the run is still active.
         """
         begun = all((path / name).is_file() for name in BEGUN)
         if not begun or (path / SUMMARY).is_file():
-            return cls.open(path)  # it ended, or is of an earlier version, or says what is missing
+            return cls.open(
+                path
+            )  # ended, or of an earlier version; or raises with the missing files
         folder = cls(path)
-        if folder.is_under_way():
+        if folder.is_active():
             raise BadInput(
                 "the run is still in progress",
                 where=str(path),
@@ -157,7 +159,7 @@ class RunFolder:
         return folder
 
     def has(self, name: str) -> bool:
-        """Whether a file is there, and not cut in the middle of a line."""
+        """Whether a file exists and ends with a complete line."""
         try:
             return (self.path / name).read_bytes().endswith(b"\n")
         except OSError:
@@ -165,19 +167,19 @@ class RunFolder:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every file of a run that finished is there."""
+        """Whether every file of a finished run exists."""
         return all((self.path / name).is_file() for name in NEEDED)
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Shows others that the run is under way, until the block or this program ends."""
+        """Marks the run as active until the block or this program ends."""
         with (self.path / EVENTS).open("rb") as stream:
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             yield
 
-    def is_under_way(self) -> bool:
-        """Whether the program that writes into the folder still runs."""
+    def is_active(self) -> bool:
+        """Whether the program that writes the folder is still running."""
         with suppress(OSError), (self.path / EVENTS).open("rb") as stream:
             try:
                 fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -191,12 +193,12 @@ class RunFolder:
 
     @property
     def mcap(self) -> Path:
-        """Where ``run.mcap`` is."""
+        """Path of ``run.mcap``."""
         return self.path / MCAP
 
     @property
     def report(self) -> Path:
-        """Where ``report.html`` is."""
+        """Path of ``report.html``."""
         return self.path / REPORT
 
     def write_plan(self, document: PlanDocument) -> None:
@@ -249,10 +251,10 @@ class RunFolder:
         return self._with_cables(CycleTable.read_csv(self.path / CYCLES), self.rig().cable_count)
 
     def cycles_cut_short(self, cable_count: int) -> CycleTable:
-        """Reads what a killed program wrote of ``cycles.csv``: its whole lines, or none.
+        """Reads the complete lines of ``cycles.csv`` of a killed program, if any.
 
         Raises:
-            BadInput: A whole line cannot be read.
+            BadInput: A complete line cannot be read.
         """
         if not (self.path / CYCLES).is_file():
             return no_cycles(cable_count)
@@ -280,12 +282,12 @@ class RunFolder:
         course.save(self.path / COURSE)
 
     def write_end_of_course(self, course: RunCourse) -> None:
-        """As `write_course`; on a full disk in the room that is there.
+        """As `write_course`; on a full disk overwrites the file.
 
         Raises:
             BadInput: The folder cannot be written to.
         """
-        course.save_where_it_was(self.path / COURSE)
+        course.overwrite(self.path / COURSE)
 
     def course(self) -> RunCourse:
         """Reads ``run.json``.
@@ -304,11 +306,11 @@ class RunFolder:
         return PoseTable.read_csv(self.path / POSES)
 
     def write_poses_of(self, camera: str, table: PoseTable) -> None:
-        """Writes ``poses-<camera>.csv``: what one of several cameras measured alone."""
+        """Writes ``poses-<camera>.csv``: the poses of one of several cameras."""
         table.write_csv(self.path / POSES_OF.format(camera))
 
     def poses_by_camera(self) -> dict[str, PoseTable]:
-        """Reads what each of several cameras measured alone; nothing of a run with one."""
+        """Reads the poses of each of several cameras; empty for a single camera."""
         begin, end = POSES_OF.split("{}")
         names = [path.name for path in self.path.glob(POSES_OF.format("*"))]
         return {
@@ -336,12 +338,12 @@ class RunFolder:
         """Reads ``summary.json``.
 
         Raises:
-            BadInput: It is no JSON, of another version, or damaged.
+            BadInput: It is not JSON, of another version, or damaged.
         """
         return read_summary(self.path / SUMMARY)
 
     def append_event(self, event: RunEvent) -> None:
-        """Adds a line to ``events.jsonl``; it is on disk when this returns.
+        """Appends a line to ``events.jsonl``; it is on disk when this returns.
 
         Raises:
             Fault: The disk is full or gone.
@@ -349,7 +351,7 @@ class RunFolder:
         self._append(EVENTS, event.line, fsync=True)
 
     def append_cycles(self, lines: str, *, fsync: bool) -> None:
-        """Adds lines to ``cycles.csv``; with ``fsync`` they are on disk when this returns.
+        """Appends lines to ``cycles.csv``; with ``fsync`` they are on disk when this returns.
 
         Raises:
             Fault: The disk is full or gone.
@@ -357,7 +359,7 @@ class RunFolder:
         self._append(CYCLES, lines, fsync=fsync)
 
     def events(self) -> list[RunEvent]:
-        """Reads ``events.jsonl``; a last line that was cut by a crash is left out.
+        """Reads ``events.jsonl``; a last line truncated by a crash is left out.
 
         Raises:
             BadInput: Another line cannot be read.
@@ -366,7 +368,7 @@ class RunFolder:
         return [RunEvent(**dict(event)) for event in read_events(path, whole_lines(path))]
 
     def write_events(self, events: Sequence[RunEvent]) -> None:
-        """Writes ``events.jsonl`` whole, where some could not be appended.
+        """Rewrites ``events.jsonl``, if some events could not be appended.
 
         Raises:
             BadInput: The folder cannot be written to.
@@ -377,9 +379,9 @@ class RunFolder:
         """Keeps a camera image, grey or BGR, as JPEG.
 
         Args:
-            frame: Number of the moment at which it was taken.
+            frame: Frame number.
             image: Shape (height, width) or (height, width, 3).
-            camera: Which of several cameras took it; each has a folder of its own.
+            camera: Name of the camera, if there are several; each has its own folder.
 
         Returns:
             Its name inside the folder, ``pictures/frame_<frame>.jpg`` or
@@ -402,16 +404,16 @@ class RunFolder:
         return name
 
     def picture(self, name: str) -> bytes:
-        """The JPEG that `write_picture` named.
+        """The JPEG of a name from `write_picture`.
 
         Raises:
-            BadInput: It is gone, or not in the folder of images.
+            BadInput: It does not exist, or is not in the folder of images.
         """
         try:
-            place = (self.path / name).resolve()
-            if not place.is_relative_to((self.path / PICTURES).resolve()):
+            file = (self.path / name).resolve()
+            if not file.is_relative_to((self.path / PICTURES).resolve()):
                 raise FileNotFoundError(0, f"it is not in {PICTURES}")
-            return read_bytes(place, PICTURE_LIMIT)
+            return read_bytes(file, PICTURE_LIMIT)
         except OSError as error:
             raise BadInput(
                 "the image cannot be read",

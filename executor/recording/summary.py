@@ -1,7 +1,7 @@
-"""``summary.json``: the verdict and the key figures of a run, made from its tables.
+"""``summary.json``: verdict and key figures of a run, computed from its tables.
 
 Keys (``schema_version`` 1): ``verdict`` (PASSED, FAILED, STOPPED), ``passed``, ``sentence``,
-``reasons`` (the sentences that decided), ``checks`` [{``name``, ``passed``, ``text``}], ``rig``,
+``reasons`` (sentences behind the verdict), ``checks`` [{``name``, ``passed``, ``text``}], ``rig``,
 ``scene``, ``plan_hash``, ``rig_hash``, ``interface``, ``simulated``, ``fast``, ``started`` (ISO
 8601, UTC), ``duration_s``, ``cycles``, ``cycle_ms``, ``lost_replies``, ``rejected_frames``,
 ``error_frames``, ``path_length_mm``, ``travelled_mm``, ``stops`` [{``name``, ``kind``,
@@ -13,8 +13,8 @@ nothing)}], ``clearance_mm`` {``required``, ``planned_min``, ``measured_min``,
 ``measured_uncertainty``, ``measured_at_most``, ``pair``, ``at_s``, ``source``} or null without
 obstacles, ``tension_n`` {``min``, ``max``, ``planned_min``, ``planned_max``, ``lower_limit``,
 ``upper_limit``}, ``lateness_ms`` {``p50``, ``p99``, ``max``} or null in simulated time,
-``final_state`` (``not_ended`` where the program was killed), ``events`` [{``time_s``, ``code``,
-``text``}], ``versions``. A number that is not known is null.
+``final_state`` (``not_ended`` if the program was killed), ``events`` [{``time_s``, ``code``,
+``text``}], ``versions``. An unknown number is null.
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ from model.rig import Rig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunContext:
-    """What a run was, beside its tables.
+    """Context of a run, besides its tables.
 
     Attributes:
-        plan: The plan that was run.
-        rig: The rig that was run.
+        plan: Its plan.
+        rig: Its rig.
         interface: Of the bus, such as ``virtual`` or ``socketcan``.
         simulated: The drives were simulated, here or by a program at the other end of the bus.
         fast: Simulated time, so that lateness has no meaning.
-        started: When; must know its time zone.
+        started: Start time, with time zone.
         duration: [s].
         final_state: ``finished``, ``stopped`` or the state of a fault.
-        events: What happened, in order.
-        versions: Of the programs that took part, by name.
-        cause: Why the run did not finish; when left out, what the last event says.
-        cameras: What became of each camera's images.
-        troubles: What of the record is lost, a sentence each.
+        events: All events, in order.
+        versions: Of programs and libraries, by name.
+        cause: Why the run did not finish; empty for the text of the last event.
+        cameras: Statistics of each camera's images.
+        troubles: Missing data, a sentence each.
     """
 
     plan: Plan
@@ -75,7 +75,7 @@ class RunContext:
 def summarize(
     context: RunContext, cycles: CycleTable, poses: PoseTable, clearance: ClearanceTable
 ) -> dict[str, Any]:
-    """The content of ``summary.json``; see the head of this file."""
+    """The content of ``summary.json``; see the module docstring."""
     last = context.events[-1].text if context.events else ""
     cause = context.cause or last
     verdict = judge(
@@ -88,7 +88,7 @@ def summarize(
         poses,
         clearance,
         context.cameras,
-        too_near=any(event.code == "clearance_low" for event in context.events),
+        clearance_stop=any(event.code == "clearance_low" for event in context.events),
         silent=any(event.code == "drive_silent" for event in context.events),
         troubles=context.troubles,
     )
@@ -136,7 +136,7 @@ def summarize(
 
 
 def _times_at(cycles: CycleTable, number: int, name: str) -> dict[str, float | None]:
-    """When the stop that ends a leg was reached and left; null for never."""
+    """Times at which the stop that ends a leg was reached and left; None for never."""
     left = cycles.leg > number
     reached = left | (np.array(cycles.stop, dtype=str) == name)
     return {"reached_s": _first(cycles, reached), "left_s": _first(cycles, left)}
@@ -172,7 +172,7 @@ def _tag_error(poses: PoseTable) -> dict[str, float | int | None] | None:
 
 
 def _clearance(clearance: ClearanceTable, required: float) -> dict[str, Any] | None:
-    """The smallest clearance by the camera where it saw something, else by the drives."""
+    """The smallest clearance, measured by the camera if it gave poses, else from the encoders."""
     for source in ("tag", "encoder"):
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():

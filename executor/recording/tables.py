@@ -1,4 +1,4 @@
-"""Tables of a run: a row a cycle of the loop, and a row an image of the cameras."""
+"""Tables of a run: one row per cycle of the loop, one row per image of the cameras."""
 
 from __future__ import annotations
 
@@ -43,21 +43,20 @@ class CycleTable:
         time: Since the start of the run, shape (n,), [s].
         state: State of the executor, n texts.
         path_index: Row of the set-point table that was sent, shape (n,).
-        leg: Part of the way between stops, counted from 1, shape (n,); it ends when its stop is
-            left.
-        stop: Name of the stop at which the platform stands, n texts; nothing on the way.
+        leg: Number of the leg between stops, from 1, shape (n,); it ends when its stop is left.
+        stop: Name of the stop at which the platform dwells, n texts; empty between stops.
         travelled: Length along the path, shape (n,), [m].
-        lateness: Of the cycle behind its deadline, shape (n,), [s]; 0 in simulated time.
+        lateness: Of the cycle after its deadline, shape (n,), [s]; 0 in simulated time.
         missing: Drives that did not answer, shape (n,).
-        rejected: Frames thrown away until then, as they could not be true, shape (n,).
-        error_frames: Error frames of the bus until then, shape (n,).
+        rejected: Implausible frames rejected so far, shape (n,).
+        error_frames: Error frames of the bus so far, shape (n,).
         planned: Commanded position of the platform, world frame, shape (n, 3), [m].
         planned_rotation: Commanded ``world_from_platform``, quaternions (w, x, y, z), shape (n, 4).
-        encoder: Position from the drives' actual positions, world frame, shape (n, 3), [m].
-        encoder_rotation: As ``planned_rotation``, from the drives, shape (n, 4).
+        encoder: Position from the encoders, world frame, shape (n, 3), [m].
+        encoder_rotation: As ``planned_rotation``, from the encoders, shape (n, 4).
         following_error: Largest of all cables, shape (n,), [m].
         set_counts: Set-points sent, shape (n, m), [counts].
-        actual_counts: Positions answered, shape (n, m), [counts].
+        actual_counts: Reported positions, shape (n, m), [counts].
         lengths: Cable lengths from the actual positions, shape (n, m), [m].
         planned_tensions: Tensions of the plan, shape (n, m), [N].
         tensions: Tensions from the drives' torques, shape (n, m), [N].
@@ -115,7 +114,7 @@ class CycleTable:
         return header(self._columns(0))
 
     def csv_rows(self, first: int) -> str:
-        """The lines of ``cycles.csv`` for cycles that are counted from ``first``."""
+        """The lines of ``cycles.csv`` for cycles numbered from ``first``."""
         return rows(self._columns(first))
 
     def _columns(self, first: int) -> list[Column]:
@@ -160,10 +159,10 @@ class CycleTable:
 
     @classmethod
     def of_lines(cls, path: Path, lines: Sequence[str]) -> CycleTable:
-        """As `read_csv`, of lines of the file, the first of them its header.
+        """As `read_csv`, from lines of the file, including its header.
 
         Raises:
-            BadInput: A line has other columns or no numbers.
+            BadInput: A line has other columns or invalid numbers.
         """
         return cls._of(TableFile(path, "\n".join(lines)))
 
@@ -196,7 +195,7 @@ class CycleTable:
 
 
 def no_cycles(cable_count: int) -> CycleTable:
-    """The table of a run of which no cycle is known."""
+    """The table of a run without cycles."""
     none, whole = np.empty(0), np.empty(0, dtype=np.int64)
     each, each_whole = np.empty((0, cable_count)), np.empty((0, cable_count), dtype=np.int64)
     return CycleTable(
@@ -222,12 +221,12 @@ def _side_by_side(names: Sequence[str], values: Array, decimals: int = 6) -> lis
 
 def quaternions_of(rotations: Array) -> Array:
     """Rotation matrices, shape (n, 3, 3), as quaternions (w, x, y, z), shape (n, 4)."""
-    if len(rotations) and (rotations == rotations[0]).all():  # the platform never turns
+    if len(rotations) and (rotations == rotations[0]).all():  # constant orientation
         return np.tile(quaternion_from_matrix(rotations[0]), (len(rotations), 1))
     return np.array([quaternion_from_matrix(r) for r in rotations]).reshape(-1, 4)
 
 
-# What the cameras measured during a run: a row an image.
+# Camera measurements of a run: one row per image.
 
 
 _DEG = float(np.degrees(1.0))
@@ -252,10 +251,10 @@ class PoseTable:
         position: Of the platform in the world, shape (n, 3), [m].
         rotation: ``world_from_platform`` as unit quaternions (w, x, y, z), shape (n, 4).
         covariance: Of position and rotation vector about world axes, shape (n, 6, 6), [m, rad].
-        tags: Numbers of the tags that were used, n texts such as ``301 303``.
+        tags: Numbers of the tags used, n texts such as ``301 303``.
         reprojection: RMS of the corners, shape (n,), [px].
         planned: Commanded position at that time, shape (n, 3), [m].
-        picture: Name of the kept image inside the run folder, or nothing, n texts.
+        picture: Name of the image kept in the run folder, or empty, n texts.
     """
 
     frame: Integers
@@ -278,7 +277,7 @@ class PoseTable:
 
     @property
     def ok(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """Which images gave a pose, shape (n,)."""
+        """Whether each image gave a pose, shape (n,)."""
         return np.array([status == OK for status in self.status], dtype=bool)
 
     @property
@@ -362,7 +361,7 @@ def no_poses() -> PoseTable:
     )
 
 
-# The platform's pose from drives and camera together: a row a cycle, from the first image on.
+# Poses fused from encoders and cameras: one row per cycle, from the first image on.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -374,7 +373,7 @@ class FusedTable:
         position: Of the platform in the world, shape (n, 3), [m].
         rotation: ``world_from_platform`` as unit quaternions (w, x, y, z), shape (n, 4).
         std: Standard deviations of position and rotation vector, shape (n, 6), [m] and [rad].
-        age: Time since the last image that was used, shape (n,), [s].
+        age: Time since the last image used, shape (n,), [s].
     """
 
     time: Array
@@ -404,7 +403,7 @@ class FusedTable:
 
 
 def fused_table(cycles: CycleTable, poses: PoseTable) -> FusedTable:
-    """The drives' poses of a run, moved to where its images show the platform."""
+    """The encoder poses of a run, corrected by its images."""
     known = np.isfinite(cycles.encoder).all(axis=1) & np.isfinite(cycles.encoder_rotation).all(
         axis=1
     )

@@ -1,4 +1,4 @@
-"""Whether a run was good: single checks, each a sentence with its numbers."""
+"""Verdict of a run: single checks, each a sentence with its values."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from model.scene import Scene
 from tracking.clearance import INTERVAL
 
 PASSED, FAILED, STOPPED = "PASSED", "FAILED", "STOPPED"
-#: The final state of a run whose end is not on record: its program was killed, or the disk full.
+#: Final state of a run without a recorded end: its program was killed, or the disk was full.
 NOT_ENDED = "not_ended"
 _ON_PATH = {state.value for state in ON_PATH}
-#: What the rounding of the tables may cost, [m].
+#: Tolerance for the rounding of the tables, [m].
 ROUNDING = 2e-9
-#: Of set-points from the goal at which the platform counts as there, [m].
+#: Distance of set-points from the goal at which the platform counts as there, [m].
 AT_GOAL = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One question about a run and its answer.
+    """One check of a run.
 
     Attributes:
         name: Short stable name.
-        passed: The answer.
-        text: One sentence with the numbers behind it.
+        passed: The result.
+        text: One sentence with its values.
     """
 
     name: str
@@ -49,12 +49,12 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The answer for the whole run.
+    """The verdict on the whole run.
 
     Attributes:
         word: ``PASSED``, ``FAILED`` or ``STOPPED``.
-        sentence: What happened, in one sentence.
-        checks: Every single check.
+        sentence: The outcome in one sentence.
+        checks: All checks.
     """
 
     word: str
@@ -68,7 +68,7 @@ class Verdict:
 
     @property
     def reasons(self) -> list[str]:
-        """The sentences of the checks that failed; of all checks when none did."""
+        """Sentences of the failed checks; of all checks if none failed."""
         failed = [check.text for check in self.checks if not check.passed]
         return failed or [check.text for check in self.checks]
 
@@ -84,25 +84,25 @@ def judge(
     clearance: ClearanceTable,
     cameras: Sequence[CameraRecord] = (),
     *,
-    too_near: bool = False,
+    clearance_stop: bool = False,
     silent: bool = False,
     troubles: Sequence[str] = (),
 ) -> Verdict:
-    """The verdict over a run.
+    """The verdict on a run.
 
     Args:
         final_state: ``finished``, ``stopped`` or any other for a fault.
         cause: Why it did not finish, if it did not.
-        simulated: The drives were simulated in the run's own process, so that no reply may be lost.
-        rig: The rig that was run.
+        simulated: The drives were simulated in the run's process, so that no reply may be lost.
+        rig: Its rig.
         scene: Its scene.
-        cycles: What the drives did.
-        poses: What the cameras saw together.
-        clearance: How near it came.
-        cameras: What became of each camera's images.
-        too_near: It was stopped for what the cameras measured, and not by the operator.
+        cycles: Of the drives.
+        poses: Fused poses of the cameras.
+        clearance: Distances to obstacles.
+        cameras: Statistics of each camera's images.
+        clearance_stop: It was stopped for the measured clearance, not by the operator.
         silent: It was stopped for drives that did not answer.
-        troubles: What of its record is lost, a sentence each.
+        troubles: Missing data, a sentence each.
     """
     measured = [
         following(cycles, rig.motion.following_error),
@@ -125,17 +125,17 @@ def judge(
     if final_state == NOT_ENDED:
         end = Check("finished", False, f"Its record ends {at}. {_KILLED}")
         return Verdict(FAILED, "The run did not finish.", (end, *measured))
-    told = cause.rstrip(".") or f"the final state is {final_state!r}"
+    cause_text = cause.rstrip(".") or f"the final state is {final_state!r}"
     where = "at the goal" if _is_at_goal(cycles, scene) else "before the goal"
-    end = Check("finished", False, f"The run ended {at}, {where}: {told}.")
-    if final_state == "stopped" and not failures and not too_near:
+    end = Check("finished", False, f"The run ended {at}, {where}: {cause_text}.")
+    if final_state == "stopped" and not failures and not clearance_stop:
         return Verdict(STOPPED, f"The run was stopped {where}.", (end, *measured))
     word = "was stopped" if final_state == "stopped" else "ended with a fault"
     return Verdict(FAILED, f"The run {word} {where}.", (end, *measured))
 
 
 def _is_at_goal(cycles: CycleTable, scene: Scene) -> bool:
-    """The last set-points were those of the goal."""
+    """Whether the last set-points were those of the goal."""
     left = cycles.planned[-1:] - scene.goal.position
     return bool(len(left)) and float(np.linalg.norm(left)) < AT_GOAL
 
@@ -147,11 +147,11 @@ _KILLED = (
 
 
 def judge_without_tables(final_state: str, cause: str, trouble: str) -> Verdict:
-    """The verdict over a run of which no table could be made.
+    """The verdict on a run whose tables could not be computed.
 
     Args:
         final_state: As for `judge`.
-        cause: Likewise.
+        cause: As for `judge`.
         trouble: Why there are no tables.
     """
     known = Check("evaluated", False, f"The measurements could not be evaluated: {trouble}.")
@@ -159,8 +159,8 @@ def judge_without_tables(final_state: str, cause: str, trouble: str) -> Verdict:
         end = Check("finished", True, "The platform reached the goal.")
         return Verdict(FAILED, "The run reached the goal, but was not evaluated.", (end, known))
     word = "was stopped" if final_state == "stopped" else "ended with a fault"
-    told = cause.rstrip(".") or f"the final state is {final_state!r}"
-    end = Check("finished", False, f"The run ended before the goal: {told}.")
+    cause_text = cause.rstrip(".") or f"the final state is {final_state!r}"
+    end = Check("finished", False, f"The run ended before the goal: {cause_text}.")
     return Verdict(FAILED, f"The run {word} before the goal.", (end, known))
 
 
@@ -173,7 +173,7 @@ def _travelled(cycles: CycleTable) -> float:
 
 
 def following(cycles: CycleTable, limit: float) -> Check:
-    """Every cable within ``limit`` [m] of its set-point, in every cycle."""
+    """Check that every cable was within ``limit`` [m] of its set-point in every cycle."""
     known = np.flatnonzero(np.isfinite(cycles.following_error))
     if not known.size and not _ON_PATH & {*cycles.state}:
         text = "The platform did not move along the path, so no following error was measured."
@@ -194,7 +194,7 @@ def following(cycles: CycleTable, limit: float) -> Check:
 
 
 def _never_followed(cycles: CycleTable) -> str:
-    """Why there is no following error: no replies, or drives that were not to follow yet."""
+    """Why there is no following error: no replies, or no drive followed set-points."""
     asked = len(cycles) * cycles.cable_count
     received = asked - int(cycles.missing.sum())
     if not received:
@@ -206,12 +206,12 @@ def _never_followed(cycles: CycleTable) -> str:
 
 
 def _rounded_up(length: float) -> float:
-    """A length [m] in mm, rounded up to a micrometre and never nothing at all."""
+    """A length [m] in mm, rounded up to a micrometre, at least 0.001."""
     return max(math.ceil(round(length * 1e6, 3)), 1) / 1e3
 
 
 def replies(cycles: CycleTable, simulated: bool, silent: bool = False) -> Check:
-    """No reply lost on simulated drives; on a real bus none for which the loop had to stop."""
+    """Check for lost replies: none from simulated drives; on a bus none that caused a stop."""
     lost = int(cycles.missing.sum())
     asked = len(cycles) * cycles.cable_count
     if not lost:
@@ -225,7 +225,7 @@ def replies(cycles: CycleTable, simulated: bool, silent: bool = False) -> Check:
 
 
 def tensions(cycles: CycleTable, rig: Rig) -> list[Check]:
-    """No slack and no overloaded cable; nothing when the drives report no torque."""
+    """Check for slack or overloaded cables; empty without torques."""
     if not np.isfinite(cycles.tensions).any():
         return []
     low, high = float(np.nanmin(cycles.tensions)), float(np.nanmax(cycles.tensions))
@@ -252,12 +252,12 @@ def _where(
 def distances(
     clearance: ClearanceTable, required: float, cameras: Sequence[CameraRecord] = ()
 ) -> list[Check]:
-    """Nowhere nearer than the scene allows, and nowhere nearer than planned by the camera.
+    """Checks of the clearance against the scene's and, for cameras, the planned one.
 
-    A distance is too small only when it is so by more than its own uncertainty.
+    A distance fails only if it is too small by more than its uncertainty.
     """
     checks = []
-    for source, source_name in (("tag", _who(cameras)), ("encoder", "the drives")):
+    for source, source_name in (("tag", _camera_phrase(cameras)), ("encoder", "the drives")):
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():
             checks.append(_against_required(rows, required, source_name))
@@ -298,7 +298,7 @@ def _against_plan(rows: ClearanceTable) -> Check:
 
 
 def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
-    """A camera saw the platform, and not all failed; nothing for a run without a camera."""
+    """Check that a camera gave poses and not all failed; empty without a camera."""
     failed = [one for one in cameras if one.failed]
     if failed and len(failed) == len(cameras):
         text = " ".join(f"Camera {one.name} failed: {one.failed}." for one in failed)
@@ -312,40 +312,40 @@ def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
     error = poses.error[poses.ok] * 1e3
     rms = float(np.sqrt(np.mean(error**2)))
     text = (
-        f"{_who(cameras).capitalize()} measured {seen} of {len(poses)} images,"
+        f"{_camera_phrase(cameras).capitalize()} measured {seen} of {len(poses)} images,"
         f" {rms:.2f} mm RMS from the plan (largest {error.max():.2f} mm)."
     )
     if len(cameras) > 1:
-        text += f" Alone: {', '.join(map(_of_one, cameras))}."
+        text += f" Alone: {', '.join(map(_single_camera_phrase, cameras))}."
     return [Check("camera", True, text)]
 
 
-def _who(cameras: Sequence[CameraRecord]) -> str:
+def _camera_phrase(cameras: Sequence[CameraRecord]) -> str:
     return f"{len(cameras)} cameras together" if len(cameras) > 1 else "the camera"
 
 
-def _of_one(record: CameraRecord) -> str:
-    """How often one of several cameras saw the platform, and why it saw it no more."""
+def _single_camera_phrase(record: CameraRecord) -> str:
+    """Poses and images of one of several cameras, and why it failed."""
     failed = f" ({record.failed})" if record.failed else ""
     return f"{record.name} {record.poses} of {record.pictures}{failed}"
 
 
-# What the documentation says about each fault: a page for every code of an event that is one.
+# Documentation of faults: a page for every event code that is a fault.
 
 
-#: Codes of events that belong to a run that goes well, or to what the operator wants.
+#: Codes of events of a good run, or of operator requests.
 ORDINARY = frozenset(
     {
         *("enabled", "moving", "hold", "resume", "speed", "stop", "held"),
         *("pass", "pick", "place", "leaving", "simulated", "traceback"),
     }
 )
-#: Codes of events that stop no run, although each has a page.
+#: Codes of events with a page that do not stop a run.
 HARMLESS = frozenset({"reply_lost", "no_real_time"})
 
 
 def page_of(code: str) -> str:
-    """The page about a fault; nothing for an event that is none, or is not known."""
+    """Path of the page about a fault; empty for other events."""
     return f"docs/faults/{code}.md" if code in fault_codes() else ""
 
 
@@ -355,7 +355,7 @@ def fault_codes() -> list[str]:
 
 
 def faults_among(codes: Iterable[str]) -> list[str]:
-    """Those of some events that are faults, each once, in order."""
+    """Fault codes among event codes, each once, in order."""
     known = fault_codes()
     return [code for code in dict.fromkeys(codes) if code in known]
 
@@ -367,10 +367,10 @@ def page_text(code: str) -> str:
 
 
 def page_of_fault(code: str) -> str:
-    """The page about a fault that somebody names, see `page_text`.
+    """The page about a fault of a user-given code; see `page_text`.
 
     Raises:
-        BadInput: There is none of that code; with the nearest, or all.
+        BadInput: There is no such code; with the nearest, or all codes.
     """
     codes = fault_codes()
     if code in codes:
@@ -387,7 +387,7 @@ def fault_titles() -> dict[str, str]:
 
 
 def _folder() -> Path:
-    """In a wheel beside the package, in the repository among its documents."""
+    """Folder of the pages: in a wheel in the package, in the repository in ``docs``."""
     package = Path(executor.__file__).resolve().parent
     inside = package / "faults"
     return inside if inside.is_dir() else package.parent / "docs" / "faults"

@@ -1,4 +1,4 @@
-"""Says something to the runs that are under way, and hears how they stand."""
+"""Client of the command sockets: sends commands to active runs, reads their status."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from executor.remote.command_socket import Reached, find_runs
+from executor.remote.command_socket import RunConnection, find_runs
 from executor.remote.protocol import make_line
 from model.errors import BadInput, Fault
 from tracking.measurement import rates
 
-#: A run answers within this, [s]: its socket has a thread of its own.
+#: Time-out of an answer, [s]; a run answers in a separate thread.
 ANSWER_TIMEOUT = 2.0
-#: While there is no run, one is looked for this often, [s].
-LOOK = 0.2
+#: Interval of searches for a run, [s].
+POLL_INTERVAL = 0.2
 _CHUNK = 65536
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What one run said.
+    """Answer of one run.
 
     Attributes:
-        process: Its number.
-        status: See `executor.remote.status`; None when it did not answer.
-        what: Why it has no status, in its own words; empty when it was silent.
-        ended: It is gone, so that nothing more will be heard of it.
+        process: Its process ID.
+        status: See `executor.remote.status`; None without an answer.
+        what: Its message on a missing status; empty if it was silent.
+        ended: The run has ended: no further answers will come.
     """
 
     process: int
@@ -38,45 +38,47 @@ class Answer:
     ended: bool = False
 
 
-def ask_all(runs: Sequence[Reached], command: str, percent: int | None = None) -> list[Answer]:
-    """Says the same to all runs, to all of them before any answer is waited for."""
+def ask_all(
+    runs: Sequence[RunConnection], command: str, percent: int | None = None
+) -> list[Answer]:
+    """Sends a command to all runs before waiting for answers."""
     return _ask_all(runs, make_line(command, percent=percent))
 
 
-def ask(run: Reached, line: bytes) -> Answer:
-    """Sends one run a line of `executor.remote.protocol.make_line`; what it said."""
+def ask(run: RunConnection, line: bytes) -> Answer:
+    """Sends a line of `executor.remote.protocol.make_line` to a run; returns its answer."""
     return _ask_all([run], line)[0]
 
 
-def _ask_all(runs: Sequence[Reached], line: bytes) -> list[Answer]:
-    told = [_told(run, line) for run in runs]
+def _ask_all(runs: Sequence[RunConnection], line: bytes) -> list[Answer]:
+    sent = [_send_line(run, line) for run in runs]
     return [
-        _heard(run) if taken else Answer(run.process, None, ended=True)
-        for run, taken in zip(runs, told, strict=True)
+        _receive(run) if taken else Answer(run.process, None, ended=True)
+        for run, taken in zip(runs, sent, strict=True)
     ]
 
 
 class RunLink:
-    """A run that is asked again and again; a late answer never passes for that to a later question.
+    """A connection for repeated requests; matches late answers to their requests.
 
     Attributes:
-        owed: Answers that were asked for and have not come.
+        owed: Outstanding answers.
     """
 
-    def __init__(self, run: Reached) -> None:
-        """Nothing was asked yet."""
+    def __init__(self, run: RunConnection) -> None:
+        """Starts without requests."""
         self._run, self._begun = run, b""
         self.owed = 0
 
     def ask(self, line: bytes, patience: float) -> Answer:
-        """Sends a line of `make_line`; what is said to it within so long, [s]."""
-        if not _told(self._run, line):
+        """Sends a line of `make_line`; waits up to ``patience`` [s] for its answer."""
+        if not _send_line(self._run, line):
             return Answer(self._run.process, None, ended=True)
         self.owed += 1
         return self.hear(patience)
 
     def hear(self, patience: float) -> Answer:
-        """The answer to the last question, once no earlier one is owed; waited for so long, [s]."""
+        """The answer to the last request, after all earlier ones; waits up to ``patience`` [s]."""
         newest, latest = b"", time.monotonic() + patience
         while self.owed:
             try:
@@ -94,17 +96,17 @@ class RunLink:
         return _parsed(self._run.process, newest)
 
 
-def _told(run: Reached, line: bytes) -> bool:
+def _send_line(run: RunConnection, line: bytes) -> bool:
     run.link.settimeout(ANSWER_TIMEOUT)
     try:
         run.link.sendall(line)
-    except OSError:  # it ended meanwhile
+    except OSError:  # the run has ended
         return False
     return True
 
 
-def _heard(run: Reached) -> Answer:
-    """What it answers; a run that hangs is distinguished from one that ended."""
+def _receive(run: RunConnection) -> Answer:
+    """The run's answer; distinguishes a hung run from one that ended."""
     try:
         line = _line(run.link)
     except TimeoutError:
@@ -126,13 +128,13 @@ def _parsed(process: int, line: bytes) -> Answer:
     return Answer(process, None, str(what or "its answer is empty"))
 
 
-def last_word(run: Reached) -> dict[str, Any] | None:
-    """What a run that ended said when it did; None when it could not say anything."""
-    return _heard(run).status
+def final_status(run: RunConnection) -> dict[str, Any] | None:
+    """The status that a run sent when it ended; None without one."""
+    return _receive(run).status
 
 
 def _line(link: socket.socket) -> bytes:
-    """The newest line: a run that ends says once more how it stands."""
+    """The newest line: a run sends its status once more when it ends."""
     got = b""
     while not got.endswith(b"\n"):
         chunk = link.recv(_CHUNK)
@@ -142,12 +144,12 @@ def _line(link: socket.socket) -> bytes:
     return got.splitlines()[-1]
 
 
-def select_run(runs: Sequence[Reached], process: int | None, verb: str) -> Reached:
-    """The run that is meant.
+def select_run(runs: Sequence[RunConnection], process: int | None, verb: str) -> RunConnection:
+    """The selected run.
 
     Raises:
-        Fault: No run is under way.
-        BadInput: There are several and none was named, or the named one is none of them.
+        Fault: No run is active.
+        BadInput: Several runs and none selected, or the selected one is not among them.
     """
     numbers = ", ".join(str(run.process) for run in runs)
     if not runs:
@@ -169,7 +171,7 @@ def select_run(runs: Sequence[Reached], process: int | None, verb: str) -> Reach
 
 
 def no_run(verb: str) -> Fault:
-    """Nothing was reached."""
+    """Error when no run was found."""
     return Fault(
         "no active run found for this user",
         where=f"cdpr {verb}",
@@ -180,12 +182,12 @@ def no_run(verb: str) -> Fault:
 
 
 def no_answer(verb: str, answers: Sequence[Answer]) -> Fault:
-    """Runs that got a command and do not report their status."""
+    """Error when runs received a command and did not report their status."""
     numbers = ", ".join(str(answer.process) for answer in answers)
     words = [answer.what for answer in answers if answer.what]
     if words:
         return Fault(
-            f"process {numbers} did not obey, or cannot confirm: {'; '.join(words)}",
+            f"process {numbers} rejected the command, or cannot confirm it: {'; '.join(words)}",
             where=f"cdpr {verb}",
             next_step="press the emergency stop if the robot still moves",
         )
@@ -207,17 +209,17 @@ def no_answer(verb: str, answers: Sequence[Answer]) -> Fault:
 def request_run(
     command: str, process: int | None = None, percent: int | None = None, *, verb: str = ""
 ) -> dict[str, Any]:
-    """Sends a command to the run that is meant; its status.
+    """Sends a command to a run; returns its status.
 
     Args:
-        command: As `executor.remote.protocol` has it: ``hold``, ``resume``, ``speed``, ``status``.
-        process: Number of the run; None for the only one.
+        command: See `executor.remote.protocol`: ``hold``, ``resume``, ``speed``, ``status``.
+        process: ID of its process; None for the only run.
         percent: Of the planned speed.
-        verb: What the user typed, where that is another word than the command.
+        verb: Command-line verb, if it differs from the command.
 
     Raises:
-        Fault: No run is under way, or it does not answer.
-        BadInput: It is not clear which run is meant.
+        Fault: No run is active, or it does not answer.
+        BadInput: The run is ambiguous.
     """
     with find_runs() as runs:
         (answer,) = ask_all([select_run(runs, process, verb or command)], command, percent)
@@ -228,11 +230,11 @@ def request_run(
 
 @dataclass(frozen=True, slots=True)
 class StopResult:
-    """Which runs were stopped.
+    """Result of a stop request to all runs.
 
     Attributes:
-        stopped: Numbers of those that answered.
-        silent: What the others said, if anything.
+        stopped: Process IDs of runs that answered.
+        silent: Answers of the others.
     """
 
     stopped: tuple[int, ...]
@@ -261,29 +263,29 @@ def follow_run(
     waits: bool = False,
     between: Callable[[float], Sequence[bytes]] = _pause,
 ) -> Iterator[dict[str, Any]]:
-    """The status of a run, again and again, on one connection; until it ends.
+    """Yields the status of a run repeatedly over one connection, until it ends.
 
     Args:
-        process: Number of the run; None for the only one.
-        rate: Reads a second, [Hz].
-        waits: Where there is no run, wait until one begins.
-        between: Passes the time given, [s], and says what the run is to be sent, lines of
+        process: ID of its process; None for the only run.
+        rate: Reading rate, [Hz].
+        waits: Without a run, wait until one begins.
+        between: Waits for a time, [s], and returns lines to send, made by
             `executor.remote.protocol.make_line`.
 
     Raises:
-        Fault: There is no run, or it does not answer, or does not do what it was sent.
-        BadInput: It is not clear which run is meant.
+        Fault: There is no run, or it does not answer, or rejects a line.
+        BadInput: The run is ambiguous.
     """
     while True:
         with find_runs() as runs:
             if runs or not waits:
                 yield from _followed(select_run(runs, process, "monitor"), rate, between)
                 return
-        between(LOOK)
+        between(POLL_INTERVAL)
 
 
 def _followed(
-    run: Reached, rate: float, between: Callable[[float], Sequence[bytes]]
+    run: RunConnection, rate: float, between: Callable[[float], Sequence[bytes]]
 ) -> Iterator[dict[str, Any]]:
     status: dict[str, Any] = {}
     lines: Sequence[bytes] = ()
@@ -291,7 +293,7 @@ def _followed(
         for line in (*lines, make_line("status")):
             answer = ask(run, line)
             if answer.ended:
-                last = last_word(run)
+                last = final_status(run)
                 if last is not None:
                     yield last
                 return
@@ -302,11 +304,11 @@ def _followed(
         lines = between(1.0 / rate)
 
 
-# The status of a run as text, see `executor.remote.status`.
+# Status of a run as text; see `executor.remote.status`.
 
 
 def status_text(status: Mapping[str, Any]) -> str:
-    """All of it."""
+    """The complete status."""
     drives = [
         f"  drive {d['node']:<3} {d['state']:<24} {d['position_counts']:>11}"
         f" ({d['position_counts'] - d['set_counts']:+d}) counts {d['tension_n']:8.2f} N"
@@ -319,7 +321,7 @@ def status_text(status: Mapping[str, Any]) -> str:
 
 
 def status_line(status: Mapping[str, Any]) -> str:
-    """One line: where the run is."""
+    """One line with the progress of the run."""
     if status["cycle"] is None:
         return f"{status['state']}  {status['rig']} on {status['bus']}"
     parts = [
@@ -352,7 +354,7 @@ def _number(value: float | None, form: str) -> str:
 
 
 def next_stop_line(status: Mapping[str, Any]) -> str:
-    """The stop that comes next, how far and how soon; empty where none is known."""
+    """Next stop with distance and time; empty if unknown."""
     stop = status["next_stop"]
     if stop is None:
         return ""
@@ -361,10 +363,10 @@ def next_stop_line(status: Mapping[str, Any]) -> str:
 
 
 def camera_line(camera: Mapping[str, Any]) -> str:
-    """One camera while images are measured.
+    """One line on a camera.
 
     Args:
-        camera: As the status has it.
+        camera: Its entry in the status.
     """
     parts = [
         f"{camera['name']} ({camera['source']})",

@@ -1,12 +1,12 @@
-"""The command socket of a run: found by `cdpr stop` and its like from any terminal, and answered.
+"""The command socket of a run, for `cdpr stop` and similar verbs from any terminal.
 
-A run listens on a socket named after its process in the user's run-time folders; a socket on which
-no process listens was left by one that ended. It is advertised in every folder that another
-terminal may look into, and only in folders that no other user can write to: a folder in /tmp that
-another user made could hold links to this user's files, or sockets of somebody else. Root reaches
-the runs of all users, each in a folder that is that user's alone.
+A run listens on a socket named after its process in the user's run-time folders; a socket without
+a listening process was left by one that ended. It is advertised in every folder that another
+terminal may search, and only in folders that no other user can write to: a folder in /tmp of
+another user could contain links to this user's files, or sockets of other users. Root reaches the
+runs of all users, each in a folder private to that user.
 
-Questions are answered in a thread of its own, in every phase of the run.
+Requests are answered in a separate thread, in every phase of the run.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from executor.remote.protocol import Presses, Told, answer_to, word_of
+from executor.remote.protocol import Presses, StatusSource, answer_to, status_answer
 from executor.supervision import RequestBoard
 from model.errors import Refused
 
@@ -38,27 +38,27 @@ class _Folder:
     owner: int
 
 
-def _own_places() -> list[Path]:
-    """The user's run-time folder, where the system has one, and one below the temporary folder."""
+def _own_folders() -> list[Path]:
+    """The user's run-time folder, if the system has one, and one in the temporary folder."""
     base = os.environ.get("XDG_RUNTIME_DIR")
     folders = [Path(base) / "cdpr"] if base else []
     return [*folders, Path(tempfile.gettempdir()) / f"cdpr-{os.getuid()}"]
 
 
-def _reached_places() -> list[Path]:
-    """Where runs are looked for: root, who may stop whatever runs here, looks at all users'."""
-    own = _own_places()
+def _reachable_folders() -> list[Path]:
+    """Folders to search for runs; for root those of all users."""
+    own = _own_folders()
     if os.getuid() != 0:
         return own
     others = [*Path("/run/user").glob("*/cdpr"), *Path(tempfile.gettempdir()).glob("cdpr-*")]
     return [*own, *sorted(path for path in others if path not in own)]
 
 
-def _opened(path: Path) -> _Folder | None:
-    """The folder if it is there and closed to all but its owner: this user, or for root anybody."""
+def _open_private(path: Path) -> _Folder | None:
+    """Opens a folder private to its owner: this user, or any user for root."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    except OSError:  # not there, a link, or not ours to read
+    except OSError:  # missing, a link, or not readable
         return None
     status = os.fstat(descriptor)
     is_ours = os.getuid() in (0, status.st_uid)
@@ -70,8 +70,8 @@ def _opened(path: Path) -> _Folder | None:
 
 @contextlib.contextmanager
 def _open_folders(paths: Sequence[Path]) -> Iterator[list[_Folder]]:
-    """All usable ones of these folders."""
-    opened = [folder for path in paths if (folder := _opened(path)) is not None]
+    """Opens all usable ones of these folders."""
+    opened = [folder for path in paths if (folder := _open_private(path)) is not None]
     try:
         yield opened
     finally:
@@ -81,42 +81,42 @@ def _open_folders(paths: Sequence[Path]) -> Iterator[list[_Folder]]:
 
 @contextlib.contextmanager
 def advertised() -> Iterator[list[socket.socket]]:
-    """Listens for the operator for as long as the block runs, in every usable folder.
+    """Listens in every usable folder while the block runs.
 
     Yields:
-        The listening sockets, one a folder.
+        The listening sockets, one per folder.
 
     Raises:
-        Refused: There is no folder for it that only this user can write to.
+        Refused: No folder is writable only by this user.
     """
-    places = _own_places()
-    for place in places:
-        with contextlib.suppress(OSError):  # there already, or its parent is read-only
-            place.mkdir(mode=0o700)
-    with _open_folders(places) as opened, contextlib.ExitStack() as stop_events:
+    paths = _own_folders()
+    for path in paths:
+        with contextlib.suppress(OSError):  # exists, or its parent is read-only
+            path.mkdir(mode=0o700)
+    with _open_folders(paths) as opened, contextlib.ExitStack() as stack:
         folders = [folder.descriptor for folder in opened if folder.owner == os.getuid()]
         if not folders:
             raise Refused(
                 "`cdpr stop` would not reach this run",
-                where=" or ".join(map(str, places)),
+                where=" or ".join(map(str, paths)),
                 why="no such folder belongs to this user alone; another user may have created it",
                 next_step="remove it or restrict it (chmod 700), or set XDG_RUNTIME_DIR",
             )
         name = f"{os.getpid()}{_ENDING}"
         listeners = []
         for folder in folders:
-            listeners.append(stop_events.enter_context(_listening(folder, name)))
-            stop_events.callback(_left, folder, name)
+            listeners.append(stack.enter_context(_listen_in(folder, name)))
+            stack.callback(_try_remove, folder, name)
         yield listeners
 
 
-def _listening(folder: int, name: str) -> socket.socket:
-    """A socket that listens under a name of the folder, from the moment the name is there on."""
+def _listen_in(folder: int, name: str) -> socket.socket:
+    """A socket in a folder that is listening as soon as its name appears."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         os.fchmod(listener.fileno(), 0o600)
-        _removed(folder, name + ".new")
-        listener.bind(_place(folder, name + ".new"))
+        _remove(folder, name + ".new")
+        listener.bind(_path_in(folder, name + ".new"))
         listener.listen()
         os.rename(name + ".new", name, src_dir_fd=folder, dst_dir_fd=folder)
     except BaseException:
@@ -125,29 +125,29 @@ def _listening(folder: int, name: str) -> socket.socket:
     return listener
 
 
-def _place(folder: int, name: str) -> str:
-    """A path to what is in an open folder; short enough for a socket, and of that very folder."""
+def _path_in(folder: int, name: str) -> str:
+    """A path into an open folder: short enough for a socket, and bound to that folder."""
     return f"/proc/self/fd/{folder}/{name}"
 
 
-def _removed(folder: int, name: str) -> None:
+def _remove(folder: int, name: str) -> None:
     with contextlib.suppress(FileNotFoundError):
         os.unlink(name, dir_fd=folder)
 
 
-def _left(folder: int, name: str) -> None:
-    """What cannot be removed is left: a socket of a run that ended is not connected to."""
+def _try_remove(folder: int, name: str) -> None:
+    """Removes a socket if possible; one left by an ended run is never connected to."""
     with contextlib.suppress(OSError):
         os.unlink(name, dir_fd=folder)
 
 
 @dataclass(frozen=True, slots=True)
-class Reached:
-    """A run that listens.
+class RunConnection:
+    """A connection to a run.
 
     Attributes:
-        process: Its number.
-        link: Connected to it; the owner closes it.
+        process: Its process ID.
+        link: Connected socket; the owner closes it.
     """
 
     process: int
@@ -155,18 +155,18 @@ class Reached:
 
 
 @contextlib.contextmanager
-def find_runs() -> Iterator[list[Reached]]:
-    """Connections to all runs that are under way, in the order of their numbers.
+def find_runs() -> Iterator[list[RunConnection]]:
+    """Connects to all active runs, in order of their process IDs.
 
-    Those of this user; for root those of all users.
+    Runs of this user; for root of all users.
     """
-    runs: dict[int, Reached] = {}
+    runs: dict[int, RunConnection] = {}
     with contextlib.ExitStack() as links:
-        with _open_folders(_reached_places()) as folders:
+        with _open_folders(_reachable_folders()) as folders:
             for folder in folders:
                 names = os.listdir(folder.descriptor)
                 for name in sorted(n for n in names if n.endswith(_ENDING)):
-                    run = _reached(folder.descriptor, name, folder.owner)
+                    run = _connect(folder.descriptor, name, folder.owner)
                     if run is None:
                         continue
                     links.callback(run.link.close)
@@ -174,19 +174,19 @@ def find_runs() -> Iterator[list[Reached]]:
         yield [runs[number] for number in sorted(runs)]
 
 
-def _reached(folder: int, name: str, owner: int) -> Reached | None:
-    """The folder owner's run behind a name; a name behind which no process listens is removed."""
+def _connect(folder: int, name: str, owner: int) -> RunConnection | None:
+    """Connects to the folder owner's run at a socket; removes a socket without a listener."""
     with contextlib.suppress(FileNotFoundError):
         if not stat.S_ISSOCK(os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode):
             return None
     link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        link.connect(_place(folder, name))
+        link.connect(_path_in(folder, name))
     except ConnectionRefusedError:
         link.close()
-        _removed(folder, name)
+        _remove(folder, name)
         return None
-    except OSError:  # gone meanwhile
+    except OSError:  # gone
         link.close()
         return None
     credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
@@ -194,15 +194,15 @@ def _reached(folder: int, name: str, owner: int) -> Reached | None:
     if user != owner:
         link.close()
         return None
-    return Reached(process, link)
+    return RunConnection(process, link)
 
 
-# Answers on the command socket of a run, in a thread of its own: in every phase of the run.
+# Server of the command socket, in a separate thread.
 
 
-#: A question is a line no longer than this, [bytes].
-LONGEST_QUESTION = 1024
-#: Connections at a time; a further one takes the place of the oldest.
+#: Largest length of a request, [bytes].
+LONGEST_REQUEST = 1024
+#: Largest number of connections; a further one replaces the oldest.
 MOST_CLIENTS = 16
 
 
@@ -210,16 +210,16 @@ MOST_CLIENTS = 16
 def serving(
     listeners: Sequence[socket.socket],
     board: RequestBoard,
-    status: Told,
+    status: StatusSource,
     presses: Presses | None = None,
 ) -> Iterator[None]:
-    """Answers every question on the sockets while the block runs.
+    """Answers all requests on the sockets while the block runs.
 
     Args:
-        listeners: Listening; they stay the caller's.
-        board: Where wishes are put up.
-        status: What is reported.
-        presses: Of a session of jogs; None for any other motion.
+        listeners: Listening sockets, which the caller closes.
+        board: Takes operator requests.
+        status: Reported in answers.
+        presses: Of a jog session; None for any other motion.
     """
     waker, woken = socket.socketpair()
     server = _Server(listeners, woken, board, status, presses)
@@ -239,92 +239,92 @@ class _Server:
         listeners: Sequence[socket.socket],
         woken: socket.socket,
         board: RequestBoard,
-        status: Told,
+        status: StatusSource,
         presses: Presses | None,
     ) -> None:
         self._board, self._status, self._woken = board, status, woken
         self._presses = presses
         self._selector = selectors.DefaultSelector()
         self._selector.register(woken, selectors.EVENT_READ)
-        self._begun: dict[socket.socket, bytes] = {}
+        self._partial: dict[socket.socket, bytes] = {}
         for listener in listeners:
             listener.setblocking(False)
             self._selector.register(listener, selectors.EVENT_READ, "listener")
 
     def run(self) -> None:
-        """Until the other end of ``woken`` is closed.
+        """Serves until the other end of ``woken`` is closed.
 
-        A run that could not be stopped from elsewhere any more is stopped.
+        If the server fails, the run is stopped, as it could no longer be stopped from outside.
         """
         try:
-            while self._serve_the_ready():
+            while self._serve_ready():
                 pass
-            self._say_the_last_word()
+            self._send_final_status()
         except BaseException:
             self._board.ask_stop()
             raise
         finally:
-            for client in list(self._begun):
-                self._let_go(client)
+            for client in list(self._partial):
+                self._drop(client)
             self._selector.close()
 
-    def _say_the_last_word(self) -> None:
-        """How the run ended, to those who watch it and may have looked just before."""
-        for client in self._begun:
-            with contextlib.suppress(OSError):  # it went away, or does not read
-                client.sendall(word_of(self._status))
+    def _send_final_status(self) -> None:
+        """Sends the final status to all clients."""
+        for client in self._partial:
+            with contextlib.suppress(OSError):  # disconnected, or does not read
+                client.sendall(status_answer(self._status))
 
-    def _serve_the_ready(self) -> bool:
-        """Waits for those that want something, and serves them; False when all is over."""
+    def _serve_ready(self) -> bool:
+        """Waits for sockets that are ready, and serves them; False at the end."""
         ready = [(key.fileobj, key.data) for key, _ in self._selector.select()]
-        for place, kind in ready:
-            if place is self._woken:
+        for ready_socket, kind in ready:
+            if ready_socket is self._woken:
                 return False
-            assert isinstance(place, socket.socket)
+            assert isinstance(ready_socket, socket.socket)
             if kind == "listener":
-                self._welcome(place)
+                self._accept(ready_socket)
             else:
-                self._listen(place)
+                self._listen(ready_socket)
         return True
 
-    def _welcome(self, listener: socket.socket) -> None:
+    def _accept(self, listener: socket.socket) -> None:
         try:
             client, _ = listener.accept()
-        except OSError:  # it went away again
+        except OSError:  # disconnected
             return
         if not _is_ours(client):
             client.close()
             return
-        if len(self._begun) >= MOST_CLIENTS:
-            self._let_go(next(iter(self._begun)))
-        client.setblocking(False)  # who does not take an answer must not keep others from a stop
-        self._begun[client] = b""
+        if len(self._partial) >= MOST_CLIENTS:
+            self._drop(next(iter(self._partial)))
+        client.setblocking(False)  # a client that does not read must not block a stop by others
+        self._partial[client] = b""
         self._selector.register(client, selectors.EVENT_READ, "client")
 
     def _listen(self, client: socket.socket) -> None:
-        """Takes what there is; answers each whole line."""
-        if client not in self._begun:  # it was let go meanwhile
+        """Receives data and answers each complete line."""
+        if client not in self._partial:  # dropped meanwhile
             return
         try:
-            got = client.recv(LONGEST_QUESTION)
-            *lines, rest = (self._begun[client] + got).split(b"\n")
+            got = client.recv(LONGEST_REQUEST)
+            *lines, rest = (self._partial[client] + got).split(b"\n")
             for line in lines:
                 client.sendall(answer_to(line, self._board, self._status, self._presses))
-        except OSError:  # it went away, or does not read
+        except OSError:  # disconnected, or does not read
             got, rest = b"", b""
-        if not got or len(rest) > LONGEST_QUESTION:
-            self._let_go(client)
+        if not got or len(rest) > LONGEST_REQUEST:
+            self._drop(client)
         else:
-            self._begun[client] = rest
+            self._partial[client] = rest
 
-    def _let_go(self, client: socket.socket) -> None:
-        del self._begun[client]
+    def _drop(self, client: socket.socket) -> None:
+        del self._partial[client]
         self._selector.unregister(client)
         client.close()
 
 
 def _is_ours(client: socket.socket) -> bool:
-    """The folder admits no other user; the system confirms who it is."""
+    """Whether the client is this user or root, in addition to the folder's permissions."""
     credentials = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     _, user, _ = struct.unpack("3i", credentials)
     return user in (os.getuid(), 0)

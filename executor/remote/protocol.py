@@ -1,12 +1,12 @@
-"""What is said on a run's command socket: one JSON object a line, a question and an answer.
+"""Protocol of a run's command socket: request and answer, one JSON object per line.
 
-The question names a ``command``: ``status``, ``stop``, ``hold``, ``resume``, or ``speed`` with
-``percent`` (1 to 100). A session of jogs also takes ``held`` with ``press`` (a number, rising),
-``step_mm`` (one of `STEPS_MM`, or null as long as it is held), ``percent`` of the jog speed, and
-what is moved: the platform by ``direction`` (x, y, z; normed by who takes it) in a ``frame``
-(``world`` or ``platform``), or one cable by ``cable`` (its number, from 1) and ``sense``
-(``wind_in`` or ``pay_out``); ``let_go`` with ``press``; and ``end``. The answer has ``ok``; when
-it is true ``status`` (see `executor.remote.status`), otherwise ``what``, a sentence.
+A request has a ``command``: ``status``, ``stop``, ``hold``, ``resume``, or ``speed`` with
+``percent`` (1 to 100). A jog session also takes ``held`` with ``press`` (a number, rising),
+``step_mm`` (one of `STEPS_MM`, or null to move while it is held), ``percent`` of the jog speed,
+and the motion: of the platform by ``direction`` (x, y, z; normalized by the receiver) in a
+``frame`` (``world`` or ``platform``), or of one cable by ``cable`` (its number, from 1) and
+``sense`` (``wind_in`` or ``pay_out``); ``let_go`` with ``press``; and ``end``. The answer has
+``ok``; if true, ``status`` (see `executor.remote.status`), otherwise ``what``, a sentence.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from executor.supervision import FASTEST, SLOWEST, RequestBoard
 from model.pose import Array
 
 
-class _Question(BaseModel):
+class _Request(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
-class RunCommand(_Question):
-    """A command without a number."""
+class RunCommand(_Request):
+    """A command without a value."""
 
     command: Literal["status", "stop", "hold", "resume"]
 
 
-class FeedCommand(_Question):
-    """How fast to go, in per cent of the planned speed."""
+class FeedCommand(_Request):
+    """Feed in per cent of the planned speed."""
 
     command: Literal["speed"]
     percent: Annotated[int, Field(ge=SLOWEST, le=FASTEST)]
@@ -42,7 +42,7 @@ class FeedCommand(_Question):
 
 Number = Annotated[int, Field(ge=1, le=2**53)]
 Share = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
-#: Steps of a jog that can be asked for, [mm].
+#: Selectable steps of a jog, [mm].
 STEPS_MM = (0.1, 1.0, 10.0)
 
 
@@ -51,8 +51,8 @@ Cable = Annotated[int, Field(ge=1, le=255)]
 Sense = Literal["wind_in", "pay_out"]
 
 
-class HeldCommand(_Question):
-    """A jog control is held: of the platform, with a direction, or of one cable, with a sense."""
+class HeldCommand(_Request):
+    """Held jog control: of the platform, with a direction, or of one cable, with a sense."""
 
     command: Literal["held"]
     press: Number
@@ -73,10 +73,10 @@ class HeldCommand(_Question):
 def require_one_motion(
     direction: Sequence[float] | None, frame: str | None, cable: int | None, sense: str | None
 ) -> None:
-    """A held control moves either the platform or one cable.
+    """Requires a motion of either the platform or one cable.
 
     Raises:
-        ValueError: It is neither, or both, or the direction is zero.
+        ValueError: Neither or both are given, or the direction is zero.
     """
     if direction is None and None not in (cable, sense) and frame is None:
         return
@@ -87,7 +87,7 @@ def require_one_motion(
 
 
 def require_step(step_mm: float | None) -> None:
-    """A jog ends after one of `STEPS_MM`, or goes on as long as it is held.
+    """Requires one of `STEPS_MM`, or None.
 
     Raises:
         ValueError: There is no such step.
@@ -96,15 +96,15 @@ def require_step(step_mm: float | None) -> None:
         raise ValueError(f"step_mm is none of {', '.join(map(str, STEPS_MM))}")
 
 
-class LetGoCommand(_Question):
-    """A jog control is no longer held."""
+class LetGoCommand(_Request):
+    """Released jog control."""
 
     command: Literal["let_go"]
     press: Number
 
 
-class EndCommand(_Question):
-    """The session of jogs is to end."""
+class EndCommand(_Request):
+    """End of the jog session."""
 
     command: Literal["end"]
 
@@ -115,54 +115,54 @@ _COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discrimin
 
 
 class Presses(Protocol):
-    """Takes what is said of jog controls; see `executor.hold_to_run.presses.PressBoard`."""
+    """Takes reports of jog controls; see `executor.hold_to_run.presses.PressBoard`."""
 
     def hold(
         self, number: int, direction: Array, *, in_platform: bool, step: float | None, percent: int
     ) -> bool:
-        """A control that moves the platform is held; False when that press is over."""
+        """Reports a held control that moves the platform; returns False if that press is over."""
         ...
 
     def hold_cable(
         self, number: int, cable: int, *, pays_out: bool, step: float | None, percent: int
     ) -> bool:
-        """A control that moves one cable is held; False when that press is over."""
+        """Reports a held control that moves one cable; returns False if that press is over."""
         ...
 
     def let_go(self, number: int) -> None:
-        """A control is no longer held."""
+        """Reports a released control."""
         ...
 
     def end(self) -> None:
-        """The session is to end."""
+        """Requests the end of the session."""
         ...
 
 
-class NotACommand(ValueError):
-    """What came over the socket is none; the text says why."""
+class InvalidCommand(ValueError):
+    """The received line is not a command; with the reason."""
 
 
 def parse_command(line: bytes) -> Command:
-    """The command in a line.
+    """Parses a command.
 
     Raises:
-        NotACommand: It is none.
+        InvalidCommand: The line is not a command.
     """
     try:
         return _COMMANDS.validate_json(line)
     except ValidationError as error:
         problems = error.errors(include_url=False, include_context=False)
-        raise NotACommand("; ".join(str(problem["msg"]) for problem in problems)) from None
+        raise InvalidCommand("; ".join(str(problem["msg"]) for problem in problems)) from None
 
 
 def make_line(command: str, **values: Any) -> bytes:
-    """A question as it is sent; a value that is None is left out."""
+    """Encodes a request; values of None are left out."""
     given = {name: value for name, value in values.items() if value is not None}
     return json.dumps({"command": command, **given}, allow_nan=False).encode() + b"\n"
 
 
-class Told(Protocol):
-    """What can say how it stands, from any thread."""
+class StatusSource(Protocol):
+    """Reports its status, from any thread."""
 
     def as_dict(self) -> dict[str, Any]:
         """See `executor.remote.status`."""
@@ -170,34 +170,34 @@ class Told(Protocol):
 
 
 def answer_to(
-    line: bytes, board: RequestBoard, status: Told, presses: Presses | None = None
+    line: bytes, board: RequestBoard, status: StatusSource, presses: Presses | None = None
 ) -> bytes:
-    """Does what a line asks for; the answer as it is sent.
+    """Executes a request; returns the encoded answer.
 
-    A command counts even where the run then cannot report its status.
+    A command takes effect even if the run then cannot report its status.
 
     Args:
-        line: What was asked.
-        board: Where wishes are put up.
-        status: What is reported.
-        presses: Of a session of jogs; None for any other motion.
+        line: The request.
+        board: Takes operator requests.
+        status: Reported in the answer.
+        presses: Of a jog session; None for any other motion.
     """
     try:
         command = parse_command(line)
         if isinstance(command, JogCommand):
             _jog(command, presses)
         else:
-            _put_up(command, board)
-        return word_of(status)
-    except NotACommand as error:
+            _request(command, board)
+        return status_answer(status)
+    except InvalidCommand as error:
         return _line({"ok": False, "what": f"not a command: {error}"})
     except Exception as error:
         what = f"the run cannot report its status: {type(error).__name__}: {error}"
         return _line({"ok": False, "what": what})
 
 
-def word_of(status: Told) -> bytes:
-    """How it stands, as an answer is sent."""
+def status_answer(status: StatusSource) -> bytes:
+    """Encodes an answer with the status."""
     return _line({"ok": True, "status": status.as_dict()})
 
 
@@ -205,7 +205,7 @@ def _line(answer: dict[str, Any]) -> bytes:
     return json.dumps(answer, allow_nan=False).encode() + b"\n"
 
 
-def _put_up(command: RunCommand | FeedCommand, board: RequestBoard) -> None:
+def _request(command: RunCommand | FeedCommand, board: RequestBoard) -> None:
     if isinstance(command, FeedCommand):
         board.ask_speed(command.percent)
     elif command.command == "stop":
@@ -216,7 +216,7 @@ def _put_up(command: RunCommand | FeedCommand, board: RequestBoard) -> None:
 
 def _jog(command: JogCommand, presses: Presses | None) -> None:
     if presses is None:
-        raise NotACommand("this run takes no jogs")
+        raise InvalidCommand("this run takes no jogs")
     if isinstance(command, EndCommand):
         presses.end()
     elif isinstance(command, LetGoCommand):
@@ -225,9 +225,9 @@ def _jog(command: JogCommand, presses: Presses | None) -> None:
         try:
             is_taken = _hold(command, presses)
         except ValueError as error:
-            raise NotACommand(str(error)) from None
+            raise InvalidCommand(str(error)) from None
         if not is_taken:
-            raise NotACommand(f"press {command.press} is over")
+            raise InvalidCommand(f"press {command.press} is over")
 
 
 def _hold(command: HeldCommand, presses: Presses) -> bool:

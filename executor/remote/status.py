@@ -1,29 +1,28 @@
-"""How a run stands at this moment, for `cdpr monitor` and the programs that read its JSON.
+"""Present status of a run, for `cdpr monitor` and programs that read its JSON.
 
 Keys: ``process``, ``rig``, ``bus``, ``folder``, ``simulated_time``, ``state``, ``cause``,
 ``elapsed_s``, ``cycle``, ``row``, ``rows``, ``path_mm``, ``path_length_mm``, ``next_stop``
-{``name`` (``goal`` at last), ``distance_mm``, ``seconds`` (at the wished speed)}, ``feed_percent``
+{``name`` (``goal`` at the end), ``distance_mm``, ``seconds`` (at the set speed)}, ``feed_percent``
 (of the planned speed, now), ``wished`` {``stop``, ``hold``, ``speed_percent``}, ``lateness_ms``,
 ``worst_lateness_ms``, ``following_error_mm``, ``lost_replies``, ``rejected_frames``,
 ``error_frames``, ``cameras`` [{``name``, ``source``, ``pictures``, ``poses``, ``dropped``,
-``pictures_per_second`` (of the run's time), ``measuring_ms``, ``tags`` (seen last), ``trouble``
-(what keeps it from measuring, or nothing), ``live_image`` (descriptor of its newest image in this
-process, see `executor.cameras.live_image`)}], ``measured`` (the newest pose of all cameras
-together, or nothing) {``time_s`` (of its images), ``position_mm``, ``quaternion``,
-``covariance_mm2`` (of the position, row by row), ``stated`` (whether it holds the errors that all
-images share), ``clearance`` {``distance_mm``, ``low_mm``, ``high_mm`` (its 95 % interval),
-``pair``}, or nothing}, ``drives`` [{``node``, ``state``, ``position_counts``, ``set_counts``,
-``tension_n``}], ``events`` [{``time_s``, ``code``, ``text``}], the newest last. A
-number that is not known is null; before the first cycle ``state`` is ``preparing`` (while `cdpr
-release` takes the torque off ``releasing``) and ``drives`` is empty; at the end ``cause`` says why
-it did not end well. Winches that move without a path (`cdpr home`, `cdpr jog --cable`) have no
-``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a percentage. A session of jogs
-has ``jog`` {``speed_mm_s`` (at most), ``position_mm``, ``quaternion`` (where the platform was
-sent), ``room_mm`` (to the end of what is proved), ``limit`` (why there is no more, or nothing)},
-and neither rows nor a path; one of single cables has ``cable_jog`` {``speed_mm_s`` (at most),
-``limit_n`` (of every tension), ``cable`` (that moved last, or nothing), ``press_mm`` (that its
-newest press paid out; negative was wound in), ``session_mm`` (the same of each cable since the
-session began), ``limit`` (why the cable goes no further, or nothing)}.
+``pictures_per_second`` (in run time), ``measuring_ms``, ``tags`` (detected last), ``trouble`` (why
+it does not measure, or empty), ``live_image`` (descriptor of its newest image in this process, see
+`executor.cameras.live_image`)}], ``measured`` (the newest fused pose of all cameras, or null)
+{``time_s`` (of its images), ``position_mm``, ``quaternion``, ``covariance_mm2`` (of the position,
+row by row), ``stated`` (whether it includes the errors common to all images), ``clearance``
+{``distance_mm``, ``low_mm``, ``high_mm`` (its 95 % interval), ``pair``}, or null}, ``drives``
+[{``node``, ``state``, ``position_counts``, ``set_counts``, ``tension_n``}], ``events``
+[{``time_s``, ``code``, ``text``}], the newest last. An unknown number is null; before the first
+cycle ``state`` is ``preparing`` (``releasing`` during `cdpr release`) and ``drives`` is empty; at
+the end ``cause`` is the reason of a bad end. Winches that move without a path (`cdpr home`, `cdpr
+jog --cable`) have no ``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a
+percentage. A jog session has ``jog`` {``speed_mm_s`` (largest), ``position_mm``, ``quaternion``
+(commanded pose), ``room_mm`` (to the end of the checked line), ``limit`` (why it ends there, or
+null)}, and neither rows nor a path; a session of single cables has ``cable_jog`` {``speed_mm_s``
+(largest), ``limit_n`` (of every tension), ``cable`` (that moved last, or null), ``press_mm`` (paid
+out by the latest press; negative for wound in), ``session_mm`` (the same for each cable since the
+session began), ``limit`` (why the cable stops, or null)}.
 """
 
 from __future__ import annotations
@@ -48,26 +47,26 @@ from tracking.clearance import MeasuredClearance
 from tracking.measurement import PoseMeasurement
 
 #: Number of newest events reported.
-EVENTS_TOLD = 12
+EVENTS_SHOWN = 12
 
 
 class CyclesSoFar:
-    """Status from cycles, for any kind of motion."""
+    """Status from cycle records, for any kind of motion."""
 
     def __init__(self, rig: Rig, *, simulated_time: bool) -> None:
-        """None so far."""
+        """Starts without cycles."""
         self.began = 0.0
-        """Time of the first one, [s]."""
+        """Time of the first cycle, [s]."""
         self.last: CycleRecord | None = None
         self._rig, self._simulated_time = rig, simulated_time
         self._worst_lateness = 0.0
         self._lost = 0
         self._end: tuple[State, str] | None = None
         self.before = "preparing"
-        """State reported as long as there is no cycle."""
+        """State reported before the first cycle."""
 
     def take(self, record: CycleRecord) -> None:
-        """One more is over."""
+        """Takes a cycle."""
         if self.last is None:
             self.began = record.at
         self._worst_lateness = max(self._worst_lateness, record.lateness)
@@ -75,13 +74,13 @@ class CyclesSoFar:
         self.last = record
 
     def take_end(self, state: State, cause: str) -> None:
-        """The motion is over; only this is reported of it."""
+        """Takes the end of the motion, which replaces the state."""
         self._end = state, cause
 
     def as_dict(self) -> dict[str, Any]:
-        """State, times, replies and drives; see the head of this file."""
+        """State, times, replies and drives; see the module docstring."""
         state, cause = self._end or (self.last.state if self.last else None, None)
-        told = {
+        data = {
             "state": state.value if state else self.before,
             "cause": cause or None,
             "simulated_time": self._simulated_time,
@@ -93,10 +92,10 @@ class CyclesSoFar:
         if record is None:
             unknown = ("elapsed_s", "cycle", "feed_percent", "lateness_ms", "worst_lateness_ms")
             nothing = dict.fromkeys((*unknown, "following_error_mm"))
-            return {**told, **nothing, "drives": []}
+            return {**data, **nothing, "drives": []}
         error = record.following_error * 1e3
         return {
-            **told,
+            **data,
             "elapsed_s": round(record.at - self.began, 3),
             "cycle": record.cycle,
             "feed_percent": round(record.rate * 100.0, 1),
@@ -132,13 +131,13 @@ class CyclesSoFar:
 
 
 def bus_name(rig: Rig) -> str:
-    """The bus of a rig as a status names it."""
+    """The bus of a rig, as in a status."""
     bus = rig.document.bus
     return f"{bus.interface} {bus.channel}".strip()
 
 
-def whose(rig: Rig, folder: Path | None) -> dict[str, Any]:
-    """What is moved, by whom, and where it is on record."""
+def identity(rig: Rig, folder: Path | None) -> dict[str, Any]:
+    """Process, rig, bus and record folder."""
     return {
         "process": os.getpid(),
         "rig": rig.name,
@@ -148,7 +147,7 @@ def whose(rig: Rig, folder: Path | None) -> dict[str, Any]:
 
 
 def measured_data(measured: PoseMeasurement, clearance: MeasuredClearance | None) -> dict[str, Any]:
-    """A measured pose and the clearance at it; see the head of this file."""
+    """A measured pose and its clearance; see the module docstring."""
     covariance = (measured.covariance + measured.shared)[:3, :3] * 1e6
     return {
         "time_s": round(measured.time, 3),
@@ -170,82 +169,82 @@ def _clearance_data(clearance: MeasuredClearance) -> dict[str, Any]:
     }
 
 
-def wished(board: RequestBoard) -> dict[str, Any]:
-    """What the operator wants."""
-    wishes = board.read()
-    speed = round(wishes.speed * 100.0)
-    return {"wished": {"stop": wishes.stop, "hold": wishes.hold, "speed_percent": speed}}
+def requests_data(board: RequestBoard) -> dict[str, Any]:
+    """Present operator requests."""
+    requests = board.read()
+    speed = round(requests.speed * 100.0)
+    return {"wished": {"stop": requests.stop, "hold": requests.hold, "speed_percent": speed}}
 
 
 class MotionStatus(ABC):
     """Collects events; answers requests for status, from any thread."""
 
     def __init__(self, rig: Rig, board: RequestBoard, *, simulated_time: bool) -> None:
-        """A motion that is being prepared."""
+        """A motion in preparation."""
         self._rig, self._board = rig, board
         self._cycles = CyclesSoFar(rig, simulated_time=simulated_time)
         self._cameras: list[dict[str, Any]] = []
         self._measured: tuple[PoseMeasurement, MeasuredClearance | None] | None = None
         self.folder: Path | None = None
-        """Where it is on record, if anywhere."""
+        """Record folder, if any."""
 
     def take_release(self) -> None:
-        """The torque is being taken off; nothing moves, and no cycle is reported."""
+        """Reports a release, in which nothing moves and no cycle is reported."""
         self._cycles.before = "releasing"
 
     def take_end(self, state: State, cause: str) -> None:
-        """The motion is over."""
+        """Takes the end of the motion."""
         self._cycles.take_end(state, cause)
 
     def as_dict(self) -> dict[str, Any]:
-        """See the head of this file."""
+        """See the module docstring."""
         return {
-            **whose(self._rig, self.folder),
+            **identity(self._rig, self.folder),
             **self._cycles.as_dict(),
-            **self._place(),
+            **self._position_fields(),
             "cameras": self._cameras,
             "measured": None if self._measured is None else measured_data(*self._measured),
-            **wished(self._board),
-            "events": self._told(),
+            **requests_data(self._board),
+            "events": self._event_data(),
         }
 
     @abstractmethod
-    def _place(self) -> dict[str, Any]:
-        """How far the motion is."""
+    def _position_fields(self) -> dict[str, Any]:
+        """Progress of the motion."""
 
     @abstractmethod
-    def _told(self) -> list[dict[str, Any]]:
+    def _event_data(self) -> list[dict[str, Any]]:
         """The newest events."""
 
 
 class RunStatus(MotionStatus):
-    """Of a run along a path."""
+    """Status of a run along a path."""
 
     def __init__(
         self, prepared: PreparedRun, folder: Path, board: RequestBoard, *, simulated_time: bool
     ) -> None:
-        """A run that is being prepared."""
+        """A run in preparation."""
         super().__init__(prepared.rig, board, simulated_time=simulated_time)
         self._prepared, self.folder = prepared, folder
-        self._events: deque[RunEvent] = deque(maxlen=EVENTS_TOLD)
+        self._events: deque[RunEvent] = deque(maxlen=EVENTS_SHOWN)
 
     def take_cycle(self, record: CycleRecord) -> None:
-        """A cycle is over."""
+        """Takes a cycle."""
         self._cycles.take(record)
 
     def take_cameras(self, cameras: list[dict[str, Any]]) -> None:
-        """How each camera does now."""
+        """Takes the state of each camera."""
         self._cameras = cameras
 
     def take_measured(self, measured: PoseMeasurement, clearance: MeasuredClearance | None) -> None:
-        """The newest pose of the cameras, and the clearance at it; read by who asks."""
+        """Takes the newest pose of the cameras and its clearance."""
         self._measured = measured, clearance
 
     def take_event(self, event: RunEvent) -> None:
-        """Something happened."""
+        """Takes an event."""
         self._events.append(event)
 
-    def _place(self) -> dict[str, Any]:
+    def _position_fields(self) -> dict[str, Any]:
         table, record = self._prepared.checked.table, self._cycles.last
         whole = {"rows": len(table), "path_length_mm": round(self._prepared.length * 1e3, 3)}
         if record is None:
@@ -261,7 +260,7 @@ class RunStatus(MotionStatus):
     def _next_stop(self, row: float, path: float) -> dict[str, Any]:
         """The scene's next stop, or the goal."""
         table, stops = self._prepared.checked.table, self._prepared.scene.stops
-        ahead = [(stand.first, stop.name) for stand, stop in zip(table.stands, stops, strict=True)]
+        ahead = [(dwell.first, stop.name) for dwell, stop in zip(table.dwells, stops, strict=True)]
         ahead.append((len(table) - 1, "goal"))
         last, name = next(one for one in ahead if one[0] >= row or one[1] == "goal")
         left = (last - row) * table.cycle / self._board.read().speed
@@ -271,7 +270,7 @@ class RunStatus(MotionStatus):
             "seconds": round(left, 1),
         }
 
-    def _told(self) -> list[dict[str, Any]]:
+    def _event_data(self) -> list[dict[str, Any]]:
         return [asdict(event) for event in list(self._events)]
 
 
@@ -279,26 +278,26 @@ _NO_PATH = {"path_mm": None, "path_length_mm": None, "next_stop": None}
 
 
 class WinchStatus(MotionStatus):
-    """Of winches that move without a path."""
+    """Status of winches that move without a path."""
 
     def __init__(self, rig: Rig, board: RequestBoard, *, simulated_time: bool) -> None:
-        """A motion that is being prepared."""
+        """A motion in preparation."""
         super().__init__(rig, board, simulated_time=simulated_time)
-        self._events: deque[LoopEvent] = deque(maxlen=EVENTS_TOLD)
+        self._events: deque[LoopEvent] = deque(maxlen=EVENTS_SHOWN)
 
     def take_cycle(self, record: CycleRecord) -> None:
-        """A cycle is over."""
+        """Takes a cycle."""
         self._cycles.take(record)
 
     def take_event(self, event: LoopEvent) -> None:
-        """Something happened."""
+        """Takes an event."""
         self._events.append(event)
 
-    def _place(self) -> dict[str, Any]:
+    def _position_fields(self) -> dict[str, Any]:
         row = None if self._cycles.last is None else round(self._cycles.last.index, 1)
         return {"row": row, "rows": 100, **_NO_PATH}
 
-    def _told(self) -> list[dict[str, Any]]:
+    def _event_data(self) -> list[dict[str, Any]]:
         began = self._cycles.began
         return [
             {"time_s": max(0.0, round(event.at - began, 3)), "code": event.code, "text": event.text}
@@ -307,44 +306,44 @@ class WinchStatus(MotionStatus):
 
 
 class SessionStatus(WinchStatus):
-    """Of a session of jogs."""
+    """Status of a jog session."""
 
-    def _place(self) -> dict[str, Any]:
+    def _position_fields(self) -> dict[str, Any]:
         return {"row": None, "rows": None, **_NO_PATH, **self._jogged()}
 
     @abstractmethod
     def _jogged(self) -> dict[str, Any]:
-        """What is moved, and how far."""
+        """Progress of the jogs."""
 
 
-class JogPlace(Protocol):
-    """Where a session of jogs is."""
+class JogProgress(Protocol):
+    """Progress of a jog session."""
 
     @property
     def pose(self) -> Pose:
-        """Where the platform was sent last, ``world_from_platform``."""
+        """Last commanded pose, ``world_from_platform``."""
         ...
 
     @property
     def room(self) -> float:
-        """To the end of what is proved, [m]."""
+        """Checked length ahead, [m]."""
         ...
 
     @property
     def limit(self) -> str:
-        """Why no more is proved; empty while there is more."""
+        """Why the checked line ends; empty while it may continue."""
         ...
 
 
 class JogStatus(SessionStatus):
-    """Of a session that jogs the platform."""
+    """Status of a session that jogs the platform."""
 
     def __init__(
-        self, rig: Rig, board: RequestBoard, place: JogPlace, *, simulated_time: bool
+        self, rig: Rig, board: RequestBoard, progress: JogProgress, *, simulated_time: bool
     ) -> None:
-        """A session that is being prepared."""
+        """A session in preparation."""
         super().__init__(rig, board, simulated_time=simulated_time)
-        self._jog = place
+        self._jog = progress
 
     def _jogged(self) -> dict[str, Any]:
         pose = self._jog.pose
@@ -358,44 +357,44 @@ class JogStatus(SessionStatus):
         return {"jog": jog}
 
 
-class CablePlace(Protocol):
-    """How far cables were jogged, one at a time."""
+class CableProgress(Protocol):
+    """Progress of a session of single cables."""
 
     @property
     def tension_limit(self) -> float:
-        """That no cable may have, [N]."""
+        """Largest tension of any cable, [N]."""
         ...
 
     @property
     def cable(self) -> int:
-        """That moved last, from 1; 0 for none."""
+        """Number of the cable that moved last, from 1; 0 for none."""
         ...
 
     @property
     def by_press(self) -> float:
-        """What the newest press paid out, [m]."""
+        """Length paid out by the latest press, [m]."""
         ...
 
     @property
     def by_session(self) -> list[float]:
-        """What was paid out of each cable, [m]."""
+        """Length paid out of each cable, [m]."""
         ...
 
     @property
     def limit(self) -> str:
-        """Why the cable goes on more slowly, or no further; empty while it may go on."""
+        """Why the cable slows down or stops; empty without a limit nearby."""
         ...
 
 
 class CableStatus(SessionStatus):
-    """Of a session that jogs one cable at a time."""
+    """Status of a session that jogs one cable at a time."""
 
     def __init__(
-        self, rig: Rig, board: RequestBoard, place: CablePlace, *, simulated_time: bool
+        self, rig: Rig, board: RequestBoard, progress: CableProgress, *, simulated_time: bool
     ) -> None:
-        """A session that is being prepared."""
+        """A session in preparation."""
         super().__init__(rig, board, simulated_time=simulated_time)
-        self._moved = place
+        self._moved = progress
 
     def _jogged(self) -> dict[str, Any]:
         moved = self._moved

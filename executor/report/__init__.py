@@ -1,4 +1,4 @@
-"""The report of a run: one page with the verdict, the scene, the plots and the facts."""
+"""The report of a run: one page with verdict, scene, charts and tables."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from model.files.documents import write_atomic
 
 
 def build_report(folder: RunFolder) -> Path:
-    """Makes ``report.html`` from the other files of a run folder.
+    """Creates ``report.html`` from the other files of a run folder.
 
     Args:
         folder: A run that ended (`RunFolder.open`).
 
     Returns:
-        Where the page is.
+        Path of the page.
 
     Raises:
         BadInput: A file of the run is missing or was changed, or the folder cannot be written to.

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 MOST_OBSTACLES = 6
 SMALL_POINTS = 300
-"""Of a line in one of several charts beside each other."""
+"""Points of a line in one of several small charts."""
 TOO_SMALL = 1e-6
-"""A following error that is never larger has nothing to show, [m]."""
+"""A following error below this is not plotted, [m]."""
 _NAMES = {"tag": "measured (camera)", "encoder": "encoders"}
 
 
@@ -51,13 +51,13 @@ def _line(
 
 
 def _level(name: str, value: float, run: RunData, *, fits: bool = True) -> ChartLine:
-    """A limit."""
+    """A horizontal line at a limit."""
     ends = np.array(_whole(run))
     return ChartLine(name, ends, np.full(2, value), "limit", dash=DOTTED, fits=fits)
 
 
 def _stops(run: RunData, *, named: bool = False) -> tuple[Span, ...]:
-    """The times at stops; one that is only passed has no length."""
+    """Time spans of stops; of zero length without a dwell."""
     last = float(run.cycles.time[-1])
     return tuple(
         Span(
@@ -81,7 +81,7 @@ def clearance_figure(run: RunData) -> str:
 
 
 def nearest_obstacles(clearance: ClearanceTable, most: int) -> list[int]:
-    """Up to ``most`` obstacles that came nearest, in the order of the scene."""
+    """Up to ``most`` nearest obstacles, in the order of the scene."""
     if not len(clearance) or not clearance.obstacles:
         return []
     least = np.nanmin(clearance.planned_distances, axis=0)
@@ -115,13 +115,13 @@ def _smallest(run: RunData) -> Chart:
 
 
 def _band(rows: ClearanceTable) -> tuple[Array, Array, Array]:
-    """The smallest distance, and between what the true one lies, [mm]."""
+    """The smallest distance and the bounds of the true one, [mm]."""
     low = rows.distance - rows.uncertainty
     return rows.distance * 1e3, low * 1e3, rows.at_most * 1e3
 
 
 def _difference(run: RunData) -> Chart:
-    """The best measurement less the plan; zero outside the band would be a contradiction."""
+    """The best measurement minus the plan; its band should contain zero."""
     rows = _sources(run.clearance)[0]
     planned = rows.planned_distance * 1e3
     time, off, low, high = with_gaps(rows.time, *(values - planned for values in _band(rows)))
@@ -177,7 +177,7 @@ def _clearance_text(run: RunData) -> str:
     )
 
 
-# What the drives did: cable lengths, tensions, following error, lateness of the cycles.
+# Drives: cable lengths, tensions, following error, lateness of the cycles.
 
 
 def length_figure(run: RunData) -> str:
@@ -238,7 +238,7 @@ def _tension(run: RunData, i: int, limits: str, reached: float) -> Chart:
 
 
 def timing_figure(run: RunData) -> str:
-    """Following error over time and, for a run in real time, how late cycles were; HTML."""
+    """Following error over time and, for a run in real time, lateness of cycles; HTML."""
     parts = _following(run)
     lateness = run.cycles.lateness * 1e3
     if not run.fast and np.isfinite(lateness).any():
@@ -247,7 +247,7 @@ def timing_figure(run: RunData) -> str:
 
 
 def _following(run: RunData) -> str:
-    """The worst cable over time, or one sentence where it was nothing."""
+    """The worst cable over time, or one sentence if negligible."""
     limit, error = run.rig.motion.following_error * 1e3, run.cycles.following_error
     known = error[np.isfinite(error)]
     if not known.size:
@@ -276,7 +276,7 @@ def _following(run: RunData) -> str:
 
 
 def _lateness(run: RunData, late: Array) -> Chart:
-    """How many cycles were how late, on a logarithmic scale."""
+    """Histogram of lateness, on a logarithmic scale."""
     counts, edges = np.histogram(late, bins=60)
     x = np.repeat(edges, 2)[1:-1]
     y = np.repeat(np.log10(np.maximum(counts, 0.5)), 2)
@@ -301,22 +301,22 @@ def _lateness(run: RunData, late: Array) -> Chart:
     )
 
 
-# Position over time: planned, from the drives, from the camera (paper, Fig. 11c).
+# Position over time: planned, from the encoders, from the camera (paper, Fig. 11c).
 
 
-#: Lines of single cameras, by which they are distinguished.
+#: Line styles of single cameras.
 _DASHES = (DASHED, DOTTED, DASH_DOTTED)
 
 
 def position_figure(run: RunData) -> str:
-    """x, y and z over time, and the distances from the planned position below; HTML."""
+    """x, y and z over time, and distances from the planned position; HTML."""
     return charts(*(_coordinate(run, i) for i in range(3)), _error(run))
 
 
 def _coordinate(run: RunData, i: int) -> Chart:
     cycles, poses, axis = run.cycles, run.poses, "xyz"[i]
     lines = []
-    # The camera's wide line lies under the thin ones, or it would hide them where all agree.
+    # The camera's wide line lies under the thin ones, which it would hide where all agree.
     if poses.ok.any():
         time, position = with_gaps(poses.time[poses.ok], poses.position[poses.ok, i] * 1e3)
         lines.append(ChartLine("camera", time, position, "tag", 4.5, opacity=0.45))
@@ -374,7 +374,7 @@ def _error_text(run: RunData) -> str:
     return text
 
 
-# A run at a glance, for scripts and notebooks: from the columns of its tables.
+# Overview figure for scripts and notebooks, from the columns of the tables.
 
 
 def run_figure(cycles: Mapping[str, NDArray[Any]], clearance: Mapping[str, NDArray[Any]]) -> Figure:

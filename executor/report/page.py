@@ -62,7 +62,7 @@ def _sections(run: RunData, view: RunScene) -> list[Section]:
         ("stops", "Stops", stop_table(run)),
         ("clearance", "Clearance", _clearance(run) if moved else ""),
         ("position", "Position", _position(run) if moved else ""),
-        ("frames", "Pictures", frames(run)),
+        ("frames", "Images", frames(run)),
         ("cables", "Cables", _cables(run) if moved else ""),
         ("timing", "Following and timing", _timing(run) if moved else ""),
         ("facts", "Plan, rig and bus", facts(run)),

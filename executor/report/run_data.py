@@ -1,4 +1,4 @@
-"""All that a report is made from, read once from a run folder."""
+"""Data of a report, read once from a run folder."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from model.rig import Rig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunData:
-    """A run as it lies on disk; ``alone`` is what each of several cameras measured, by its name."""
+    """A run as on disk; ``alone`` has the poses of each of several cameras, by name."""
 
     folder: RunFolder
     plan: Plan
@@ -32,7 +32,7 @@ class RunData:
 
     @property
     def fast(self) -> bool:
-        """True when time was simulated."""
+        """Whether time was simulated."""
         return bool(self.summary["fast"])
 
 
@@ -58,23 +58,23 @@ def read_run(folder: RunFolder) -> RunData:
 
 
 def _require_agreement(run: RunData) -> None:
-    """The files are of one run: the same stops."""
+    """Requires files of one run: the same stops."""
     stops = [stop.name for stop in run.plan.scene.stops]
-    said = [stop["name"] for stop in run.summary["stops"]]
-    if said != stops:
+    found = [stop["name"] for stop in run.summary["stops"]]
+    if found != stops:
         raise BadInput(
-            f"summary.json has the stops {said}, plan.json {stops}",
+            f"summary.json has the stops {found}, plan.json {stops}",
             where=str(run.folder.path),
             why="files of different runs are mixed",
             next_step=AGAIN,
         )
 
 
-# The little Markdown of the pages about faults.
+# Markdown of the pages about faults.
 
 
 def markdown(text: str) -> str:
-    """The little Markdown of the pages about faults: headings, paragraphs, code and emphasis."""
+    """Renders the Markdown of fault pages: headings, paragraphs, code and emphasis."""
     parts = []
     for block in filter(None, map(str.strip, text.split("\n\n"))):
         kind, content = ("h3", block[3:]) if block.startswith("## ") else ("p", block)

@@ -1,4 +1,4 @@
-"""The verdict, the key figures and the marks of a run at the top of its page."""
+"""Verdict, key figures and tables of a run's page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CLASS = {"PASSED": "pass", "STOPPED": "stop"}
 
 
 def verdict_banner(summary: dict[str, Any]) -> str:
-    """The verdict in a word, a sentence, and check by check."""
+    """The verdict as a word, a sentence and its checks."""
     checks = "".join(_check(check) for check in summary["checks"])
     return (
         f'<section class="verdict {_CLASS.get(summary["verdict"], "fail")}" id="verdict">'
@@ -40,7 +40,7 @@ def _check(check: dict[str, Any]) -> str:
 
 
 def chips(summary: dict[str, Any]) -> str:
-    """What kind of run it was, in a few words each."""
+    """Properties of the run, in a few words each."""
     drives = "simulated drives" if summary["simulated"] else "real drives"
     time = "simulated time" if summary["fast"] else "real time"
     words = [summary["started"].replace("T", " ").split(".")[0] + " UTC"]
@@ -53,7 +53,7 @@ def chips(summary: dict[str, Any]) -> str:
 
 
 def key_figures(summary: dict[str, Any]) -> str:
-    """The figures that a reader looks for first."""
+    """The most important figures."""
     parts = [
         tile("Path", known(summary["path_length_mm"], 0, "mm"), _path_note(summary)),
         *_clearance(summary["clearance_mm"]),
@@ -82,7 +82,7 @@ def _clearance(key: dict[str, Any] | None) -> list[str]:
 
 
 def _span(key: dict[str, Any]) -> str:
-    """Between what the smallest true clearance lies."""
+    """Bounds of the smallest true clearance."""
     if key["measured_min"] is None:
         return "–"
     low = key["measured_min"] - key["measured_uncertainty"]
@@ -118,11 +118,11 @@ def _lateness(key: dict[str, Any] | None) -> list[str]:
     return [tile("Lateness", known(key["p99"], 2, "ms"), note)]
 
 
-# The plain facts of a run: plan, rig, bus, programs, events.
+# Tables of a run: plan, rig, bus, programs, events.
 
 
 def facts(run: RunData) -> str:
-    """All tables, two beside each other where there is room."""
+    """All tables, in two columns where there is room."""
     parts = [
         ("Plan", _plan(run)),
         ("Search", _search(run)),
@@ -135,7 +135,7 @@ def facts(run: RunData) -> str:
 
 
 def stop_table(run: RunData) -> str:
-    """What was carried to each stop and on from it, and when; nothing without stops."""
+    """Payload and times at each stop; empty without stops."""
     loads = [leg.scene.load.payload_mass for leg in legs_of(run.plan.scene)]
     rows = [
         (
@@ -143,10 +143,10 @@ def stop_table(run: RunData) -> str:
             stop.kind,
             ", ".join(f"{x * 1e3:z.1f}" for x in stop.pose.position) + " mm",
             f"{before:g} → {after:g} kg",
-            known(told["reached_s"], 2, "s"),
-            known(told["left_s"], 2, "s"),
+            known(times["reached_s"], 2, "s"),
+            known(times["left_s"], 2, "s"),
         )
-        for stop, before, after, told in zip(
+        for stop, before, after, times in zip(
             run.plan.scene.stops, loads[:-1], loads[1:], run.summary["stops"], strict=True
         )
     ]
@@ -155,7 +155,7 @@ def stop_table(run: RunData) -> str:
 
 
 def camera_table(run: RunData) -> str:
-    """How each camera did; nothing of a run without one."""
+    """Statistics of each camera; empty without a camera."""
     rows = [
         (
             one["name"],
@@ -168,28 +168,28 @@ def camera_table(run: RunData) -> str:
         )
         for one in run.summary["cameras"]
     ]
-    head = ("Camera", "Source", "Poses", "Left out", "Time per image", "Alone to plan", "Failed")
+    head = ("Camera", "Source", "Poses", "Dropped", "Time per image", "Alone to plan", "Failed")
     return list_table(head, rows) if rows else ""
 
 
 def _alone(poses: PoseTable | None) -> str:
-    """How far one of several cameras saw the platform from the plan."""
+    """Distance of one camera's poses from the plan."""
     if poses is None or not poses.ok.any():
         return "–"
     return f"{float(np.sqrt(np.mean(poses.error[poses.ok] ** 2))) * 1e3:.2f} mm RMS"
 
 
 def event_table(run: RunData) -> str:
-    """What happened, in order."""
+    """All events, in order."""
     rows = [(f"{e.time_s:.2f} s", e.code, e.text, page_of(e.code)) for e in run.events]
     head = ("Time", "Event", "Text", "More about it")
-    # A narrow window has no room for a column that is empty.
+    # An empty column wastes room in a narrow window.
     shown = 4 if any(row[-1] for row in rows) else 3
     return list_table(head[:shown], [row[:shown] for row in rows])
 
 
 def fault_texts(run: RunData) -> str:
-    """The pages about the faults among the events, folded up; nothing of a run without one."""
+    """Collapsed pages about the faults among the events; empty without a fault."""
     pages = [page_text(code).split("\n", 1) for code in faults_among(e.code for e in run.events)]
     return "".join(
         f"<details><summary>{escape(title.removeprefix('# '))}</summary>{markdown(text)}</details>"
@@ -311,7 +311,7 @@ def _short(digest: str) -> str:
     return f"{kind}:{value[:16]}…" if value else digest
 
 
-# Images of the run at a few instants, with what was measured in them (paper, Fig. 12).
+# Images of the run with their measurements (paper, Fig. 12).
 
 
 COUNT = 6
@@ -320,12 +320,12 @@ _QUALITY = 80
 
 
 def frames(run: RunData) -> str:
-    """Up to six images, evenly over the kept ones; nothing for a run without images."""
+    """Up to six images, evenly spread over the kept ones; empty without images."""
     kept = [i for i, name in enumerate(run.poses.picture) if name]
     if not kept:
         return ""
-    places = np.unique(np.linspace(0, len(kept) - 1, min(COUNT, len(kept))).astype(int))
-    figures = "".join(_figure(run, kept[k]) for k in places.tolist())
+    indices = np.unique(np.linspace(0, len(kept) - 1, min(COUNT, len(kept))).astype(int))
+    figures = "".join(_figure(run, kept[k]) for k in indices.tolist())
     return f'<div class="frames">{figures}</div>'
 
 
@@ -358,10 +358,10 @@ def _measured(run: RunData, row: int) -> str:
     poses = run.poses
     if not poses.ok[row]:
         return f"No pose: {poses.status[row]}"
-    place = ", ".join(f"{value * 1e3:.1f}" for value in poses.position[row])
+    position = ", ".join(f"{value * 1e3:.1f}" for value in poses.position[row])
     tags = len(poses.tags[row].split())
     error = float(poses.error[row]) * 1e3
-    return f"{place} mm · {error:.2f} mm from the plan · {tags} tag{'s' if tags != 1 else ''}"
+    return f"{position} mm · {error:.2f} mm from the plan · {tags} tag{'s' if tags != 1 else ''}"
 
 
 def _smaller(jpeg: bytes) -> bytes:

@@ -1,1 +1,1 @@
-"""Pure decisions about safety: what may be sent, and what must stop the rig. No clock, no bus."""
+"""Pure safety decisions: which set-points may be sent, and when the rig must stop."""

@@ -1,4 +1,4 @@
-"""Every set-point passes here before it is sent. What is not explicitly allowed is denied."""
+"""The safety gate for every set-point before it is sent; denies by default."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from enum import Enum
 
 
 class Purpose(Enum):
-    """What a set-point is for."""
+    """Purpose of a set-point."""
 
     HOLD = "hold"
-    """Keep still: the targets of the cycle before, or the drives' own positions."""
+    """Keep still: the previous targets, or the drives' own positions."""
     MOVE = "move"
     """Follow the checked table."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What set-points may be, one entry a drive, [counts].
+    """Limits of set-points, one entry per drive, [counts].
 
     Attributes:
         lowest: Smallest position.
@@ -33,10 +33,10 @@ class Limits:
     largest_lag: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        """Refuses limits that do not agree: a limit that is missing would deny nothing.
+        """Refuses inconsistent limits: a missing limit would deny nothing.
 
         Raises:
-            ValueError: Not one whole number a drive everywhere, or an empty range.
+            ValueError: Not one whole number per drive in each, or an empty range.
         """
         rows = (self.lowest, self.highest, self.largest_step, self.largest_lag)
         if not self.lowest or len({len(row) for row in rows}) > 1:
@@ -53,14 +53,14 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One cycle's set-points and the state they are to be sent in.
+    """One cycle's set-points, and the state in which they would be sent.
 
     Attributes:
-        purpose: Why they are sent.
-        targets: One position a drive, [counts].
-        previous: The targets of the cycle before; None before the first.
-        actual: The drives' positions as last received, [counts].
-        armed: The checked table's hash was confirmed and the operator said go.
+        purpose: Their purpose.
+        targets: One position per drive, [counts].
+        previous: Targets of the previous cycle; None before the first.
+        actual: Last reported drive positions, [counts].
+        armed: The checked table's hash was confirmed and the operator confirmed the motion.
         enabled: All drives report that they follow.
         latched: A fault is latched.
     """
@@ -139,7 +139,7 @@ def _move(limits: Limits, request: Request) -> GateDecision:
 
 
 def _whole(values: Sequence[int]) -> bool:
-    """Whole numbers only; NaN, which every comparison lets pass, is none."""
+    """Whether all are ints; NaN, which passes every comparison, is not."""
     return all(type(value) is int for value in values)
 
 

@@ -1,4 +1,4 @@
-"""The limits that gate, watch and verdict judge by, from the rig and the checked table."""
+"""Limits for gate, monitors and verdict, from the rig and the checked table."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from executor.safety.monitor import SyncAge, WatchLimits
 from executor.safety.stall import StuckLimits
 from model.rig import Rig
 
-#: A cable is slack below this share of the least planned tension. Plans run at the least tension
-#: itself (in 6 % of the paper rig's box), and a whole count is worth 1.7 N there: not yet slack.
+#: A cable is slack below this share of the least planned tension. Plans reach the least tension
+#: itself (in 6 % of the paper rig's box), and one count changes it by 1.7 N: not yet slack.
 SLACK_SHARE = 0.5
-#: Below this share of it a cable has no tension: it is broken or slack.
+#: Below this share of it a cable has no tension: broken or slack.
 LOOSE_SHARE = 0.1
-#: Set-points are whole counts and so are positions: both together are noise of one count, and a
-#: drive is judged over 8/3 of the noise at least. See `executor.safety.stall`.
+#: Set-points and positions are whole counts: together a noise of one count. A drive is judged
+#: over at least 8/3 of the noise. See `executor.safety.stall`.
 LEAST_TRAVEL = 3
 #: A step of one count may be rounding alone, [counts].
 LEAST_STEP = 2
@@ -27,18 +27,17 @@ OVERLOAD_SHARE = 1.02
 
 
 def tension_limits(rig: Rig) -> tuple[float, float]:
-    """Below the first a cable is slack, above the second overloaded, [N]."""
+    """Tensions below which a cable is slack and above which it is overloaded, [N]."""
     return SLACK_SHARE * rig.min_tension, OVERLOAD_SHARE * rig.max_tension
 
 
 def watch_limits(rig: Rig, sync_age: SyncAge, *, slack_counts: bool = True) -> WatchLimits:
-    """When the watch speaks up.
+    """Limits of the monitor.
 
     Args:
         rig: The robot.
-        sync_age: How old the last SYNC may be.
-        slack_counts: A cable that hangs slack is wrong; otherwise only one whose tension is no
-            number.
+        sync_age: Limit on the age of the last SYNC.
+        slack_counts: Whether a slack cable is a fault; otherwise only a tension of NaN is.
     """
     low, high = tension_limits(rig)
     return WatchLimits(
@@ -51,7 +50,7 @@ def watch_limits(rig: Rig, sync_age: SyncAge, *, slack_counts: bool = True) -> W
 
 
 def stuck_limits(rig: Rig, cycle: float) -> tuple[StuckLimits, ...]:
-    """When a drive stands still, from the rig file's motion; one a drive.
+    """Limits of stall detection per drive, from the rig file's motion.
 
     Args:
         rig: The robot.
@@ -80,7 +79,7 @@ def gate_limits(rig: Rig, setpoints: NDArray[np.int32], cycle: float) -> Limits:
     speeds = np.array([w.max_speed for w in rig.winches])
     rows = setpoints.astype(np.int64)
     step = np.floor(per_metre * speeds * cycle).astype(int) + 1
-    # The actual position is of one cycle before, and the drives follow one cycle behind.
+    # The actual position is one cycle old, and the drives follow one cycle behind.
     lag = np.floor(per_metre * rig.motion.following_error).astype(int) + 2 * step
     return Limits(
         lowest=tuple((rows.min(axis=0) - margin).tolist()),

@@ -1,4 +1,4 @@
-"""Watches what the drives report and says when, and how, the rig must stop."""
+"""Monitors the drives' reports and decides when, and how, the rig must stop."""
 
 from __future__ import annotations
 
@@ -6,53 +6,52 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
-# How old the last SYNC may be when drives are commanded to follow a set-point.
+# Limit on the age of the last SYNC when drives are commanded to follow a set-point.
 #
-# A drive that misses SYNC stops by itself, and "enable operation" (0Fh) takes it out of that stop
-# again: CiA 402 transition 16 acts by level. So the sender of 0Fh must know that no drive has
+# A drive that misses SYNC stops on its own, and "enable operation" (0Fh) takes it out of that stop
+# again: CiA 402 transition 16 is level-triggered. So the sender of 0Fh must know that no drive has
 # stopped meanwhile. A drive stops `timeout` periods after the SYNC that it received last; the age
-# of that SYNC is measured here from just before it was sent, which is never less than what the
-# drive counts.
+# of that SYNC is measured here from just before it was sent, so it is never less than the drive's.
 #
 # The arithmetic, in periods, for a cycle that begins L periods late:
 #
 #     age = 1 + L                         the last SYNC belongs to the cycle before
-#     limit = timeout - margin            from this age on 0Fh is not sent
+#     limit = timeout - margin            0Fh is not sent from this age on
 #     margin = min(1/2, (timeout - 1)/2)
 #
-# The margin covers what the measurement cannot see: the new SYNC waits for the set-points before
-# it and for one foreign frame, at most 0.7 periods at the largest bus load that arming allows
-# minus the same wait of the SYNC before, and the drives' own clocks. A drive that tolerates 1.5
-# periods leaves only half a period in all; half of it is kept.
+# The margin covers what is not measured: the new SYNC waits for the set-points before it and for
+# one foreign frame, at most 0.7 periods at the largest bus load that arming allows minus the same
+# wait of the previous SYNC; and the drives' clocks. A drive that tolerates 1.5 periods leaves only
+# half a period in all; half of it is the margin.
 #
 # Source: CiA 301 (communication cycle period, 1006h), CiA 402-2 (transition 16). Pure.
 
 
-#: Periods without SYNC after which drives stop by themselves unless their profile says otherwise.
+#: Periods without SYNC after which drives stop on their own unless their profile says otherwise.
 USUAL_TIMEOUT = 3.0
-#: A drive less patient than this could not be kept going, in periods.
+#: Shortest time-out of a drive that can be kept enabled, in periods.
 LEAST_TIMEOUT = 1.1
 #: The largest margin, in periods.
 MARGIN = 0.5
-#: Age from which the operator hears of a late cycle and the motion stops along the path, periods.
+#: Age from which a late cycle is reported and causes a path stop, in periods.
 LATE_AGE = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class SyncAge:
-    """The rule for drives with one time-out.
+    """Limit on the age of SYNC for drives with a common time-out.
 
     Attributes:
-        timeout: Periods without SYNC after which a drive stops by itself, at least 1.1.
+        timeout: Periods without SYNC after which a drive stops on its own, at least 1.1.
     """
 
     timeout: float = USUAL_TIMEOUT
 
     def __post_init__(self) -> None:
-        """Refuses a time-out that no cycle could keep.
+        """Refuses a time-out that no cycle could meet.
 
         Raises:
-            ValueError: It leaves no room beside one period.
+            ValueError: It is not longer than one period by enough.
         """
         if not self.timeout >= LEAST_TIMEOUT:
             raise ValueError(
@@ -61,25 +60,25 @@ class SyncAge:
 
     @property
     def margin(self) -> float:
-        """Kept before the time-out, in periods."""
+        """Margin before the time-out, in periods."""
         return min(MARGIN, (self.timeout - 1.0) / 2.0)
 
     @property
     def limit(self) -> float:
-        """From this age of the last SYNC on no drive is commanded to follow, in periods."""
+        """Age of the last SYNC from which no drive is commanded to follow, in periods."""
         return self.timeout - self.margin
 
     def may_enable(self, age: float) -> bool:
-        """Whether 0Fh may be sent with the next SYNC; not when the age is no number."""
+        """Whether 0Fh may be sent with the next SYNC; False for NaN."""
         return age < self.limit
 
 
-#: Missing replies in a row that are one too many.
+#: Consecutive missing replies that are a fault.
 MISSING_CYCLES = 2
 
 
 class StopReaction(IntEnum):
-    """What a finding asks for; of several the larger one is done."""
+    """Reaction that an alarm requires; the largest one wins."""
 
     NOTE = 0
     PATH_STOP = 1
@@ -88,13 +87,13 @@ class StopReaction(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """Something that the watch saw.
+    """A condition found by a monitor.
 
     Attributes:
-        reaction: What must happen.
-        code: Stable name.
-        text: What, where, measured value and limit.
-        drive: Which cable and drive it is about, counted from 1 as in the rig file; 0 for all.
+        reaction: Required reaction.
+        code: Stable code.
+        text: Condition, measured value and limit.
+        drive: Number of the cable and drive, from 1 as in the rig file; 0 for all.
     """
 
     reaction: StopReaction
@@ -105,19 +104,19 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class WatchLimits:
-    """When the watch speaks up.
+    """Limits of the monitor.
 
     Attributes:
         following_error: Cable length, [m].
         min_tension: Slack below this, [N].
         max_tension: Over-tension above this, [N].
         no_tension: Below this a cable is broken or slack, [N].
-        slack_cycles: Cycles of slack or over-tension that are one too many.
-        loose_cycles: Cycles without tension that are one too many.
-        missing_cycles: Missing replies in a row that are one too many.
-        late_periods: Lateness, in cycles, from which on the path stops.
-        gone_periods: Lateness, in cycles, from which on drives may have stopped by themselves, as
-            SYNC stayed away: no set-point may follow. See `executor.safety.monitor`.
+        slack_cycles: Consecutive cycles of slack or over-tension that cause an alarm.
+        loose_cycles: Consecutive cycles without tension that cause an alarm.
+        missing_cycles: Consecutive missing replies that cause a quick stop.
+        late_periods: Lateness, in cycles, that causes a path stop.
+        gone_periods: Lateness, in cycles, after which drives may have stopped on their own for
+            lack of SYNC: no set-point may follow. See `SyncAge`.
     """
 
     following_error: float
@@ -133,19 +132,18 @@ class WatchLimits:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One cycle as it came back; one entry a drive.
+    """The replies of one cycle; one entry per drive.
 
     Attributes:
-        following: True when the drives follow their set-points; otherwise following errors and
-            tensions say nothing and are not judged.
+        following: Whether the drives follow their set-points; otherwise following errors and
+            tensions are not judged.
         following_errors: Signed, in cable length, [m].
         tensions: From the drives' torque, [N].
         missing: True where a drive did not answer.
-        faults: What drives reported as wrong: which drive, counted from 1, or 0 for the bus, and
-            the text.
+        faults: Reported faults: number of the drive, from 1, or 0 for the bus, and the text.
         lateness: How late the cycle began, in cycles.
-        warnings: What drives that stay enabled reported: which drive, counted from 1, the text, and
-            whether the path must stop for it.
+        warnings: Reported by drives that stay enabled: number of the drive, from 1, the text, and
+            whether it requires a path stop.
     """
 
     following: bool
@@ -159,7 +157,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Monitor:
-    """Counts in a row, per drive; `look` returns the next watch and what was found."""
+    """Counts of consecutive cycles per drive; `update` returns the next state and alarms."""
 
     limits: WatchLimits
     names: tuple[str, ...]
@@ -170,15 +168,15 @@ class Monitor:
 
     @classmethod
     def fresh(cls, limits: WatchLimits, names: Sequence[str]) -> Monitor:
-        """A watch that has seen nothing, of drives that are called so."""
+        """The initial state, for drives of these names."""
         zeros = (0,) * len(names)
         return cls(limits, tuple(names), zeros, zeros, zeros, zeros)
 
-    def look(self, seen: Observation) -> tuple[Monitor, tuple[Alarm, ...]]:
-        """Takes in one cycle.
+    def update(self, seen: Observation) -> tuple[Monitor, tuple[Alarm, ...]]:
+        """Evaluates one cycle.
 
         Raises:
-            ValueError: Not one entry for every drive; one that is missing would hide a fault.
+            ValueError: Not one entry per drive: a missing one would hide a fault.
         """
         limits = self.limits
         counts = {len(seen.following_errors), len(seen.tensions), len(seen.missing)}
@@ -186,11 +184,11 @@ class Monitor:
             raise ValueError(
                 f"the monitor was given {counts} entries for {len(self.missing)} drives"
             )
-        # "Not at least" and "not at most", so that a tension that is no number counts as wrong.
+        # "not ... >=" and "not ... <=", so that NaN counts as wrong.
         slack = [seen.following and not t >= limits.min_tension for t in seen.tensions]
         loose = [seen.following and not t >= limits.no_tension for t in seen.tensions]
         over = [seen.following and not t <= limits.max_tension for t in seen.tensions]
-        # A drive that did not answer says nothing new about its tension.
+        # The tension of a drive that did not answer is unknown.
         watch = Monitor(
             limits,
             self.names,
@@ -228,7 +226,7 @@ class Monitor:
         for drive, error in enumerate(seen.following_errors, start=1):
             if not seen.following or seen.missing[drive - 1]:
                 continue
-            # "Not at most", so that an error that is no number counts as too large.
+            # "not ... <=", so that NaN counts as too large.
             if not abs(error) <= self.limits.following_error:
                 text = (
                     f"cable {drive} is {error * 1000:.2f} mm from its set-point,"
@@ -253,9 +251,9 @@ class Monitor:
         return found
 
     def lateness(self, cycles: float) -> list[Alarm]:
-        """What a cycle that begins so late asks for, before anything is sent in it."""
+        """Alarms of a cycle that begins this late, before anything is sent in it."""
         text = f"a cycle began {cycles:.1f} cycles late"
-        if not cycles < self.limits.gone_periods:  # also when it is no number
+        if not cycles < self.limits.gone_periods:  # also for NaN
             return [Alarm(StopReaction.QUICK_STOP, "late", text)]
         if cycles >= self.limits.late_periods:
             return [Alarm(StopReaction.PATH_STOP, "late", text)]
@@ -265,7 +263,7 @@ class Monitor:
 def _counted(
     before: Sequence[int], now: Sequence[bool], unknown: Sequence[bool]
 ) -> tuple[int, ...]:
-    """Counts in a row; where nothing is known the count stays."""
+    """Counts of consecutive hits; unchanged where the state is unknown."""
     return tuple(
         count if hidden else (count + 1 if hit else 0)
         for count, hit, hidden in zip(before, now, unknown, strict=True)

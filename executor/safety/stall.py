@@ -1,18 +1,18 @@
-"""Notices a drive that stands still while its set-points go on: jammed, deaf, or its reply old.
+"""Detects a stalled drive: at rest while its set-points advance, or its replies stale.
 
-The following error reports the same, but only when millimetres are lost.
+The following error detects the same, but only after millimetres are lost.
 
-A drive is judged over the shortest stretch of its last replies, two cycles at least, in which its
-set-points went on by `travel`. What its position did meanwhile, as a share of what its set-points
-did, is 1 for a drive that follows and 0 for one that stands still; noise of the position of at most
-+-n changes that share by 2 n / travel. So with the shares below
+A drive is judged over the shortest window of its last replies, two cycles at least, in which its
+set-points advanced by `travel`. The travel of its position, as a share of that of its set-points,
+is 1 for a drive that follows and 0 for one that has stalled; position noise of at most ±n changes
+that share by 2 n / travel. So with the shares below
 
-    n <= 3/8 travel    a drive that follows is never found
-    n <  1/8 travel    a drive that stands still is found as soon as its set-points went on by
-                       `travel` (and by two cycles) without it
+    n <= 3/8 travel    a drive that follows is never reported
+    n <  1/8 travel    a stalled drive is reported as soon as its set-points have advanced by
+                       `travel` (and two cycles) without it
 
-Only motion one way is judged, at a speed that friction does not eat up (`least`), and only of a
-drive that was seen to follow since: at the begin of a motion a servo lags.
+Only motion in one direction is judged, above a speed that friction may absorb (`least`), and only
+of a drive that has followed since: at the start of a motion a servo lags.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from dataclasses import dataclass, replace
 
 from executor.safety.monitor import Alarm, StopReaction
 
-#: A drive that moves by less than this share of what its set-points move stands still.
-STANDING_SHARE = 0.25
-#: A drive that moved by at least this share of it was following.
+#: A drive that moves by less than this share of its set-points' travel is stalled.
+STALLED_SHARE = 0.25
+#: A drive that moves by at least this share of it is following.
 FOLLOWING_SHARE = 0.5
-#: Cycles of standing still that are one too many; one alone is what a lost set-point leaves.
+#: Stalled cycles that are a fault; a single one is the effect of a lost set-point.
 STUCK_CYCLES = 2
 
 
 @dataclass(frozen=True, slots=True)
 class StuckLimits:
-    """What is judged of one drive.
+    """Stall limits of one drive.
 
     Attributes:
-        least: Steps of set-points from cycle to cycle below this say nothing, [counts].
-        travel: Set-points must go on by this before anything is judged, [counts].
+        least: Smaller set-point steps from cycle to cycle are not judged, [counts].
+        travel: Travel of the set-points over which a drive is judged, [counts].
     """
 
     least: int
@@ -45,98 +45,98 @@ class StuckLimits:
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What is known of one drive.
+    """Stall detection of one drive.
 
     Attributes:
-        limits: What is judged.
-        replies: Position and demand of each reply of the stretch, [counts]; the oldest first.
-        followed: It was seen to follow; a drive that has not yet begun to move is not judged.
-        standing: Cycles in which it stood still, until the last reply; 0 for a drive that moves.
+        limits: Its limits.
+        replies: Position and demand of each reply in the window, [counts]; the oldest first.
+        followed: It has followed; a drive that has not yet begun to move is not judged.
+        stalled: Stalled cycles up to the last reply; 0 for a drive that moves.
     """
 
     limits: StuckLimits
     replies: tuple[tuple[int, int], ...] = ()
     followed: bool = False
-    standing: int = 0
+    stalled: int = 0
 
     def seen(self, position: int, demand: int) -> Drive:
-        """After one more reply."""
-        if not self.replies or not self._goes_on(demand - self.replies[-1][1]):
+        """The state after one more reply."""
+        if not self.replies or not self._advances(demand - self.replies[-1][1]):
             return Drive(self.limits, ((position, demand),))
-        replies = self._stretch((*self.replies, (position, demand)))
+        replies = self._window((*self.replies, (position, demand)))
         share = self._share(replies)
-        if share is None:  # and none that followed: its stretch is never too short again
+        if share is None:  # `followed` is False here: once set, the window is never too short again
             return Drive(self.limits, replies)
-        if self.followed and share < STANDING_SHARE:
+        if self.followed and share < STALLED_SHARE:
             return Drive(self.limits, replies, True, len(replies) - 1)
         followed = self.followed or share >= FOLLOWING_SHARE
         return Drive(self.limits, replies, followed, int(followed and self._misses_step(replies)))
 
-    def _goes_on(self, step: int) -> bool:
-        """The set-points move far enough, and the way they moved before."""
+    def _advances(self, step: int) -> bool:
+        """Whether the set-points move far enough, in the same direction as before."""
         before = self.replies[-1][1] - self.replies[0][1]
         return abs(step) >= self.limits.least and step * before >= 0
 
-    def _stretch(self, replies: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
-        """Without the oldest ones that are not needed."""
+    def _window(self, replies: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+        """The window: replies without the oldest that are not needed."""
         demand = replies[-1][1]
         while len(replies) > STUCK_CYCLES + 1 and abs(demand - replies[1][1]) >= self.limits.travel:
             replies = replies[1:]
         return replies
 
     def _share(self, replies: tuple[tuple[int, int], ...]) -> float | None:
-        """Of the set-points' travel that the drive made; None while it is too short."""
+        """Share of the set-points' travel that the drive made; None while it is too short."""
         (first, begin), (last, end) = replies[0], replies[-1]
         if len(replies) <= STUCK_CYCLES or abs(end - begin) < self.limits.travel:
             return None
         return (last - first) / (end - begin)
 
     def _misses_step(self, replies: tuple[tuple[int, int], ...]) -> bool:
-        """It stood still in the last cycle, whose step alone is larger than noise."""
+        """Whether it stalled in the last cycle, whose step alone exceeds the noise."""
         (first, begin), (last, end) = replies[-2:]
         if abs(end - begin) < self.limits.travel:
             return False
-        return (last - first) / (end - begin) < STANDING_SHARE
+        return (last - first) / (end - begin) < STALLED_SHARE
 
     def forgotten(self) -> Drive:
-        """While the drive follows nothing."""
+        """The state while the drive follows no set-points."""
         return Drive(self.limits)
 
 
 @dataclass(frozen=True, slots=True)
 class StuckWatch:
-    """All drives; `look` returns the next watch and what was found."""
+    """Stall detection of all drives; `update` returns the next state and alarms."""
 
     drives: tuple[Drive, ...]
     names: tuple[str, ...]
 
     @classmethod
     def fresh(cls, limits: Sequence[StuckLimits], names: Sequence[str]) -> StuckWatch:
-        """A watch that has seen nothing.
+        """The initial state.
 
         Args:
-            limits: What is judged, one a drive.
-            names: What the drives are called.
+            limits: One per drive.
+            names: Of the drives.
         """
         return cls(tuple(Drive(each) for each in limits), tuple(names))
 
-    def look(
+    def update(
         self,
         following: bool,
         positions: Sequence[int],
         demands: Sequence[int],
         missing: Sequence[bool],
     ) -> tuple[StuckWatch, tuple[Alarm, ...]]:
-        """Takes in one cycle; one entry a drive.
+        """Evaluates one cycle; one entry per drive.
 
         Args:
-            following: The drives follow set-points; otherwise nothing is judged.
+            following: Whether the drives follow set-points; otherwise nothing is judged.
             positions: Actual positions, [counts].
-            demands: Where the drives were to be when they reported them, [counts].
-            missing: True where a drive did not answer; it says nothing new.
+            demands: Demanded positions at the time of those reports, [counts].
+            missing: True where a drive did not answer.
 
         Raises:
-            ValueError: Not one entry for every drive.
+            ValueError: Not one entry per drive.
         """
         if not following:
             return replace(self, drives=tuple(drive.forgotten() for drive in self.drives)), ()
@@ -146,14 +146,14 @@ class StuckWatch:
             for drive, position, demand, silent in rows
         )
         found = [
-            _finding(number, self.names[number - 1], drive.standing)
+            _alarm(number, self.names[number - 1], drive.stalled)
             for number, (drive, silent) in enumerate(zip(drives, missing, strict=True), start=1)
-            if drive.standing and not silent
+            if drive.stalled and not silent
         ]
         return replace(self, drives=drives), tuple(found)
 
 
-def _finding(number: int, name: str, cycles: int) -> Alarm:
+def _alarm(number: int, name: str, cycles: int) -> Alarm:
     text = f"{name} did not move for {cycles} cycle{'s' if cycles > 1 else ''}"
     text += " while its set-points advanced"
     if cycles < STUCK_CYCLES:

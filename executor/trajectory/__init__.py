@@ -1,1 +1,1 @@
-"""From a verified plan to checked set-points."""
+"""Trajectories: from a verified plan to checked set-points."""

@@ -1,9 +1,8 @@
-"""Where in the set-point table the platform stands at the scene's stops, and proof that it may.
+"""Dwells of the set-point table at the scene's stops, and the check of its loads.
 
-Between two stops a table is for one load. While the platform stands at a pick or place, the planned
-tensions go evenly from those that hold the one load to those that hold the other; whatever part of
-the change has happened, tensions within the limits hold it, as the wrenches they can give are a
-convex set.
+Between two stops a table is for one load. During a pick or put-down, the planned tensions change
+linearly from those that hold the old load to those that hold the new one; at any stage of the
+change tensions within the limits hold it, as the feasible wrenches are a convex set.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ from model.rig import Rig
 from model.scene import Load, Scene, legs_of
 from model.statics.gravity import gravity_wrench
 
-#: How far planned tensions may be from holding the load, [N] and [N·m].
+#: Largest residual wrench of planned tensions and load, [N] and [N·m].
 HOLDING_ACCURACY = 1e-4
-#: How far a stand may be from its stop, [m] and [rad].
-STANDING_ACCURACY = 1e-6
+#: Largest distance of a dwell from its stop, [m] and [rad].
+DWELL_ACCURACY = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Dwell:
-    """Rows of a table at one stop; a single row where nothing is waited for.
+    """Rows of a table at one stop; a single row without a dwell time.
 
     Attributes:
         first: Row at which the stop is reached.
-        last: Row from which the way goes on.
+        last: Row after which the platform moves on.
     """
 
     first: int
@@ -41,61 +40,61 @@ class Dwell:
 
 
 def rows_of(dwell: float, cycle: float) -> int:
-    """Cycles that a dwell [s] takes, never less than asked for."""
+    """Cycles of a dwell [s], rounded up."""
     return int(np.ceil(dwell / cycle - 1e-9))
 
 
 def legs_at(
-    stands: Sequence[Dwell], places: Array
+    dwells: Sequence[Dwell], indices: Array
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """Legs, counted from 1, at places in the table; a dwell belongs to the leg that led there."""
-    lasts = np.array([stand.last for stand in stands], dtype=np.float64)
-    return 1 + np.searchsorted(lasts, places, side="right").astype(np.int64)
+    """Leg numbers, from 1, at table indices; a dwell belongs to the leg before it."""
+    lasts = np.array([dwell.last for dwell in dwells], dtype=np.float64)
+    return 1 + np.searchsorted(lasts, indices, side="right").astype(np.int64)
 
 
-def order_violations(scene: Scene, stands: Sequence[Dwell], rows: int) -> list[str]:
-    """Stands that are not one for each stop, in order, within the table."""
-    bounds = [row for stand in stands for row in (stand.first, stand.last)]
-    if len(stands) != len(scene.stops):
-        return [f"the table rests at {len(stands)} stops, the scene has {len(scene.stops)}"]
+def order_violations(scene: Scene, dwells: Sequence[Dwell], rows: int) -> list[str]:
+    """Violations of one dwell per stop, in order, within the table."""
+    bounds = [row for dwell in dwells for row in (dwell.first, dwell.last)]
+    if len(dwells) != len(scene.stops):
+        return [f"the table rests at {len(dwells)} stops, the scene has {len(scene.stops)}"]
     if any(a > b for a, b in pairwise([0, *bounds, rows - 1])):
         return [f"the table rests at the rows {bounds} of {rows}, which are out of order"]
     return []
 
 
-def stand_violations(
-    scene: Scene, stands: Sequence[Dwell], poses: Sequence[Pose], cycle: float
+def dwell_violations(
+    scene: Scene, dwells: Sequence[Dwell], poses: Sequence[Pose], cycle: float
 ) -> list[str]:
-    """Stands that are elsewhere than their stop, or shorter than its dwell."""
+    """Dwells that are not at their stop, or too short."""
     found = []
-    for stop, stand in zip(scene.stops, stands, strict=True):
-        there = poses[stand.first : stand.last + 1]
+    for stop, dwell in zip(scene.stops, dwells, strict=True):
+        there = poses[dwell.first : dwell.last + 1]
         off = max(pose.distance_to(stop.pose) for pose in there)
-        turned = max(pose.angle_to(stop.pose) for pose in there)
-        if not max(off, turned) <= STANDING_ACCURACY:
+        angle = max(pose.angle_to(stop.pose) for pose in there)
+        if not max(off, angle) <= DWELL_ACCURACY:
             found.append(
                 f"at stop {stop.name!r} the table is {off * 1000:.4f} mm and"
-                f" {np.degrees(turned):.4f}° off"
+                f" {np.degrees(angle):.4f}° off"
             )
-        stands_for = (stand.last - stand.first) * cycle
-        if not stands_for >= stop.dwell - 1e-9:
+        duration = (dwell.last - dwell.first) * cycle
+        if not duration >= stop.dwell - 1e-9:
             found.append(
-                f"at stop {stop.name!r} the table rests for {stands_for:g} s,"
+                f"at stop {stop.name!r} the table rests for {duration:g} s,"
                 f" required {stop.dwell:g} s"
             )
     return found
 
 
 def load_violations(
-    rig: Rig, scene: Scene, stands: Sequence[Dwell], poses: Sequence[Pose], tensions: Array
+    rig: Rig, scene: Scene, dwells: Sequence[Dwell], poses: Sequence[Pose], tensions: Array
 ) -> list[str]:
-    """Rows whose planned tensions do not hold what hangs there; the worst of each leg and stand.
+    """Rows whose planned tensions do not hold the load; the worst of each leg and dwell.
 
     Args:
         rig: The robot.
         scene: Its loads.
-        stands: In order.
-        poses: One a row.
+        dwells: In order.
+        poses: One per row.
         tensions: Planned, shape (n, m), [N].
     """
     positions = np.array([pose.position for pose in poses])
@@ -104,14 +103,14 @@ def load_violations(
     matrices = structure_matrix_of(cables_to(rig, anchors), positions)
     given = np.einsum("nij,nj->ni", matrices, tensions)
     legs = legs_of(scene)
-    bounds = [0, *(row for stand in stands for row in (stand.first, stand.last)), len(poses) - 1]
+    bounds = [0, *(row for dwell in dwells for row in (dwell.first, dwell.last)), len(poses) - 1]
     found = []
     for number, leg in enumerate(legs):
         rows = slice(bounds[2 * number], bounds[2 * number + 1] + 1)
         missing = given[rows] + _weights(rig, leg.scene.load, rotations[rows])
         found += _missing(missing, rows.start, f"from {leg.begin} to {leg.end}")
-    for stand, before, after in zip(stands, legs[:-1], legs[1:], strict=True):
-        rows = slice(stand.first, stand.last + 1)
+    for dwell, before, after in zip(dwells, legs[:-1], legs[1:], strict=True):
+        rows = slice(dwell.first, dwell.last + 1)
         weights = [_weights(rig, leg.scene.load, rotations[rows]) for leg in (before, after)]
         missing = _least(given[rows] + weights[0], weights[1] - weights[0])
         found += _missing(missing, rows.start, f"at {before.end}")
@@ -129,7 +128,7 @@ def _weights(rig: Rig, load: Load, rotations: Array) -> Array:
 
 
 def _least(missing: Array, change: Array) -> Array:
-    """What is missing where the best part of a change has happened, shape (n, 6)."""
+    """Smallest residual over all stages of a load change, shape (n, 6)."""
     size = np.sum(change * change, axis=1)
     share = -np.sum(missing * change, axis=1) / np.where(size > 0.0, size, 1.0)
     least: Array = missing + np.clip(share, 0.0, 1.0)[:, None] * change
@@ -145,7 +144,7 @@ def _missing(missing: Array, begin: int, where: str) -> list[str]:
     return [f"row {begin + worst}: planned tensions miss the load {where} by {size}"]
 
 
-# What is due at places of the table: announcements of stops, and changes of what is carried.
+# Events due at table indices: announcements of stops, and changes of the load.
 
 
 Thing = TypeVar("Thing")
@@ -154,47 +153,47 @@ _HAPPENS = {"pick": "is picked up", "place": "is put down"}
 
 
 class Schedule(Generic[Thing]):
-    """Hands out each thing once, when a run comes to its place in the table."""
+    """Returns each item once, when the run reaches its table index."""
 
     def __init__(self, things: Sequence[tuple[float, Thing]]) -> None:
-        """Places, rows or between two of them, and what is due there; in order."""
+        """Takes table indices, which may lie between rows, and their items; in order."""
         self._things = list(things)
 
-    def due(self, place: float) -> list[Thing]:
-        """What is due up to a place and was not handed out before."""
-        count = sum(1 for at, _ in self._things if at <= place)
+    def due(self, index: float) -> list[Thing]:
+        """Items due up to this index and not returned before."""
+        count = sum(1 for at, _ in self._things if at <= index)
         due, self._things = self._things[:count], self._things[count:]
         return [thing for _, thing in due]
 
 
-def stop_events(scene: Scene, stands: Sequence[Dwell]) -> Schedule[tuple[str, str]]:
-    """A stable short name and a sentence when a stop is reached, and when a dwell is over."""
+def stop_events(scene: Scene, dwells: Sequence[Dwell]) -> Schedule[tuple[str, str]]:
+    """Code and text of events at the beginning and end of each dwell."""
     due: list[tuple[float, tuple[str, str]]] = []
     carried = [leg.scene.load.payload_mass for leg in legs_of(scene)]
-    for number, (stop, stand) in enumerate(zip(scene.stops, stands, strict=True)):
+    for number, (stop, dwell) in enumerate(zip(scene.stops, dwells, strict=True)):
         text = f"at stop {stop.name!r}"
         if stop.dwell > 0.0:
             text += f", resting for {stop.dwell:g} s"
         if stop.kind in _HAPPENS:
             changed = abs(carried[number + 1] - carried[number])
             text += f" while {changed:g} kg {_HAPPENS[stop.kind]}"
-        due.append((stand.first, (stop.kind, text)))
+        due.append((dwell.first, (stop.kind, text)))
         if stop.dwell > 0.0:
             text = f"continuing from stop {stop.name!r}, carrying {carried[number + 1]:g} kg"
-            due.append((stand.last, ("leaving", text)))
+            due.append((dwell.last, ("leaving", text)))
     return Schedule(due)
 
 
-def load_changes(scene: Scene, stands: Sequence[Dwell]) -> Schedule[Load]:
-    """What is carried on from each pick and place.
+def load_changes(scene: Scene, dwells: Sequence[Dwell]) -> Schedule[Load]:
+    """Load after each pick and put-down, due at the middle of its dwell.
 
-    When in its dwell that happens is not given; in the middle, the planned tensions are there, too.
+    The time within the dwell is not specified; in the middle the planned tensions change as well.
     """
     loads = [leg.scene.load for leg in legs_of(scene)][1:]
     return Schedule(
         [
-            ((stand.first + stand.last) / 2.0, load)
-            for stop, stand, load in zip(scene.stops, stands, loads, strict=True)
+            ((dwell.first + dwell.last) / 2.0, load)
+            for stop, dwell, load in zip(scene.stops, dwells, loads, strict=True)
             if stop.kind in _HAPPENS
         ]
     )

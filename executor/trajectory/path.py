@@ -1,6 +1,6 @@
 """The geometric path: straight segments and rounded corners, by travelled length.
 
-Every segment is a Bézier curve in the chart of one rotation R₀: a point (p, r) of R⁶ stands for the
+Every segment is a Bézier curve in the chart of one rotation R₀: a point (p, r) of R⁶ is the
 pose (p, R₀ exp[r]). Straight moves with a constant axis of rotation are straight lines there, so a
 corner's curve meets its two neighbours with the same direction and with zero curvature.
 
@@ -26,9 +26,9 @@ from model.pose import (
 )
 
 CORNER_SAMPLES = 257
-#: Where the control points of a corner stand on its two legs, in shares of the leg.
+#: Control points of a corner along its two legs, as shares of the leg.
 _SHARES = (1.0, 0.6, 0.2)
-#: Distance from a corner's point to the middle of its curve: this share of the sum of its legs,
+#: Distance from a corner point to the middle of its curve, as a share of the sum of its legs:
 #: (1·1 + 5·0.6 + 10·0.2)/32, the legs' weights at the middle of a quintic.
 MIDDLE_SHARE = 6.0 / 32.0
 
@@ -40,7 +40,7 @@ class Segment:
     Attributes:
         chart: Rotation R₀, shape (3, 3).
         control: Control points (position [m], rotation vector [rad]), shape (2 or 6, 6).
-        weight: ρ, metres of path for a radian of rotation.
+        weight: ρ, metres of path per radian of rotation.
     """
 
     chart: Array
@@ -49,7 +49,7 @@ class Segment:
 
     @property
     def straight(self) -> bool:
-        """True for a line, False for a rounded corner."""
+        """Whether it is a line, not a rounded corner."""
         return len(self.control) == 2
 
     @cached_property
@@ -62,7 +62,7 @@ class Segment:
 
     @cached_property
     def _speeds(self) -> Array:
-        """Length for a unit of the parameter at even parameters, shape (CORNER_SAMPLES,), [m]."""
+        """Length per unit of the parameter at even parameters, shape (CORNER_SAMPLES,), [m]."""
         speeds: Array = np.linalg.norm(self._derivative(1, self._even), axis=1)
         return speeds
 
@@ -85,8 +85,8 @@ class Segment:
     def bends(self) -> tuple[float, float]:
         """Largest second and third derivative of the curve by its length, [1/m] and [1/m²].
 
-        At a speed v along it they make an acceleration of v² times the first and a jerk of v³
-        times the second, translation and rotation together.
+        At a path speed v they cause an acceleration of v² times the first and a jerk of v³ times
+        the second, translation and rotation together.
         """
         if self.straight:
             return 0.0, 0.0
@@ -108,7 +108,7 @@ class Segment:
         return _bezier(control, parameters)
 
     def _parameters(self, travelled: Array) -> Array:
-        """Where on the curve a length is reached: cubic between even parameters, slopes exact."""
+        """Curve parameters at given lengths: cubic between even parameters, exact slopes."""
         if self.length == 0.0:
             return np.zeros_like(travelled)
         if self.straight:
@@ -131,7 +131,7 @@ class Segment:
 
 
 def metric(weight: float) -> Array:
-    """Metres of path for each coordinate of (position, rotation vector), shape (6,)."""
+    """Metres of path per unit of each coordinate (position, rotation vector), shape (6,)."""
     return np.array([1.0, 1.0, 1.0, weight, weight, weight])
 
 
@@ -194,19 +194,19 @@ def line(start: Pose, end: Pose, weight: float) -> Segment:
 
 
 def corner(before: Pose, at: Pose, after: Pose, weight: float) -> Segment:
-    """The rounded corner from ``before`` to ``after``, points of the two lines that meet at ``at``.
+    """The rounded corner from ``before`` to ``after``, points on two lines that meet at ``at``.
 
-    Its middle is `MIDDLE_SHARE` of the sum of the two legs away from the corner point; with legs
-    of the same length no point of it is farther from the two lines.
+    Its middle is at a distance of `MIDDLE_SHARE` times the sum of the two legs from the corner
+    point; with legs of equal length no point of it is farther from the two lines.
 
     Raises:
-        ValueError: The path turns straight back, so that no smooth curve follows it.
+        ValueError: The path reverses, so that no smooth curve follows it.
     """
     corner_point = _in_chart(at, at)
     legs = [_in_chart(at, end) - corner_point for end in (before, after)]
     apart, *sizes = np.linalg.norm([legs[0] - legs[1], *legs] * metric(weight), axis=1)
     if apart <= 1e-6 * sum(sizes):
-        raise ValueError("a path that turns straight back cannot be rounded")
+        raise ValueError("a corner at which the path reverses cannot be rounded")
     control = [corner_point + share * legs[0] for share in _SHARES]
     control += [corner_point + share * legs[1] for share in reversed(_SHARES)]
     return Segment(at.rotation, np.array(control), weight)
@@ -233,17 +233,17 @@ def poses_of(positions: Array, rotations: Array) -> list[Pose]:
     return [Pose(p, r) for p, r in zip(positions, rotations, strict=True)]
 
 
-# Rounds the corners of a plan as far as the tolerance and the clearance allow.
+# Rounding of a plan's corners, as far as tolerance and clearance allow.
 
 
-#: A corner takes at most this share of each neighbouring line, so that corners never meet.
+#: A corner uses at most this share of each adjacent line, so that corners never meet.
 LONGEST_SHARE = 0.45
-#: How often a corner that is too tight is halved before the path stops at it instead.
+#: Halvings of a too tight corner before the path stops at it instead.
 HALVINGS = 5
 #: A turn of more than 105° is not rounded: its curve is so tight that a stop takes less time
-#: (measured for both ready rigs), and that of a turn straight back has no direction at all.
+#: (measured for both example rigs), and a reversal has no smooth curve.
 SHARPEST_TURN = float(np.radians(105.0))
-#: Waypoints that change the path by less are left out, [m] and [rad].
+#: Waypoints that change the path by less are dropped, [m] and [rad].
 SAME = 1e-9
 
 IsAllowed = Callable[[Sequence[Pose]], bool]
@@ -255,15 +255,14 @@ def rounded(
     """The path through waypoints with rounded corners.
 
     Rounding cuts a corner on its inner side, where an obstacle usually is. Each corner is therefore
-    checked; one that is too tight is rounded less, and if nothing helps the path goes through the
-    corner itself and stops there.
+    checked; one that is too tight is rounded less, or else the path stops at the corner itself.
 
     Args:
         waypoints: At least two poses, ``world_from_platform``.
         tolerance: Largest distance of a rounded corner from the sharp one, rotation counted as
-            ``weight`` metres for a radian, [m]; 0 keeps all sharp.
-        weight: Metres of path for a radian of rotation.
-        is_allowed: Returns whether all of some dense poses keep the scene's clearances.
+            ``weight`` metres per radian, [m]; 0 keeps all sharp.
+        weight: Metres of path per radian of rotation.
+        is_allowed: Returns whether dense poses all keep the scene's clearances.
     """
     points = _needed(waypoints, weight)
     segments: list[Segment] = []
@@ -282,12 +281,12 @@ def rounded(
 
 
 def _needed(waypoints: Sequence[Pose], weight: float) -> list[Pose]:
-    """Waypoints without repeats and without those on the way between their neighbours."""
+    """Waypoints without repeats and without those on the line between their neighbours."""
     kept = [waypoints[0]]
     for pose in waypoints[1:]:
         if _same(pose, kept[-1]):
             continue
-        if len(kept) > 1 and _on_the_way(kept[-2], kept[-1], pose, weight):
+        if len(kept) > 1 and _is_between(kept[-2], kept[-1], pose, weight):
             kept.pop()
         kept.append(pose)
     return kept if len(kept) > 1 else [waypoints[0], waypoints[-1]]
@@ -297,7 +296,7 @@ def _same(a: Pose, b: Pose) -> bool:
     return a.distance_to(b) <= SAME and a.angle_to(b) <= SAME
 
 
-def _on_the_way(before: Pose, at: Pose, after: Pose, weight: float) -> bool:
+def _is_between(before: Pose, at: Pose, after: Pose, weight: float) -> bool:
     """Whether the straight move from the first to the last passes through the second."""
     legs = [line(before, at, weight).length, line(at, after, weight).length]
     return _same(interpolate(before, after, legs[0] / sum(legs)), at)
@@ -308,7 +307,7 @@ def _largest_allowed(
 ) -> tuple[Pose, Pose, Segment] | None:
     before, at, after = turn
     lengths = [line(before, at, weight).length, line(at, after, weight).length]
-    # Both moves as they are run, from before to after: a half turn read backwards goes astray.
+    # Both moves in the direction of travel: a half turn is ambiguous in reverse.
     legs = [
         direction(at, interpolate(before, at, 0.5), weight),
         direction(at, interpolate(at, after, 0.5), weight),

@@ -1,6 +1,6 @@
-"""From a plan to a checked set-point table: round the corners, time the path, check all of it.
+"""From a plan to a checked set-point table: round the corners, time the path, check all.
 
-Leg by leg between stops: each begins and ends at rest, so that no corner is rounded at a stop.
+Each leg between stops begins and ends at rest, so that no corner is rounded at a stop.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from planner.check_report import VerifiedPlan
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedRun:
-    """A run that is proved and ready to be sent.
+    """A checked run, ready to be armed.
 
     Attributes:
         plan: The plan, verified for this rig.
@@ -45,12 +45,12 @@ class PreparedRun:
 
     @property
     def length(self) -> float:
-        """Of the path with rounded corners, [m]."""
+        """Length of the path with rounded corners, [m]."""
         return float(self.checked.table.travelled[-1])
 
     @property
     def duration(self) -> float:
-        """With the time at stops, [s]."""
+        """Duration including dwells, [s]."""
         return (len(self.checked.table) - 1) * self.checked.table.cycle
 
 
@@ -58,8 +58,8 @@ def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:
     """Makes and checks the set-points of a plan.
 
     Raises:
-        Refused: The executed curve does not keep what the scene and the rig ask for, or its
-            clearance is less than the platform needs to stop when the master is lost.
+        Refused: The executed curve violates the scene or the rig, or its clearance is less than the
+            stopping distance when the master is lost.
         TensionInfeasible: A pose on it cannot be held.
     """
     plan = verified.plan
@@ -77,25 +77,25 @@ def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:
 
 
 def _keeps_clearance(rig: Rig, scene: Scene) -> IsAllowed:
-    """Dense poses keep the scene's clearances and half of the way between two of them as well.
+    """A check that dense poses keep the scene's clearances plus half their spacing.
 
-    And every move between them the scene's rotation limits.
+    Moves between them must keep the scene's rotation limits.
     """
     model = ClearanceModel(rig, scene)
 
     def is_allowed(poses: Sequence[Pose]) -> bool:
         reach = float(np.max(np.linalg.norm(rig.anchors, axis=1)))
-        half_way = 0.5 * max(a.distance_to(b) + reach * a.angle_to(b) for a, b in pairwise(poses))
+        half_step = 0.5 * max(a.distance_to(b) + reach * a.angle_to(b) for a, b in pairwise(poses))
         limits = scene.rotation_limits
         if limits and any(limits.excess(a, b) for a, b in pairwise(poses)):
             return False
         for pose in poses:
             near = model.smallest(pose)
-            if near is not None and near.distance < scene.obstacle_clearance + half_way:
+            if near is not None and near.distance < scene.obstacle_clearance + half_step:
                 return False
         positions = np.array([pose.position for pose in poses])
         rotations = np.array([pose.rotation for pose in poses])
         own = float(model.self_clearances(positions, rotations).min())
-        return own >= scene.self_clearance + 2.0 * half_way
+        return own >= scene.self_clearance + 2.0 * half_step
 
     return is_allowed

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from executor.trajectory.dwell import (
     Dwell,
+    dwell_violations,
     load_violations,
     order_violations,
     rows_of,
-    stand_violations,
 )
 from executor.trajectory.path import Path, poses_of
 from executor.trajectory.time_scaling import TimeLaw
@@ -29,10 +29,10 @@ from model.winches import WinchMap
 from planner.check import check_path
 from planner.check_report import CheckReport
 
-# What the loop sends: checked set-points and their fingerprint.
+# Input of the loop: checked set-points and their fingerprint.
 #
-# A `CheckedTrajectory` has the poses and the proof; the loop needs only this part of it, which can
-# also be handed to another process and be compared there with what was checked.
+# A `CheckedTrajectory` has the poses and the check report; the loop needs only this part of it,
+# which can be passed to another process and verified there.
 
 
 Setpoints = NDArray[np.int32]
@@ -51,9 +51,9 @@ class CheckedSetpoints:
 
     Attributes:
         rig: The rig they were checked for.
-        cycle: Time of a cycle, [s].
-        setpoints: One row a cycle, shape (n, m), [counts]; read-only.
-        hash: Their fingerprint when they were checked; arming compares.
+        cycle: Cycle time, [s].
+        setpoints: One row per cycle, shape (n, m), [counts]; read-only.
+        hash: Their fingerprint when checked; compared on arming.
     """
 
     rig: Rig
@@ -67,34 +67,34 @@ class CheckedSetpoints:
 
     @property
     def unchanged(self) -> bool:
-        """The set-points are still those that were checked; recomputed every time."""
+        """Whether the set-points are those that were checked; recomputed on each call."""
         return fingerprint(self.cycle, self.setpoints) == self.hash
 
 
 def checked_setpoints_of(checked: CheckedTrajectory) -> CheckedSetpoints:
-    """The course of a checked table."""
+    """The set-points of a checked table, for the loop."""
     return CheckedSetpoints(checked.rig, checked.table.cycle, checked.table.setpoints, checked.hash)
 
 
 INT32_MAX = 2**31 - 1
 _ARRAYS = ("travelled", "positions", "rotations", "lengths", "tensions", "counts")
-#: Tensions are solved to this accuracy, [N].
+#: Accuracy of the tension solver, [N].
 TENSION_ACCURACY = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One row a cycle, from rest at the start to rest at the goal; arrays are read-only.
+    """One row per cycle, from rest at the start to rest at the goal; arrays are read-only.
 
     Attributes:
-        cycle: Time of a cycle, [s].
+        cycle: Cycle time, [s].
         travelled: Path length, shape (n,), [m].
         positions: Of the platform's origin, world frame, shape (n, 3), [m].
         rotations: ``world_from_platform``, shape (n, 3, 3).
         lengths: Free cable lengths, shape (n, m), [m].
         tensions: Planned tensions, shape (n, m), [N].
         counts: Drive positions, not yet rounded, shape (n, m).
-        stands: Rows at the scene's stops.
+        dwells: Rows at the scene's stops.
     """
 
     cycle: float
@@ -104,10 +104,10 @@ class Trajectory:
     lengths: Array
     tensions: Array
     counts: Array
-    stands: tuple[Dwell, ...]
+    dwells: tuple[Dwell, ...]
 
     def __post_init__(self) -> None:
-        """Copies the arrays and makes them read-only, so that what was checked is what is sent."""
+        """Copies the arrays and makes them read-only: what was checked is what is sent."""
         for name in _ARRAYS:
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
@@ -117,18 +117,18 @@ class Trajectory:
 
     @cached_property
     def setpoints(self) -> NDArray[np.int32]:
-        """What is sent, shape (n, m); meaningful for a table that passed `check_table`."""
+        """Set-points, shape (n, m), [counts]; valid for a table that passed `check_table`."""
         rounded = np.rint(self.counts).astype(np.int32)
         rounded.setflags(write=False)
         return rounded
 
     @property
     def hash(self) -> str:
-        """SHA-256 over the set-points and their cycle, recomputed every time."""
+        """SHA-256 over the set-points and their cycle, recomputed on each call."""
         return fingerprint(self.cycle, self.setpoints)
 
     def poses(self) -> list[Pose]:
-        """The executed poses, one a row."""
+        """The executed poses, one per row."""
         return poses_of(self.positions, self.rotations)
 
 
@@ -137,14 +137,14 @@ _PROOF = object()
 
 @dataclass(frozen=True, eq=False)
 class CheckedTrajectory:
-    """A table that `check_table` passed; nothing else makes one, and the loop takes nothing else.
+    """A table that passed `check_table`, which alone makes one; the loop accepts nothing else.
 
     Attributes:
         table: The set-points.
         rig: The rig they were checked for.
-        hash: Its hash when it was checked.
+        hash: Its hash when checked.
         report: The independent check of the executed curve.
-        winches: The map between cable lengths and counts that made it.
+        winches: The map between cable lengths and counts used for it.
     """
 
     table: Trajectory
@@ -165,33 +165,33 @@ class CheckedTrajectory:
 def build_table(
     rig: Rig, scene: Scene, legs: Sequence[tuple[Path, TimeLaw]], cycle: float
 ) -> Trajectory:
-    """Samples the run at every cycle and turns poses into drive positions.
+    """Samples the run at every cycle and converts poses to drive positions.
 
-    Tensions are the rig's working tensions under the load of each leg; the cables' stretch under
-    them is fed forward.
+    Tensions are the rig's working tensions under the load of each leg; the cables' elastic stretch
+    under them is compensated.
 
     Args:
         rig: The robot.
         scene: Its stops, dwells and loads.
-        legs: The curve of each leg between stops, and how fast it is run.
+        legs: Curve and time law of each leg between stops.
         cycle: [s].
 
     Raises:
         TensionInfeasible: A pose cannot be held.
     """
     parts: list[list[Array]] = []
-    stands: list[Dwell] = []
+    dwells: list[Dwell] = []
     reached: list[Array] = []
     for (path, law), leg in zip(legs, legs_of(scene), strict=True):
         part = _leg_rows(rig, leg.scene.load, path, law, cycle)
         if parts:
             part[0] += reached[0]
             first = sum(len(rows[0]) for rows in parts) - 1
-            waiting = rows_of(scene.stops[len(stands)].dwell, cycle)
-            stands.append(Dwell(first, first + waiting))
-            parts.append(_standing_rows(reached, part, max(waiting - 1, 0)))
+            waiting = rows_of(scene.stops[len(dwells)].dwell, cycle)
+            dwells.append(Dwell(first, first + waiting))
+            parts.append(_dwell_rows(reached, part, max(waiting - 1, 0)))
         reached = [values[-1] for values in part]
-        parts.append(part if not stands or waiting else [values[1:] for values in part])
+        parts.append(part if not dwells or waiting else [values[1:] for values in part])
     travelled, positions, rotations, tensions = map(np.concatenate, zip(*parts, strict=True))
     anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
     lengths = cables_to(rig, anchors).lengths
@@ -204,7 +204,7 @@ def build_table(
         lengths=lengths,
         tensions=tensions,
         counts=winches.counts(winches.unstrained(lengths, tensions)),
-        stands=tuple(stands),
+        dwells=tuple(dwells),
     )
 
 
@@ -218,8 +218,8 @@ def _leg_rows(rig: Rig, load: Load, path: Path, law: TimeLaw, cycle: float) -> l
     return [travelled, positions, rotations, tensions]
 
 
-def _standing_rows(reached: list[Array], after: list[Array], count: int) -> list[Array]:
-    """Rows between the last of a leg and the first of the next, which stand at the same pose."""
+def _dwell_rows(reached: list[Array], after: list[Array], count: int) -> list[Array]:
+    """Rows between the last of a leg and the first of the next, all at the same pose."""
     travelled, positions, rotations = (np.repeat(v[None], count, axis=0) for v in reached[:3])
     shares = np.linspace(0.0, 1.0, count + 2)[1:-1, None]
     tensions = reached[3] + shares * (after[3][0] - reached[3])
@@ -227,28 +227,28 @@ def _standing_rows(reached: list[Array], after: list[Array], count: int) -> list
 
 
 def check_table(rig: Rig, scene: Scene, table: Trajectory) -> CheckedTrajectory:
-    """Passes a table on, or refuses it with everything that is wrong.
+    """Checks a table; refuses it with all violations.
 
     Raises:
-        Refused: A value is not finite or no int32; a winch is too fast; a tension is outside the
-            rig's limits or tensions do not hold the load; drive positions are not those of the
-            poses; ends and stands are not the scene's start, stops and goal; or the executed curve
-            fails the independent check.
+        Refused: A value is not finite or not an int32; a winch is too fast; a tension is outside
+            the rig's limits or tensions do not hold the load; drive positions do not match the
+            poses; ends and dwells do not match the scene's start, stops and goal; or the executed
+            curve fails the independent check.
     """
-    found = _number_violations(rig, table) or order_violations(scene, table.stands, len(table))
+    found = _number_violations(rig, table) or order_violations(scene, table.dwells, len(table))
     poses = [] if found else table.poses()
     if not found:
         found = [
             *_end_violations(scene, table),
-            *stand_violations(scene, table.stands, poses, table.cycle),
-            *load_violations(rig, scene, table.stands, poses, table.tensions),
+            *dwell_violations(scene, table.dwells, poses, table.cycle),
+            *load_violations(rig, scene, table.dwells, poses, table.tensions),
             *_speed_violations(rig, table),
             *_tension_violations(rig, table),
             *_count_violations(rig, table),
         ]
     if found:
         raise _refusal(found)
-    report = check_path(rig, scene, poses, [stand.first for stand in table.stands])
+    report = check_path(rig, scene, poses, [dwell.first for dwell in table.dwells])
     if not report.passed:
         raise _refusal(
             [violation.sentence() for violation in report.violations],
@@ -313,7 +313,7 @@ def _tension_violations(rig: Rig, table: Trajectory) -> list[str]:
 
 
 def _count_violations(rig: Rig, table: Trajectory) -> list[str]:
-    """The check of the executed curve looks at poses, the drives get counts: they must agree."""
+    """Set-points that do not match their poses, for which the executed curve is checked."""
     winches = WinchMap(rig)
     unstrained = winches.unstrained_from_counts(table.setpoints.astype(np.float64))
     anchors = [pose.apply(rig.anchors) for pose in table.poses()]

@@ -20,12 +20,11 @@ from model.rig import Motion
 # takes the shortest time that the limits allow, so for given ends the highest peak is the fastest
 # motion.
 #
-# Where the length just suffices (the usual case after corner speeds were cut to what can be
-# reached), the general solver Ruckig moves backwards or gives up in one case of ten to ten
-# thousand; here the peak is bisected and every phase goes forward by construction.
+# Where the length just suffices (the usual case after corner speeds were reduced to reachable
+# ones), the general solver Ruckig moves backwards or fails in one case of ten to ten thousand;
+# here the peak is bisected and every phase moves forward by construction.
 #
-# A change of speed alone, from any acceleration and over whatever length it takes, is
-# `speed_change`.
+# `speed_change` changes speed alone, from any acceleration and over any length.
 
 
 _JERK_BISECTIONS = 80
@@ -33,7 +32,7 @@ _JERK_BISECTIONS = 80
 
 @dataclass(frozen=True, slots=True)
 class _Phase:
-    """A time of constant jerk: begin [s], length, speed and acceleration there, jerk."""
+    """A phase of constant jerk: start time [s]; length, speed and acceleration there; jerk."""
 
     begin: float
     travelled: float
@@ -42,11 +41,11 @@ class _Phase:
     jerk: float
 
     def after(self, time: float) -> tuple[float, float, float]:
-        """Travelled length, speed and acceleration some time [s] after the begin."""
+        """Travelled length, speed and acceleration at a time [s] after its start."""
         acceleration = self.acceleration + self.jerk * time
         speed = self.speed + (self.acceleration + self.jerk * time / 2.0) * time
-        way = (self.speed + (self.acceleration / 2.0 + self.jerk * time / 6.0) * time) * time
-        return self.travelled + way, speed, acceleration
+        distance = (self.speed + (self.acceleration / 2.0 + self.jerk * time / 6.0) * time) * time
+        return self.travelled + distance, speed, acceleration
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +53,7 @@ class SCurve:
     """Motion over a length.
 
     Attributes:
-        phases: Of constant jerk, one after the other.
+        phases: Of constant jerk, in order.
         length: [m].
         end_speed: [m/s].
         duration: [s].
@@ -80,8 +79,8 @@ class SpeedChange:
     """A change of speed; afterwards the new speed is kept.
 
     Attributes:
-        phases: Of constant jerk, one after the other; the last has no end.
-        duration: Until there.
+        phases: Of constant jerk, in order; the last is unbounded.
+        duration: Time until the new speed is reached.
     """
 
     phases: tuple[_Phase, ...]
@@ -97,14 +96,14 @@ class SpeedChange:
 def speed_change(
     start: tuple[float, float], end_speed: float, acceleration: float, jerk: float
 ) -> SpeedChange:
-    """The fastest change of speed within limits of acceleration and jerk, to rest of acceleration.
+    """The fastest change of speed within acceleration and jerk limits, to zero acceleration.
 
-    The acceleration grows at full jerk to a peak, stays there if the peak is the limit, and goes
-    back to zero. The units of length and time are the caller's.
+    The acceleration rises at full jerk to a peak, stays there if the peak is the limit, and
+    returns to zero. Units of length and time are the caller's.
 
     Args:
-        start: Speed and acceleration at the begin; the acceleration is within its limit.
-        end_speed: Speed at the end.
+        start: Initial speed and acceleration; the acceleration is within its limit.
+        end_speed: Final speed.
         acceleration: Its limit.
         jerk: Its limit.
     """
@@ -131,12 +130,12 @@ def s_curve(length: float, speeds: tuple[float, float], cap: float, motion: Moti
 
     Args:
         length: [m].
-        speeds: At the begin and at the end, neither above ``cap``, [m/s].
+        speeds: Initial and final, neither above ``cap``, [m/s].
         cap: Largest speed, [m/s].
         motion: Limits of acceleration and jerk.
 
     Raises:
-        Fault: The length does not suffice to change the speed.
+        Fault: The length is too short for the change of speed.
     """
     start, end = speeds
     peak = _peak(length, speeds, cap, motion)
@@ -155,7 +154,7 @@ def s_curve(length: float, speeds: tuple[float, float], cap: float, motion: Moti
 
 
 def length_to_change(slow: float, fast: float, motion: Motion) -> float:
-    """Length to change speed in the shortest time, [m]; the ramp is symmetric about its middle."""
+    """Length of the fastest change of speed, [m]; the ramp is symmetric about its middle."""
     return (slow + fast) / 2.0 * sum(time for time, _ in _ramp(fast - slow, motion, 1.0))
 
 
@@ -184,7 +183,7 @@ def _peak(length: float, speeds: tuple[float, float], cap: float, motion: Motion
 
 
 def _joined(steps: list[tuple[float, float]], start: tuple[float, float]) -> tuple[_Phase, ...]:
-    """Phases from times and jerks; they begin with this speed and acceleration."""
+    """Phases from times and jerks, from an initial speed and acceleration."""
     phases = [_Phase(0.0, 0.0, *start, steps[0][1])]
     for (time, _), (_, jerk) in pairwise(steps):
         last = phases[-1]
@@ -227,13 +226,13 @@ class TimeLaw:
 def time_law(path: Path, motion: Motion) -> TimeLaw:
     """A fast jerk-limited run along a path within the motion limits.
 
-    All speeding up and slowing down is done on straight segments. A rounded corner is passed at one
-    speed, so low that what its bend makes of it stays within the limits of acceleration and jerk;
-    so the limits hold for the platform's motion in space, not only along the path. Where two
-    straight segments meet at an angle (a corner that could not be rounded) the path stops.
+    Speed changes only on straight segments. A rounded corner is passed at constant speed, low
+    enough that its curvature keeps to the limits of acceleration and jerk; so the limits hold for
+    the platform's motion in space, not only along the path. Where two straight segments meet at an
+    angle (a corner that could not be rounded), the platform stops.
 
     Raises:
-        Fault: No time law was found (never seen; the limits are consistent by construction).
+        Fault: No time law was found (not expected; the limits are consistent by construction).
     """
     caps = [_speed_cap(segment, motion) for segment in path.segments]
     speeds = _boundary_speeds(path, caps, motion)
@@ -256,7 +255,7 @@ def _speed_cap(segment: Segment, motion: Motion) -> float:
 
 
 def _boundary_speeds(path: Path, caps: list[float], motion: Motion) -> list[float]:
-    """Speeds where segments meet: as high as both allow and the lengths let them be reached."""
+    """Speeds where segments meet: as high as both allow and the lengths permit."""
     segments = path.segments
     speeds = [0.0]
     for left, right, cap_left, cap_right in zip(
@@ -288,7 +287,7 @@ def _reachable(known: float, wanted: float, segment: Segment, motion: Motion) ->
     return low
 
 
-# From one place to another in a given time, at rest at both ends.
+# Rest-to-rest motion in a given time.
 
 
 #: Ratio of the step's peak speed to its mean speed.

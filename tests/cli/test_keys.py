@@ -24,7 +24,7 @@ from executor.hold_to_run.presses import TIMEOUT, PressBoard
 from executor.hold_to_run.session import jog_session
 from executor.remote import client
 from executor.remote.client import StopResult, follow_run
-from executor.remote.command_socket import Reached, advertised, serving
+from executor.remote.command_socket import RunConnection, advertised, serving
 from executor.remote.protocol import make_line, parse_command
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord
@@ -187,7 +187,7 @@ def test_a_run_is_waited_for_and_takes_what_it_is_sent(monkeypatch: pytest.Monke
     find_runs, passed = client.find_runs, [0.0]
 
     @contextmanager
-    def later() -> Iterator[list[Reached]]:
+    def later() -> Iterator[list[RunConnection]]:
         if not next(looks):
             yield []
             return
@@ -203,7 +203,7 @@ def test_a_run_is_waited_for_and_takes_what_it_is_sent(monkeypatch: pytest.Monke
     with advertised() as listeners, serving(listeners, board, run_status):
         following = follow_run(None, 10.0, waits=True, between=between)
         first = next(following)
-        assert passed[0] == pytest.approx(2 * client.LOOK)
+        assert passed[0] == pytest.approx(2 * client.POLL_INTERVAL)
         assert not first["wished"]["hold"]
         assert next(following)["wished"]["hold"]
         following.close()

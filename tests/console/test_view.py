@@ -69,7 +69,7 @@ def test_a_run_that_is_under_way_is_seen_in_its_own_scene(tmp_path: Path) -> Non
     folder.write_rig(THE_RIG.document)
     view = RobotView(THE_RIG, SCENE)
     with folder.held():
-        assert folder.is_under_way()
+        assert folder.is_active()
         view.take({**status_at(THE_RIG.home), "folder": str(folder.path)})
     assert [one.name for one in view.scene.obstacles] == [o.name for o in plan.scene.obstacles]
     assert view.scene.obstacles != SCENE.obstacles

@@ -41,7 +41,7 @@ TAG_STD = 0.0003
 
 @dataclass(frozen=True)
 class FakeRun:
-    """All that a run folder is made from."""
+    """Data of a run folder."""
 
     context: RunContext
     cycles: CycleTable
@@ -82,7 +82,7 @@ def write(run: FakeRun, path: Path, pictures: bool = True) -> RunFolder:
 
 @lru_cache(maxsize=4)
 def make(rate_hz: float = 10.0, every: int = 1, camera: bool = True) -> FakeRun:
-    """The run; ``every`` keeps one cycle in so many."""
+    """The run; ``every`` is the interval of kept cycles."""
     rig, scene = (
         load_rig(ROOT / "configs/gachon_8_6.yaml"),
         load_scene(ROOT / "configs/environment_3.yaml"),

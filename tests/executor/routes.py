@@ -38,28 +38,28 @@ HALL = Motion(
 
 
 def at_mm(x: float, y: float, z: float, turn_deg: float = 0.0) -> Pose:
-    """A pose turned about z."""
+    """A pose rotated about z."""
     turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
     return Pose(np.array([x, y, z]) / 1000.0, turn)
 
 
 def random_pose(rng: np.random.Generator, size: float, turn: float = 0.0) -> Pose:
-    """A pose in a cube of half width ``size`` [m], turned by up to ``turn`` [rad]."""
+    """A pose in a cube of half width ``size`` [m], rotated by up to ``turn`` [rad]."""
     axis = rng.normal(size=3)
     vector = axis / np.linalg.norm(axis) * turn * rng.random()
     return Pose(rng.uniform(-size, size, 3), Rotation.from_rotvec(vector).as_matrix())
 
 
 def random_route(
-    seed: int, turned: bool = False, count: int | None = None, sharpest_deg: float = 130.0
+    seed: int, rotated: bool = False, count: int | None = None, sharpest_deg: float = 130.0
 ) -> list[Pose]:
     """Two to seven waypoints, from some millimetres to some decimetres apart.
 
-    Every turn is by an even chance between 0 and ``sharpest_deg``, in any plane.
+    Turns are uniformly distributed between 0 and ``sharpest_deg``, in any plane.
     """
     rng = np.random.default_rng(seed)
     size = 10.0 ** rng.uniform(-2.5, -0.5)
-    turn = 0.5 * size if turned else 0.0  # [rad] for [m]: a part of the way, not most of it
+    turn = 0.5 * size if rotated else 0.0  # [rad] for [m]: part of the path length, not most of it
     poses = [random_pose(rng, size, turn)]
     heading = rng.normal(size=3)
     heading /= np.linalg.norm(heading)
@@ -76,8 +76,8 @@ def steps_between(positions: Array, rotations: Array, weight: float = WEIGHT) ->
     """√(|Δp|² + (ρ Δθ)²) of neighbouring rows, shape (n − 1,), [m]."""
     moved = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     relative = np.einsum("nji,njk->nik", rotations[:-1], rotations[1:])
-    turned = Rotation.from_matrix(relative).magnitude()
-    return np.hypot(moved, weight * turned)
+    rotated = Rotation.from_matrix(relative).magnitude()
+    return np.hypot(moved, weight * rotated)
 
 
 def always(_poses: object) -> bool:

@@ -36,12 +36,12 @@ def _rounded_corners(path: Path) -> list[int]:
     return [i for i, segment in enumerate(path.segments) if not segment.straight]
 
 
-@given(seed=seeds, turned=st.booleans())
+@given(seed=seeds, rotated=st.booleans())
 @settings(max_examples=25)
-def test_a_corner_keeps_the_tolerance_on_both_sides_and_uses_it(seed, turned):
-    """Neither does the curve leave the lines, nor the corner point the curve, by more."""
+def test_a_corner_keeps_the_tolerance_on_both_sides_and_uses_it(seed, rotated):
+    """Largest distances of the curve from the lines and of the corner point from the curve."""
     tolerance = 10.0 ** np.random.default_rng(seed).uniform(-4, -2)
-    waypoints = random_route(seed, turned, count=3, sharpest_deg=75.0 if turned else 104.0)
+    waypoints = random_route(seed, rotated, count=3, sharpest_deg=75.0 if rotated else 104.0)
     path = rounded(waypoints, tolerance, WEIGHT, always)
     (index,) = _rounded_corners(path)
     segment = path.segments[index]
@@ -49,8 +49,8 @@ def test_a_corner_keeps_the_tolerance_on_both_sides_and_uses_it(seed, turned):
     moves = list(pairwise(waypoints))
     off = [min(_distance_to_move(pose, *move) for move in moves) for pose in samples]
     nearest = min(_apart(pose, waypoints[1]) for pose in samples)
-    # Rotation vectors are not exactly additive: 1 % with turned poses.
-    allowed = tolerance * (1.01 if turned else 1.0 + 1e-6)
+    # Rotation vectors are not exactly additive: 1 % with rotated poses.
+    allowed = tolerance * (1.01 if rotated else 1.0 + 1e-6)
     assert max(off) <= allowed
     assert nearest <= allowed
     limited_by_line = min(path.segments[0].length, path.segments[2].length) < 0.56 * min(
@@ -59,10 +59,10 @@ def test_a_corner_keeps_the_tolerance_on_both_sides_and_uses_it(seed, turned):
     assert limited_by_line or nearest == pytest.approx(tolerance, rel=0.02)
 
 
-@given(seed=seeds, turned=st.booleans())
+@given(seed=seeds, rotated=st.booleans())
 @settings(max_examples=40)
-def test_corners_leave_a_tenth_of_every_line(seed, turned):
-    waypoints = random_route(seed, turned)
+def test_corners_leave_a_tenth_of_every_line(seed, rotated):
+    waypoints = random_route(seed, rotated)
     path = rounded(waypoints, 1.0, WEIGHT, always)
     lines = [segment.length for segment in path.segments if segment.straight]
     moves = [_apart(a, b) for a, b in pairwise(waypoints)]
@@ -71,10 +71,10 @@ def test_corners_leave_a_tenth_of_every_line(seed, turned):
         assert left >= (1.0 - 2.0 * LONGEST_SHARE) * whole * (1.0 - 1e-6)
 
 
-@given(seed=seeds, turned=st.booleans())
+@given(seed=seeds, rotated=st.booleans())
 @settings(max_examples=40)
-def test_segments_meet_and_the_ends_are_the_waypoints(seed, turned):
-    waypoints = random_route(seed, turned)
+def test_segments_meet_and_the_ends_are_the_waypoints(seed, rotated):
+    waypoints = random_route(seed, rotated)
     path = rounded(waypoints, 0.002, WEIGHT, always)
     ends = [poses_of(*s.at(np.array([0.0, s.length]))) for s in path.segments]
     for (_, end), (begin, _) in pairwise(ends):
@@ -133,7 +133,7 @@ def test_only_the_refused_corner_stays_sharp():
     assert [s.straight for s in path.segments] == [True, True, False, True]
 
 
-def test_the_samples_that_are_asked_about_are_dense_and_cover_the_corner():
+def test_the_samples_to_check_are_dense_and_cover_the_corner():
     seen: list[Pose] = []
 
     def looked_at(poses: list[Pose]) -> bool:
@@ -153,7 +153,7 @@ def test_no_tolerance_keeps_every_corner_sharp():
     assert [s.straight for s in path.segments] == [True, True]
 
 
-def test_repeats_and_waypoints_on_the_way_are_left_out():
+def test_repeats_and_waypoints_in_between_are_left_out():
     waypoints = [
         at_mm(0, 0, 0),
         at_mm(0, 0, 0),
@@ -166,7 +166,7 @@ def test_repeats_and_waypoints_on_the_way_are_left_out():
     assert path.length == pytest.approx(_apart(waypoints[0], waypoints[-1]))
 
 
-def test_a_turn_on_the_spot_is_no_repeat():
+def test_a_rotation_in_place_is_not_a_repeat():
     waypoints = [at_mm(0, 0, 0), at_mm(0, 0, 0, turn_deg=10), at_mm(0, 50, 0, turn_deg=10)]
     assert len(rounded(waypoints, 0.0, WEIGHT, always).segments) == 2
 
@@ -186,20 +186,20 @@ def test_a_turn_so_sharp_that_a_stop_is_faster_stays_sharp(turn_deg, straight):
 
 @pytest.mark.parametrize("sideways_mm", [0.0, 1e-7, 1e-3, 1.0])
 def test_a_reversal_is_stopped_at_never_rounded(sideways_mm):
-    """Its curve would reverse within no length at all, at any speed."""
+    """Its curve would reverse within zero length, at any speed."""
     waypoints = [at_mm(0, 0, 0), at_mm(100, 0, 0), at_mm(0, sideways_mm, 0)]
     path = rounded(waypoints, 0.001, WEIGHT, always)
     assert [s.straight for s in path.segments] == [True, True]
     assert path.length == pytest.approx(0.2, rel=1e-3)
 
 
-def test_turning_on_in_steps_is_not_turned_back_by_leaving_out_waypoints():
-    """Three thirds of a turn about z: the direct way between the ends is the other way round."""
+def test_turning_on_in_steps_is_not_reversed_by_leaving_out_waypoints():
+    """Three thirds of a turn about z: the shortest rotation between the ends is the other one."""
     waypoints = [at_mm(0, 0, 0, turn_deg=a) for a in (0, 120, 240)]
     path = rounded(waypoints, 0.001, WEIGHT, always)
     _, rotations = path.at(np.linspace(0.0, path.length, 241))
-    turned = np.unwrap(Rotation.from_matrix(rotations).as_euler("zyx")[:, 0])
-    assert np.degrees(turned) == pytest.approx(np.linspace(0, 240, 241), abs=0.01)
+    rotated = np.unwrap(Rotation.from_matrix(rotations).as_euler("zyx")[:, 0])
+    assert np.degrees(rotated) == pytest.approx(np.linspace(0, 240, 241), abs=0.01)
 
 
 def test_a_half_turn_is_rounded_on_the_side_on_which_it_is_run():

@@ -1,4 +1,4 @@
-"""One cable at a time by hold-to-run, in simulated time: only what is held, never too tight."""
+"""One cable at a time by hold-to-run, in simulated time: only while held, never too tight."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from model.rig import Rig, load_rig, rig_from_document
 from tests.cli.plans import RIG
 
 SPEED = 0.020
-#: From the jog speed to rest, [s].
+#: Time from the jog speed to rest, [s].
 RAMP = 0.35
 
 
@@ -49,7 +49,7 @@ Say = Callable[[PressBoard], object]
 
 @dataclass
 class Script:
-    """Holds controls by simulated time, and keeps what the loop did."""
+    """Holds controls in simulated time, and keeps the records of the loop."""
 
     holds: list[tuple[float, float, Say]]
     end: float
@@ -75,7 +75,7 @@ def hold(number: int, cable: int, out: bool, step: float | None = None, percent:
 
 
 def moved(records: list[CycleRecord], robot: Rig) -> Array:
-    """Of each cable and cycle, what was paid out since the begin, shape (n, m), [m]."""
+    """Length paid out since the start, per cycle and cable, shape (n, m), [m]."""
     targets = np.array([record.targets for record in records], dtype=np.float64)
     return (targets - targets[0]) / [winch.counts_per_metre for winch in robot.winches]
 
@@ -91,17 +91,17 @@ def is_moving(records: list[CycleRecord]) -> list[bool]:
 SOFT = 0.002
 
 
-def test_a_cable_is_paid_out_while_held_and_rests_when_let_go() -> None:
+def test_a_cable_is_paid_out_while_held_and_rests_when_released() -> None:
     robot = rig(soft=SOFT)
     script = Script([(0.5, 1.0, hold(1, 3, out=True))], 2.5)
     records = script.run(robot)
     at = np.array([record.at for record in records])
     out, still = moved(records, robot), np.array(is_moving(records))
     assert out[-1, 2] > 5e-4
-    assert (np.delete(out, 2, axis=1) == 0.0).all(), "the others stand"
+    assert (np.delete(out, 2, axis=1) == 0.0).all(), "the others rest"
     assert not still[at < 0.5].any()
     assert not still[at > 1.0 + TIMEOUT + RAMP].any()
-    assert (np.diff(out[:, 2]) >= 0.0).all(), "never the other way"
+    assert (np.diff(out[:, 2]) >= 0.0).all(), "never in the other direction"
     assert records[-1].state is State.SECURING
     assert script.travel is not None
     assert script.travel.cable == 3
@@ -114,11 +114,11 @@ def test_a_cable_is_paid_out_while_held_and_rests_when_let_go() -> None:
 def test_a_step_ends_where_it_should(length: float, out: bool) -> None:
     robot = rig(soft=0.0002)  # so soft that 10 mm are far from any limit
     script = Script([(0.5, 4.0, hold(1, 3, out=out, step=length))], 4.2)
-    way = moved(script.run(robot), robot)[-1, 2]
-    assert way == pytest.approx(length if out else -length, abs=2e-6)
+    travel = moved(script.run(robot), robot)[-1, 2]
+    assert travel == pytest.approx(length if out else -length, abs=2e-6)
 
 
-def test_a_step_that_is_let_go_ends_early() -> None:
+def test_a_step_that_is_released_ends_early() -> None:
     robot = rig(soft=SOFT)
     out = moved(Script([(0.5, 0.7, hold(1, 3, out=True, step=0.010))], 2.0).run(robot), robot)
     assert 0.0 < out[-1, 2] < 0.009
@@ -149,14 +149,14 @@ def test_what_was_wound_in_can_be_paid_out_again() -> None:
     assert moved(records, rig())[-1, 2] > moved(records, rig())[:, 2].min()
 
 
-def test_a_press_moves_a_cable_by_no_more_than_its_longest_way(
+def test_a_press_moves_a_cable_by_no_more_than_its_longest_travel(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sessions, "LONGEST_MM", 8.0)
     robot = rig(soft=SOFT)
     script = Script([(0.5, 6.0, hold(1, 3, out=True))], 6.5)
-    way = moved(script.run(robot), robot)[-1, 2]
-    assert 0.004 < way <= 0.008
+    travel = moved(script.run(robot), robot)[-1, 2]
+    assert 0.004 < travel <= 0.008
 
 
 COMMANDS = st.lists(
@@ -192,7 +192,7 @@ def test_nothing_moves_unless_held_and_no_tension_is_beyond_the_limit(
         say = hold(number, cable, out, step)
         holds.append((begin, until, say))
         spans.append((begin, until, cable - 1, out))
-        if silent:  # heard of again after it was silent for too long: it must stay over
+        if silent:  # reported again after too long a silence: it must stay over
             holds.append((until + 0.25, until + 0.5, say))
             begin = until + 0.6
         else:
@@ -210,12 +210,12 @@ def test_nothing_moves_unless_held_and_no_tension_is_beyond_the_limit(
     held_pull = tensions([r for r in records if r.state is State.MOVING], robot)
     assert held_pull.max() <= limit
     out_of = np.diff(moved(records, robot), axis=0)
-    for record, way in zip(records[1:], out_of, strict=True):
-        for cable in np.flatnonzero(way):
+    for record, travel in zip(records[1:], out_of, strict=True):
+        for cable in np.flatnonzero(travel):
             may = [
                 (a, b)
                 for a, b, which, pays in spans
-                if which == cable and pays == (way[cable] > 0.0)
+                if which == cable and pays == (travel[cable] > 0.0)
             ]
             assert any(a <= record.at <= b + TIMEOUT + RAMP for a, b in may)
     fastest = max(np.abs(out_of).max(), 0.0)
@@ -236,10 +236,10 @@ def test_it_slows_down_on_release_with_limited_acceleration() -> None:
     assert released[-1] == 0.0
 
 
-def test_another_cable_that_goes_slack_all_the_same_ends_in_a_fault(
+def test_another_cable_that_goes_slack_anyway_ends_in_a_fault(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As `cdpr jog --cable`: the platform is then not where anybody thinks."""
+    """As for `cdpr jog --cable`: the platform pose is unknown afterwards."""
     monkeypatch.setattr(winch_laws, "LEAST_SHARE", -100.0)
     script = Script([(0.5, 9.0, hold(1, 1, out=True))], 9.5)
     with pytest.raises(Fault, match="went slack"):
@@ -270,7 +270,7 @@ def test_a_stop_ends_the_session() -> None:
     assert np.abs(np.diff([record.rate for record in script.records])).max() < 0.5
 
 
-def test_a_session_ends_by_itself_when_nothing_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_ends_on_its_own_when_nothing_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sessions, "IDLE", 0.8)
     records = Script([], 99.0).run()
     assert 0.8 < records[-1].at < 2.0
@@ -304,10 +304,10 @@ def test_a_press_stays_within_the_positions_of_its_drive(
     positions = [0] * 8
     positions[cable] = here
     held = PressState(1, 1.0, False, cable + 1, out, step)
-    way = limits.way(robot, positions, held)
-    assert way >= 0.0 if out else way <= 0.0
-    assert abs(way) <= (step or 0.050)
-    end = here + way * robot.winches[cable].counts_per_metre
+    travel = limits.travel(robot, positions, held)
+    assert travel >= 0.0 if out else travel <= 0.0
+    assert abs(travel) <= (step or 0.050)
+    end = here + travel * robot.winches[cable].counts_per_metre
     if low <= here <= high:
         assert low - 1e-6 <= end <= high + 1e-6
     elif (here > high) == (end > here):
@@ -341,7 +341,7 @@ def cycle(targets: list[int], tension: list[float], index: float, rate: float) -
     )  # fmt: skip
 
 
-def test_what_keeps_a_cable_from_going_on_is_said() -> None:
+def test_what_keeps_a_cable_from_continuing_is_reported() -> None:
     travel = CableTravel(rig(), 62.0, 0.050)
     assert (travel.cable, travel.limit, travel.by_session) == (0, "", [0.0] * 8)
     easy, tight, slack = [20.0] * 8, [20.0] * 8, [20.0] * 8

@@ -1,4 +1,4 @@
-"""The camera's process by itself."""
+"""The camera's process alone."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from executor.cameras.process import _serve
 
 
 class _Camera:
-    """Sees nothing, and may say that it broke."""
+    """A worker that detects nothing, and may fail."""
 
     def __enter__(self) -> _Camera:
         return self

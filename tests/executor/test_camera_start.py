@@ -1,4 +1,4 @@
-"""Cameras open all at once, and a stop is heard while they do."""
+"""Cameras open at the same time, and a stop is handled meanwhile."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from model.errors import Fault, HardwareMissing, StoppedByOperator
 
 
 class Opening:
-    """A camera that is open, or fails, when it was asked so often."""
+    """A camera that is open, or fails, after a number of calls."""
 
     def __init__(self, name: str, after: float, fails: bool = False) -> None:
         self.name, self.asked = name, 0
@@ -32,13 +32,13 @@ class Opening:
 def wait(*cameras: Opening, stop_after: float = float("inf")) -> None:
     looks = 0
 
-    def unless_stopped() -> None:
+    def check_stop() -> None:
         nonlocal looks
         looks += 1
         if looks > stop_after:
             raise StoppedByOperator("stopped before anything moved")
 
-    wait_until_ready([cast(CameraProcess, camera) for camera in cameras], unless_stopped)
+    wait_until_ready([cast(CameraProcess, camera) for camera in cameras], check_stop)
 
 
 def test_each_is_asked_until_it_is_open() -> None:
@@ -47,14 +47,14 @@ def test_each_is_asked_until_it_is_open() -> None:
     assert (slow.asked, fast.asked) == (5, 2)
 
 
-def test_one_that_fails_is_told_though_another_one_hangs() -> None:
+def test_one_that_fails_is_reported_though_another_one_hangs() -> None:
     hung, broken = Opening("hung", float("inf")), Opening("broken", 3, fails=True)
     with pytest.raises(HardwareMissing, match="cannot be opened"):
         wait(hung, broken)
     assert hung.asked == 3
 
 
-def test_a_stop_is_heard_while_a_camera_hangs() -> None:
+def test_a_stop_is_handled_while_a_camera_hangs() -> None:
     hung = Opening("hung", float("inf"))
     with pytest.raises(StoppedByOperator):
         wait(hung, stop_after=4)

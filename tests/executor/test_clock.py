@@ -16,7 +16,7 @@ CYCLE_NS = 10_000_000
 
 
 class _Time:
-    """A monotonic clock that is moved by hand; sleeping overshoots by a given time."""
+    """A monotonic clock set by the test; sleeping overshoots by a given time."""
 
     def __init__(self) -> None:
         self.now = 5_000_000_000
@@ -61,7 +61,7 @@ def test_cycles_begin_on_time_whatever_the_work_takes(time):
         assert time.now == begin + cycle * CYCLE_NS
 
 
-def test_small_delays_are_told_and_do_not_add_up(time):
+def test_small_delays_are_reported_and_do_not_add_up(time):
     real = RealClock(CYCLE)
     real.next_cycle()
     begin, time.overshoot = time.now, 80_000
@@ -109,7 +109,7 @@ def test_the_time_of_a_cycle_is_when_it_truly_began(time):
     assert real.time - first == pytest.approx(CYCLE + 80e-6)
 
 
-def test_a_moment_that_is_over_is_not_slept_for():
+def test_a_frame_that_is_over_is_not_slept_for():
     scheduling.sleep_until(1)
 
 
@@ -125,7 +125,7 @@ def test_time_left_ends_before_the_cycle_does(time):
 
 
 @given(works=st.lists(st.floats(0.0, 0.02), min_size=1, max_size=20))
-def test_what_the_operator_says_counts_until_a_fifth_of_the_cycle_is_left(works):
+def test_what_the_operator_requests_counts_until_a_fifth_of_the_cycle_is_left(works):
     time, real = _Time(), RealClock(CYCLE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scheduling, "time", time)

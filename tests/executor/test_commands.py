@@ -1,4 +1,4 @@
-"""The command socket: what is a command, who is answered, and that nobody keeps others waiting."""
+"""The command socket: commands, answers, and clients that do not block others."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.remote.client import ask_all, last_word, no_answer, select_run
+from executor.remote.client import ask_all, final_status, no_answer, select_run
 from executor.remote.command_socket import (
-    LONGEST_QUESTION,
+    LONGEST_REQUEST,
     MOST_CLIENTS,
-    Reached,
+    RunConnection,
     advertised,
     find_runs,
     serving,
 )
-from executor.remote.protocol import NotACommand, answer_to, make_line, parse_command
+from executor.remote.protocol import InvalidCommand, answer_to, make_line, parse_command
 from executor.supervision import LocalRequests, OperatorRequests
 from model.errors import BadInput, Fault
 
 
 class _Status:
-    """Stands in for `RunStatus`: its content is not what these tests are about."""
+    """Replaces `RunStatus`, whose content does not matter here."""
 
     def as_dict(self) -> dict[str, Any]:
         return {"state": "moving"}
@@ -44,11 +44,11 @@ def _answer(line: bytes, board: LocalRequests | None = None) -> dict[str, Any]:
     return json.loads(answer_to(line, board or LocalRequests(), STATUS))
 
 
-def test_each_command_puts_up_its_wish_and_leaves_the_others():
+def test_each_command_posts_its_request_and_leaves_the_others():
     board = LocalRequests()
     assert _answer(make_line("status"), board) == {"ok": True, "status": {"state": "moving"}}
     assert board.read() == OperatorRequests()
-    for command, percent, wishes in (
+    for command, percent, requests in (
         ("speed", 40, OperatorRequests(speed=0.4)),
         ("hold", None, OperatorRequests(speed=0.4, hold=True)),
         ("resume", None, OperatorRequests(speed=0.4)),
@@ -56,7 +56,7 @@ def test_each_command_puts_up_its_wish_and_leaves_the_others():
         ("resume", None, OperatorRequests(speed=0.4, stop=True)),
     ):
         assert _answer(make_line(command, percent=percent), board)["ok"] is True
-        assert board.read() == wishes
+        assert board.read() == requests
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_each_command_puts_up_its_wish_and_leaves_the_others():
         b"\xff\xfe",
     ],
 )
-def test_what_is_no_command_changes_nothing_and_is_told(line):
+def test_what_is_not_a_command_changes_nothing_and_is_reported(line):
     board = LocalRequests()
     answer = _answer(line, board)
     assert answer["ok"] is False
@@ -94,20 +94,20 @@ def test_no_bytes_do_anything_but_a_command(line):
 
 
 @given(percent=st.integers(1, 100))
-def test_a_speed_travels_as_it_was_said(percent):
+def test_a_speed_travels_as_given(percent):
     command = parse_command(make_line("speed", percent=percent))
     assert command.percent == percent  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("percent", [0, 101])
-def test_a_speed_that_is_none_is_no_command(percent):
-    with pytest.raises(NotACommand):
+def test_a_speed_that_is_invalid_is_not_a_command(percent):
+    with pytest.raises(InvalidCommand):
         parse_command(make_line("speed", percent=percent))
 
 
 @pytest.fixture
 def board(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[LocalRequests]:
-    """Of a run that answers."""
+    """The socket of a run that answers."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
@@ -144,12 +144,12 @@ def test_several_lines_at_once_and_a_line_in_pieces_are_understood(board):
 
 def test_a_line_without_end_is_cut_off(board):
     with _connected() as link:
-        link.sendall(b"x" * (LONGEST_QUESTION + 1))
+        link.sendall(b"x" * (LONGEST_REQUEST + 1))
         with suppress(ConnectionResetError):  # what was not read yet is thrown away
             assert link.recv(10) == b""
 
 
-def test_a_client_that_never_reads_or_never_speaks_keeps_nobody_waiting(board):
+def test_a_client_that_never_reads_or_never_speaks_blocks_no_other(board):
     with _connected() as deaf:
         deaf.setblocking(False)
         with suppress(OSError):  # full, or let go
@@ -166,17 +166,17 @@ def test_a_client_that_never_reads_or_never_speaks_keeps_nobody_waiting(board):
                 link.close()
 
 
-def test_a_run_that_ends_is_told_apart_from_one_that_hangs(monkeypatch):
+def test_a_run_that_ends_is_distinguished_from_one_that_hangs(monkeypatch):
     monkeypatch.setattr("executor.remote.client.ANSWER_TIMEOUT", 0.05)
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        (hanging,) = ask_all([Reached(7, ours)], "stop")
+        (hanging,) = ask_all([RunConnection(7, ours)], "stop")
         assert (hanging.status, hanging.ended) == (None, False)
         assert theirs.recv(100) == make_line("stop")
     ours, theirs = socket.socketpair()
     theirs.close()
     with ours:
-        (ended,) = ask_all([Reached(7, ours)], "stop")
+        (ended,) = ask_all([RunConnection(7, ours)], "stop")
         assert (ended.status, ended.ended) == (None, True)
     assert "did not answer" in no_answer("stop", [hanging]).what
     assert "ended" in no_answer("stop", [ended]).what
@@ -197,14 +197,14 @@ def test_a_run_that_refuses_is_quoted(said, what):
     with ours, theirs:
         thread = threading.Thread(target=lambda: (theirs.recv(100), theirs.sendall(said)))
         thread.start()
-        (answer,) = ask_all([Reached(7, ours)], "status")
+        (answer,) = ask_all([RunConnection(7, ours)], "status")
         thread.join()
     assert (answer.status, answer.ended) == (None, False)
     assert what in answer.what
     assert what in no_answer("hold", [answer]).what
 
 
-def test_a_command_counts_although_the_run_cannot_tell_how_it_stands():
+def test_a_command_counts_although_the_run_cannot_report_its_status():
     class Broken:
         def as_dict(self) -> dict[str, Any]:
             raise RuntimeError("half a status")
@@ -230,7 +230,7 @@ def test_a_run_that_could_not_be_stopped_from_elsewhere_any_more_is_stopped(monk
 def test_which_run_is_meant_must_be_clear():
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        one, other = Reached(7, ours), Reached(8, theirs)
+        one, other = RunConnection(7, ours), RunConnection(8, theirs)
         assert select_run([one], None, "hold") is one
         assert select_run([one, other], 8, "hold") is other
         with pytest.raises(BadInput, match="2 runs"):
@@ -242,12 +242,12 @@ def test_which_run_is_meant_must_be_clear():
 
 
 @pytest.mark.parametrize("asked", [0, 1])
-def test_a_run_that_ends_says_once_more_how_it_stands(
+def test_a_run_that_ends_sends_its_status_once_more(
     asked: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """To those who watch it; who looks a few times a second may have missed the end."""
+    """A monitor that reads a few times per second may have missed the end."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setenv("TMPDIR", str(tmp_path))  # root looks at all users' runs there
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # root finds all users' runs there
     monkeypatch.setattr(tempfile, "tempdir", None)
     now = {"state": "moving"}
     status: Any = SimpleNamespace(as_dict=lambda: now)
@@ -258,27 +258,27 @@ def test_a_run_that_ends_says_once_more_how_it_stands(
                 assert ask_all(runs, "status")[0].status == {"state": "moving"}
             now = {"state": "latched", "cause": "cable 6 is slack"}
         assert ask_all(runs, "status")[0].ended
-        assert last_word(runs[0]) == now
-        assert last_word(runs[0]) is None
+        assert final_status(runs[0]) == now
+        assert final_status(runs[0]) is None
 
 
 class _Presses:
-    """Keeps what it is told; takes every press but the last."""
+    """Records its calls; accepts every press except the last."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[Any, ...]] = []
+        self.calls: list[tuple[Any, ...]] = []
 
     def hold(
         self, number: int, direction: Any, *, in_platform: bool, step: float | None, percent: int
     ) -> bool:
-        self.told.append((number, direction.tolist(), in_platform, step, percent))
+        self.calls.append((number, direction.tolist(), in_platform, step, percent))
         return number < 9
 
     def let_go(self, number: int) -> None:
-        self.told.append(("let go", number))
+        self.calls.append(("let go", number))
 
     def end(self) -> None:
-        self.told.append(("end",))
+        self.calls.append(("end",))
 
 
 def _said(presses: _Presses | None, **question: Any) -> dict[str, Any]:
@@ -288,14 +288,14 @@ def _said(presses: _Presses | None, **question: Any) -> dict[str, Any]:
     return answer
 
 
-def test_a_session_of_jogs_takes_what_is_said_of_presses() -> None:
+def test_a_session_of_jogs_takes_what_is_reported_of_presses() -> None:
     presses = _Presses()
     held = {"command": "held", "press": 3, "direction": [0, 0.6, 0.8], "frame": "platform"}
     assert _said(presses, **held, step_mm=0.1, percent=25)["ok"]
     assert _said(presses, command="held", press=4, direction=[1, 1, 0])["ok"]
     assert _said(presses, command="let_go", press=4)["ok"]
     assert _said(presses, command="end")["ok"]
-    first, second, *others = presses.told
+    first, second, *others = presses.calls
     assert first == (3, [0.0, pytest.approx(0.6), pytest.approx(0.8)], True, 0.0001, 25)
     assert second == (4, pytest.approx([0.5**0.5, 0.5**0.5, 0.0]), False, None, 100)
     assert others == [("let go", 4), ("end",)]
@@ -317,13 +317,13 @@ def test_a_session_of_jogs_takes_what_is_said_of_presses() -> None:
         {"more": 1},
     ],
 )
-def test_a_press_that_is_none_is_refused(wrong: dict[str, Any]) -> None:
+def test_a_press_that_is_invalid_is_refused(wrong: dict[str, Any]) -> None:
     presses = _Presses()
     good = {"command": "held", "press": 1, "direction": [1, 0, 0]}
     assert _said(presses, **good)["ok"]
-    presses.told.clear()
+    presses.calls.clear()
     assert not _said(presses, **{**good, **wrong})["ok"]
-    assert not presses.told
+    assert not presses.calls
 
 
 @pytest.mark.parametrize("command", ["held", "let_go", "end"])
@@ -333,7 +333,7 @@ def test_any_other_motion_takes_no_jogs(command: str) -> None:
 
 
 class _Noted:
-    """Notes what is said of presses; a cable 9 is not there."""
+    """Records reports of presses; there is no cable 9."""
 
     def __init__(self) -> None:
         self.said: list[Any] = []

@@ -1,4 +1,4 @@
-"""What whole counts and noisy torques make of a pose is what its covariance says."""
+"""The scatter of poses from whole counts and noisy torques agrees with their covariance."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from executor.recording.clearance import covariance_by_drives, tension_noise
+from executor.recording.clearance import encoder_covariance, tension_noise
 from model.kinematics import cable_lengths, forward_kinematics
 from model.pose import Array, Pose, rotation_vector_from_matrix
 from model.rig import Rig, load_rig, rig_from_document
@@ -23,18 +23,18 @@ def soft(stiffness_n: float) -> Rig:
 
 
 def found(rig: Rig, winches: WinchMap, pose: Pose, noise: float, count: int) -> Array:
-    """Twists from the true pose to those by drives that round and torques that are noisy."""
+    """Twists from the true pose to encoder poses with rounded counts and noisy torques."""
     random = np.random.default_rng(5)
     tensions = working_tensions(rig, pose).tensions
     counts = winches.counts(winches.unstrained(cable_lengths(rig, pose), tensions))
     twists = []
     for _ in range(count):
         rounded = counts + random.uniform(-0.5, 0.5, rig.cable_count)
-        told = tensions + noise * random.standard_normal(rig.cable_count)
-        lengths = winches.strained(winches.unstrained_from_counts(rounded), told)
+        measured = tensions + noise * random.standard_normal(rig.cable_count)
+        lengths = winches.strained(winches.unstrained_from_counts(rounded), measured)
         at = forward_kinematics(rig, lengths, pose).pose
-        turned = rotation_vector_from_matrix(at.rotation @ pose.rotation.T)
-        twists.append(np.concatenate([at.position - pose.position, turned]))
+        rotated = rotation_vector_from_matrix(at.rotation @ pose.rotation.T)
+        twists.append(np.concatenate([at.position - pose.position, rotated]))
     return np.array(twists)
 
 
@@ -43,7 +43,7 @@ def test_it_is_what_many_measurements_show(stiffness_n: float) -> None:
     rig = soft(stiffness_n)
     winches = WinchMap(rig)
     pose = Pose.level(rig.home.position + np.array([0.08, -0.05, 0.06]))
-    stated = covariance_by_drives(winches, rig, pose, np.full(rig.cable_count, 0.5))
+    stated = encoder_covariance(winches, rig, pose, np.full(rig.cable_count, 0.5))
     seen = found(rig, winches, pose, 0.5, 400)
     assert np.sqrt(np.diag(stated)) == pytest.approx(seen.std(axis=0), rel=0.15)
 
@@ -52,8 +52,8 @@ def test_soft_cables_and_noisy_torques_make_it_worse() -> None:
     stiff, weak = soft(848e3), soft(1.4e3)
 
     def worst(rig: Rig, noise: float) -> float:
-        told = np.full(rig.cable_count, noise)
-        covariance = covariance_by_drives(WinchMap(rig), rig, rig.home, told)
+        measured = np.full(rig.cable_count, noise)
+        covariance = encoder_covariance(WinchMap(rig), rig, rig.home, measured)
         return float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
 
     assert worst(stiff, 0.5) < 0.1e-3
@@ -66,8 +66,8 @@ def test_noise_is_taken_from_what_changes_between_cycles() -> None:
     random = np.random.default_rng(2)
     slow = 20.0 + 5.0 * np.sin(np.linspace(0.0, 3.0, 4000))[:, None] * np.ones(rig.cable_count)
     true = np.linspace(0.2, 3.0, rig.cable_count)
-    told = slow + true * random.standard_normal(slow.shape)
-    assert tension_noise(rig, told) == pytest.approx(true, rel=0.1)
+    measured = slow + true * random.standard_normal(slow.shape)
+    assert tension_noise(rig, measured) == pytest.approx(true, rel=0.1)
     rounding = tension_noise(rig, np.full((5, rig.cable_count), np.nan))
     assert (rounding > 0.0).all()
     assert tension_noise(rig, np.ones((5, rig.cable_count))) == pytest.approx(rounding)

@@ -1,4 +1,4 @@
-"""The latch of a bus: who holds it, what a second program sees, and what cannot be kept."""
+"""The fault latch: who holds it, what a second program sees, and write failures."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ BUS = BusSettings("udp_multicast", "239.74.163.62")
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(locks, "SHARED", tmp_path / "absent")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    monkeypatch.setattr(fault_latch, "LOOKS_WITHIN", 0.02)
+    monkeypatch.setattr(fault_latch, "LOCK_TIMEOUT", 0.02)
     return tmp_path / "cdpr"
 
 
 def two() -> tuple[FaultLatch, FaultLatch]:
-    """Of two programs; locks of two open files keep each other out in one process, too."""
+    """The latches of two programs; locks of two open files also conflict in one process."""
     return FaultLatch(BUS), FaultLatch(BUS)
 
 
@@ -45,7 +45,7 @@ def test_nothing_is_latched_at_first() -> None:
     assert not mine.held_by_another()
 
 
-def test_while_a_motion_is_under_way_others_are_refused_by_its_process(folder: Path) -> None:
+def test_while_a_motion_is_active_others_are_refused_by_its_process(folder: Path) -> None:
     mine, other = two()
     mine.engage("a rig", folder)
     assert not mine.held_by_another(), "it is held by this one"
@@ -74,7 +74,7 @@ def test_an_engaged_latch_is_not_engaged_again(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("state", [State.FINISHED, State.STOPPED])
-def test_a_good_end_disengages_and_lets_go(folder: Path, state: State) -> None:
+def test_a_good_end_disengages_and_releases_the_lock(folder: Path, state: State) -> None:
     mine, other = two()
     mine.engage("a rig", folder)
     mine.settle("a rig", state, "", folder)
@@ -123,7 +123,7 @@ def test_a_latch_that_changed_since_it_was_shown_is_not_reset(folder: Path) -> N
     assert not mine.held_by_another()
 
 
-def test_a_file_that_is_no_latch_counts_as_engaged(folder: Path) -> None:
+def test_a_file_that_is_not_a_latch_counts_as_engaged(folder: Path) -> None:
     mine, _ = two()
     folder.mkdir()
     mine.path.write_text("[]")
@@ -155,7 +155,7 @@ def test_what_cannot_be_written_is_refused_with_its_reason(folder: Path, what: s
             other.held_by_another()
 
 
-def test_a_latch_that_cannot_be_removed_is_told_and_stays_held(folder: Path) -> None:
+def test_a_latch_that_cannot_be_removed_is_reported_and_stays_held(folder: Path) -> None:
     mine, other = two()
     mine.engage("a rig", folder)
     mine.path.unlink()
@@ -201,10 +201,10 @@ def test_nothing_moves_when_the_lock_or_its_folder_cannot_be_made(
     assert not other.held_by_another()
 
 
-def test_a_motion_that_engages_between_two_looks_keeps_the_other_out(
+def test_a_motion_that_engages_between_two_reads_keeps_the_other_out(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first look is without the lock: what was engaged and settled since counts."""
+    """The first check is without the lock: changes since then count."""
     mine, other = two()
     hold = FaultLatch._hold
 
@@ -223,7 +223,7 @@ def test_a_motion_that_engages_between_two_looks_keeps_the_other_out(
     assert latched.cause == "a drive failed"
 
 
-def test_looks_and_refusals_leave_no_file_open(
+def test_reads_and_refusals_leave_no_file_open(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mine, other = two()

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "faults"
 HEADINGS = ["## What it means", "## Likely cause", "## State of the machine", "## Next step"]
 #: Which argument of a call is the code of an event.
-PLACES = {
+CODE_ARGUMENT = {
     "CameraNews": 0,
     "Alarm": 1,
     "LoopEvent": 2,
@@ -28,25 +28,25 @@ PLACES = {
     "StopReason": 0,
     "_stop": 2,
     "_fault": 0,
-    "_tell": 0,
-    "_tell_cause": 0,
-    "tell": 0,
+    "_report": 0,
+    "_report_cause": 0,
+    "report_event": 0,
 }
 
 
 def codes_in_the_source() -> Iterator[str]:
-    """Codes that are written where events are made; and those of faults of the bus."""
+    """Codes of events in the source, and those of bus faults."""
     for path in [*(ROOT / "executor").rglob("*.py"), *(ROOT / "cdpr").rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.Call):
                 continue
             name = getattr(node.func, "attr", getattr(node.func, "id", ""))
-            place = PLACES.get(name)
-            if place is not None and len(node.args) > place:
-                code = node.args[place]
+            index = CODE_ARGUMENT.get(name)
+            if index is not None and len(node.args) > index:
+                code = node.args[index]
                 if isinstance(code, ast.Constant) and isinstance(code.value, str):
                     yield code.value
-    yield from ("recorder", "supervisor_lost")  # told in a loop, by name
+    yield from ("recorder", "supervisor_lost")  # reported in a loop, by name
     yield from (kind.code for kind in (BusFault, *BusFault.__subclasses__()))
 
 
@@ -90,11 +90,11 @@ def test_faults_are_named_once_and_nothing_else_is() -> None:
     "code",
     [*sorted(ORDINARY), *get_args(StopDocument.model_fields["kind"].annotation), "unheard_of"],
 )
-def test_an_event_that_is_no_fault_points_to_no_page(code: str) -> None:
+def test_an_event_that_is_not_a_fault_points_to_no_page(code: str) -> None:
     assert page_of(code) == ""
 
 
-def test_every_page_is_explained_and_a_wrong_code_is_told_the_right_ones() -> None:
+def test_every_page_is_explained_and_a_wrong_code_gets_the_right_ones() -> None:
     for code in fault_codes():
         answer = call("explain", code)
         assert answer.code == 0

@@ -17,12 +17,12 @@ motions = st.sampled_from([GACHON, HALL])
 
 
 def _to_rest(feed: Feed, most: int = 5000) -> list[float]:
-    """Every place until it is at rest."""
-    places = [feed.index]
+    """All indices until it is at rest."""
+    indices = [feed.index]
     for _ in range(most):
         if feed.at_rest:
-            return places
-        places.append(feed.advance())
+            return indices
+        indices.append(feed.advance())
     raise AssertionError("it never came to rest")
 
 
@@ -50,21 +50,21 @@ def test_a_table_of_one_row_is_at_rest_from_the_start():
 @given(rows=st.integers(1, 400), before=st.integers(0, 400), motion=motions)
 @settings(max_examples=60)
 def test_a_stop_anywhere_comes_to_rest_ahead_and_never_beyond_the_end(rows, before, motion):
-    places = _stopped(rows, before, motion)
-    assert places[0] == min(before, rows - 1)
-    steps = np.diff(places)
+    indices = _stopped(rows, before, motion)
+    assert indices[0] == min(before, rows - 1)
+    steps = np.diff(indices)
     assert (steps >= 0.0).all()
     assert (steps <= 1.0 + 1e-9).all()
-    assert max(places) <= rows - 1
+    assert max(indices) <= rows - 1
     assert (np.diff(steps) <= 1e-9).all(), "it slows down only"
 
 
 @given(before=st.integers(0, 50), motion=motions, cycle=st.sampled_from([0.004, 0.01, 0.02]))
 @settings(max_examples=40)
 def test_at_full_speed_a_stop_keeps_the_paths_acceleration_and_jerk(before, motion, cycle):
-    places = _stopped(5000, before, motion, cycle)
+    indices = _stopped(5000, before, motion, cycle)
     metres = (
-        np.array([before - 2.0, before - 1.0, *places, *[places[-1]] * 3]) * motion.speed * cycle
+        np.array([before - 2.0, before - 1.0, *indices, *[indices[-1]] * 3]) * motion.speed * cycle
     )
     acceleration = np.abs(np.diff(metres, 2)) / cycle**2
     jerk = np.abs(np.diff(metres, 3)) / cycle**3
@@ -74,13 +74,13 @@ def test_at_full_speed_a_stop_keeps_the_paths_acceleration_and_jerk(before, moti
 
 @given(before=st.integers(0, 50), motion=motions)
 @settings(max_examples=20)
-def test_a_stop_takes_the_textbook_way(before, motion):
+def test_a_stop_takes_the_textbook_distance(before, motion):
     """From v to rest, acceleration a, jerk j: v/2 (v/a + a/j), or v √(v/j) if a is not reached."""
     v, a, j = motion.speed, motion.acceleration, motion.jerk
     time = v / a + a / j if v >= a**2 / j else 2.0 * np.sqrt(v / j)
-    places = _stopped(5000, before, motion)
-    assert (places[-1] - before) * CYCLE == pytest.approx(time / 2.0, rel=1e-6)
-    assert len(places) - 1 == pytest.approx(np.ceil(time / CYCLE), abs=1)
+    indices = _stopped(5000, before, motion)
+    assert (indices[-1] - before) * CYCLE == pytest.approx(time / 2.0, rel=1e-6)
+    assert len(indices) - 1 == pytest.approx(np.ceil(time / CYCLE), abs=1)
 
 
 def test_a_second_stop_changes_nothing():
@@ -100,46 +100,46 @@ def test_at_rest_it_stays_at_rest():
     feed = Feed(500, CYCLE, GACHON)
     feed.advance()
     feed.stop()
-    places = _to_rest(feed)
-    assert [feed.advance() for _ in range(5)] == [places[-1]] * 5
+    indices = _to_rest(feed)
+    assert [feed.advance() for _ in range(5)] == [indices[-1]] * 5
 
 
 def test_a_stop_that_reaches_the_last_row_ends_there():
-    places = _stopped(30, 27, GACHON)
-    assert places[-1] == 29
+    indices = _stopped(30, 27, GACHON)
+    assert indices[-1] == 29
 
 
 def test_a_stop_harder_than_one_cycle_can_show_is_at_rest_at_once():
     fierce = Motion(0.02, 1e6, 1e12, 0.001, 0.002, 0.001, 0.00007, 0.002)
-    places = _stopped(100, 10, fierce)
-    assert len(places) <= 3
-    assert places[-1] <= 11.0
+    indices = _stopped(100, 10, fierce)
+    assert len(indices) <= 3
+    assert indices[-1] <= 11.0
 
 
-def _walked(motion: Motion, wishes: list[tuple[int, float]], rows: int = 5000) -> list[float]:
-    """Places of a feed that is asked for another rate after so many cycles each."""
+def _walked(motion: Motion, requests: list[tuple[int, float]], rows: int = 5000) -> list[float]:
+    """Indices of a feed with requests (cycles, rate) in sequence."""
     feed = Feed(rows, CYCLE, motion)
-    places = [feed.index]
-    for cycles, rate in wishes:
+    indices = [feed.index]
+    for cycles, rate in requests:
         feed.go_to(rate)
-        places += [feed.advance() for _ in range(cycles)]
-    return places
+        indices += [feed.advance() for _ in range(cycles)]
+    return indices
 
 
 @given(
-    wishes=st.lists(st.tuples(st.integers(0, 60), st.floats(0.0, 1.0)), min_size=1, max_size=8),
+    requests=st.lists(st.tuples(st.integers(0, 60), st.floats(0.0, 1.0)), min_size=1, max_size=8),
     motion=motions,
 )
 @settings(max_examples=80)
-def test_whatever_is_asked_for_it_keeps_between_rest_and_full_rate_and_changes_smoothly(
-    wishes, motion
+def test_whatever_is_requested_it_keeps_between_rest_and_full_rate_and_changes_smoothly(
+    requests, motion
 ):
-    """Also when one change is interrupted by the next."""
-    places = np.array(_walked(motion, wishes))
-    rates = np.diff(places)
+    """Also if a change is interrupted by the next."""
+    indices = np.array(_walked(motion, requests))
+    rates = np.diff(indices)
     assert (rates >= 0.0).all()
     assert (rates <= 1.0 + 1e-9).all()
-    metres = places * motion.speed * CYCLE
+    metres = indices * motion.speed * CYCLE
     limit = motion.acceleration * (1 + 1e-6)
     assert np.abs(np.diff(metres, 2)).max(initial=0.0) / CYCLE**2 <= limit
     limit = motion.jerk * (1 + 1e-6)
@@ -148,14 +148,14 @@ def test_whatever_is_asked_for_it_keeps_between_rest_and_full_rate_and_changes_s
 
 @given(rate=st.floats(0.01, 1.0), motion=motions)
 @settings(max_examples=30)
-def test_it_reaches_the_rate_that_was_asked_for_and_keeps_it(rate, motion):
-    places = _walked(motion, [(5, 1.0), (1000, rate)])
-    assert np.diff(places[-50:]) == pytest.approx(rate, abs=1e-9)
+def test_it_reaches_the_rate_that_was_requested_and_keeps_it(rate, motion):
+    indices = _walked(motion, [(5, 1.0), (1000, rate)])
+    assert np.diff(indices[-50:]) == pytest.approx(rate, abs=1e-9)
 
 
 @given(motion=motions, before=st.integers(0, 60), held=st.integers(0, 300))
 @settings(max_examples=30)
-def test_after_a_hold_it_goes_on_to_the_end_without_leaving_a_row_out(motion, before, held):
+def test_after_a_hold_it_continues_to_the_end_without_leaving_a_row_out(motion, before, held):
     feed = Feed(600, CYCLE, motion)
     for _ in range(before):
         feed.advance()
@@ -163,10 +163,10 @@ def test_after_a_hold_it_goes_on_to_the_end_without_leaving_a_row_out(motion, be
     for _ in range(held):
         feed.advance()
     feed.go_to(1.0)
-    places = _to_rest(feed)
-    assert places[-1] == 599
+    indices = _to_rest(feed)
+    assert indices[-1] == 599
     assert feed.at_end
-    assert (np.diff(places) <= 1.0 + 1e-9).all()
+    assert (np.diff(indices) <= 1.0 + 1e-9).all()
 
 
 def test_asking_again_for_the_same_rate_changes_nothing():
@@ -179,7 +179,7 @@ def test_asking_again_for_the_same_rate_changes_nothing():
 
 
 @pytest.mark.parametrize("rate", [-0.01, 1.01, float("nan")])
-def test_a_rate_the_table_was_not_proved_for_is_refused(rate):
+def test_a_rate_the_table_was_not_checked_for_is_refused(rate):
     with pytest.raises(ValueError, match="not from 0 to 1"):
         Feed(10, CYCLE, GACHON).go_to(rate)
 
@@ -201,14 +201,14 @@ def test_between_rows_of_opposite_ends_nothing_overflows():
 
 @given(
     steps=st.lists(st.integers(-400, 400), min_size=1, max_size=30),
-    place=st.floats(0.0, 1.0),
+    share=st.floats(0.0, 1.0),
     rate=st.floats(0.0, 1.0),
 )
 @settings(max_examples=300)
-def test_no_step_between_places_is_longer_than_the_longest_row(steps, place, rate):
+def test_no_step_between_indices_is_longer_than_the_longest_row(steps, share, rate):
     """The gate allows a row's step and not a count more, also while slowing down."""
     table = np.cumsum([[0], *[[s] for s in steps]], axis=0).astype(np.int32)
-    here = place * len(steps)
+    here = share * len(steps)
     there = min(here + rate, float(len(steps)))
     before, after = (targets_at(table, index)[0] for index in (here, there))
     assert abs(after - before) <= max(abs(s) for s in steps)

@@ -45,7 +45,7 @@ def scene() -> Scene:
 
 @dataclass
 class Script:
-    """Holds controls by simulated time, and keeps what the loop did."""
+    """Holds controls in simulated time, and keeps the records of the loop."""
 
     holds: list[tuple[float, float, Callable[[PressBoard], object]]]
     end: float
@@ -73,7 +73,7 @@ def hold(
 
 
 def positions(records: list[CycleRecord]) -> Array:
-    """Where the platform was sent, by an inverse of its own, shape (n, 3), [m]."""
+    """Commanded positions, by an independent forward kinematics, shape (n, 3), [m]."""
     winches, pose, found = WinchMap(rig()), rig().home, []
     last: tuple[int, ...] = ()
     for record in records:
@@ -94,14 +94,14 @@ def moved(records: list[CycleRecord]) -> list[bool]:
     return [False, *(a != b for a, b in pairwise(targets))]
 
 
-def test_it_goes_straight_while_held_and_stops_when_let_go() -> None:
+def test_it_goes_straight_while_held_and_stops_when_released() -> None:
     x = np.array([1.0, 0.0, 0.0])
     records = Script([(0.5, 1.5, hold(1, x))], 3.0).run(scene())
-    way = positions(records) - rig().home.position
+    path = positions(records) - rig().home.position
     at = np.array([record.at for record in records])
-    assert way[-1, 0] == pytest.approx(0.02, abs=0.005), "about a second at 20 mm/s"
-    assert np.abs(way[:, 1:]).max() < 2e-4
-    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    assert path[-1, 0] == pytest.approx(0.02, abs=0.005), "about a second at 20 mm/s"
+    assert np.abs(path[:, 1:]).max() < 2e-4
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     cycle = rig().document.bus.cycle_ms / 1000.0
     assert steps.max() <= 0.020 * cycle * 1.2
     still = np.array(moved(records))
@@ -115,16 +115,16 @@ def test_it_goes_straight_while_held_and_stops_when_let_go() -> None:
 def test_a_step_ends_where_it_should(length: float) -> None:
     z = np.array([0.0, 0.0, 1.0])
     records = Script([(0.5, 3.0, hold(1, z, step=length))], 3.5).run(scene())
-    way = positions(records)[-1] - positions(records[:5])[-1]
-    assert way[2] == pytest.approx(length, abs=3e-5)
-    assert np.abs(way[:2]).max() < 5e-5
+    path = positions(records)[-1] - positions(records[:5])[-1]
+    assert path[2] == pytest.approx(length, abs=3e-5)
+    assert np.abs(path[:2]).max() < 5e-5
 
 
-def test_a_step_that_is_let_go_ends_early() -> None:
+def test_a_step_that_is_released_ends_early() -> None:
     z = np.array([0.0, 0.0, 1.0])
     records = Script([(0.5, 0.7, hold(1, z, step=0.010))], 3.0).run(scene())
-    way = positions(records)[-1, 2] - rig().home.position[2]
-    assert 0.0005 < way < 0.008
+    path = positions(records)[-1, 2] - rig().home.position[2]
+    assert 0.0005 < path < 0.008
 
 
 def test_the_speed_follows_the_share_that_is_held() -> None:
@@ -134,7 +134,7 @@ def test_the_speed_follows_the_share_that_is_held() -> None:
 
 
 def test_it_comes_to_rest_before_an_obstacle_as_near_as_it_may() -> None:
-    """Towards the nearest body, until no more can be proved; the limit is the scene's."""
+    """Towards the nearest obstacle, to the end of the checked line; the limit is the scene's."""
     model, home = ClearanceModel(rig(), scene()), rig().home
     near = model.smallest(home)
     assert near is not None
@@ -165,10 +165,10 @@ def test_nothing_moves_unless_it_is_held(presses: list[tuple[int, int, int, bool
     spans = []
     for number, (axis, step, length, silent) in enumerate(presses, start=1):
         until = begin + 0.05 * length
-        way = None if step > 2 else STEPS[step]
-        say = hold(number, AXES[axis], step=way)
+        path = None if step > 2 else STEPS[step]
+        say = hold(number, AXES[axis], step=path)
         holds.append((begin, until, say))
-        if silent:  # heard of again after it was silent for too long: it must stay over
+        if silent:  # reported again after too long a silence: it must stay over
             holds.append((until + 0.25, until + 0.5, say))
             spans.append((begin, until))
             begin = until + 0.6
@@ -205,10 +205,10 @@ def test_a_stop_ends_the_session_along_the_line() -> None:
     rates = [record.rate for record in script.records]
     steps = np.abs(np.diff(rates))
     assert script.records[-1].at < 2.5
-    assert steps.max() < 0.5, "it slows down, it does not break off"
+    assert steps.max() < 0.5, "it slows down smoothly"
 
 
-def test_rows_that_changed_on_their_way_are_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_that_changed_in_transit_are_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     put = PieceRing.put
 
     def bend(ring: PieceRing, piece: Piece) -> None:
@@ -222,17 +222,17 @@ def test_rows_that_changed_on_their_way_are_a_fault(monkeypatch: pytest.MonkeyPa
         Script([(0.5, 1.5, hold(1, x))], 3.0).run(scene())
 
 
-def test_a_session_ends_by_itself_when_nothing_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_ends_on_its_own_when_nothing_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sessions, "IDLE", 0.8)
     records = Script([], 99.0).run(scene())
     assert 0.8 < records[-1].at < 2.0
 
 
-def test_a_line_is_proved_as_a_whole_would_be() -> None:
-    """Its pieces, end to end, are the set-points of the line; none is left out or there twice."""
+def test_a_line_is_checked_as_a_whole_would_be() -> None:
+    """Its pieces, end to end, are the set-points of the line, without gaps or repeats."""
     slow = with_speed(rig(), 0.020)
     line = JogLine(slow, scene(), rig().home, np.array([0.0, 1.0, 0.0]))
-    parts = [line.go_on(FIRST_ROWS), line.go_on(MOST_ROWS), line.go_on(3)]
+    parts = [line.extend(FIRST_ROWS), line.extend(MOST_ROWS), line.extend(3)]
     rows = np.concatenate([parts[0].table.setpoints, *(p.table.setpoints[1:] for p in parts[1:])])
     assert len(rows) == line.rows == FIRST_ROWS + MOST_ROWS + 3 + 1
     for before, after in pairwise(parts):
@@ -240,15 +240,15 @@ def test_a_line_is_proved_as_a_whole_would_be() -> None:
     spacing = 0.020 * slow.document.bus.cycle_ms / 1000.0
     end = line.pose(line.rows - 1).position - rig().home.position
     assert end[1] == pytest.approx(spacing * (line.rows - 1), abs=1e-9)
-    assert np.abs(np.diff(rows.astype(np.int64), n=2, axis=0)).max() <= 4, "at an even speed"
+    assert np.abs(np.diff(rows.astype(np.int64), n=2, axis=0)).max() <= 4, "at constant speed"
 
 
-def test_what_cannot_be_proved_is_not_added() -> None:
+def test_what_cannot_be_checked_is_not_added() -> None:
     slow = with_speed(rig(), 0.020)
     line = JogLine(slow, scene(), rig().home, np.array([0.0, 0.0, -1.0]))
-    line.go_on(FIRST_ROWS)
+    line.extend(FIRST_ROWS)
     with pytest.raises(CdprError):
-        line.go_on(6000)
+        line.extend(6000)
     assert line.rows == FIRST_ROWS + 1
 
 

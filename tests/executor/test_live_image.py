@@ -1,4 +1,4 @@
-"""Images for who looks on: whole or not at all, at most five a second, and none for nobody."""
+"""Images for viewers: complete or not at all, at most five per second, none without a viewer."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NOTHING = NoPose(0.5, "no tag")
 
 @pytest.fixture
 def now(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[float]]:
-    """The clock, which the test moves."""
+    """The clock, set by the test."""
     time = [100.0]
     monkeypatch.setattr(live_image.time, "monotonic", lambda: time[0])
     return time
@@ -48,7 +48,7 @@ def test_what_was_seen_arrives_with_what_was_measured(
     board = ImageBoard(memory)
     pose = Pose(np.array([0.1, 0.2, 0.3]), np.eye(3))
     found = PoseMeasurement(1.5, pose, np.eye(6), (3, 7), 0.1, "tracked")
-    assert not board.show(1, picture(1), found), "nobody looks"
+    assert not board.show(1, picture(1), found), "there is no viewer"
     with closing(ImageReader(os.getpid(), memory.descriptor)) as reader:
         assert reader.newest() is None
         assert board.show(2, picture(2), found)
@@ -67,7 +67,7 @@ def test_what_was_seen_arrives_with_what_was_measured(
         assert newest.found == NoPose(2.0, "dark")
 
 
-def test_at_most_five_a_second_are_shown_and_none_when_nobody_looks(
+def test_at_most_five_a_second_are_shown_and_none_when_there_is_no_viewer(
     memory: SharedMemory, now: list[float]
 ) -> None:
     board, shown = ImageBoard(memory), []
@@ -82,8 +82,8 @@ def test_at_most_five_a_second_are_shown_and_none_when_nobody_looks(
     assert min(b - a for a, b in itertools.pairwise(shown)) >= SHOWN_EVERY - 1e-9
 
 
-def test_half_an_image_is_none(memory: SharedMemory, now: list[float]) -> None:
-    """The reader comes while the camera's process writes."""
+def test_half_an_image_is_not_shown(memory: SharedMemory, now: list[float]) -> None:
+    """The viewer reads while the camera's process writes."""
     board = ImageBoard(memory)
     with closing(ImageReader(os.getpid(), memory.descriptor)) as reader:
         reader.newest()

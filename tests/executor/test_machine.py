@@ -1,4 +1,4 @@
-"""The state machine: every pair of state and event is either foreseen here or forbidden."""
+"""The state machine: every pair of state and event is either listed here or forbidden."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from executor.state_machine import Event, ForbiddenTransition, Machine, State
 
-#: The shortest way to every state.
-WAYS = {
+#: The shortest sequence of events to every state.
+EVENTS_TO = {
     State.READY: (),
     State.ENABLING: (Event.ENABLE,),
     State.APPROACHING: (Event.ENABLE, Event.ENABLED),
@@ -56,12 +56,12 @@ def _after(*events: Event) -> Machine:
 
 @pytest.mark.parametrize("state", list(State))
 def test_every_state_can_be_reached(state):
-    assert _after(*WAYS[state]).state is state
+    assert _after(*EVENTS_TO[state]).state is state
 
 
 @pytest.mark.parametrize(("state", "event"), list(product(State, Event)))
-def test_every_event_in_every_state_is_foreseen_or_forbidden(state, event):
-    machine = _after(*WAYS[state])
+def test_every_event_in_every_state_is_listed_or_forbidden(state, event):
+    machine = _after(*EVENTS_TO[state])
     if (state, event) in FORESEEN:
         wanted = FORESEEN[state, event]
         assert machine.on(event) is wanted
@@ -74,7 +74,7 @@ def test_every_event_in_every_state_is_foreseen_or_forbidden(state, event):
 
 @pytest.mark.parametrize("event", list(Event))
 def test_nothing_leads_out_of_latched(event):
-    machine = _after(*WAYS[State.MOVING], Event.FAULT)
+    machine = _after(*EVENTS_TO[State.MOVING], Event.FAULT)
     if event is not Event.FAULT:
         with pytest.raises(ForbiddenTransition):
             machine.on(event)
@@ -100,14 +100,14 @@ def test_nothing_but_events_changes_the_state():
     ],
 )
 def test_the_end_tells_how_it_came_to_it_and_a_fault_outweighs_a_stop(events, end):
-    machine = _after(*WAYS[State.MOVING], *events)
+    machine = _after(*EVENTS_TO[State.MOVING], *events)
     assert machine.state is State.SECURING
     assert machine.on(Event.HELD) is end
 
 
 @pytest.mark.parametrize("state", [State.ENABLING, State.APPROACHING])
 def test_a_stop_before_the_motion_ends_stopped(state):
-    assert _after(*WAYS[state], Event.STOP, Event.HELD).state is State.STOPPED
+    assert _after(*EVENTS_TO[state], Event.STOP, Event.HELD).state is State.STOPPED
 
 
 @given(events=st.lists(st.sampled_from(list(Event)), max_size=25))
@@ -122,7 +122,7 @@ def test_no_sequence_of_events_leaves_an_end_or_unlatches(events):
 
 
 @given(events=st.lists(st.sampled_from(list(Event)), max_size=25))
-def test_a_fault_on_the_way_never_ends_as_finished_or_stopped(events):
+def test_a_fault_on_the_path_never_ends_as_finished_or_stopped(events):
     machine, faulted = Machine(), False
     for event in events:
         try:

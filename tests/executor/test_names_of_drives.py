@@ -1,4 +1,4 @@
-"""What a run says of a drive: cables are counted, drives have the numbers they have on the bus."""
+"""Names of drives in reports: cables are counted, drives have their numbers on the bus."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class _Group:
         self.faults = tuple(faults)
 
     def send_cycle(self, _targets: Sequence[int], _may_send: object) -> None:
-        """Nobody listens."""
+        """Does nothing."""
 
     def receive(self, _timeout: float) -> SimpleNamespace:
-        """What they told."""
+        """Their reports."""
         return SimpleNamespace(
             positions=HOME[0],
             demands=HOME[0],
@@ -48,7 +48,7 @@ class _Group:
         )
 
 
-def test_a_drive_has_one_name_whoever_speaks_of_it():
+def test_a_drive_has_one_name_in_every_message():
     watch = DriveMonitor(HALL.drive_names, [1e9] * 10)
     watch.take(EMCY_BASE + 13, bytes.fromhex("1023000000000000"))
     group = _Group([*watch.news(), (WHOLE_BUS, "bus-off")])
@@ -56,8 +56,8 @@ def test_a_drive_has_one_name_whoever_speaks_of_it():
     exchange = Cycle(course, SyncMaster(HALL, group, SimulatedClock(0.01)))
     exchange.actual = tuple(HOME[0].tolist())
     done = exchange.cycle(Purpose.HOLD, exchange.actual, at_rest=True)
-    told = {(finding.drive, finding.text.split(":")[0]) for finding in done.findings}
-    assert told == {
+    reported = {(alarm.drive, alarm.text.split(":")[0]) for alarm in done.alarms}
+    assert reported == {
         (3, "cable 3 (drive 13)"),
         (0, "bus-off"),
         (5, "cable 5 (drive 15) did not answer for 1 cycle"),

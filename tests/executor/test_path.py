@@ -56,9 +56,9 @@ def test_a_line_is_the_straight_move_with_a_constant_axis(seed):
         start.position + shares[:, None] * (end.position - start.position), abs=1e-12
     )
     assert rotations == pytest.approx(Slerp([0, 1], ends)(shares).as_matrix(), abs=1e-9)
-    turned = (ends[0].inv() * ends[1]).magnitude()
+    rotated = (ends[0].inv() * ends[1]).magnitude()
     moved = np.linalg.norm(end.position - start.position)
-    assert segment.length == pytest.approx(np.hypot(moved, WEIGHT * turned), rel=1e-9)
+    assert segment.length == pytest.approx(np.hypot(moved, WEIGHT * rotated), rel=1e-9)
 
 
 def test_a_line_without_length_stays_where_it_is():
@@ -78,7 +78,7 @@ def test_a_corner_joins_its_lines_with_one_tangent_and_without_curvature(seed, t
     for joint in path.starts[1:3]:
         left, here, right = _coordinates(path, at, joint + np.array([-h, 0.0, h]))
         assert (here - left) / h == pytest.approx((right - here) / h, abs=1e-3)
-        # Zero on the line's side, so a jump of the curvature would show here as a whole.
+        # Zero on the line's side, so a jump of the curvature would show here in full.
         assert np.linalg.norm(right - 2.0 * here + left) / h**2 < 0.02 * path.segments[1].bends[0]
 
 
@@ -147,7 +147,7 @@ def test_a_polyline_goes_through_its_waypoints():
         assert pose.angle_to(waypoint) < 1e-9
 
 
-def test_a_turn_straight_back_is_no_corner():
+def test_a_turn_straight_back_is_not_a_corner():
     """Its curve would stop and reverse at full travelled speed."""
-    with pytest.raises(ValueError, match="straight back"):
+    with pytest.raises(ValueError, match="path reverses"):
         corner(at_mm(0, 0, 0), at_mm(10, 0, 0), at_mm(0, 0, 0), WEIGHT)

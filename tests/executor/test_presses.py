@@ -25,7 +25,7 @@ TIMES = st.floats(0.0, 2.0)
 
 
 class Time:
-    """A clock that goes when it is told to."""
+    """A clock set by the test."""
 
     def __init__(self) -> None:
         self.now = 10.0
@@ -49,7 +49,7 @@ def hold(board: PressBoard, number: int, percent: int = 100) -> bool:
 
 
 def test_a_press_lasts_150_ms_without_a_word() -> None:
-    """The number of the safety page, not of the code."""
+    """The value of the safety page, not of the code."""
     assert PressRule().held(1, heard=10.0, now=10.150 - 1e-9)
     assert not PressRule().held(1, heard=10.0, now=10.151)
     assert PressRule().held(1, heard=0.0, now=TIMEOUT), "up to the end of its time"
@@ -69,7 +69,7 @@ def test_a_new_board_holds_nothing_and_ends_nothing(board: PressBoard, time: Tim
 def test_a_press_that_comes_after_its_time_is_over_for_every_reader(
     board: PressBoard, time: Time
 ) -> None:
-    """Also for one whose clock lags: what is written says that nothing is held."""
+    """Also for a reader whose clock lags: the entry states that nothing is held."""
     hold(board, 1)
     time.now += 2.0 * TIMEOUT
     assert not hold(board, 1)
@@ -111,7 +111,7 @@ def test_a_press_that_was_over_is_never_held_again(looks: list[tuple[int, float,
     st.lists(st.tuples(st.sampled_from(["hold", "let go", "wait"]), NUMBERS, TIMES), max_size=40)
 )
 def test_loop_and_board_never_hold_what_is_not_held(said: list[tuple[str, int, float]]) -> None:
-    """The oracle keeps for each press when it was last said to be held, and whether it ended."""
+    """The oracle keeps the last report of each press, and whether it ended."""
     time = Time()
     board = PressBoard(time)
     reader = PressReader(board.memory)
@@ -130,8 +130,8 @@ def test_loop_and_board_never_hold_what_is_not_held(said: list[tuple[str, int, f
                 ended = max(ended, number)
             if number > ended and number >= newest:
                 newest, heard[number] = number, time.now
-        told, press = reader.read(time.now), board.held()
-        for seen in (told.press, 0 if press is None else press.number):
+        state, press = reader.read(time.now), board.held()
+        for seen in (state.press, 0 if press is None else press.number):
             assert seen in (0, newest)
             assert seen == 0 or (seen > ended and time.now - heard[seen] <= TIMEOUT)
         if newest > ended and time.now - heard[newest] > TIMEOUT:
@@ -139,7 +139,7 @@ def test_loop_and_board_never_hold_what_is_not_held(said: list[tuple[str, int, f
     board.close()
 
 
-def test_a_press_is_held_as_long_as_it_is_heard_of(board: PressBoard, time: Time) -> None:
+def test_a_press_is_held_as_long_as_it_is_reported(board: PressBoard, time: Time) -> None:
     reader = PressReader(board.memory)
     for _ in range(50):
         assert hold(board, 1)
@@ -152,7 +152,7 @@ def test_a_press_is_held_as_long_as_it_is_heard_of(board: PressBoard, time: Time
     assert reader.read(time.now).press == 2
 
 
-def test_what_a_press_asked_for_first_stays(board: PressBoard) -> None:
+def test_what_a_press_requested_first_stays(board: PressBoard) -> None:
     hold(board, 1)
     board.hold(1, -UP, in_platform=True, step=0.001, percent=50)
     press = board.held()
@@ -165,9 +165,9 @@ def test_what_a_press_asked_for_first_stays(board: PressBoard) -> None:
 def test_the_end_of_a_session_ends_what_is_held(board: PressBoard, time: Time) -> None:
     hold(board, 1)
     board.end()
-    told = PressReader(board.memory).read(time.now)
-    assert told.ends
-    assert told.press == 0
+    state = PressReader(board.memory).read(time.now)
+    assert state.ends
+    assert state.press == 0
     assert board.held() is None
 
 
@@ -177,22 +177,22 @@ def test_a_clock_that_jumps_back_holds_nothing(board: PressBoard, time: Time) ->
     assert PressReader(board.memory).read(time.now).press == 0
 
 
-@pytest.mark.parametrize("place", range(32))
-def test_an_entry_that_is_half_written_does_not_count(board: PressBoard, place: int) -> None:
+@pytest.mark.parametrize("index", range(32))
+def test_an_entry_that_is_half_written_does_not_count(board: PressBoard, index: int) -> None:
     hold(board, 1, percent=40)
     reader = PressReader(board.memory)
     assert reader.read(10.0).press == 1
-    before = board.memory.view[place]
-    board.memory.view[place] = before ^ 0xFF
-    assert reader.read(10.0).press == 1, "what was before counts until it is whole"
-    assert reader.read(10.0 + 2.0 * TIMEOUT).press == 0, "and is not held for ever"
+    before = board.memory.view[index]
+    board.memory.view[index] = before ^ 0xFF
+    assert reader.read(10.0).press == 1, "the previous entry counts until the new one is complete"
+    assert reader.read(10.0 + 2.0 * TIMEOUT).press == 0, "and is not held forever"
 
 
 def test_nothing_is_held_at_first(board: PressBoard) -> None:
     assert PressReader(board.memory).read(10.0).press == 0
     assert board.held() is None
     board.let_go(3)
-    assert not hold(board, 3), "what was let go before it was held is over"
+    assert not hold(board, 3), "a press released before it was held is over"
     assert math.isnan(board._heard)
 
 
@@ -226,17 +226,17 @@ def test_the_loop_reads_cable_sense_and_step(
     cables: PressBoard, time: Time, out: bool, step: float | None
 ) -> None:
     assert cables.hold_cable(4, 8, pays_out=out, step=step, percent=30)
-    told = PressReader(cables.memory).read(time.now)
-    assert (told.press, told.cable, told.pays_out, told.step) == (4, 8, out, step)
-    assert told.share == 0.3
+    state = PressReader(cables.memory).read(time.now)
+    assert (state.press, state.cable, state.pays_out, state.step) == (4, 8, out, step)
+    assert state.share == 0.3
 
 
 def test_a_press_keeps_its_cable(cables: PressBoard, time: Time) -> None:
-    """What is said later under the same number changes neither cable nor sense nor length."""
+    """Later reports under the same number change neither cable nor sense nor length."""
     cables.hold_cable(4, 3, pays_out=False, step=None, percent=100)
     assert cables.hold_cable(4, 5, pays_out=True, step=0.001, percent=50)
-    told = PressReader(cables.memory).read(time.now)
-    assert (told.cable, told.pays_out, told.step, told.share) == (3, False, None, 0.5)
+    state = PressReader(cables.memory).read(time.now)
+    assert (state.cable, state.pays_out, state.step, state.share) == (3, False, None, 0.5)
     press = cables.held()
     assert isinstance(press, CablePress)
     assert (press.cable, press.pays_out) == (3, False)

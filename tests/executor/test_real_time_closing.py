@@ -1,4 +1,4 @@
-"""What the board of a run says once the real-time process is closed."""
+"""The requests of a run after the real-time process is closed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from executor.state_machine import State
 
 
 class Still:
-    """A motion that is none."""
+    """A motion that does nothing."""
 
     cables, cycle = 8, 0.004
 
@@ -36,13 +36,13 @@ def arms_and_ends(_job: Any, link: Connection, _supervisor: int) -> None:
 def test_a_motion_that_is_over_leaves_no_stop_behind_on_the_board(
     monkeypatch: pytest.MonkeyPatch, goes: bool
 ) -> None:
-    """The last images are waited for then, and shortly only if the operator stopped."""
+    """The last images are then waited for, briefly only if the operator stopped."""
     monkeypatch.setattr(real_time_process, "serve", arms_and_ends)
     board, nobody_listens = SharedRequests(), SimpleNamespace()
     motion_on_board: Any = (Still(), print, board)
     try:
         with real_time_process.real_time_process(
-            *motion_on_board, need_real_time=False, look_again=str
+            *motion_on_board, need_real_time=False, check_drives=str
         ) as process:
             process.arm(nobody_listens)  # type: ignore[arg-type]
             if goes:

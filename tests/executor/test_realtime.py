@@ -1,4 +1,4 @@
-"""What the system grants this process, as it tells itself."""
+"""The privileges of this process, as it reports them itself."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from executor.realtime.scheduling import CAP_IPC_LOCK, CAP_SYS_NICE
 
 ROOT = Path(__file__).parents[2]
-#: Gives a privilege up for good, then tells whether it is still there.
-TELL = """
+#: Drops a privilege for good, then prints whether it is still there.
+SCRIPT = """
 import ctypes, sys
 from executor.realtime.scheduling import has_capability
 data = (ctypes.c_uint32 * 6)()
@@ -27,12 +27,12 @@ print(has_capability(14), has_capability(23))
 
 
 @pytest.mark.parametrize(
-    ("dropped", "told"), [(CAP_IPC_LOCK, "False True"), (CAP_SYS_NICE, "True False")]
+    ("dropped", "expected"), [(CAP_IPC_LOCK, "False True"), (CAP_SYS_NICE, "True False")]
 )
-def test_a_privilege_is_told_apart_from_being_root(dropped: int, told: str) -> None:
+def test_a_privilege_is_distinguished_from_being_root(dropped: int, expected: str) -> None:
     answer = subprocess.run(
-        [sys.executable, "-c", TELL, str(dropped)], capture_output=True, text=True, cwd=ROOT
+        [sys.executable, "-c", SCRIPT, str(dropped)], capture_output=True, text=True, cwd=ROOT
     )
     if answer.stdout.strip() == "False False":
         pytest.skip("only a process with these privileges can give one up")
-    assert answer.stdout.strip() == told, answer.stderr
+    assert answer.stdout.strip() == expected, answer.stderr

@@ -1,4 +1,4 @@
-"""The record of a run on disk while it goes on: it never lacks more than the last second."""
+"""The record of a run on disk during the run: it never lacks more than the last second."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CYCLE = 0.01
 
 
 class Log:
-    """Cycles that are their own numbers; a stand-in for `RunLog`."""
+    """Cycles that are their own numbers; a substitute for `RunLog`."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -106,7 +106,7 @@ def test_a_disk_that_hangs_holds_nothing_up_and_is_a_fault_when_it_is_far_behind
 
 
 def full_at(size: int, folder: RunFolder) -> RecordWriter:
-    """A writer whose files cannot grow beyond a size: a part of what is written last still fits."""
+    """A writer with a file size limit: part of the last write still fits."""
     log: Any = Log()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))

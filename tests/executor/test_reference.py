@@ -1,4 +1,4 @@
-"""The reference of drives: which rig it counts for, and when it counts no more."""
+"""The homing reference: for which rig it is valid, and when it is lost."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def reference_of(rig: Rig, shift: int = 1000) -> HomingReference:
     return reference_at(rig, rig.home, counts, np.full(rig.cable_count, 20.0), "stated", 0.0)
 
 
-def test_it_takes_the_place_of_the_rig_files_counts() -> None:
+def test_it_replaces_the_rig_files_counts() -> None:
     rig = rig_with("incremental")
     document = reference_of(rig)
     MotionInterlock(rig).file.write(document)
@@ -67,13 +67,13 @@ def test_it_counts_for_its_rig_file_alone() -> None:
 
 
 @pytest.mark.parametrize("encoder", ["absolute", "incremental"])
-def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
+def test_it_is_lost_where_a_cable_was_released(encoder: str) -> None:
     rig = rig_with(encoder)
     if encoder == "incremental":
         MotionInterlock(rig).file.write(reference_of(rig))
     interlock = MotionInterlock(rig)
     interlock.begin(Path("run"), None)
-    interlock.end(State.LATCHED, "emergency stop", Path("run"), holding=False, stands_at=range(8))
+    interlock.end(State.LATCHED, "emergency stop", Path("run"), holding=False, positions=range(8))
     interlock.cancel()  # as a reset releases the latch
     for ask in (interlock.reference, interlock.require_ready):
         with pytest.raises(Refused, match="homing reference is lost") as caught:
@@ -83,18 +83,18 @@ def test_it_is_lost_where_a_cable_was_let_go(encoder: str) -> None:
     assert interlock.reference() is not None
 
 
-def test_every_motion_that_counts_from_it_notes_where_the_drives_stand() -> None:
+def test_every_motion_that_counts_from_it_notes_the_drive_positions() -> None:
     rig = rig_with("incremental")
     interlock = MotionInterlock(rig)
     interlock.file.write(reference_of(rig))
     interlock.begin(Path("run"), reference_of(rig))
-    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))
     kept = interlock.kept_reference()
     assert kept is not None
     assert kept.stands_at == list(range(8))
     interlock.begin(Path("run"), kept)
-    interlock.end(State.LATCHED, "killed", Path("run"), holding=True, stands_at=None)
-    assert interlock.kept_reference() == kept, "nobody heard anything of the drives"
+    interlock.end(State.LATCHED, "killed", Path("run"), holding=True, positions=None)
+    assert interlock.kept_reference() == kept, "the drives' state is unknown"
 
 
 def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
@@ -106,14 +106,14 @@ def test_a_motion_from_elsewhere_does_not_make_a_reference_good_again() -> None:
     assert interlock.still_counts(left.stands_at) == left
     assert interlock.still_counts(moved) is None
     interlock.begin(Path("run"), interlock.still_counts(moved))
-    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=moved)
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=moved)
     assert interlock.kept_reference() == left
     absolute = MotionInterlock(rig_with("absolute"))
     assert absolute.still_counts(moved) == left, "it cannot lose count"
 
 
 def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
-    """Setting them up wipes out its evidence, so the next opening sees nothing any more."""
+    """Configuration erases the evidence, so that the next opening would not detect it."""
     rig = rig_with("incremental")
     interlock = MotionInterlock(rig)
     interlock.file.write(reference_of(rig))
@@ -128,7 +128,7 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     assert found is not None
     assert interlock.still_counts(found.stands_at) is None
     interlock.begin(Path("run"), None)
-    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))
     interlock.confirm_held(range(8))
     assert interlock.kept_reference() == found, "no motion and no reset brings it back"
     absolute = MotionInterlock(rig_with("absolute"))
@@ -143,7 +143,7 @@ def test_homing_that_does_not_come_to_its_end_leaves_no_reference(ended: State) 
     interlock = MotionInterlock(rig)
     interlock.file.write(reference_of(rig))
     interlock.begin(Path("run"), reference_of(rig), rehome=True)
-    interlock.end(ended, "stopped", Path("run"), holding=True, stands_at=range(8))
+    interlock.end(ended, "stopped", Path("run"), holding=True, positions=range(8))
     interlock.cancel()
     with pytest.raises(Refused, match="homing reference is lost") as caught:
         interlock.reference()
@@ -163,7 +163,7 @@ def test_an_end_that_cannot_be_kept_leaves_the_bus_latched(
 
     monkeypatch.setattr(interlock.file, "write", full)
     with pytest.raises(Refused, match="cannot be written"):
-        interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+        interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))
     with pytest.raises(Refused, match=r"latched.*cannot be written"):
         interlock.require_free()
 
@@ -186,10 +186,10 @@ def test_a_file_that_cannot_be_read_is_not_ignored(content: str) -> None:
     interlock.file.path.write_text(content)
     with pytest.raises(Refused, match="cannot be read"):
         interlock.reference()
-    # Homing replaces it; what was moved meanwhile must not stumble over it.
+    # Homing replaces it; an earlier motion must not prevent that.
     interlock.found_restarted((1,))
     interlock.begin(Path("run"), interlock.still_counts(range(8)), rehome=True)
-    interlock.end(State.FINISHED, "", Path("run"), holding=True, stands_at=range(8))
+    interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))
     assert interlock.file.path.read_text() == content
     interlock.file.write(reference_of(rig))
     assert interlock.reference() is not None

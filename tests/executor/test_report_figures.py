@@ -1,4 +1,4 @@
-"""The small calculations behind the figures: thinning, gaps, label places, solids, the eye."""
+"""Calculations for the figures: thinning, gaps, label positions, solids, the view."""
 
 from __future__ import annotations
 
@@ -68,10 +68,10 @@ def test_an_even_line_is_not_broken() -> None:
 
 @given(st.lists(st.floats(0.0, 10.0), min_size=1, max_size=12))
 def test_labels_keep_apart_and_in_order(values: list[float]) -> None:
-    places = spread(values, 0.5)
+    positions = spread(values, 0.5)
     order = np.argsort(values, kind="stable")
-    assert np.all(np.diff(np.sort(places)) > 0.45)
-    assert np.all(np.diff(places[order]) > -1e-9) or len(set(values)) < len(values)
+    assert np.all(np.diff(np.sort(positions)) > 0.45)
+    assert np.all(np.diff(positions[order]) > -1e-9) or len(set(values)) < len(values)
 
 
 def volume(solid: Solid) -> float:

@@ -71,8 +71,8 @@ def test_times_are_the_start_plus_run_time(run: fake_run.FakeRun, messages: Mess
     times = np.array([time - start for time, _ in messages["/drives"]]) / 1e9
     np.testing.assert_allclose(times, run.cycles.time, atol=1e-9)
     stamps = [m.timestamp for _, m in messages["/tag_pose"]]
-    told = [s.seconds * 1_000_000_000 + s.nanos for s in stamps]
-    assert told == [time for time, _ in messages["/tag_pose"]]
+    at = [s.seconds * 1_000_000_000 + s.nanos for s in stamps]
+    assert at == [time for time, _ in messages["/tag_pose"]]
 
 
 def test_numbers_are_those_of_the_tables(run: fake_run.FakeRun, messages: Messages) -> None:
@@ -94,7 +94,7 @@ def test_numbers_are_those_of_the_tables(run: fake_run.FakeRun, messages: Messag
     )
 
 
-def test_a_picture_without_a_pose_says_why_and_has_nulls(
+def test_a_image_without_a_pose_states_why_and_has_nulls(
     run: fake_run.FakeRun, messages: Messages
 ) -> None:
     lost = run.poses.status.index("no tags seen, 2 needed")
@@ -104,14 +104,14 @@ def test_a_picture_without_a_pose_says_why_and_has_nulls(
     assert set(status["covariance"]) == {None}
 
 
-def test_pictures_are_the_jpegs_of_the_folder(folder: RunFolder, messages: Messages) -> None:
+def test_images_are_the_jpegs_of_the_folder(folder: RunFolder, messages: Messages) -> None:
     name = next(name for name in folder.poses().picture if name)
     _, picture = messages["/pictures"][0]
     assert picture.data == folder.picture(name)
     assert (picture.format, picture.frame_id) == ("jpeg", "camera")
 
 
-def test_the_camera_stands_in_the_tree_of_frames_with_its_lens(
+def test_the_camera_is_in_the_tree_of_frames_with_its_lens(
     run: fake_run.FakeRun, messages: Messages
 ) -> None:
     (camera,) = run.context.rig.cameras
@@ -122,8 +122,12 @@ def test_the_camera_stands_in_the_tree_of_frames_with_its_lens(
     frames = {m.transforms[0].child_frame_id: m.transforms[0] for _, m in messages["/tf"]}
     assert frames.keys() == {"camera", "platform"}
     assert {frame.parent_frame_id for frame in frames.values()} == {"world"}
-    place = frames["camera"].translation
-    assert [place.x, place.y, place.z] == camera.world_from_camera.position.tolist()
+    translation = frames["camera"].translation
+    assert [
+        translation.x,
+        translation.y,
+        translation.z,
+    ] == camera.world_from_camera.position.tolist()
 
 
 def test_cables_are_drawn_from_their_outlets_to_the_platform(
@@ -167,7 +171,7 @@ def test_every_channel_has_its_schema_and_messages_fit_it(
             assert all(MessageToDict(message) for _, message in messages[topic][:3])
 
 
-def assert_fits(value: Any, schema: dict[str, Any], place: str) -> None:
+def assert_fits(value: Any, schema: dict[str, Any], path: str) -> None:
     kinds = {
         "object": dict,
         "array": list,
@@ -178,14 +182,14 @@ def assert_fits(value: Any, schema: dict[str, Any], place: str) -> None:
         "boolean": bool,
     }
     types = schema["type"] if isinstance(schema["type"], list) else [schema["type"]]
-    assert any(isinstance(value, kinds[name]) for name in types), f"{place}: {value!r}"
+    assert any(isinstance(value, kinds[name]) for name in types), f"{path}: {value!r}"
     if isinstance(value, dict):
-        assert set(value) <= set(schema["properties"]), place
+        assert set(value) <= set(schema["properties"]), path
         for key, inner in value.items():
-            assert_fits(inner, schema["properties"][key], f"{place}.{key}")
+            assert_fits(inner, schema["properties"][key], f"{path}.{key}")
     elif isinstance(value, list):
         for inner in value[:3]:
-            assert_fits(inner, schema["items"], f"{place}[]")
+            assert_fits(inner, schema["items"], f"{path}[]")
 
 
 def test_a_full_disk_leaves_no_broken_log(

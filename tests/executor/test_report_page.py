@@ -1,4 +1,4 @@
-"""The page of a run: whole, self-contained, honest about what is not known."""
+"""The page of a run: complete, self-contained, explicit about unknown values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SVG_LINKS = {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
 
 
 class Page(HTMLParser):
-    """What a page is made of."""
+    """Elements of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ def test_the_verdict_comes_first_and_every_section_is_there(page: Page) -> None:
         "Scene and path",
         "Clearance",
         "Position",
-        "Pictures",
+        "Images",
         "Cables",
         "Following and timing",
         "Plan, rig and bus",
@@ -84,7 +84,7 @@ def test_the_verdict_comes_first_and_every_section_is_there(page: Page) -> None:
 
 
 def test_nothing_is_asked_from_outside(page: Page) -> None:
-    """A lab's machine has no network, and a report must not tell anybody that it was opened."""
+    """A lab's machine has no network, and opening a report must make no request."""
     assert set(re.findall(r"https?://[^\s\"'<)]+", page.text)) <= SVG_LINKS
     for tag, attributes in page.tags:
         assert tag not in {"link", "iframe", "object", "base"}
@@ -105,7 +105,7 @@ def test_ids_are_unique_and_links_lead_somewhere(page: Page) -> None:
     assert not missing
 
 
-def test_every_picture_says_what_it_shows(page: Page) -> None:
+def test_every_image_says_what_it_shows(page: Page) -> None:
     assert len(page.all("img")) == 5
     assert all(len(image["alt"] or "") > 10 for image in page.all("img"))
     figures = [svg for svg in page.all("svg") if svg.get("role") == "img"]
@@ -114,7 +114,7 @@ def test_every_picture_says_what_it_shows(page: Page) -> None:
 
 
 def test_figures_take_their_colours_from_the_page(page: Page) -> None:
-    """A colour that stayed matplotlib's would be wrong in one of the two schemes."""
+    """A matplotlib colour would be wrong in one of the two colour schemes."""
     figures = "".join(re.findall(r"<svg.*?</svg>", page.text, re.DOTALL))
     used = set(re.findall(r"var\(--([\w]+)\)", figures))
     defined = set(re.findall(r"--([\w]+):", page.text))
@@ -184,12 +184,12 @@ def with_scene(run: fake_run.FakeRun, scene: SceneDocument) -> Plan:
 def test_a_run_without_camera_has_no_camera_section(tmp_path: Path, run: fake_run.FakeRun) -> None:
     only = replace(run, poses=no_poses(), clearance=run.clearance.of("encoder"))
     page = built(only, tmp_path / "run")
-    assert "Pictures" not in page.headings
+    assert "Images" not in page.headings
     assert "Clearance" in page.headings
     assert "no camera" in page.text
 
 
-def test_a_scene_without_obstacles_says_so(tmp_path: Path, run: fake_run.FakeRun) -> None:
+def test_a_scene_without_obstacles_reports_it(tmp_path: Path, run: fake_run.FakeRun) -> None:
     scene = run.context.plan.document.scene.model_copy(update={"obstacles": []})
     context = replace(run.context, plan=with_scene(run, scene))
     empty = replace(run, context=context, poses=no_poses(), clearance=no_clearance())
@@ -261,7 +261,7 @@ def test_an_incomplete_folder_gets_no_page(tmp_path: Path, run: fake_run.FakeRun
     assert not folder.report.exists()
 
 
-def test_an_error_too_small_for_its_digits_is_not_told_as_zero(
+def test_an_error_too_small_for_its_digits_is_not_shown_as_zero(
     tmp_path: Path, run: fake_run.FakeRun
 ) -> None:
     exact = replace(run.cycles, following_error=np.full(len(run.cycles), 1e-8))

@@ -1,4 +1,4 @@
-"""The verdict: passed only when all that was measured kept its limit; each reason in numbers."""
+"""The verdict: passed only if all measurements kept their limits; reasons state values."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_without_camera_and_obstacles_these_figures_are_null(run: fake_run.FakeR
     assert made["clearance_mm"] is None
 
 
-def test_lateness_is_told_for_a_run_in_real_time(run: fake_run.FakeRun) -> None:
+def test_lateness_is_reported_for_a_run_in_real_time(run: fake_run.FakeRun) -> None:
     late = np.arange(len(run.cycles)) * 1e-6
     slow = replace(run, cycles=replace(run.cycles, lateness=late))
     made = summary(slow, fast=False)
@@ -139,13 +139,13 @@ def test_the_following_error_is_held_against_its_limit(
     assert f"{worst_mm:.3f} mm" in check.text
 
 
-def test_no_drive_position_at_all_is_no_pass(run: fake_run.FakeRun) -> None:
+def test_no_drive_position_at_all_does_not_pass(run: fake_run.FakeRun) -> None:
     unknown = replace(run.cycles, following_error=np.full(len(run.cycles), np.nan))
     assert not following(unknown, 0.002).passed
 
 
 def test_positions_that_were_received_are_not_denied(run: fake_run.FakeRun) -> None:
-    """Drives that were never enabled report positions all the same; there is no error to judge."""
+    """Drives that were never enabled still report positions; there is no error to judge."""
     unknown = np.full(len(run.cycles), np.nan)
     asked = len(run.cycles) * run.cycles.cable_count
     for lost, expected in (
@@ -163,7 +163,7 @@ def test_positions_that_were_received_are_not_denied(run: fake_run.FakeRun) -> N
 
 
 @pytest.mark.parametrize(("simulated", "passed"), [(True, False), (False, True)])
-def test_lost_replies_fail_simulated_drives_and_are_told_on_a_bus(
+def test_lost_replies_fail_simulated_drives_and_are_reported_on_a_bus(
     run: fake_run.FakeRun, simulated: bool, passed: bool
 ) -> None:
     missing = run.cycles.missing.copy()
@@ -245,13 +245,13 @@ def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRu
 
 
 def test_drives_that_say_they_are_simulated_are_believed_on_every_bus() -> None:
-    """They may lose replies there as real ones do: the bus is a real one."""
+    """They may lose replies like real ones: the bus is real."""
     run = fake_run.make(rate_hz=1.0, every=100, camera=False)
     course = RunCourse(run.context.started, "udp_multicast", False, False, "finished")
     for events, simulated in (((), False), ((RunEvent(0.0, "simulated", ""),), True)):
         context = _context_of(run.context.plan, run.context.rig, course, run.cycles, events)
         cycles = replace(run.cycles, missing=run.cycles.missing + (run.cycles.path_index == 0))
-        told = summarize(context, cycles, run.poses, run.clearance)
-        assert told["simulated"] is simulated
-        assert told["verdict"] == "PASSED"
-        assert ("simulated drives" in chips(told)) is simulated
+        summary = summarize(context, cycles, run.poses, run.clearance)
+        assert summary["simulated"] is simulated
+        assert summary["verdict"] == "PASSED"
+        assert ("simulated drives" in chips(summary)) is simulated

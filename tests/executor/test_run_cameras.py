@@ -1,4 +1,4 @@
-"""Several cameras of a run: late ones, ones that disagree, ones that never answer."""
+"""Several cameras of a run: late, in disagreement, or without an answer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from executor.cameras import multi_camera as run_cameras
 from executor.cameras import process as camera_process
-from executor.cameras.client import BLIND_PICTURES, CameraClient, wait_until_ready
+from executor.cameras.client import BLIND_IMAGES, CameraClient, wait_until_ready
 from executor.cameras.multi_camera import HURRY, PATIENCE, ROUND, RunCameras
 from executor.cameras.process import CameraProcess, CameraSample, FrameRequest
 from executor.remote.client import camera_line
@@ -39,7 +39,7 @@ MODEL = ClearanceModel(_RIG, _SCENE)
 def seen_at(
     trigger: FrameRequest, shift: float = 0.0, deviation: float = 1e-4, late: float = 0.0
 ) -> CameraSample:
-    """A look that finds the platform, so far off along x [m], so much later [s]."""
+    """A sample with a pose, shifted along x [m] and delayed [s]."""
     covariance = np.diag([deviation**2] * 3 + [1e-6] * 3)
     pose = Pose(HERE.position + np.array([shift, 0.0, 0.0]), HERE.rotation)
     found = PoseMeasurement(
@@ -49,7 +49,7 @@ def seen_at(
 
 
 class Scripted:
-    """A camera that answers after so many further moments; with -1 never, with -2 it dies."""
+    """A camera that answers after a number of further frames; with -1 never, with -2 it dies."""
 
     def __init__(
         self, name: str, delays: Sequence[int], shift: float = 0.0, late: float = 0.0
@@ -81,25 +81,25 @@ class Scripted:
 
 
 def never() -> bool:
-    """Nobody wishes a stop."""
+    """No stop is requested."""
     return False
 
 
 def run_of(moments: int, *cameras: Any) -> tuple[RunCameras, list[str]]:
-    """Cameras after so many moments, and what was told."""
+    """Cameras after a number of frames, and their reports."""
     eyes = [CameraClient(camera, "here") for camera in cameras]
-    run, told = RunCameras(eyes, MODEL, _SCENE.obstacle_clearance, RATE), []
+    run, reported = RunCameras(eyes, MODEL, _SCENE.obstacle_clearance, RATE), []
     for k in range(moments):
         run.trigger(k / RATE, 100.0 + k / RATE, None, None)
-        told += [news.text for news in run.news()]
-    return run, told
+        reported += [news.text for news in run.news()]
+    return run, reported
 
 
 DELAYS = st.lists(st.integers(0, 5), min_size=1, max_size=6)
 
 
 @given(front=DELAYS, side=DELAYS, moments=st.integers(1, 25))
-def test_however_late_cameras_answer_every_moment_is_told_once_and_nothing_is_lost(
+def test_for_any_delay_of_cameras_every_frame_is_reported_once_and_nothing_is_lost(
     front: list[int], side: list[int], moments: int
 ) -> None:
     run, _ = run_of(moments, Scripted("front", front), Scripted("side", side))
@@ -115,29 +115,29 @@ def test_however_late_cameras_answer_every_moment_is_told_once_and_nothing_is_lo
 
 @given(late=st.integers(2, 5))
 def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
-    """Too little clearance is seen by the fast camera: the stop must not wait for the slow one."""
+    """The fast camera measures too small a clearance: the stop must not wait for the slow one."""
     cameras: list[Any] = [Scripted("front", [0]), Scripted("side", [late])]
-    limit = 10.0  # everything is too near
+    limit = 10.0  # every clearance is too small
     run = RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE)
     for k in range(5):
         run.trigger(k / RATE, k / RATE, None, None)
     assert "the scene requires 10000 mm" in run.near
 
 
-def test_pictures_of_both_make_a_better_pose() -> None:
-    run, told = run_of(5, Scripted("front", [0]), Scripted("side", [0]))
+def test_images_of_both_make_a_better_pose() -> None:
+    run, reported = run_of(5, Scripted("front", [0]), Scripted("side", [0]))
     seen = run.finish(never)
     for look in seen.together:
         assert isinstance(look.found, PoseMeasurement)
         assert look.found.position_deviation == pytest.approx(np.full(3, 1e-4 / np.sqrt(2)))
         assert look.clearance is not None
-    assert not told
+    assert not reported
 
 
-def test_cameras_that_disagree_are_told_once_and_clearance_is_not_measured() -> None:
-    run, told = run_of(25, Scripted("front", [0]), Scripted("side", [0], shift=0.02))
-    assert told == [
-        f"cameras front and side disagree by 20.0 mm, {BLIND_PICTURES} times in a row;"
+def test_cameras_that_disagree_are_reported_once_and_clearance_is_not_measured() -> None:
+    run, reported = run_of(25, Scripted("front", [0]), Scripted("side", [0], shift=0.02))
+    assert reported == [
+        f"cameras front and side disagree by 20.0 mm, {BLIND_IMAGES} times in a row;"
         " fused clearance is not measured, each camera monitors it alone"
     ]
     assert all(look.clearance is None for look in run.finish(never).together)
@@ -153,42 +153,42 @@ def nearest_at(shift: float) -> MeasuredClearance:
 
 @pytest.mark.parametrize("wrong", ["front", "side"])
 def test_of_cameras_that_disagree_one_that_sees_too_little_clearance_is_enough(wrong: str) -> None:
-    """Nobody knows which of them is right, so the one that sees too little may be."""
+    """It is unknown which one is right, so the smaller clearance counts."""
     shifts = {name: 0.02 if name == wrong else 0.0 for name in ("front", "side")}
     at_most = {name: nearest_at(shift).at_most for name, shift in shifts.items()}
     limit = sum(at_most.values()) / 2.0
     assert abs(at_most["front"] - at_most["side"]) > 0.002
     sees = min(at_most, key=lambda name: at_most[name])
     eyes = [CameraClient(Scripted(n, [0], shift), "here") for n, shift in shifts.items()]  # type: ignore[arg-type]
-    run, told = RunCameras(eyes, MODEL, limit, RATE), []
+    run, reported = RunCameras(eyes, MODEL, limit, RATE), []
     for k in range(4):
         run.trigger(k / RATE, k / RATE, None, None)
-        told.append(run.near)
-    assert not any(told[:2])
+        reported.append(run.near)
+    assert not any(reported[:2])
     assert f"measured by camera {sees} alone" in run.near
     assert all(look.clearance is None for look in run.finish(never).together)
 
 
-def test_one_that_dies_is_told_and_after_the_last_one_none_is_left() -> None:
-    one_left, told = run_of(4, Scripted("front", [0, 0, -2]), Scripted("side", [0]))
-    (text,) = told
+def test_one_that_dies_is_reported_and_after_the_last_one_none_is_left() -> None:
+    one_left, reported = run_of(4, Scripted("front", [0, 0, -2]), Scripted("side", [0]))
+    (text,) = reported
     assert "camera front failed (the process of camera front ended" in text
     assert text.endswith("clearance is measured by side")
     assert one_left.all_failed == ""
-    none_left, told = run_of(4, Scripted("front", [0, 0, -2]), Scripted("side", [0, -2]))
-    assert len(told) == 2
-    assert "camera side failed" in told[0]
-    assert told[1].startswith("camera front failed")
-    assert told[1].endswith("clearance is not measured")
+    none_left, reported = run_of(4, Scripted("front", [0, 0, -2]), Scripted("side", [0, -2]))
+    assert len(reported) == 2
+    assert "camera side failed" in reported[0]
+    assert reported[1].startswith("camera front failed")
+    assert reported[1].endswith("clearance is not measured")
     each = (f"{n}: the process of camera {n} ended without an answer" for n in ("front", "side"))
     assert none_left.all_failed == f"all cameras failed: {'; '.join(each)}"
 
 
-def test_moments_in_which_cameras_were_not_taken_together_are_counted_and_told() -> None:
-    run, told = run_of(10, Scripted("front", [0]), Scripted("side", [0], late=0.12))
+def test_frames_in_which_cameras_were_not_taken_together_are_counted_and_reported() -> None:
+    run, reported = run_of(10, Scripted("front", [0]), Scripted("side", [0], late=0.12))
     run.finish(never)
-    told += [news.text for news in run.news()]
-    assert told == [
+    reported += [news.text for news in run.news()]
+    assert reported == [
         "at 10 of 10 times not all cameras were used: images were taken more than 50 ms from"
         " the others"
     ]
@@ -215,7 +215,7 @@ def test_at_the_end_all_that_hang_are_waited_for_together_and_a_stop_cuts_it_sho
     assert seen.cameras[-1].poses == 3
 
 
-def test_live_figures_are_those_of_the_newest_pictures() -> None:
+def test_live_figures_are_those_of_the_newest_images() -> None:
     run, _ = run_of(30, Scripted("front", [0]), Scripted("side", [1]))
     front, side = run.as_dict()
     assert (front["pictures_per_second"], side["pictures_per_second"]) == (10.0, 5.0)
@@ -225,7 +225,7 @@ def test_live_figures_are_those_of_the_newest_pictures() -> None:
     )
 
 
-def test_the_pace_of_a_source_is_that_of_its_newest_pictures() -> None:
+def test_the_pace_of_a_source_is_that_of_its_newest_images() -> None:
     pace = FrameRate()
     assert (pace.pictures_per_second, pace.measuring_ms) == (None, None)
     for k in range(30):
@@ -236,7 +236,7 @@ def test_the_pace_of_a_source_is_that_of_its_newest_pictures() -> None:
 
 
 class Quick:
-    """An observer that finds the platform at once, or keeps silent for ever."""
+    """A worker that finds the platform at once, or never answers."""
 
     def __init__(self, silent: bool) -> None:
         self._silent = silent
@@ -265,10 +265,10 @@ def silent() -> Quick:
 
 
 @pytest.mark.parametrize("how", ["stopped", "silent"])
-def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
+def test_in_real_time_a_process_that_hangs_is_reported_while_the_other_measures(
     monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    """Real processes; the loop's clock is ours, so nobody has to wait for 2 s."""
+    """Real processes; the test sets the loop's clock, so that it need not wait 2 s."""
     monkeypatch.setattr(run_cameras, "PATIENCE", 1.0)
     monkeypatch.setattr(camera_process, "END_TIMEOUT", 0.2)
     make = {"front": quick, "side": silent if how == "silent" else quick}
@@ -276,21 +276,21 @@ def test_in_real_time_a_process_that_hangs_is_told_while_the_other_measures(
     try:
         wait_until_ready(processes, lambda: None)
         eyes = [CameraClient(process, "here") for process in processes]
-        run, told, now = RunCameras(eyes, MODEL, 0.01, RATE), [], 0.0
-        while not told:
+        run, reported, now = RunCameras(eyes, MODEL, 0.01, RATE), [], 0.0
+        while not reported:
             now += 1.0 / RATE
-            assert now < 60.0, "it is told soon"
+            assert now < 60.0, "it is reported soon"
             run.trigger(now, now, None, None)
-            told += [news.text for news in run.news()]
-            if how == "stopped" and len(eyes[1].looks) == 3:
+            reported += [news.text for news in run.news()]
+            if how == "stopped" and len(eyes[1].samples) == 3:
                 os.kill(child("side"), signal.SIGSTOP)
-            front_only = len(eyes[1].looks) >= 3
+            front_only = len(eyes[1].samples) >= 3
             wait_for_answers(processes[:1] if front_only else processes)
         seen = run.finish(never)
     finally:
         for process in processes:
             process.close()
-    assert told == ["camera side did not answer for 2 s; clearance is measured by front"]
+    assert reported == ["camera side did not answer for 2 s; clearance is measured by front"]
     front, side = seen.cameras
     assert front.poses == front.pictures > 20
     assert side.poses == side.pictures - 1 >= 3
@@ -311,7 +311,7 @@ def wait_for_answers(processes: Sequence[CameraProcess]) -> None:
             assert process._link.poll(20.0)
 
 
-def test_the_names_of_the_pictures_tell_the_camera(tmp_path: Path) -> None:
+def test_the_names_of_the_images_name_the_camera(tmp_path: Path) -> None:
     from executor.recording.run_folder import RunFolder
 
     folder = RunFolder.create(tmp_path / "run")

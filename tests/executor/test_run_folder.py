@@ -1,4 +1,4 @@
-"""The run folder: made whole or not at all, and everything written into it comes back."""
+"""The run folder: created completely or not at all, and everything written is read back."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def same(one: Any, other: Any) -> None:
             assert left == right, field.name
 
 
-def test_a_new_folder_has_a_place_for_events_and_pictures(tmp_path: Path) -> None:
+def test_a_new_folder_has_room_for_events_and_images(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "a run")
     assert folder.events() == []
     assert (folder.path / "pictures").is_dir()
@@ -143,10 +143,10 @@ def test_cycles_of_a_rig_with_other_cables_are_refused(
     folder.write_cycles(run.cycles)
     path = folder.path / "cycles.csv"
     path.write_text(path.read_text().replace("set_8_counts", "set_8_count", 1))
-    told = "cycles.csv has 7 cables, rig.json has 8"
-    with pytest.raises(BadInput, match=told):
+    message = "cycles.csv has 7 cables, rig.json has 8"
+    with pytest.raises(BadInput, match=message):
         folder.cycles()
-    with pytest.raises(BadInput, match=told):
+    with pytest.raises(BadInput, match=message):
         folder.cycles_cut_short(8)
 
 
@@ -167,7 +167,7 @@ def test_an_event_cut_by_a_crash_is_left_out(tmp_path: Path) -> None:
     assert [event.code for event in folder.events()] == ["moving"]
 
 
-def test_a_broken_event_in_the_middle_is_told_with_its_line(tmp_path: Path) -> None:
+def test_a_broken_event_in_the_middle_is_reported_with_its_line(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run")
     (folder.path / "events.jsonl").write_text('{"time_s": 0.7}\n')
     folder.append_event(RunEvent(0.5, "moving", "moves"))
@@ -176,7 +176,7 @@ def test_a_broken_event_in_the_middle_is_told_with_its_line(tmp_path: Path) -> N
     assert caught.value.where.endswith("events.jsonl:1")
 
 
-def test_a_picture_comes_back_as_jpeg(tmp_path: Path) -> None:
+def test_a_image_comes_back_as_jpeg(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run")
     name = folder.write_picture(7, np.full((48, 64), 99, dtype=np.uint8))
     assert name == "pictures/frame_000007.jpg"
@@ -210,7 +210,9 @@ CLEARANCE_FACTS = (
         ("rig.json", "{}", "this key is missing"),
     ],
 )
-def test_a_damaged_file_is_told_by_name(tmp_path: Path, name: str, text: str, what: str) -> None:
+def test_a_damaged_file_is_reported_by_name(
+    tmp_path: Path, name: str, text: str, what: str
+) -> None:
     folder = RunFolder.create(tmp_path / "run")
     (folder.path / name).write_text(text)
     readers = {
@@ -326,7 +328,7 @@ def test_rotations_become_quaternions_whether_they_change_or_not() -> None:
 
 
 def test_cycles_without_rows_round_trip(tmp_path: Path, run: fake_run.FakeRun) -> None:
-    """A fault before the first cycle still leaves a whole folder."""
+    """A fault before the first cycle still leaves a complete folder."""
     none = CycleTable(**{f.name: getattr(run.cycles, f.name)[:0] for f in fields(CycleTable)})
     none.write_csv(tmp_path / "cycles.csv")
     again = CycleTable.read_csv(tmp_path / "cycles.csv")

@@ -1,4 +1,4 @@
-"""A damaged record of a run ends in one message that names what is wrong."""
+"""A damaged record of a run causes one message that names the defect."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_course_that_no_run_writes_is_named(tmp_path: Path, key: str, value: A
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"schema_version": 2}', "\0"])
-def test_a_summary_that_is_none_is_refused(folder: RunFolder, text: str) -> None:
+def test_a_summary_that_is_invalid_is_refused(folder: RunFolder, text: str) -> None:
     (folder.path / "summary.json").write_text(text)
     with pytest.raises(BadInput):
         folder.summary()
@@ -114,7 +114,7 @@ def test_a_summary_that_is_none_is_refused(folder: RunFolder, text: str) -> None
         "[" * 100_000,
     ],
 )
-def test_an_event_that_is_none_is_told_with_its_line(folder: RunFolder, line: str) -> None:
+def test_an_event_that_is_invalid_is_reported_with_its_line(folder: RunFolder, line: str) -> None:
     path = folder.path / "events.jsonl"
     path.write_text(path.read_text() + line + "\n")
     with pytest.raises(BadInput, match="not an event") as caught:
@@ -128,7 +128,7 @@ def test_a_last_line_that_a_crash_cut_is_left_out(folder: RunFolder) -> None:
     assert len(folder.events()) == 3
 
 
-def test_files_of_two_runs_are_told_apart(folder: RunFolder) -> None:
+def test_files_of_two_runs_are_distinguished(folder: RunFolder) -> None:
     stop = {"name": "shelf", "kind": "pass", "reached_s": 1.0, "left_s": None}
     changed(folder, "stops", [stop])
     with pytest.raises(BadInput, match="shelf"):

@@ -1,4 +1,4 @@
-"""Reaching runs from elsewhere: every advertised run is reached, and nothing else is touched."""
+"""Connecting to runs: every advertised run is found, and nothing else is touched."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from executor.remote.command_socket import advertised, find_runs
 from executor.supervision import LocalRequests
 from model.errors import Refused
 
-#: A run as the command line makes one: tells that it is advertised, ends when it was asked to.
+#: A run as made by the command line: prints that it is advertised, ends on request.
 RUN = """
 import signal
 from cdpr.cli.operate.supervision import stop_requests
@@ -91,7 +91,7 @@ def test_every_run_is_reached(folders):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_ctrl_c_a_signal_and_a_closed_terminal_are_wishes_not_ends(folders, number):
+def test_ctrl_c_a_signal_and_a_closed_terminal_are_requests_not_ends(folders, number):
     with _run() as process:
         process.send_signal(number)
         assert process.stdout is not None
@@ -115,7 +115,7 @@ def test_a_run_that_ended_leaves_nothing(folders):
 
 
 NOBODY = 65534
-#: Like `RUN`, of another user from there on where all that it needs is loaded.
+#: Like `RUN`, as another user from the point where all modules are loaded.
 FOREIGN = RUN.replace("board = ", f"import os\nos.setgid({NOBODY})\nos.setuid({NOBODY})\nboard = ")
 
 
@@ -155,8 +155,8 @@ def test_folder_and_socket_are_closed_to_others(folders):
             assert file.stat().st_mode & 0o077 == 0
 
 
-def test_a_link_in_place_of_the_socket_is_not_followed(folders, tmp_path):
-    """Who could write to the folder before it was closed could have had any file replaced."""
+def test_a_link_instead_of_the_socket_is_not_followed(folders, tmp_path):
+    """A user with earlier write access to the folder could have had any file replaced."""
     precious = tmp_path / "precious"
     precious.write_text("mine")
     folders[0].mkdir(mode=0o700)
@@ -215,8 +215,8 @@ def test_a_run_that_no_stop_could_reach_is_refused(folders, tmp_path, monkeypatc
 
 
 @spoilt
-def test_nobody_is_spoken_to_in_a_folder_that_others_control(folders, tmp_path, monkeypatch, how):
-    """A stop that goes to somebody else's socket stops nothing."""
+def test_no_connection_is_made_in_a_folder_that_others_control(folders, tmp_path, monkeypatch, how):
+    """A stop sent to another user's socket would stop nothing."""
     with socket.socket(socket.AF_UNIX) as listener:
         _spoil(folders[1], how, tmp_path, monkeypatch)
         monkeypatch.chdir(folders[1])

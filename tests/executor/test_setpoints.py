@@ -1,4 +1,4 @@
-"""Set-points: the right counts for both ready rigs, and nothing wrong gets through the check."""
+"""Set-points: correct counts for both example rigs, and no violation passes the check."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ names = pytest.mark.parametrize("name", list(RIGS))
 
 @lru_cache(maxsize=4)
 def _made(name: str) -> tuple[Rig, Scene, Trajectory]:
-    """A short way with one corner, its ends the scene's."""
+    """A short path with one corner, its ends the scene's."""
     scene_name, corners = RIGS[name]
     rig = load_rig(CONFIGS / f"{name}.yaml")
     waypoints = [Pose.level(np.array(corner) / 1000.0) for corner in corners]
@@ -115,7 +115,7 @@ def test_a_longer_cable_is_more_counts_where_the_direction_is_positive():
 
 @names
 def test_stretch_is_fed_forward_by_paying_out_less(name):
-    """A taut cable is longer than what was wound off, so less must be wound off."""
+    """A taut cable is longer than its unstrained length, so less must be paid out."""
     rig, scene, table = _made(name)
     per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
     behind = np.array([winch.drum_to_outlet for winch in rig.winches])
@@ -162,7 +162,7 @@ def test_a_table_that_was_not_checked_cannot_be_called_checked(proof: object) ->
 
 
 def test_a_checked_table_of_another_path_needs_a_check_of_its_own() -> None:
-    """Not even what was checked may be changed afterwards without its proof."""
+    """Even checked data must not be changed afterwards without the proof object."""
     rig, scene, table = _made("gachon_8_6")
     checked = check_table(rig, scene, table)
     with pytest.raises(TypeError, match="comes only from"):
@@ -197,7 +197,7 @@ def test_the_hash_tells_a_changed_set_point_and_a_changed_cycle():
     assert replace(table, cycle=0.02).hash != table.hash
 
 
-def test_the_hash_is_computed_anew_so_that_it_tells_a_change_in_place():
+def test_the_hash_is_recomputed_so_that_it_shows_a_change_in_memory():
     table = replace(_made("gachon_8_6")[2])
     before = table.hash
     table.setpoints.setflags(write=True)
@@ -221,7 +221,7 @@ def _refused(name: str, table: Trajectory) -> str:
 
 
 def _said(name: str, table: Trajectory) -> str:
-    """Why it is refused; nothing if it is not."""
+    """Why it is refused; empty if it is not."""
     rig, scene, _ = _made(name)
     try:
         check_table(rig, scene, table)
@@ -235,7 +235,7 @@ def _said(name: str, table: Trajectory) -> str:
     "field", ["travelled", "positions", "rotations", "lengths", "tensions", "counts"]
 )
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_value_that_is_no_number_is_refused_wherever_it_stands(name, field, value):
+def test_a_value_that_is_not_a_number_is_refused_wherever_it_is(name, field, value):
     assert f"row 3 has {field}" in _refused(name, _spoilt(name, field, 3, 0, value))
 
 
@@ -269,7 +269,7 @@ def test_a_winch_that_would_run_too_fast_is_refused_by_name(name, share, wrong):
 
 @names
 def test_a_jump_that_no_winch_limit_forbids_is_refused(name):
-    """A slow step away from the pose: the curve's check sees poses, the drives would get this."""
+    """A slow drift from the pose: the curve's check sees poses, the drives would get this."""
     assert "row 40" in _refused(name, _spoilt(name, "counts", 40, 1, 3.0))
 
 
@@ -282,7 +282,7 @@ def test_ends_that_are_not_the_scenes_are_refused(name, row):
 
 
 @names
-def test_a_turned_end_is_refused(name):
+def test_a_rotated_end_is_refused(name):
     table = _made(name)[2]
     rotations = table.rotations.copy()
     rotations[-1] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
@@ -307,7 +307,7 @@ def test_a_table_of_another_shape_is_refused():
     assert "shape" in _refused("gachon_8_6", replace(table, **empty))
 
 
-def test_everything_that_is_wrong_is_told_at_once():
+def test_everything_that_is_wrong_is_reported_at_once():
     table = _spoilt("gachon_8_6", "positions", 0, 0, 1e-4)
     tensions = table.tensions.copy()
     tensions[0, 0] = 200.0
@@ -322,7 +322,7 @@ def test_a_curve_that_fails_the_independent_check_is_refused():
         check_table(rig, scene.changed(clearance=0.1), table)
 
 
-# Each limit from both sides, and what is said of it.
+# Each limit from both sides, and its message.
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.001, 2.0])
@@ -332,15 +332,15 @@ def test_a_table_for_another_cycle_is_refused(factor: float) -> None:
     assert what == f"the table is for a cycle of {rig.cycle * factor} s, the bus has {rig.cycle} s"
 
 
-def test_stands_that_the_scene_has_not_are_refused() -> None:
+def test_dwells_that_the_scene_has_not_are_refused() -> None:
     table = _made("gachon_8_6")[2]
     said = "the table rests at 1 stops, the scene has 0"
-    assert _refused("gachon_8_6", replace(table, stands=(Dwell(3, 5),))) == said
+    assert _refused("gachon_8_6", replace(table, dwells=(Dwell(3, 5),))) == said
 
 
 @names
 @pytest.mark.parametrize(("turn", "wrong"), [(0.5e-6, False), (3e-6, True)])
-def test_a_slightly_turned_end_is_refused_beyond_the_accuracy(
+def test_a_slightly_rotated_end_is_refused_beyond_the_accuracy(
     name: str, turn: float, wrong: bool
 ) -> None:
     table = _made(name)[2]
@@ -353,12 +353,12 @@ def test_a_slightly_turned_end_is_refused_beyond_the_accuracy(
 
 
 @names
-def test_how_far_an_end_is_off_is_told_in_millimetres(name: str) -> None:
+def test_how_far_an_end_is_off_is_reported_in_millimetres(name: str) -> None:
     assert "is 0.2500 mm and" in _refused(name, _spoilt(name, "positions", 0, 0, 0.25e-3))
 
 
 @names
-def test_counts_beyond_32_bits_are_told_by_row_and_cable(name: str) -> None:
+def test_counts_beyond_32_bits_are_reported_by_row_and_cable(name: str) -> None:
     what = _refused(name, _spoilt(name, "counts", 7, 1, -(2.0**40)))
     assert re.fullmatch(r"row 7, cable 2: -1\d{12} counts exceed 32 bits", what)
 

@@ -1,4 +1,4 @@
-"""What two processes share: rings that lose nothing silently, and wishes that reach the loop."""
+"""Shared memory: rings that lose nothing silently, and requests that reach the loop."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def memory() -> Iterator[SharedMemory]:
     made.close()
 
 
-def test_sealed_memory_cannot_be_written_to_by_anybody():
+def test_sealed_memory_cannot_be_written_to_by_any_process():
     sealed = SharedMemory.sealed(b"proved" * 1000)
     try:
         assert sealed.view[:6] == b"proved"
@@ -82,7 +82,7 @@ def test_what_was_written_over_is_counted(count):
 
 @given(spoilt=st.integers(0, 15 + CONTENT))
 def test_half_a_slot_is_not_taken_for_a_whole_one(spoilt):
-    """Whatever byte of it is not there yet."""
+    """For any byte that is not yet written."""
     memory = SharedMemory.create(Ring.size(CONTENT, SLOTS))
     writer, reader = Ring(memory, SLOTS), Ring(memory, SLOTS)
     writer.put(b"first")
@@ -108,9 +108,9 @@ def test_what_does_not_fit_is_refused(memory):
     counts=st.lists(st.integers(-(2**31), 2**31 - 1), min_size=8, max_size=8),
     numbers=st.tuples(*[st.floats(allow_nan=False)] * 4),
     error=st.floats(),
-    turned=st.booleans(),
+    rotated=st.booleans(),
 )
-def test_a_record_comes_back_as_it_was(state, counts, numbers, error, turned):
+def test_a_record_comes_back_as_it_was(state, counts, numbers, error, rotated):
     pair = tuple(counts[:2])
     record = CycleRecord(
         cycle=2**40,
@@ -129,18 +129,18 @@ def test_a_record_comes_back_as_it_was(state, counts, numbers, error, turned):
         lateness=numbers[3],
     )
     wire = CycleRecordCodec(2)
-    pose = Pose(np.array([0.1, -0.2, 0.3]), np.diag([1.0, -1.0, -1.0])) if turned else None
+    pose = Pose(np.array([0.1, -0.2, 0.3]), np.diag([1.0, -1.0, -1.0])) if rotated else None
     content = wire.pack(record, pose)
     assert len(content) == wire.size
-    back, place = wire.unpack(content)
+    back, pose_back = wire.unpack(content)
     if math.isnan(error):
         assert math.isnan(back.following_error)
     else:
         assert back == record
-    assert (place is None) is (pose is None)
-    if pose is not None and place is not None:
-        assert place.position == pytest.approx(pose.position)
-        assert place.rotation == pytest.approx(pose.rotation)
+    assert (pose_back is None) is (pose is None)
+    if pose is not None and pose_back is not None:
+        assert pose_back.position == pytest.approx(pose.position)
+        assert pose_back.rotation == pytest.approx(pose.rotation)
 
 
 @given(text=st.text(max_size=3000), most=st.integers(300, 5000))
@@ -176,7 +176,7 @@ def board() -> Iterator[SharedRequests]:
     made.memory.close()
 
 
-def test_wishes_reach_the_other_side_and_stay(board, clock):
+def test_requests_reach_the_other_side_and_stay(board, clock):
     other = Supervised(board.memory, os.getppid())
     assert other.read() == board.read() == OperatorRequests()
     board.ask_speed(30)
@@ -200,20 +200,20 @@ def test_what_a_stop_is_for_reaches_the_other_side(board, clock, text):
     assert text.startswith(reason.text.rstrip("�"))
 
 
-def test_a_stop_that_was_wished_before_was_for_nothing_else(board, clock):
+def test_a_stop_that_was_requested_before_was_for_nothing_else(board, clock):
     board.ask_stop()
     board.ask_stop(StopReason("camera", "all cameras failed"))
     assert board.read() == OperatorRequests(stop=True)
 
 
-def test_a_process_that_is_asked_to_end_stops(board, clock):
+def test_a_process_that_is_requested_to_end_stops(board, clock):
     other = Supervised(board.memory, os.getppid())
     other.ask_stop()
     assert other.read().stop
     assert not board.read().stop
 
 
-def test_a_supervisor_that_says_nothing_for_too_long_is_lost_until_it_is_heard_again(board, clock):
+def test_a_supervisor_that_says_nothing_for_too_long_is_lost_until_it_is_alive_again(board, clock):
     other = Supervised(board.memory, os.getppid())
     for _ in range(5):
         clock.now += SILENCE
@@ -234,7 +234,7 @@ def test_a_supervisor_that_is_gone_is_noticed_at_once(board, clock):
 
 
 @pytest.mark.parametrize("text", ["the disk is full", "ü" * 1000])
-def test_the_first_trouble_is_told(board, clock, text):
+def test_the_first_trouble_is_reported(board, clock, text):
     other = Supervised(board.memory, os.getppid())
     board.complain(text)
     board.complain("something else")
@@ -243,8 +243,8 @@ def test_the_first_trouble_is_told(board, clock, text):
     assert text.startswith(lost.rstrip("�"))
 
 
-def test_the_layout_leaves_room_for_every_wish(board):
-    """Bytes of their own: a wish that is written while another is read changes nothing of it."""
+def test_the_layout_leaves_room_for_every_request(board):
+    """Separate bytes: writing one request does not affect reading another."""
     before = bytes(board.memory.view)
     board.ask_stop()
     board.ask_hold(True)

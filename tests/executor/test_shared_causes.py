@@ -11,19 +11,19 @@ NAMES = [f"cable {k} (drive {k + 10})" for k in range(1, 9)]
 
 
 def silent(*drives: int, cycles: int = 2) -> tuple[Alarm, ...]:
-    """What the watch finds when these drives do not answer for so many cycles."""
+    """Alarms when these drives do not answer for a number of cycles."""
     watch = Monitor.fresh(WatchLimits(1e-3, 2.0, 50.0, 0.5), NAMES)
     found: tuple[Alarm, ...] = ()
     missing = [drive in drives for drive in range(1, 9)]
     for _ in range(cycles):
-        watch, found = watch.look(Observation(True, [0.0] * 8, [9.0] * 8, missing, [], 0.0))
+        watch, found = watch.update(Observation(True, [0.0] * 8, [9.0] * 8, missing, [], 0.0))
     return found
 
 
 def test_all_drives_that_fall_silent_at_once_are_one_cause() -> None:
-    (finding,) = shared_causes(silent(*range(1, 9)), NAMES)
-    assert finding.text == "all 8 drives did not answer for 2 cycles: bus or supply"
-    assert (finding.code, finding.reaction, finding.drive) == (
+    (alarm,) = shared_causes(silent(*range(1, 9)), NAMES)
+    assert alarm.text == "all 8 drives did not answer for 2 cycles: bus or supply"
+    assert (alarm.code, alarm.reaction, alarm.drive) == (
         "drive_silent",
         StopReaction.QUICK_STOP,
         0,
@@ -33,8 +33,8 @@ def test_all_drives_that_fall_silent_at_once_are_one_cause() -> None:
 
 
 def test_some_drives_are_named_and_one_keeps_its_own_text() -> None:
-    (finding,) = shared_causes(silent(2, 5), NAMES)
-    assert finding.text == ("cable 2 (drive 12), cable 5 (drive 15) did not answer for 2 cycles")
+    (alarm,) = shared_causes(silent(2, 5), NAMES)
+    assert alarm.text == ("cable 2 (drive 12), cable 5 (drive 15) did not answer for 2 cycles")
     assert shared_causes(silent(3), NAMES) == silent(3)
 
 
@@ -42,7 +42,7 @@ def test_other_findings_keep_their_order_and_their_texts() -> None:
     late = Alarm(StopReaction.PATH_STOP, "late", "a cycle began 2.0 cycles late")
     slack = [Alarm(StopReaction.PATH_STOP, "slack", f"cable {k} carries 1.0 N", k) for k in (1, 2)]
     both = shared_causes([slack[0], *silent(1, 2), slack[1], late], NAMES)
-    assert [finding.code for finding in both] == ["slack", "drive_silent", "slack", "late"]
+    assert [alarm.code for alarm in both] == ["slack", "drive_silent", "slack", "late"]
     assert shared_causes([*slack, late], NAMES) == (*slack, late)
 
 

@@ -1,4 +1,4 @@
-"""Tables of runs with stops: exact stands, loads by legs, and refusals of what is not so."""
+"""Tables of runs with stops: exact dwells, loads by legs, and refusals of violations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PICKED = {"kind": "pick", "dwell_s": 0.5, "mass_kg": 2.0, "mass_centre_mm": [0, 
 
 @lru_cache(maxsize=1)
 def _made() -> tuple[Rig, Scene, Trajectory]:
-    """A pick, a way-pose, a place at the way-pose, and back; the third leg has no length."""
+    """A pick, a via pose, a put-down at the via pose, and back; the third leg has no length."""
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     scene = scene_from_document(
         SceneDocument.model_validate(
@@ -79,18 +79,18 @@ def test_a_table_with_stops_passes_its_check() -> None:
     assert checked.report.length == pytest.approx(table.travelled[-1], abs=1e-5)
 
 
-def test_the_platform_stands_exactly_at_its_stops_for_the_whole_dwell() -> None:
+def test_the_platform_rests_exactly_at_its_stops_for_the_whole_dwell() -> None:
     _, scene, table = _made()
-    take, by, leave = table.stands
+    take, by, leave = table.dwells
     assert by.first == by.last
     assert take.last - take.first == 50
     assert leave.last - leave.first == 21, "a dwell is never cut to whole cycles"
-    for stop, stand in zip(scene.stops, table.stands, strict=True):
-        there = table.positions[stand.first : stand.last + 1]
+    for stop, dwell in zip(scene.stops, table.dwells, strict=True):
+        there = table.positions[dwell.first : dwell.last + 1]
         np.testing.assert_allclose(there - stop.pose.position, 0.0, atol=1e-9)
     steps = np.linalg.norm(np.diff(table.positions, axis=0), axis=1)
-    for stand in table.stands:
-        around = steps[max(0, stand.first - 1) : stand.last + 1]
+    for dwell in table.dwells:
+        around = steps[max(0, dwell.first - 1) : dwell.last + 1]
         assert around.max() < 0.02 * steps.max(), "from rest to rest"
 
 
@@ -99,7 +99,7 @@ def test_tensions_and_counts_are_those_of_each_legs_load() -> None:
     rig, _, table = _made()
     nothing = np.zeros(3)
     centre = np.array([0.0, 0.020, -0.050])
-    take, by, leave = table.stands
+    take, by, leave = table.dwells
     rows = {0: 0.0, take.first: 0.0, take.last: 2.0, by.first: 2.0, leave.first: 2.0}
     rows |= {leave.last: 1.5, len(table) - 1: 1.5}
     for row, mass in rows.items():
@@ -109,27 +109,27 @@ def test_tensions_and_counts_are_those_of_each_legs_load() -> None:
         lengths = cables_to(rig, pose.apply(rig.anchors)).lengths
         np.testing.assert_allclose(table.lengths[row], lengths, atol=1e-9)
     stretch = np.abs(table.counts[take.last] - table.counts[take.first])
-    assert stretch.max() > 1.0, "less is wound off for the heavier load, at the same pose"
+    assert stretch.max() > 1.0, "less cable is paid out for the heavier load, at the same pose"
 
 
 def test_during_a_dwell_tensions_go_evenly_from_one_load_to_the_other() -> None:
     _, _, table = _made()
-    stand = table.stands[0]
-    during = table.tensions[stand.first : stand.last + 1]
+    dwell = table.dwells[0]
+    during = table.tensions[dwell.first : dwell.last + 1]
     steps = np.diff(during, axis=0)
     np.testing.assert_allclose(steps, np.tile(steps[0], (len(steps), 1)), atol=1e-9)
     assert np.abs(during[-1] - during[0]).max() > 1.0
 
 
 def test_legs_are_counted_by_the_stops_that_were_left() -> None:
-    stands = [Dwell(10, 20), Dwell(30, 30)]
-    places = np.array([0.0, 10.0, 19.9, 20.0, 29.5, 30.0, 40.0])
-    assert legs_at(stands, places).tolist() == [1, 1, 1, 2, 2, 3, 3]
-    assert legs_at([], places).tolist() == [1] * 7
+    dwells = [Dwell(10, 20), Dwell(30, 30)]
+    indices = np.array([0.0, 10.0, 19.9, 20.0, 29.5, 30.0, 40.0])
+    assert legs_at(dwells, indices).tolist() == [1, 1, 1, 2, 2, 3, 3]
+    assert legs_at([], indices).tolist() == [1] * 7
 
 
 def test_tensions_that_do_not_hold_the_load_are_refused() -> None:
-    """The pose, the counts and the limits are right; only the load is another."""
+    """Pose, counts and limits are right; only the load differs."""
     _, scene, table = _made()
     heavier = [s.model_copy() for s in scene.document.stops]
     heavier[0] = heavier[0].model_copy(update={"mass_kg": 2.1})
@@ -140,15 +140,15 @@ def test_tensions_that_do_not_hold_the_load_are_refused() -> None:
 
 def test_tensions_beside_those_of_either_load_are_refused_during_a_dwell() -> None:
     table = _made()[2]
-    stand = table.stands[0]
+    dwell = table.dwells[0]
     tensions = table.tensions.copy()
-    tensions[stand.first + 5, 2] += 0.01
-    assert f"row {stand.first + 5}: planned tensions miss the load at stop 'take'" in _refused(
+    tensions[dwell.first + 5, 2] += 0.01
+    assert f"row {dwell.first + 5}: planned tensions miss the load at stop 'take'" in _refused(
         replace(table, tensions=tensions)
     )
 
 
-def test_a_stand_elsewhere_than_its_stop_is_refused() -> None:
+def test_a_dwell_elsewhere_than_its_stop_is_refused() -> None:
     _, scene, table = _made()
     moved = [s.model_copy() for s in scene.document.stops]
     moved[1] = moved[1].model_copy(update={"position_mm": [10.0, 8.0, 460.01]})
@@ -164,7 +164,7 @@ def test_a_dwell_that_is_too_short_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stands", "words"),
+    ("dwells", "words"),
     [
         ((), "rests at 0 stops, the scene has 3"),
         ((Dwell(60, 50), Dwell(90, 90), Dwell(90, 95)), "out of order"),
@@ -172,25 +172,25 @@ def test_a_dwell_that_is_too_short_is_refused() -> None:
         ((Dwell(20, 50), Dwell(60, 90), Dwell(90, 10**6)), "out of order"),
     ],
 )
-def test_stands_that_are_none_are_refused(stands: tuple[Dwell, ...], words: str) -> None:
-    assert words in _refused(replace(_made()[2], stands=stands))
+def test_dwells_that_are_invalid_are_refused(dwells: tuple[Dwell, ...], words: str) -> None:
+    assert words in _refused(replace(_made()[2], dwells=dwells))
 
 
 def test_stops_are_announced_once_when_they_are_reached_and_left() -> None:
     _, scene, table = _made()
-    told, take = stop_events(scene, table.stands), table.stands[0]
-    assert told.due(take.first - 0.5) == []
+    events, take = stop_events(scene, table.dwells), table.dwells[0]
+    assert events.due(take.first - 0.5) == []
     text = "at stop 'take', resting for 0.5 s while 2 kg is picked up"
-    assert told.due(float(take.first)) == [("pick", text)]
-    assert told.due(take.last - 0.5) == []
-    codes = [code for code, _ in told.due(float(len(table)))]
+    assert events.due(float(take.first)) == [("pick", text)]
+    assert events.due(take.last - 0.5) == []
+    codes = [code for code, _ in events.due(float(len(table)))]
     assert codes == ["leaving", "pass", "place", "leaving"]
-    assert told.due(float(len(table))) == []
+    assert events.due(float(len(table))) == []
 
 
 def test_the_load_changes_in_the_middle_of_a_dwell() -> None:
     _, scene, table = _made()
-    loads, take = load_changes(scene, table.stands), table.stands[0]
+    loads, take = load_changes(scene, table.dwells), table.dwells[0]
     assert loads.due(take.first + 24.5) == []
     assert [load.payload_mass for load in loads.due(take.first + 25.0)] == [2.0]
     assert [load.payload_mass for load in loads.due(float(len(table)))] == [1.5]

@@ -1,4 +1,4 @@
-"""Where the platform stands, found again from the drive positions that hold it there."""
+"""The platform pose, recovered from the drive positions that hold it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ turns = st.tuples(*[st.floats(-0.03, 0.03)] * 3)
 
 
 def planned_counts(rig: Rig, pose: Pose) -> Array:
-    """As the set-point table makes them."""
+    """Drive positions as in the set-point table."""
     winches = WinchMap(rig)
     tensions = working_tensions(rig, pose, LOAD).tensions
     return np.rint(winches.counts(winches.unstrained(cables_at(rig, pose).lengths, tensions)))
@@ -35,8 +35,8 @@ def planned_counts(rig: Rig, pose: Pose) -> Array:
 @given(share=shares, turn=turns)
 @settings(max_examples=15)
 def test_a_pose_is_found_again_from_its_drive_positions(rig, share, turn):
-    place = rig.workspace_lower + np.array(share) * (rig.workspace_upper - rig.workspace_lower)
-    pose = Pose(place, matrix_from_rotation_vector(np.array(turn)))
+    position = rig.workspace_lower + np.array(share) * (rig.workspace_upper - rig.workspace_lower)
+    pose = Pose(position, matrix_from_rotation_vector(np.array(turn)))
     try:
         counts = planned_counts(rig, pose)
     except CdprError:  # the cables cannot hold this one

@@ -1,4 +1,4 @@
-"""Files of a shared state folder: a link is not followed, a FIFO or a huge file hangs nothing."""
+"""Files of a shared state folder: links are not followed, FIFOs and huge files do not block."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(autouse=True)
 def nothing_hangs() -> Iterator[None]:
-    """A program that waits for a FIFO fails its test instead."""
+    """A program that blocks on a FIFO fails its test."""
 
     def hung(_number: int, _frame: FrameType | None) -> None:
         pytest.fail("it waits for the file")
@@ -74,7 +74,7 @@ STRANGE: dict[str, Callable[[Path], object]] = {
 
 @pytest.fixture(params=STRANGE)
 def strange(request: pytest.FixtureRequest, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A kind of file, put in the place of every file of the bus."""
+    """A kind of file that replaces every file of the bus."""
     monkeypatch.chdir(folder)
     for path in (_latched(), _latched().with_suffix(".lock"), _set_up(), _reference()):
         (path.parent / "elsewhere").unlink(missing_ok=True)

@@ -15,7 +15,7 @@ PATIENCE_S = 20.0
 
 
 def until_stopped(board: LocalRequests, then: Callable[[], str]) -> Callable[[], str]:
-    """A motion that goes on until a stop is wished."""
+    """A motion that continues until a stop is requested."""
     ended = threading.Event()
 
     def motion() -> str:

@@ -1,4 +1,4 @@
-"""The one sender of SYNC: when 0Fh may go out, what is waited for, and how it leaves the drives."""
+"""The SYNC master: when 0Fh may be sent, what it waits for, and how it leaves the drives."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from executor.control.sync_master import (
     GIVEN_UP_AFTER,
     ReplyTimeout,
     SyncMaster,
+    changed_states,
     late_fault,
-    left_otherwise,
 )
 from executor.safety.monitor import USUAL_TIMEOUT
 from model.errors import Fault, HardwareMissing
@@ -28,7 +28,7 @@ TARGETS = list(range(8))
 
 
 class Clock:
-    """Each cycle takes its time; a cycle may begin late."""
+    """Each cycle takes time; a cycle may begin late."""
 
     def __init__(self) -> None:
         self.now, self.late, self.cycles = 5.0, 0.0, 0
@@ -50,7 +50,7 @@ class Clock:
 
 
 class Group:
-    """Drives that are asked, and answer as they are told to here."""
+    """Drives with scripted answers."""
 
     def __init__(self, sync_timeout: float | None = 3.0, monitored_for: float = 0) -> None:
         self.capabilities = SimpleNamespace(
@@ -58,7 +58,7 @@ class Group:
         )
         self.targets = np.array(TARGETS)
         self.sent: list[tuple[tuple[int, ...], bool]] = []
-        self.told: list[object] = []
+        self.commands: list[object] = []
         self.missing = [False] * 8
         self.paced: list[float] = []
         self.monitored_for, self.asked = monitored_for, 0
@@ -80,10 +80,10 @@ class Group:
         return "looked"
 
     def quick_stop_now(self) -> None:
-        self.told.append("stop")
+        self.commands.append("stop")
 
     def command(self, command: GroupCommand) -> None:
-        self.told.append(command)
+        self.commands.append(command)
 
     @property
     def ending(self) -> frozenset[int]:
@@ -142,7 +142,7 @@ def test_a_stop_counts_as_a_sync() -> None:
     master.exchange(TARGETS)
     clock.now += 7.0 * CYCLE
     master.stop_now()
-    assert group.told == ["stop"]
+    assert group.commands == ["stop"]
     assert master.age == 0.0
 
 
@@ -155,10 +155,10 @@ def test_positions_are_read_in_cycles_that_count() -> None:
     assert master.age == pytest.approx(1.0)
 
 
-def test_the_cycle_goes_on_until_the_word_is_heard() -> None:
+def test_the_cycle_continues_until_the_message_arrives() -> None:
     master, group, clock = made()
     words: list[int | None] = [None, None, None, 0]
-    assert master.keep_until(lambda: words.pop(0)) == 0
+    assert master.cycle_until(lambda: words.pop(0)) == 0
     assert clock.cycles == 3
     assert group.sent == [(tuple(TARGETS), True)] * 3
 
@@ -167,7 +167,7 @@ def test_a_drive_that_falls_silent_before_the_word_is_named() -> None:
     master, group, _ = made()
     group.missing[4] = True
     with pytest.raises(HardwareMissing, match=r"cable 5 \(drive 5\) stopped answering") as caught:
-        master.keep_until(lambda: None)
+        master.cycle_until(lambda: None)
     assert len(group.sent) == 2
     assert caught.value.where == "arming"
     assert "nothing was enabled" in caught.value.next_step
@@ -177,22 +177,22 @@ def test_drives_that_fall_silent_all_at_once_have_one_cause() -> None:
     master, group, _ = made()
     group.missing = [True] * len(group.missing)
     with pytest.raises(HardwareMissing, match=r"all 8 drives stopped .*: bus or supply"):
-        master.keep_until(lambda: None)
+        master.cycle_until(lambda: None)
 
 
 def test_it_leaves_as_soon_as_no_drive_watches_it() -> None:
     master, group, clock = made(monitored_for=3)
     cycles: list[None] = []
     assert master.leave(lambda: cycles.append(None) is None) == "looked"
-    assert group.told == [GroupCommand.END_MONITORING]
+    assert group.commands == [GroupCommand.END_MONITORING]
     assert len(cycles) == 3
-    assert clock.cycles == 1, "the look alone: no time-out of a drive is waited for"
+    assert clock.cycles == 1, "only the reading: no time-out of a drive is waited for"
     assert master.status == "looked"
     assert master.age == 0.0
 
 
 def test_a_monitoring_that_stays_on_is_waited_for_in_silence() -> None:
-    """As long as the end may take; then the drives' own time-out must be over."""
+    """For the longest end; then the drives' own time-out must be over."""
     master, group, clock = made(monitored_for=10_000)
     cycles: list[None] = []
     master.leave(lambda: cycles.append(None) is None)
@@ -259,7 +259,7 @@ def test_after_the_end_the_age_of_sync_is_forgotten() -> None:
     master, group, clock = made()
     master.begin()
     master.exchange(TARGETS)
-    master.look()
+    master.read_state()
     assert group.paced == [0.004]
     clock.now += 100.0 * CYCLE
     assert master.age == 0.0
@@ -267,7 +267,7 @@ def test_after_the_end_the_age_of_sync_is_forgotten() -> None:
 
 def test_drives_that_were_never_enabled_are_left_where_they_are() -> None:
     master, group, clock = made(monitored_for=2)
-    master.leave_unmoved()
+    master.leave_disabled()
     assert group.sent == [(tuple(TARGETS), True)] * 2
     assert clock.cycles == 3
     assert master.status == "looked"
@@ -280,7 +280,7 @@ def test_a_bus_that_fails_then_is_left_as_it_is() -> None:
         raise Fault("bus-off")
 
     group.send_cycle = fails
-    master.leave_unmoved()
+    master.leave_disabled()
     assert master.status is None
 
 
@@ -305,13 +305,13 @@ def test_a_frame_that_goes_out_too_late_after_all_is_a_stop_at_once() -> None:
     held_up = 1.4
     master.begin()
     master.exchange(TARGETS)
-    assert (master.overdue, group.told) == (0.0, [])
+    assert (master.overdue, group.commands) == (0.0, [])
     clock.now -= held_up * CYCLE
     held_up = 1.6
     master.begin()
     master.exchange(TARGETS)
     assert group.sent[-1][1] is True
-    assert group.told == ["stop"]
+    assert group.commands == ["stop"]
     assert master.overdue == pytest.approx(2.6)
 
 
@@ -323,7 +323,7 @@ def test_what_enables_nothing_is_sent_however_late() -> None:
         master.begin()
         master.exchange(TARGETS)
     assert group.sent == [True, True]
-    assert (master.overdue, group.told) == (0.0, [])
+    assert (master.overdue, group.commands) == (0.0, [])
 
 
 @pytest.mark.parametrize(("age", "cycles"), [(0.0, 0), (0.9, 0), (1.0, 1), (1.7, 1)])
@@ -332,7 +332,7 @@ def test_a_cycle_is_kept_where_the_last_one_is_over(age: float, cycles: int) -> 
     clock.now = 0.0
     master.stop_now()
     clock.now = age * CYCLE
-    master.freshen()
+    master.refresh()
     assert len(group.sent) == cycles
 
 
@@ -363,7 +363,7 @@ def reported(words: Sequence[int], silent: Sequence[int] = ()) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("words", "silent", "but", "told"),
+    ("words", "silent", "but", "expected"),
     [
         ([HELD] * 8, [], [], ""),
         ([HELD] * 7 + [FAILED], [], [], "cable 8 (drive 8) went from quick stop active to fault"),
@@ -374,7 +374,7 @@ def reported(words: Sequence[int], silent: Sequence[int] = ()) -> Any:
     ],
 )
 def test_drives_that_are_not_as_they_were_left_are_named(
-    words: list[int], silent: list[int], but: list[int], told: str
+    words: list[int], silent: list[int], but: list[int], expected: str
 ) -> None:
-    said = left_otherwise(THE_RIG, reported([HELD] * 8), reported(words, silent), but)
-    assert said == (f"drives left the state they held in: {told}" if told else "")
+    said = changed_states(THE_RIG, reported([HELD] * 8), reported(words, silent), but)
+    assert said == (f"drives left the state they held in: {expected}" if expected else "")

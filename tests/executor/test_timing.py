@@ -30,16 +30,16 @@ def _largest(values: np.ndarray, order: int, step: float) -> float:
     return float(np.linalg.norm(np.diff(values, order, axis=0), axis=1).max()) / step**order
 
 
-def _route(seed: int, motion: Motion, turned: bool) -> tuple[Path, TimeLaw]:
-    path = rounded(random_route(seed, turned), motion.blend_tolerance, WEIGHT, always)
+def _route(seed: int, motion: Motion, rotated: bool) -> tuple[Path, TimeLaw]:
+    path = rounded(random_route(seed, rotated), motion.blend_tolerance, WEIGHT, always)
     return path, time_law(path, motion)
 
 
-@given(seed=seeds, motion=motions, turned=st.booleans())
+@given(seed=seeds, motion=motions, rotated=st.booleans())
 @settings(max_examples=25)
-def test_speed_acceleration_and_jerk_in_space_keep_their_limits(seed, motion, turned):
-    """Differences of the executed positions, so bends count and not only the way along the path."""
-    path, law = _route(seed, motion, turned)
+def test_speed_acceleration_and_jerk_in_space_keep_their_limits(seed, motion, rotated):
+    """Differences of the executed positions, which include curvature, not only path speed."""
+    path, law = _route(seed, motion, rotated)
     step = law.duration / 4000
     times = np.linspace(0.0, law.duration, 4001)
     positions, _ = path.at(np.array([law.at(float(t))[0] for t in times]))
@@ -53,7 +53,7 @@ def test_speed_acceleration_and_jerk_in_space_keep_their_limits(seed, motion, tu
 @given(seed=seeds, motion=motions)
 @settings(max_examples=25)
 def test_it_goes_forward_from_rest_to_rest_and_tells_its_speed(seed, motion):
-    path, law = _route(seed, motion, turned=True)
+    path, law = _route(seed, motion, rotated=True)
     times, (travelled, speed, acceleration) = (lambda t, v: (t, v.T))(*_sampled(path, law))
     assert (np.diff(travelled) >= 0.0).all()
     assert travelled[[0, -1]] == pytest.approx([0.0, path.length], abs=1e-12)
@@ -78,7 +78,7 @@ def test_a_straight_path_takes_the_textbook_time():
 
 
 def test_a_path_too_short_for_its_speed_takes_the_textbook_time():
-    """Jerk-limited all the way: four equal times t with length = 2 j t³."""
+    """Jerk-limited throughout: four equal times t with length = 2 j t³."""
     law = time_law(polyline([at_mm(0, 0, 0), at_mm(0.01, 0, 0)], WEIGHT), GACHON)
     assert law.duration == pytest.approx(4.0 * (1e-5 / 2.0 / 1.0) ** (1 / 3), rel=1e-9)
 
@@ -115,7 +115,7 @@ def test_a_corner_is_passed_at_one_speed_as_high_as_its_bend_allows(seed):
 @given(seed=seeds)
 @settings(max_examples=40)
 def test_rounding_never_costs_more_than_stopping_and_comes_near_the_least_time(seed):
-    """Between length / speed, which nothing can beat, and the time of the sharp path."""
+    """Between length / speed, the lower bound, and the time of the sharp path."""
     waypoints = random_route(seed, count=5)
     path = rounded(waypoints, 0.001, WEIGHT, always)
     duration = time_law(path, GACHON).duration
@@ -165,7 +165,7 @@ def test_a_path_without_length_takes_no_time():
     extra=st.one_of(st.just(0.0), st.floats(0.0, 0.2)),
 )
 def test_one_move_covers_its_length_forward_also_where_it_just_suffices(start, end, extra):
-    """With exactly the length that the change of speed needs, there is no way but straight on."""
+    """With exactly the length of the change of speed, there is no cruise."""
     slow, fast = min(start, end), max(start, end)
     length = length_to_change(slow, fast, GACHON) + extra
     curve = s_curve(length, (start, end), 0.02, GACHON)

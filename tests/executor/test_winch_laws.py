@@ -1,4 +1,4 @@
-"""What winches are told without a path: bounded, in one direction, never more than can be seen."""
+"""Set-points of winches without a path: bounded, in one direction, limited by the feedback."""
 
 from __future__ import annotations
 
@@ -81,11 +81,11 @@ def test_a_step_raises_no_tension_beyond_what_is_left_before_it_is_seen():
 
 
 @pytest.mark.parametrize("wrong", [61.0, float("nan")])
-def test_beyond_the_limit_no_winch_goes_on(wrong):
+def test_beyond_the_limit_no_winch_continues(wrong):
     rig = RIGS[0]
     for law in (
         PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002),
-        CableStep(rig, [0] * 8, cable=1, way=-0.02, limit=60.0, speed=0.005),
+        CableStep(rig, [0] * 8, cable=1, length=-0.02, limit=60.0, speed=0.005),
     ):
         for _ in range(200):
             begun, found = law.next(1.0, [0.0] * 8)
@@ -101,38 +101,38 @@ def test_beyond_the_limit_no_winch_goes_on(wrong):
         ]
 
 
-def test_near_the_limit_all_go_on_more_slowly():
-    rig, ways = RIGS[0], []
+def test_near_the_limit_all_continue_more_slowly():
+    rig, steps = RIGS[0], []
     for tension in (10.0, 35.0, 59.9):
         law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002)
         targets, _ = law.next(1.0, [0.0] * 7 + [tension])
         for _ in range(99):
             targets, _ = law.next(1.0, [0.0] * 7 + [tension])
-        ways.append(abs(targets[0]))
-    assert ways[1] == pytest.approx(0.5 * ways[0], rel=0.01)
-    assert ways[2] == pytest.approx(0.05 * ways[0], rel=0.05)
+        steps.append(abs(targets[0]))
+    assert steps[1] == pytest.approx(0.5 * steps[0], rel=0.01)
+    assert steps[2] == pytest.approx(0.05 * steps[0], rel=0.05)
 
 
-def test_a_cable_that_stays_slack_is_told():
+def test_a_cable_that_stays_slack_is_reported():
     rig = RIGS[0]
     law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=1e-5, speed=0.002)
     found = ()
     for _ in range(10):
         _, found = law.next(1.0, [12.0] * 7 + [0.3])
-    (finding,) = found
-    assert (finding.code, finding.reaction, finding.drive) == (
+    (alarm,) = found
+    assert (alarm.code, alarm.reaction, alarm.drive) == (
         "not_taut",
         StopReaction.PATH_STOP,
         8,
     )
-    assert "0.3 N" in finding.text
+    assert "0.3 N" in alarm.text
 
 
 @settings(max_examples=40, deadline=None)
-@given(way=st.floats(-0.05, 0.05).filter(lambda w: abs(w) > 1e-4), speed=st.floats(1e-3, 0.02))
-def test_one_cable_goes_its_way_smoothly_and_the_others_stand(way, speed):
+@given(length=st.floats(-0.05, 0.05).filter(lambda w: abs(w) > 1e-4), speed=st.floats(1e-3, 0.02))
+def test_one_cable_moves_smoothly_and_the_others_rest(length, speed):
     rig = RIGS[0]
-    law = CableStep(rig, [7] * 8, cable=2, way=way, limit=60.0, speed=speed)
+    law = CableStep(rig, [7] * 8, cable=2, length=length, limit=60.0, speed=speed)
     sent = []
     while not law.done:
         targets, found = law.next(1.0, [0.0] * 8)
@@ -140,15 +140,15 @@ def test_one_cable_goes_its_way_smoothly_and_the_others_stand(way, speed):
         assert found == ()
     rows = np.array(sent)
     assert (np.delete(rows, 2, axis=1) == 7).all()
-    assert rows[-1, 2] == 7 + round(way * rig.winches[2].counts_per_metre)
+    assert rows[-1, 2] == 7 + round(length * rig.winches[2].counts_per_metre)
     steps = np.abs(np.diff(rows[:, 2])) / per_metre(rig)[2]
     assert steps.max(initial=0.0) <= speed * 0.01 * 1.001 + 1.0 / per_metre(rig)[2]
 
 
 def test_a_taut_cable_is_moved_as_carefully_as_it_would_be_wound_in():
     rig = RIGS[0]
-    slow = CableStep(rig, [0] * 8, cable=2, way=-0.01, limit=60.0, speed=0.02)
-    quick = CableStep(rig, [0] * 8, cable=2, way=-0.01, limit=60.0, speed=0.02)
+    slow = CableStep(rig, [0] * 8, cable=2, length=-0.01, limit=60.0, speed=0.02)
+    quick = CableStep(rig, [0] * 8, cable=2, length=-0.01, limit=60.0, speed=0.02)
     for _ in range(20):
         slow.next(1.0, [20.0] * 8)
         quick.next(1.0, [0.0] * 8)
@@ -158,40 +158,42 @@ def test_a_taut_cable_is_moved_as_carefully_as_it_would_be_wound_in():
 @pytest.mark.parametrize("was", [20.0, 0.0])
 def test_only_a_cable_that_was_taut_may_not_go_slack(was):
     rig = RIGS[0]
-    law = CableStep(rig, [0] * 8, cable=2, way=0.01, limit=60.0, speed=0.005)
+    law = CableStep(rig, [0] * 8, cable=2, length=0.01, limit=60.0, speed=0.005)
     law.next(1.0, [20.0] * 5 + [was] + [20.0] * 2)
     codes = []
     for _ in range(6):
         _, found = law.next(1.0, [20.0] * 2 + [0.0] + [20.0] * 2 + [0.1] + [20.0] * 2)
-        codes.append([finding.code for finding in found])
+        codes.append([alarm.code for alarm in found])
     assert codes[:4] == [[]] * 4
     assert codes[4] == (["went_slack"] if was else [])
 
 
-# A jog of one cable that is held: `CableFeed`, and where it comes to rest.
+# A held jog of one cable: `CableFeed`, and where it comes to rest.
 
 
 @settings(max_examples=60, deadline=None)
 @given(
     rig=st.sampled_from(RIGS),
-    way=st.floats(-0.05, 0.05),
+    length=st.floats(-0.05, 0.05),
     speed=st.floats(1e-3, 0.02),
     paces=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=80),
     seed=st.integers(0, 10**6),
 )
-def test_a_held_cable_goes_one_way_and_no_farther_than_its_reach(rig, way, speed, paces, seed):
+def test_a_held_cable_moves_in_one_direction_and_no_farther_than_its_reach(
+    rig, length, speed, paces, seed
+):
     random = np.random.default_rng(seed)
-    law = CableFeed(rig, [7] * 8, cable=2, way=way, limit=60.0, speed=speed)
+    law = CableFeed(rig, [7] * 8, cable=2, length=length, limit=60.0, speed=speed)
     counts = rig.winches[2].counts_per_metre
     begin, end = law.reach
     assert begin == (7,) * 8
-    assert end[2] == 7 + round(way * counts)
+    assert end[2] == 7 + round(length * counts)
     before, left = 7, law.cycles_left
     for pace in paces:
         targets, _ = law.next(pace, random.uniform(0.0, 80.0, 8).tolist())
-        assert (np.delete(targets, 2) == 7).all(), "the others stand"
+        assert (np.delete(targets, 2) == 7).all(), "the others rest"
         ahead = targets[2] - before
-        assert ahead * np.sign(way * counts) >= 0
+        assert ahead * np.sign(length * counts) >= 0
         assert abs(ahead) <= abs(counts) * speed * 0.01 * pace + 1
         assert abs(targets[2] - 7) <= abs(end[2] - 7)
         assert law.cycles_left <= left
@@ -201,20 +203,20 @@ def test_a_held_cable_goes_one_way_and_no_farther_than_its_reach(rig, way, speed
     assert law.next(1.0, [0.0] * 8)[0] == end
 
 
-def test_a_way_of_nothing_is_done_at_once():
-    law = CableFeed(RIGS[0], [0] * 8, cable=2, way=0.0, limit=60.0, speed=0.02)
+def test_a_zero_length_is_done_at_once():
+    law = CableFeed(RIGS[0], [0] * 8, cable=2, length=0.0, limit=60.0, speed=0.02)
     assert law.done
     assert law.next(1.0, [0.0] * 8) == ((0,) * 8, ())
 
 
 def test_a_cable_that_goes_slack_speeds_up_without_a_jerk():
     rig = RIGS[0]
-    law = CableFeed(rig, [0] * 8, cable=2, way=0.05, limit=60.0, speed=0.02)
-    places = [0]
+    law = CableFeed(rig, [0] * 8, cable=2, length=0.05, limit=60.0, speed=0.02)
+    positions = [0]
     for tension in [20.0] * 20 + [0.0] * 60:
         targets, _ = law.next(1.0, [20.0, 20.0, tension] + [20.0] * 5)
-        places.append(abs(targets[2]))
-    steps = np.diff(places) / abs(per_metre(rig)[2])
+        positions.append(abs(targets[2]))
+    steps = np.diff(positions) / abs(per_metre(rig)[2])
     most = rig.motion.acceleration / rig.motion.speed * 0.01 * 0.02 * 0.01
     assert np.diff(steps).max() <= most + 2.0 / abs(per_metre(rig)[2])
     assert steps[-1] > 5.0 * steps[10]
@@ -245,7 +247,7 @@ def test_winding_in_rests_from_the_reserve_on_whichever_cable_is_tight(cable):
     assert share(SLACK, out=False, before=SLACK) == 1.0
 
 
-def test_paying_out_goes_on_as_long_as_no_other_cable_becomes_tighter():
+def test_paying_out_continues_as_long_as_no_other_cable_becomes_tighter():
     assert share(one(2, LIMIT + 30.0), out=True) == 1.0, "its own tension falls by it"
     assert share(CEILING + 3.0, out=True, before=CEILING + 3.0) == 1.0
     assert share(one(6, CEILING + 0.01), out=True) == 0.0
@@ -260,12 +262,12 @@ def test_it_rests_before_another_cable_that_was_taut_is_slack(out):
     assert 0.0 < share(one(6, FLOOR + 0.5), out=out) < 0.1
     assert share(one(2, FLOOR - 0.01), out=out) > 0.2, "its own may go slack"
     hung = one(6, SLACK - 0.5)
-    assert share(one(6, 0.0), out=out, before=hung) > 0.2, "what hung slack may go on so"
+    assert share(one(6, 0.0), out=out, before=hung) > 0.2, "a slack cable may stay slack"
 
 
 @pytest.mark.parametrize("out", [True, False])
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
-def test_a_tension_that_is_no_number_leaves_no_room(out, wrong):
+def test_a_tension_that_is_not_a_number_leaves_no_room(out, wrong):
     for cable in (2, 6):
         assert share(one(cable, wrong), out=out) == 0.0
         assert share(20.0, out=out, before=one(cable, wrong)) >= 0.0

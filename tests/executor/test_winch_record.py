@@ -1,4 +1,4 @@
-"""The record of a motion without a path: what was told, cycle by cycle, and nothing for nothing."""
+"""The record of a motion without a path: every cycle, and no folder without cycles."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def test_every_cycle_and_event_is_there(tmp_path: Path) -> None:
         ("0", "0.000000"), ("1", "0.010000"), ("2", "0.020000")
     ]  # fmt: skip
     assert rows[2]["state"] == "moving"
-    told = {key: rows[2][key] for key in rows[2] if key.endswith(("_1", "_2"))}
-    assert told == {
+    numbers = {key: rows[2][key] for key in rows[2] if key.endswith(("_1", "_2"))}
+    assert numbers == {
         "set_counts_1": "10", "set_counts_2": "20", "counts_1": "11", "counts_2": "-21",
         "torque_per_mille_1": "30", "torque_per_mille_2": "40",
     }  # fmt: skip
@@ -72,10 +72,10 @@ def full_disk(full: str, name: str) -> AbstractContextManager[object]:
 
 
 @pytest.mark.parametrize("name", ["winches.csv", "events.jsonl"])
-def test_a_full_disk_is_told_and_changes_nothing_of_how_the_motion_ends(
+def test_a_full_disk_is_reported_and_changes_nothing_of_how_the_motion_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """Closing the files raised once more, in place of the result of the motion."""
+    """Closing the files raised again, instead of returning the result of the motion."""
     full_from_the_start(monkeypatch, name)
     event = LoopEvent(0, 100.0, "stop", "stop requested")
     with recording(tmp_path / "home") as kept:

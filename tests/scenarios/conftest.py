@@ -1,4 +1,4 @@
-"""Short prepared runs of both ready rigs."""
+"""Short prepared runs of both example rigs."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def slow_run(short_plan: Path, slow_rig: Path) -> PreparedRun:
 
 @pytest.fixture(scope="session")
 def hall_plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first 150 mm of the hall robot's way, with its payload, pulleys and ten cables."""
+    """The first 150 mm of the hall robot's path, with its payload, pulleys and ten cables."""
     scene = load_scene(CONFIGS / "hall_pillar.yaml")
     corners = [(700.0, 0.0, 900.0), (620.0, 40.0, 1020.0)]
     scene = scene.changed(goal=Pose.level(millimetres(list(corners[1]))))

@@ -1,4 +1,4 @@
-"""A rig of eight drives of one make, from `cdpr doctor --drives` to `cdpr release`.
+"""A rig with eight drives of one maker, from `cdpr doctor --drives` to `cdpr release`.
 
 Every step is the real command line; the drives are simulated from the EDS file of their profile.
 """
@@ -23,7 +23,7 @@ from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan
 from tests.cli.program import Answer, call
 from tests.scenarios.faults.samples import WatchedRehearsal, emergencies
 from tests.scenarios.test_processes import program
-from tests.scenarios.test_real_time import told
+from tests.scenarios.test_real_time import send
 
 MAKERS = ("epos4", "nanotec-c5e", "akd")
 STEPS = ["doctor", "home", "run", "stop", "fault", "reset", "home again", "release"]
@@ -34,7 +34,7 @@ _YES = ("--yes", "--without-real-time")
 
 
 def rig_of(profile: str, settings: BusSettings, folder: Path) -> Path:
-    """The paper's rig on a bus, with drives of a profile that do not know where they are."""
+    """The paper's rig on a bus, with drives of a profile without absolute encoders."""
     text = RIG.read_text().replace("encoder: absolute, ", "")
     bus = f"  interface: {settings.interface}\n  channel: '{settings.channel}'\n"
     assert text.count(_BUS) == 1
@@ -45,7 +45,7 @@ def rig_of(profile: str, settings: BusSettings, folder: Path) -> Path:
 
 
 def plan_back(folder: Path) -> Path:
-    """The short plan the other way round."""
+    """The short plan in reverse."""
     scene: Scene = free_scene(GOAL_MM, START_MM)
     path = folder / "back.json"
     save_plan(straight_plan(load_rig(RIG), scene, [GOAL_MM, START_MM]), path)
@@ -53,7 +53,7 @@ def plan_back(folder: Path) -> Path:
 
 
 class HeldUp(Exception):
-    """This computer did something else for a while; the program stopped for it, as it must."""
+    """This computer was busy for a while, for which the program rightly stopped."""
 
 
 def is_held_up(said: str) -> bool:
@@ -63,7 +63,7 @@ def is_held_up(said: str) -> bool:
 
 @dataclass
 class Day:
-    """One day with a rig: each step leaves drives and bus as it must.
+    """One day with a rig: each step leaves drives and bus in the right state.
 
     Attributes:
         rig: Its file.
@@ -115,7 +115,7 @@ class Day:
         assert self.states() == {HOLDING}
 
     def run(self, plan: Path, name: str, *, stops: bool) -> None:
-        """With a hold on the way; then it goes on to the end, or is stopped."""
+        """A run with a feed hold, then resumed to the end, or stopped."""
         run = self.folder / name
         words = ("run", plan, "--rig", self.rig, "-o", run, "--no-camera", *_YES)
         with program(*words) as process:
@@ -123,7 +123,7 @@ class Day:
             for code, word in (("moving", "hold"), ("hold", "resume"), ("resume", "")):
                 self._wait_for(events, code, process)
                 if word:
-                    told(word)
+                    send(word)
             if stops:
                 process.send_signal(signal.SIGINT)
             out, err = process.communicate()
@@ -181,7 +181,7 @@ def a_day(day: Day, prepared: PreparedRun, plan: Path, back: Path) -> Iterator[s
 
 
 def _fails_when_moving(rehearsal: WatchedRehearsal) -> None:
-    """The third drive, once all follow and it turns."""
+    """The third drive, once all follow and it rotates."""
     drive = rehearsal.drives[2]
     if drive.state is DriveState.OPERATION_ENABLED and drive.motor.speed != 0.0:
         drive.fail(OVERCURRENT)

@@ -1,4 +1,4 @@
-"""A run of a prepared plan on simulated drives, with a script of what happens in which cycle."""
+"""A run of a prepared plan on simulated drives, with a script of events by cycle."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ _CHANNELS = itertools.count()
 
 @dataclass
 class Stage:
-    """Everything of one run; it is the run's clock too.
+    """All parts of one run; also its clock.
 
     Attributes:
-        prepared: What is run.
+        prepared: The run.
         rehearsal: The simulated drives and platform.
         group: The executor's side of them.
         folder: The run folder.
         script: Called at the beginning of every cycle with the stage.
         cycle: Counted from 0.
-        board: What the executor sees as the operator's wishes.
-        status: What it tells those who ask.
-        lateness: What the clock tells, in cycles.
+        board: Operator requests.
+        status: Of the run.
+        lateness: Reported by the clock, in cycles.
         now: Its time with all lateness so far, [s].
         armed: The positions were read; from here on cycles count.
     """
@@ -79,7 +79,7 @@ class Stage:
         return 0.0
 
     def wait_to_decide(self) -> None:
-        """Within a cycle no time passes."""
+        """Returns at once: no time passes within a cycle."""
 
     @property
     def drives(self) -> tuple[SimulatedDrive, ...]:
@@ -143,7 +143,7 @@ def concluded(stage: Stage, outcome: Outcome) -> dict[str, Any]:
 def staged(
     prepared: PreparedRun, path: Path, script: Callable[[Stage], None], start: Pose | None = None
 ) -> Iterator[Stage]:
-    """Drives on a virtual bus of their own, configured; the platform stands at the start."""
+    """Configured drives on a separate virtual bus, with the platform at the start."""
     settings = BusSettings("virtual", f"scenario-{next(_CHANNELS)}")
     with open_bus(settings) as near, open_bus(settings) as far:
         rehearsal = SimulatedCia402Rig(
@@ -166,15 +166,15 @@ def at(cycle: int, happens: Callable[[Stage], object]) -> Callable[[Stage], None
 
 
 def path_indices(prepared: PreparedRun, targets: Array) -> tuple[Array, Array, Array]:
-    """Where in the table the drives are told to be, from the one drive that turns most.
+    """Table indices of the targets, from the drive that moves most.
 
     Args:
         prepared: The run.
-        targets: What was sent, shape (n, m), [counts].
+        targets: Set-points sent, shape (n, m), [counts].
 
     Returns:
-        Index of each cycle, shape (n,); how inexact it is because counts are whole, shape (n,); and
-        how far each target is from that place of the table, shape (n, m), [counts].
+        Index of each cycle, shape (n,); its uncertainty due to whole counts, shape (n,); and the
+        distance of each target from the table at that index, shape (n, m), [counts].
     """
     table = prepared.checked.table.counts
     rows = np.arange(len(table), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""A bus that fails while a run goes on: stopped, latched, on record with what it was."""
+"""A bus that fails during a run: stopped, latched, recorded with its cause."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CRUISING = 150
 
 
 def comes(can_id: int, data: bytes = b"", *, error: bool = False) -> Callable[[Stage], None]:
-    """Somebody else's frame on the bus of the drives."""
+    """A frame of another node on the drives' bus."""
     message = can.Message(
         arbitration_id=can_id, data=data, is_extended_id=False, is_error_frame=error
     )
@@ -58,7 +58,7 @@ def test_it_ends_in_a_stop_with_its_name(
         assert words in outcome.cause
         assert any(words in event.text for event in stage.events())
         assert {drive.state for drive in stage.drives} == {DriveState.QUICK_STOP_ACTIVE}
-        # After the stop everything was still recorded: the bus works, what came over it was wrong.
+        # After the stop everything was still recorded: the bus works, its content was wrong.
         assert outcome.log.table().missing[-1] == 0
 
 

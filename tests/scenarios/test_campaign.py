@@ -1,4 +1,4 @@
-"""A slice of the campaign: every environment plans, proves and runs as asked."""
+"""Part of the campaign: every environment is planned, checked and run."""
 
 from __future__ import annotations
 

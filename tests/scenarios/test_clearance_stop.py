@@ -1,4 +1,4 @@
-"""A platform nearer to an obstacle than its drives know: the camera sees it, the run stops."""
+"""A platform closer to an obstacle than its encoder pose: the camera detects it, the run stops."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from tests.scenarios.stage import at, staged
 from tracking.clearance import clearance_of
 from tracking.measurement import PoseMeasurement
 
-#: The platform truly stands so far towards the block, [m].
+#: True offset of the platform towards the block, [m].
 OFF = np.array([-0.005, 0.0, 0.0])
-#: What a camera may have seen.
+#: Possible measurements of a camera.
 NEAR = "less clearance than the scene requires: platform to block: 6.0 ± 1.0 mm"
 
 
@@ -93,7 +93,7 @@ def test_a_run_stops_along_the_path_when_the_camera_sees_too_little_clearance(
     assert answer.code == 1, answer
     assert "below 10 mm, measured by the cameras" in answer.out
     assert "front (synthetic)" in answer.out
-    assert "too near" in answer.said
+    assert "clearance too small" in answer.said
     assert "the scene requires 10 mm" in answer.said
     summary: dict[str, Any] = RunFolder.open(run).summary()
     assert summary["final_state"] == "stopped"
@@ -149,7 +149,7 @@ def test_the_loop_tells_what_the_stop_was_for(
 
 
 class Rendered:
-    """Images of the platform where a trigger says that it is."""
+    """Images of the platform at the pose of the request."""
 
     def __init__(self, camera: SyntheticCamera) -> None:
         self._camera = camera
@@ -162,7 +162,7 @@ class Rendered:
         pass
 
 
-def test_one_picture_alone_does_not_stop_a_run(narrow_plan: Path, tmp_path: Path) -> None:
+def test_one_image_alone_does_not_stop_a_run(narrow_plan: Path, tmp_path: Path) -> None:
     rig, scene = load_rig(RIG), load_plan(narrow_plan).scene
     eye = SyntheticCamera(rig, scene, rig.cameras[0])
     near, far = Pose.level([-0.008, 0.02, 0.48]), Pose.level([0.05, 0.02, 0.48])
@@ -170,9 +170,9 @@ def test_one_picture_alone_does_not_stop_a_run(narrow_plan: Path, tmp_path: Path
     folder = RunFolder.create(tmp_path / "run")
     watch, model = ClearanceMonitor(scene.obstacle_clearance), ClearanceModel(rig, scene)
     with CameraWorker(rig, rig.cameras[0], Rendered(eye), folder, 1000, named=False) as observer:
-        told = []
+        reported = []
         for frame, pose in enumerate([near, far, near, near, far]):
-            found = observer.look(FrameRequest(frame, frame * 0.1, 0.0, pose)).found
+            found = observer.measure(FrameRequest(frame, frame * 0.1, 0.0, pose)).found
             assert isinstance(found, PoseMeasurement)
-            told.append(bool(watch.take(clearance_of(model, found))))
-    assert told == [False, False, False, True, False]
+            reported.append(bool(watch.take(clearance_of(model, found))))
+    assert reported == [False, False, False, True, False]

@@ -1,6 +1,6 @@
-"""The console with simulated drives on a bus: jog, teach, plan, run, hold, go on, stop.
+"""The console with simulated drives on a bus: jog, teach, plan, run, hold, resume, stop.
 
-What is waited for are states of the console, 20 a second: no test here counts seconds.
+Tests wait for states of the console, 20 per second, and never count seconds.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from tests.scenarios.test_processes import program
 
 pytestmark = pytest.mark.slow
 
-#: States until something must have happened.
+#: Largest number of states to wait for.
 PATIENCE = 3000
-#: Programs that a test left are ended after this, [s].
+#: Time-out of programs left by a test, [s].
 ENDS_WITHIN_S = 400.0
 
 
@@ -36,14 +36,14 @@ class Busy(Exception):
 
 
 class Operator:
-    """Somebody at the page, without a page."""
+    """An operator without a browser."""
 
     def __init__(self, page: ClientConnection) -> None:
         self._page, self._press, self._words = page, 0, 0
         self.state: dict[str, Any] = {}
 
     def until(self, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
-        """The first state in which something holds."""
+        """The first state that meets a condition."""
         for _ in range(PATIENCE):
             message = json.loads(self._page.recv(timeout=60))
             if message["kind"] == "state":
@@ -55,7 +55,7 @@ class Operator:
         raise AssertionError(f"it did not happen: {self.state}")
 
     def command(self, command: str, **values: Any) -> dict[str, Any]:
-        """What the console answers."""
+        """The console's answer."""
         self._page.send(json.dumps({"kind": "command", "id": 1, "command": command, **values}))
         while True:
             message = json.loads(self._page.recv(timeout=60))
@@ -69,36 +69,36 @@ class Operator:
         self.until(lambda state: state["busy"] is not None or state["outcome"] is not None)
         return self.until(lambda state: state["busy"] is None)["outcome"]
 
-    def jog(self, axis: int, way_mm: float) -> None:
-        """Holds a control until the platform has gone so far; anew where the press ended."""
+    def jog(self, axis: int, distance_mm: float) -> None:
+        """Holds a control until the platform has moved this far; presses again if a press ends."""
         begin = self.until(lambda state: state["platform"])["platform"]["position_mm"][axis]
         direction = [0.0, 0.0, 0.0]
-        direction[axis] = 1.0 if way_mm > 0.0 else -1.0
+        direction[axis] = 1.0 if distance_mm > 0.0 else -1.0
         tries = iter(range(PATIENCE))
 
         def gone(state: dict[str, Any]) -> bool:
             if next(tries) % 40 == 0:
                 self.press()
             self.held(direction)
-            way = state["platform"]["position_mm"][axis] - begin
-            return bool(way / way_mm >= 1.0)
+            moved = state["platform"]["position_mm"][axis] - begin
+            return bool(moved / distance_mm >= 1.0)
 
         self.until(gone)
         self._page.send(json.dumps({"kind": "let_go", "hold": self._press}))
         self.until(lambda state: not state["jog"]["moving"])
 
     def press(self) -> None:
-        """What is held from now on is a new press."""
+        """Begins a new press."""
         self._press += 1
 
     def held(self, direction: list[float]) -> None:
-        """One word of a press."""
+        """Sends one report of a press."""
         word = {"kind": "held", "hold": self._press, "direction": direction, "frame": "world"}
         word |= {"step_mm": None, "speed_mm_s": 20.0, "seq": 1}
         self._page.send(json.dumps(word))
 
     def winds_in(self, cable: int, state: dict[str, Any]) -> float:
-        """Goes on holding; anew where the press ended. What it has paid out by then, [mm]."""
+        """Keeps holding, with new presses if one ends; returns the length paid out, [mm]."""
         jog = state["cable"]
         self._words += 1
         if self._words % 40 == 1:
@@ -112,7 +112,7 @@ class Operator:
         self._page.send(json.dumps({"kind": "let_go", "hold": self._press}))
 
     def moves(self, direction: list[float], state: dict[str, Any]) -> bool:
-        """Goes on holding; whether the platform has begun to move."""
+        """Keeps holding; returns whether the platform has begun to move."""
         self.held(direction)
         return bool(state["jog"]["moving"])
 
@@ -164,16 +164,16 @@ Day = Callable[[Path, tuple[str, ...], Path], None]
 def on_a_day(
     slow_rig: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[Day], None]:
-    """Runs a scenario with drives of its own; again where the computer was too busy for it."""
+    """Runs a scenario with its own drives; repeats it if the computer was too busy."""
 
     def run(day: Day) -> None:
         for number in range(3):
-            place = tmp_path / str(number)
-            place.mkdir()
-            monkeypatch.chdir(place)
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            monkeypatch.chdir(folder)
             with drives(slow_rig, number) as bus:
                 try:
-                    return day(slow_rig, bus, place)
+                    return day(slow_rig, bus, folder)
                 except Busy as busy:
                     late = busy
         raise AssertionError(f"three times in a row: {late}")
@@ -187,7 +187,7 @@ def test_a_taught_path_is_planned_run_held_continued_and_stopped(
     on_a_day(taught_and_run)
 
 
-def taught_and_run(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
+def taught_and_run(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
     with console(slow_rig, bus) as (process, address), operator(address) as me:
         at_rest = me.until(lambda state: state["platform"])
         assert at_rest["motion"] is None, "the drives are asked at first, too"
@@ -224,16 +224,16 @@ def taught_and_run(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
         assert "STOPPED" in ended["text"]
         assert ended["report"].startswith("/runs/")
         assert process.poll() is None
-    assert list((place / "runs").glob("*/report.html"))
+    assert list((folder / "runs").glob("*/report.html"))
 
 
-def test_what_moves_goes_on_without_the_console_but_no_press_does(
+def test_what_moves_continues_without_the_console_but_no_press_does(
     on_a_day: Callable[[Day], None],
 ) -> None:
     on_a_day(console_killed)
 
 
-def console_killed(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
+def console_killed(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
     with console(slow_rig, bus) as (process, address), operator(address) as me:
         assert me.command("jog_begin")["ok"]
         me.until(lambda state: state["jog"]["ready"])
@@ -247,7 +247,7 @@ def console_killed(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
         # Its record is whole when the session has ended; nothing moves in its last cycles.
         assert stop_runs().stopped
         rows: list[str] = []
-        record = place / "runs" / "jog-session"
+        record = folder / "runs" / "jog-session"
         while find_any():
             pass
         rows = (record / "winches.csv").read_text().splitlines()
@@ -258,7 +258,7 @@ def console_killed(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
 
 
 def find_any() -> bool:
-    """Whether a motion is under way; each look waits for the answer of the system."""
+    """Whether a motion is active; each check waits for the answer of the system."""
     with find_runs() as runs:
         return bool(runs)
 
@@ -269,7 +269,7 @@ def test_one_cable_moves_in_service_mode_as_long_as_a_page_holds_it(
     on_a_day(one_cable)
 
 
-def one_cable(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
+def one_cable(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
     with console(slow_rig, bus) as (process, address), operator(address) as me:
         reference = me.until(lambda state: state["platform"])["reference"]
         assert "service mode" in me.command("cable_begin")["what"]
@@ -295,7 +295,7 @@ def one_cable(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
         while find_any():
             pass
     for name, cable in (("jog-cables", 3), ("jog-cables-2", 5)):
-        rows = (place / "runs" / name / "winches.csv").read_text().splitlines()[1:]
+        rows = (folder / "runs" / name / "winches.csv").read_text().splitlines()[1:]
         moving = [row.split(",") for row in rows if row.split(",")[2] in ("moving", "stopping")]
         targets = [[int(v) for v in row[3:11]] for row in moving]
         moved = {k for row in targets for k in range(8) if row[k] != targets[0][k]}
@@ -304,11 +304,11 @@ def one_cable(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
         assert all(target == last[0] for target in last)
 
 
-def test_a_stop_that_nobody_needs_says_so(on_a_day: Callable[[Day], None]) -> None:
+def test_a_stop_without_a_run_reports_it(on_a_day: Callable[[Day], None]) -> None:
     on_a_day(nothing_to_stop)
 
 
-def nothing_to_stop(slow_rig: Path, bus: tuple[str, ...], place: Path) -> None:
+def nothing_to_stop(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
     with console(slow_rig, bus) as (_, address), operator(address) as me:
         assert me.command("stop")["what"] == "nothing moves"
         assert "nothing moves" in me.command("hold")["what"]

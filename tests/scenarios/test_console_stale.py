@@ -1,4 +1,4 @@
-"""The page with the real server: whoever falls silent, the page says so, and who it is.
+"""The page with the real server: it reports which part has become silent.
 
 How soon is measured by `python benchmarks/console_stale.py`.
 """
@@ -58,7 +58,7 @@ def silent(page: Page, who: str) -> None:
     assert page.evaluate("() => document.getElementById('main').inert")
 
 
-def test_whoever_falls_silent_is_named_and_figures_count_again_afterwards(
+def test_a_silent_part_is_named_and_figures_count_again_afterwards(
     browser: Browser, slow_rig: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Faults while a run goes on: latched, announced, drives held, everything on record, FAILED."""
+"""Faults during a run: latched, reported, drives held, everything recorded, FAILED."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ CRUISING = 150
 
 @dataclass(frozen=True)
 class Case:
-    """A fault: what happens, in which cycle, and how it must be told.
+    """A fault: its script, its cycle, and the required report.
 
     Attributes:
         happens: Called at the beginning of the cycle.
         code: Of the event.
         words: In the cause.
         cycle: In which it happens.
-        within: Cycles from there until the drives are told to stop.
+        within: Cycles from there until the drives are commanded to stop.
         lost: Drives that cannot hold by quick stop: they are gone or in fault themselves.
     """
 
@@ -67,7 +67,7 @@ def slip(stage: Stage) -> None:
 
 
 def tear(stage: Stage) -> None:
-    """The cable's motor feels nothing any more."""
+    """The cable's motor has no load any more."""
     stage.rehearsal._drive_train.per_newton[5] = 0.0
 
 
@@ -84,7 +84,7 @@ def far_too_late(stage: Stage) -> None:
 
 
 def jump_in_table(stage: Stage) -> None:
-    """As if memory had been written to after the check."""
+    """As if memory had changed after the check."""
     table: Trajectory = stage.prepared.checked.table
     table.setpoints.setflags(write=True)
     table.setpoints[CRUISING + 5 :, 3] += 4000
@@ -112,7 +112,7 @@ CASES = {
         ("(drive 3)", "temperature", "stopped along"),
         within=40,
     ),
-    "a drive starts anew": Case(
+    "a drive restarts": Case(
         lambda stage: stage.drives[0].power_on(), "drive_fault", ("drive 1",), lost=(0,)
     ),
     "a winch jams": Case(jam, "drive_stuck", ("(drive 2) did not move",), lost=(1,)),
@@ -166,7 +166,7 @@ def table_restored(prepared: PreparedRun) -> Iterator[None]:
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.usefixtures("no_pictures", "table_restored")
-def test_a_fault_is_latched_told_held_and_recorded(
+def test_a_fault_is_latched_reported_held_and_recorded(
     prepared: PreparedRun, tmp_path: Path, name: str
 ) -> None:
     case = CASES[name]
@@ -175,9 +175,9 @@ def test_a_fault_is_latched_told_held_and_recorded(
         assert outcome.state is State.LATCHED
         assert all(word in outcome.cause for word in case.words), outcome.cause
         events = stage.events()
-        told = [event for event in events if event.code == case.code]
-        assert told, events
-        since = told[-1].time_s / prepared.checked.table.cycle - case.cycle
+        reported = [event for event in events if event.code == case.code]
+        assert reported, events
+        since = reported[-1].time_s / prepared.checked.table.cycle - case.cycle
         assert 0 <= since <= case.within
         held = [d.state for i, d in enumerate(stage.drives) if i not in case.lost]
         if case.cycle < 10:  # nothing was enabled: the brakes hold
@@ -200,7 +200,7 @@ def test_a_fault_is_latched_told_held_and_recorded(
 def test_a_mere_warning_of_a_drive_ends_no_run(
     prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each is told once, however often it comes; the drive says that it goes on."""
+    """Each is reported once, however often it is sent; the drive stays enabled."""
     monkeypatch.setattr(ProfileDocument, "is_warning", lambda _profile, code: code == 0x3280)
 
     def warn(stage: Stage) -> None:
@@ -209,15 +209,15 @@ def test_a_mere_warning_of_a_drive_ends_no_run(
     with staged(prepared, tmp_path / "run", at(CRUISING, warn)) as stage:
         outcome = stage.run()
         assert outcome.state is State.FINISHED
-        told = [event.text for event in stage.events() if event.code == "drive_warning"]
-    assert len(told) == 1
-    assert "3280h" in told[0]
+        reported = [event.text for event in stage.events() if event.code == "drive_warning"]
+    assert len(reported) == 1
+    assert "3280h" in reported[0]
 
 
 def test_less_clearance_than_the_platform_needs_to_stop_is_refused(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
-    """Drives that hardly slow down go on for 319 mm; the path keeps 284 mm."""
+    """Drives that hardly slow down travel 319 mm; the path has 284 mm of clearance."""
     profile = tmp_path / "lab.yaml"
     gentle = 'ranges: {"6085h:00": {low: 1, high: 2000}}'
     profile.write_text(f"name: Gentle\nsources: [this test]\n{gentle}\n")
@@ -228,7 +228,7 @@ def test_less_clearance_than_the_platform_needs_to_stop_is_refused(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_a_bus_that_fails_leaves_the_drives_stopping_by_themselves(
+def test_a_bus_that_fails_leaves_the_drives_stopping_on_their_own(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     with staged(prepared, tmp_path / "run", at(CRUISING, unplug)) as stage:
@@ -266,7 +266,7 @@ def test_an_error_in_a_callback_stops_the_drives_and_is_on_record(
 def test_a_full_disk_stops_the_drives(
     prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An event that cannot be written is a fault; the drives are stopped before it is told."""
+    """An event that cannot be written is a fault; the drives are stopped before it is reported."""
 
     def full(_folder: RunFolder, _event: RunEvent) -> None:
         raise Fault("the run folder cannot be written", why="No space left on device")
@@ -280,7 +280,7 @@ def test_a_full_disk_stops_the_drives(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_the_first_of_several_causes_is_the_one_that_is_told(
+def test_the_first_of_several_causes_is_the_one_that_is_reported(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     def both(stage: Stage) -> None:
@@ -299,10 +299,10 @@ def test_the_first_of_several_causes_is_the_one_that_is_told(
 
 @pytest.mark.parametrize("lateness", [1.5, 2.0, 3.0, 1371.9])
 @pytest.mark.usefixtures("no_pictures")
-def test_after_the_drives_stopped_by_themselves_no_set_point_follows(
+def test_after_the_drives_stopped_on_their_own_no_set_point_follows(
     prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lateness: float
 ) -> None:
-    """Targets stay those of the cycle before the silence; the first of the stop tells how late."""
+    """Targets stay those of the cycle before the silence; the first one of the stop is late."""
     with staged(
         prepared, tmp_path / "run", at(CRUISING, lambda s: setattr(s, "lateness", lateness))
     ) as stage:
@@ -326,7 +326,7 @@ def test_after_the_drives_stopped_by_themselves_no_set_point_follows(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_a_stop_wish_does_not_hide_a_fault(prepared: PreparedRun, tmp_path: Path) -> None:
+def test_a_stop_request_does_not_hide_a_fault(prepared: PreparedRun, tmp_path: Path) -> None:
     def both(stage: Stage) -> None:
         if stage.cycle == CRUISING:
             stage.board.ask_stop()
@@ -404,14 +404,16 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
     assert any("camera front ended" in reason for reason in summary["reasons"])
     assert summary["final_state"] == ("stopped" if cycle == CRUISING else "finished")
     codes = [event["code"] for event in summary["events"]]
-    assert codes.count("camera") == (2 if cycle == CRUISING else 1), "told, then stopped for it"
+    assert codes.count("camera") == (2 if cycle == CRUISING else 1), (
+        "reported, then the cause of a stop"
+    )
     assert not {"recorder", "supervisor_lost"} & set(codes)
     if cycle == CRUISING:
         assert any("all cameras failed: front: the process" in r for r in summary["reasons"])
     assert folder.report.is_file()
 
 
-def test_a_camera_that_looks_elsewhere_fails_the_run_and_says_why(
+def test_a_camera_that_faces_elsewhere_fails_the_run_and_states_why(
     short_plan: Path, tmp_path: Path
 ) -> None:
     """The motion is good; that it was measured is not true, and is not claimed."""
@@ -429,7 +431,7 @@ def test_a_camera_that_looks_elsewhere_fails_the_run_and_says_why(
     summary = RunFolder.open(run).summary()
     codes = [event["code"] for event in summary["events"]]
     assert codes.count("camera_sees_nothing") == 1
-    assert codes.index("camera_sees_nothing") < codes.index("held"), "told while it moves"
+    assert codes.index("camera_sees_nothing") < codes.index("held"), "reported during motion"
     assert summary["final_state"] == "finished"
     assert summary["clearance_mm"]["source"] == "encoder"
     assert summary["tag_error_mm"]["frames_without_pose"] == summary["tag_error_mm"]["frames"] > 15

@@ -1,4 +1,4 @@
-"""Stopped in the middle, planned on from there, run to the end; refused where that is unsafe."""
+"""Stopped in the middle, replanned from there, run to the end; refused where unsafe."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.scenarios.stage import Stage, concluded, staged
 
 SCENE = {
     "schema_version": 1,
-    "name": "short way",
+    "name": "short path",
     "start": {"position_mm": [0, 0, 445]},
     "goal": {"position_mm": [0, 0, 445]},
     "stops": [
@@ -60,7 +60,7 @@ CARRIED = Payload(1.5, (0.0, 0.0, -60.0))
 
 @dataclass(frozen=True)
 class Ended:
-    """A run that ended: its folder, and where the simulated platform truly is."""
+    """A finished run: its folder, and the true pose of the simulated platform."""
 
     folder: RunFolder
     state: State
@@ -70,7 +70,7 @@ class Ended:
 def ended(
     prepared: PreparedRun, path: Path, stop: Callable[[Stage], bool], start: Pose | None = None
 ) -> Ended:
-    """Runs until the operator wants a stop; ``stop`` looks at the cycles."""
+    """Runs until the operator requests a stop; ``stop`` checks the cycles."""
 
     def script(stage: Stage) -> None:
         if stop(stage):
@@ -112,8 +112,8 @@ def first(scene: Scene) -> PreparedRun:
 
 @pytest.fixture(scope="module")
 def stopped(first: PreparedRun, tmp_path_factory: pytest.TempPathFactory) -> Ended:
-    """On the second leg, half way from the pick to the way-pose."""
-    take, by, _ = first.checked.table.stands
+    """On the second leg, halfway from the pick to the via pose."""
+    take, by, _ = first.checked.table.dwells
     path = tmp_path_factory.mktemp("stopped") / "run"
     return ended(first, path, after_row(first, (take.last + by.first) // 2))
 
@@ -127,7 +127,7 @@ def test_the_end_of_a_run_is_where_the_platform_is_with_what_it_carries(
     assert end.payload == CARRIED
     assert [stop.name for stop in end.done] == ["take"]
     assert (end.waiting_at, end.finished) == ("", False)
-    times = {told["name"]: told for told in stopped.folder.summary()["stops"]}
+    times = {times_at["name"]: times_at for times_at in stopped.folder.summary()["stops"]}
     assert times["take"]["left_s"] - times["take"]["reached_s"] == pytest.approx(0.4, abs=0.011)
     assert times["by"] == {"name": "by", "kind": "pass", "reached_s": None, "left_s": None}
 
@@ -135,7 +135,7 @@ def test_the_end_of_a_run_is_where_the_platform_is_with_what_it_carries(
 def test_a_plan_from_a_stopped_run_runs_to_the_goal_through_the_stops_left(
     stopped: Ended, scene_file: Path, tmp_path: Path
 ) -> None:
-    """By the command line; the simulated rig stands where the first run truly left it."""
+    """From the command line; the simulated rig is where the first run truly left it."""
     plan = tmp_path / "rest.json"
     folder = stopped.folder.path
     answer = call("plan", RIG, scene_file, "-o", plan, "--from-run", folder, "--rounds", "3")
@@ -163,7 +163,7 @@ def test_a_plan_from_a_stopped_run_runs_to_the_goal_through_the_stops_left(
 def test_a_dwell_cut_short_is_done_again_with_the_load_before_it(
     first: PreparedRun, scene: Scene, tmp_path: Path
 ) -> None:
-    take = first.checked.table.stands[0]
+    take = first.checked.table.dwells[0]
     cut = ended(first, tmp_path / "run", after_row(first, take.first + 5))
     end = run_end(cut.folder)
     assert end.waiting_at == "take"
@@ -197,7 +197,7 @@ def test_a_stop_that_was_changed_since_is_refused(stopped: Ended, tmp_path: Path
     one_message(answer, 2, "visited 'take' as stops that differ from the scene's")
 
 
-def test_a_clearance_that_is_not_there_is_told_with_the_one_that_is(
+def test_a_clearance_that_is_not_there_is_reported_with_the_one_that_is(
     stopped: Ended, scene_file: Path, tmp_path: Path
 ) -> None:
     arguments = ("plan", RIG, scene_file, "-o", tmp_path / "plan.json", "--rounds", "3")
@@ -207,7 +207,7 @@ def test_a_clearance_that_is_not_there_is_told_with_the_one_that_is(
     possible = answer.said.split("pass --clearance-mm ")[1].split(",")[0]
     above = call(*arguments, str(float(possible) + 0.02))
     assert above.code == 2
-    # At that clearance the plan may begin; the rest of the way is as near to the block.
+    # With that clearance the plan may begin; the rest of the path is as close to the block.
     assert "the platform stopped" not in call(*arguments, possible).said
 
 
@@ -263,7 +263,7 @@ def test_a_folder_without_its_cycles_or_with_silent_drives_is_refused(
     one_message(both, 2, "--from-run and --start-mm contradict each other")
 
 
-def test_way_poses_of_the_command_line_are_met_before_the_scenes_stops(
+def test_via_poses_of_the_command_line_are_met_before_the_scenes_stops(
     scene_file: Path, tmp_path: Path
 ) -> None:
     plan = tmp_path / "plan.json"
@@ -274,5 +274,5 @@ def test_way_poses_of_the_command_line_are_met_before_the_scenes_stops(
     assert [stop.name for stop in made.scene.stops] == ["via 1", "via 2", "take", "by", "leave"]
     np.testing.assert_allclose(made.waypoints[made.stops[0]].position, [0.005, -0.005, 0.45])
     for wrong in ("1 2", "1 2 x", "1 2 nan"):
-        told = call(*arguments, "--force", "--via-mm", *wrong.split())
-        one_message(told, 2, f"--via-mm {wrong}:", "numbers are required")
+        times_at = call(*arguments, "--force", "--via-mm", *wrong.split())
+        one_message(times_at, 2, f"--via-mm {wrong}:", "numbers are required")

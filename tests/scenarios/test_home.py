@@ -1,4 +1,4 @@
-"""Homing: slack cables are taken up, drives referenced; a run then goes where tags see it."""
+"""Homing: slack cables are wound in, drives referenced; a run then agrees with the tags."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from executor.cameras.client import static_pose
 from executor.control.preconditions import counted_here, require_below, with_reduced_limits
 from executor.control.winch_laws import CableStep, PretensionLaw, WinchLaw, wind_in_speed
 from executor.control.winch_loop import LawMotion, WinchesHere
-from executor.control.winch_motion import WinchesStand, move_winches, require_held
+from executor.control.winch_motion import WinchResult, move_winches, require_held
 from executor.drives import current_pose
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at, referenced
-from executor.jogging import straight_way
+from executor.jogging import plan_straight_move
 from executor.realtime.job import ReadyDrives
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import RunFolder
@@ -52,8 +52,8 @@ FINDINGS = {"over_tension", "went_slack"}
 
 
 @dataclass
-class Told:
-    """Hands on what happens."""
+class Records:
+    """Forwards cycles and events."""
 
     on_cycle: Callable[[CycleRecord], None]
     take_event: Callable[[LoopEvent], None]
@@ -63,7 +63,7 @@ class Told:
 
 
 def mover(as_set_up: Rig, law: WinchLaw, group: DriveGroup, board: LocalRequests) -> WinchesHere:
-    """A law in simulated time, on drives that are set up."""
+    """A law in simulated time, on configured drives."""
     drives = ReadyDrives(as_set_up, group, None, lambda _load: None, ())
     limit, speed = as_set_up.max_tension, max(w.max_speed for w in as_set_up.winches)
     motion = LawMotion(as_set_up.cable_count, 0.01, lambda _rig, _counts: law, limit, speed)
@@ -71,16 +71,16 @@ def mover(as_set_up: Rig, law: WinchLaw, group: DriveGroup, board: LocalRequests
 
 
 @dataclass
-class Place:
-    """A rig after its power was gone, and what is done there."""
+class Bench:
+    """A rig after a power loss, and the motions on it."""
 
     rig: Rig
     rehearsal: SimulatedCia402Rig
     group: DriveGroup
     as_set_up: Rig
     counts: list[int]
-    script: Callable[[Place, int], None] = lambda _place, _cycle: None
-    at_rest: Callable[[WinchesStand], HomingReference | None] = lambda _stand: None
+    script: Callable[[Bench, int], None] = lambda _bench, _cycle: None
+    at_rest: Callable[[WinchResult], HomingReference | None] = lambda _result: None
     interlock: MotionInterlock | None = None
     rehome: bool = True
     board: LocalRequests = field(default_factory=LocalRequests)
@@ -88,13 +88,13 @@ class Place:
     events: list[LoopEvent] = field(default_factory=list)
     tensions: list[Array] = field(default_factory=list)
 
-    def take_up(self, reach: float = 0.02) -> WinchesStand:
+    def take_up(self, reach: float = 0.02) -> WinchResult:
         law = PretensionLaw(
             self.as_set_up, self.counts, target=TARGET, limit=LIMIT, reach=reach, speed=0.002
         )
         return self.move(law)
 
-    def move(self, law: WinchLaw) -> WinchesStand:
+    def move(self, law: WinchLaw) -> WinchResult:
         def on_cycle(record: CycleRecord) -> None:
             self.records.append(record)
             self.tensions.append(self.rehearsal.tensions)
@@ -104,10 +104,10 @@ class Place:
             mover(self.as_set_up, law, self.group, self.board),
             self.rig,
             self.interlock or MotionInterlock(self.rig),
-            Told(on_cycle, self.events.append),
+            Records(on_cycle, self.events.append),
             record=Path("nowhere"),
             rehome=self.rehome,
-            at_rest=lambda stand, _true_pose: self.at_rest(stand),
+            at_rest=lambda result, _true_pose: self.at_rest(result),
         )
 
     @property
@@ -115,7 +115,7 @@ class Place:
         return {drive.state for drive in self.rehearsal.drives}
 
     def steps(self) -> Array:
-        """Of what was sent, in cable wound in, shape (n, m), [m]."""
+        """Steps of the set-points, in cable wound in, shape (n, m), [m]."""
         per_metre = np.array([winch.counts_per_metre for winch in self.rig.winches])
         sent = np.array([r.targets for r in self.records if np.isfinite(r.following_error)])
         return -np.diff(sent, axis=0) / per_metre
@@ -124,7 +124,7 @@ class Place:
 @contextmanager
 def after_power_loss(
     loss: PowerLoss | None, rig: Rig | None = None, limit: float = LIMIT, speed: float = 0.005
-) -> Iterator[Place]:
+) -> Iterator[Bench]:
     rig = rig or load_rig(RIG)
     settings = BusSettings("virtual", f"home-{next(_CHANNELS)}")
     with open_bus(settings) as near, open_bus(settings) as far:
@@ -138,27 +138,27 @@ def after_power_loss(
         as_set_up = with_reduced_limits(counted, limit=limit, speed=speed)
         group = make_drive_group(counted, near, rehearsal.pump, max_tension=limit)
         group.configure()
-        yield Place(rig, rehearsal, group, as_set_up, counts)
+        yield Bench(rig, rehearsal, group, as_set_up, counts)
 
 
 def lost(seed: int, slack_mm: float = 3.0, *, on_a_stand: bool) -> PowerLoss:
     return PowerLoss.drawn(load_rig(RIG), seed, slack_mm / 1000.0, on_a_stand=on_a_stand)
 
 
-def test_nobody_else_may_move_the_drives_before_the_reference_is_kept() -> None:
+def test_no_other_program_may_move_the_drives_before_the_reference_is_kept() -> None:
     rig = load_rig(RIG)
     bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can0"})
     kept = rig_from_document(rig.document.model_copy(update={"bus": bus}))
     interlock = MotionInterlock(kept)
 
-    def at_rest(stand: WinchesStand) -> HomingReference:
+    def at_rest(result: WinchResult) -> HomingReference:
         with pytest.raises(Refused, match="in progress"):
             MotionInterlock(kept).require_free()
-        return reference_at(kept, kept.home, stand.counts, stand.tensions, "stated pose", 0.0)
+        return reference_at(kept, kept.home, result.counts, result.tensions, "stated pose", 0.0)
 
-    with after_power_loss(lost(1, on_a_stand=True)) as place:
-        place.interlock, place.at_rest = interlock, at_rest
-        assert place.take_up().state is State.FINISHED
+    with after_power_loss(lost(1, on_a_stand=True)) as bench:
+        bench.interlock, bench.at_rest = interlock, at_rest
+        assert bench.take_up().state is State.FINISHED
     MotionInterlock(kept).require_free()
     reference = MotionInterlock(kept).reference()
     assert reference is not None
@@ -170,51 +170,53 @@ def test_nobody_else_may_move_the_drives_before_the_reference_is_kept() -> None:
 def test_slack_cables_are_wound_in_together_and_none_is_paid_out(
     seed: int, on_a_stand: bool
 ) -> None:
-    with after_power_loss(lost(seed, on_a_stand=on_a_stand)) as place:
-        assert place.rehearsal.tensions.min() < 0.1, "some hang slack"
-        torque_limits = {drive.objects[0x6072, 0] for drive in place.rehearsal.drives}
+    with after_power_loss(lost(seed, on_a_stand=on_a_stand)) as bench:
+        assert bench.rehearsal.tensions.min() < 0.1, "some hang slack"
+        torque_limits = {drive.objects[0x6072, 0] for drive in bench.rehearsal.drives}
         assert torque_limits == {1.2 * LIMIT / 100.0 * 1000.0}, "of the drives themselves, in ‰"
-        stand = place.take_up()
-        assert (stand.state, stand.cause) == (State.FINISHED, "")
-        assert place.states == {HOLDING}
-        assert place.rehearsal.tensions.min() >= 0.75 * TARGET
-        assert np.max(place.tensions) <= LIMIT
-        assert np.abs(stand.tensions - place.rehearsal.tensions).max() < 0.1
-        steps = place.steps()
+        result = bench.take_up()
+        assert (result.state, result.cause) == (State.FINISHED, "")
+        assert bench.states == {HOLDING}
+        assert bench.rehearsal.tensions.min() >= 0.75 * TARGET
+        assert np.max(bench.tensions) <= LIMIT
+        assert np.abs(result.tensions - bench.rehearsal.tensions).max() < 0.1
+        steps = bench.steps()
         assert steps.min() >= 0.0
         assert steps.max() <= 0.00002 + 2e-6
         moving = {tuple(np.flatnonzero(row)) for row in steps}
-        assert any(len(cables) == place.rig.cable_count for cables in moving)
+        assert any(len(cables) == bench.rig.cable_count for cables in moving)
 
 
 def test_home_then_run_then_the_tags_agree(tmp_path: Path) -> None:
-    with after_power_loss(lost(5, on_a_stand=True)) as place:
-        stand = place.take_up()
+    with after_power_loss(lost(5, on_a_stand=True)) as bench:
+        result = bench.take_up()
         rig = referenced(
-            place.rig,
-            reference_at(place.rig, place.rig.home, stand.counts, stand.tensions, "stated", 0.0),
+            bench.rig,
+            reference_at(bench.rig, bench.rig.home, result.counts, result.tensions, "stated", 0.0),
         )
-        place.group.close()
-        home = place.rig.home.position
-        way = empty_scene(rig).changed(goal=Pose.level(home + np.array([0.012, -0.006, 0.015])))
-        document = straight_plan(rig, way, [tuple(home * 1e3), tuple(way.goal.position * 1e3)])
+        bench.group.close()
+        home = bench.rig.home.position
+        scene = nothing_in_the_way(rig).changed(
+            goal=Pose.level(home + np.array([0.012, -0.006, 0.015]))
+        )
+        document = straight_plan(rig, scene, [tuple(home * 1e3), tuple(scene.goal.position * 1e3)])
         prepared = prepare(verify(plan_from_document(document), rig), rig)
-        bus = place.group._bus  # type: ignore[attr-defined]
-        unhomed = make_drive_group(place.rig, bus, place.rehearsal.pump)
+        bus = bench.group._bus  # type: ignore[attr-defined]
+        unhomed = make_drive_group(bench.rig, bus, bench.rehearsal.pump)
         unhomed.configure()
         folder = RunFolder.create(tmp_path / "unhomed")
-        wrong = prepare(verify(plan_from_document(document), place.rig), place.rig)
+        wrong = prepare(verify(plan_from_document(document), bench.rig), bench.rig)
         with pytest.raises(Refused, match="not at the start"):
-            Stage(wrong, place.rehearsal, unhomed, folder, lambda _stage: None).run()
+            Stage(wrong, bench.rehearsal, unhomed, folder, lambda _stage: None).run()
         unhomed.close()
-        group = make_drive_group(rig, bus, place.rehearsal.pump)
+        group = make_drive_group(rig, bus, bench.rehearsal.pump)
         group.configure()
         folder = RunFolder.create(tmp_path / "run")
-        outcome = Stage(prepared, place.rehearsal, group, folder, lambda _stage: None).run()
+        outcome = Stage(prepared, bench.rehearsal, group, folder, lambda _stage: None).run()
         assert outcome.state is State.FINISHED, outcome.cause
-        seen = static_pose(rig, looks(rig, place.rehearsal.pose))
-        assert seen.pose.distance_to(way.goal) < 0.5e-3
-        assert place.rehearsal.pose.distance_to(way.goal) < 0.05e-3
+        seen = static_pose(rig, looks(rig, bench.rehearsal.pose))
+        assert seen.pose.distance_to(scene.goal) < 0.5e-3
+        assert bench.rehearsal.pose.distance_to(scene.goal) < 0.05e-3
         group.close()
 
 
@@ -230,28 +232,28 @@ def looks(rig: Rig, *poses: Pose) -> list[object]:
 def test_a_platform_that_hangs_free_is_referenced_by_its_tags_and_goes_home(
     tmp_path: Path,
 ) -> None:
-    with after_power_loss(lost(7, on_a_stand=False)) as place:
-        stand = place.take_up()
-        true = place.rehearsal.pose
-        assert true.angle_to(place.rig.home) > 0.005, "it came to hang elsewhere"
-        seen = static_pose(place.rig, looks(place.rig, true))
+    with after_power_loss(lost(7, on_a_stand=False)) as bench:
+        result = bench.take_up()
+        true = bench.rehearsal.pose
+        assert true.angle_to(bench.rig.home) > 0.005, "it came to rest elsewhere"
+        seen = static_pose(bench.rig, looks(bench.rig, true))
         assert seen.pose.distance_to(true) < 4.0 * seen.uncertainty
         reference = reference_at(
-            place.rig, seen.pose, stand.counts, stand.tensions, "tags", seen.uncertainty
+            bench.rig, seen.pose, result.counts, result.tensions, "tags", seen.uncertainty
         )
-        rig, load = referenced(place.rig, reference), empty_scene(place.rig).load
-        found = current_pose(rig, stand.counts, load)
+        rig, load = referenced(bench.rig, reference), nothing_in_the_way(bench.rig).load
+        found = current_pose(rig, result.counts, load)
         assert found.distance_to(true) < 4.0 * seen.uncertainty
-        home = straight_way(rig, empty_scene(rig), found, rig.home)
+        home = plan_straight_move(rig, nothing_in_the_way(rig), found, rig.home)
         prepared = prepare(verify(plan_from_document(home), rig), rig)
-        bus = place.group._bus  # type: ignore[attr-defined]
-        place.group.close()
-        group = make_drive_group(rig, bus, place.rehearsal.pump)
+        bus = bench.group._bus  # type: ignore[attr-defined]
+        bench.group.close()
+        group = make_drive_group(rig, bus, bench.rehearsal.pump)
         group.configure()
         folder = RunFolder.create(tmp_path / "run")
-        outcome = Stage(prepared, place.rehearsal, group, folder, lambda _stage: None).run()
+        outcome = Stage(prepared, bench.rehearsal, group, folder, lambda _stage: None).run()
         assert outcome.state is State.FINISHED, outcome.cause
-        reached = place.rehearsal.pose
+        reached = bench.rehearsal.pose
         assert reached.distance_to(rig.home) < 4.0 * seen.uncertainty
         assert reached.angle_to(rig.home) < 0.01
         group.close()
@@ -259,137 +261,139 @@ def test_a_platform_that_hangs_free_is_referenced_by_its_tags_and_goes_home(
 
 @pytest.mark.parametrize("phase", [3, 60, 200])
 def test_stop_ends_it_in_every_phase_and_a_hold_waits(phase: int) -> None:
-    with after_power_loss(lost(1, on_a_stand=False)) as place:
+    with after_power_loss(lost(1, on_a_stand=False)) as bench:
 
-        def script(place: Place, cycle: int) -> None:
+        def script(bench: Bench, cycle: int) -> None:
             if cycle == phase:
-                place.board.ask_stop()
+                bench.board.ask_stop()
 
-        place.script = script
-        stand = place.take_up()
-        assert stand.state is State.STOPPED
-        assert DriveState.OPERATION_ENABLED not in place.states
-    with after_power_loss(lost(1, on_a_stand=False)) as place:
+        bench.script = script
+        result = bench.take_up()
+        assert result.state is State.STOPPED
+        assert DriveState.OPERATION_ENABLED not in bench.states
+    with after_power_loss(lost(1, on_a_stand=False)) as bench:
 
-        def hold(place: Place, cycle: int) -> None:
+        def hold(bench: Bench, cycle: int) -> None:
             if cycle in (phase, phase + 100):
-                place.board.ask_hold(cycle == phase)
+                bench.board.ask_hold(cycle == phase)
 
-        place.script = hold
-        assert place.take_up().state is State.FINISHED
-        still = [r.targets for r in place.records if r.cycle in (phase + 50, phase + 99)]
+        bench.script = hold
+        assert bench.take_up().state is State.FINISHED
+        still = [r.targets for r in bench.records if r.cycle in (phase + 50, phase + 99)]
         assert still[0] == still[1]
 
 
-def falls_silent(place: Place) -> None:
-    place.rehearsal.drives[2].silent = True
+def falls_silent(bench: Bench) -> None:
+    bench.rehearsal.drives[2].silent = True
 
 
-def loses_all_torque(place: Place) -> None:
-    for drive in place.rehearsal.drives:
+def loses_all_torque(bench: Bench) -> None:
+    for drive in bench.rehearsal.drives:
         drive.state = DriveState.SWITCH_ON_DISABLED
 
 
-def starts_again(place: Place) -> None:
-    place.rehearsal.drives[4].power_on()
+def starts_again(bench: Bench) -> None:
+    bench.rehearsal.drives[4].power_on()
 
 
-def fails(place: Place) -> None:
-    place.rehearsal.drives[6].fail(0x2310)
+def fails(bench: Bench) -> None:
+    bench.rehearsal.drives[6].fail(0x2310)
 
 
 @pytest.mark.parametrize("happens", [falls_silent, loses_all_torque, starts_again, fails])
-def test_every_fault_stops_all_drives_together(happens: Callable[[Place], None]) -> None:
-    with after_power_loss(lost(1, on_a_stand=True)) as place:
-        place.script = lambda place, cycle: happens(place) if cycle == 80 else None
-        stand = place.take_up()
-        assert stand.state is State.LATCHED
-        assert stand.cause
-        assert DriveState.OPERATION_ENABLED not in place.states
-        after = np.array([r.targets for r in place.records if r.cycle > 83])
+def test_every_fault_stops_all_drives_together(happens: Callable[[Bench], None]) -> None:
+    with after_power_loss(lost(1, on_a_stand=True)) as bench:
+        bench.script = lambda bench, cycle: happens(bench) if cycle == 80 else None
+        result = bench.take_up()
+        assert result.state is State.LATCHED
+        assert result.cause
+        assert DriveState.OPERATION_ENABLED not in bench.states
+        after = np.array([r.targets for r in bench.records if r.cycle > 83])
         assert len(np.unique(after, axis=0)) == 1, "nothing is sent on after the fault"
 
 
-def test_a_bus_that_dies_at_once_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    with after_power_loss(lost(1, on_a_stand=True)) as place:
+def test_a_bus_that_dies_at_once_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    with after_power_loss(lost(1, on_a_stand=True)) as bench:
 
         def broken(*_: object) -> None:
             raise BusDown("the interface is down", "can0")
 
-        there = SimpleNamespace(positions=np.array(place.counts))
-        monkeypatch.setattr(place.group, "read_positions", lambda _pace: there)
-        monkeypatch.setattr(place.group, "send_cycle", broken)
-        stand = place.take_up()
-        assert stand.state is State.LATCHED
-        assert "interface is down" in stand.cause
-        assert np.isnan(stand.counts).all()
+        there = SimpleNamespace(positions=np.array(bench.counts))
+        monkeypatch.setattr(bench.group, "read_positions", lambda _pace: there)
+        monkeypatch.setattr(bench.group, "send_cycle", broken)
+        result = bench.take_up()
+        assert result.state is State.LATCHED
+        assert "interface is down" in result.cause
+        assert np.isnan(result.counts).all()
 
 
 def test_a_cable_that_stays_slack_after_its_reach_stops_all() -> None:
     slack = np.zeros(8)
     slack[4] = 0.02
-    with after_power_loss(PowerLoss(np.zeros(8), slack, on_a_stand=True)) as place:
-        stand = place.take_up(reach=0.004)
-        assert stand.state is State.LATCHED
-        assert "cable 5 carries" in stand.cause
-        assert "off its drum" in stand.cause
-        assert np.abs(np.sum(place.steps(), axis=0)).max() <= 0.004 + 1e-5
-        found = next(e.cycle for e in place.events if e.code == "not_taut")
-        assert len({r.targets for r in place.records if r.cycle >= found - 1}) == 1, "none goes on"
-        assert place.states == {HOLDING}
+    with after_power_loss(PowerLoss(np.zeros(8), slack, on_a_stand=True)) as bench:
+        result = bench.take_up(reach=0.004)
+        assert result.state is State.LATCHED
+        assert "cable 5 carries" in result.cause
+        assert "off its drum" in result.cause
+        assert np.abs(np.sum(bench.steps(), axis=0)).max() <= 0.004 + 1e-5
+        found = next(e.cycle for e in bench.events if e.code == "not_taut")
+        assert len({r.targets for r in bench.records if r.cycle >= found - 1}) == 1, "none goes on"
+        assert bench.states == {HOLDING}
 
 
 def test_one_cable_alone_moves_freely_only_while_it_hangs_slack() -> None:
-    with after_power_loss(lost(3, 6.0, on_a_stand=True)) as place:
+    with after_power_loss(lost(3, 6.0, on_a_stand=True)) as bench:
         law = CableStep(
-            place.as_set_up, place.counts, cable=2, way=-0.001, limit=LIMIT, speed=0.005
+            bench.as_set_up, bench.counts, cable=2, length=-0.001, limit=LIMIT, speed=0.005
         )
-        stand = place.move(law)
-        assert stand.state is State.FINISHED
-        moved = (stand.counts - place.counts) / [w.counts_per_metre for w in place.rig.winches]
+        result = bench.move(law)
+        assert result.state is State.FINISHED
+        moved = (result.counts - bench.counts) / [w.counts_per_metre for w in bench.rig.winches]
         assert moved == pytest.approx([0, 0, -0.001, 0, 0, 0, 0, 0], abs=3e-6)
-        assert place.steps().max() <= 0.005 * 0.01 + 2e-6
+        assert bench.steps().max() <= 0.005 * 0.01 + 2e-6
 
 
-@pytest.mark.parametrize(("way", "cause"), [(-0.005, "more than"), (0.005, "went slack")])
-def test_on_a_taut_platform_one_cable_alone_is_stopped(way: float, cause: str) -> None:
-    with after_power_loss(None) as place:
-        law = CableStep(place.as_set_up, place.counts, cable=2, way=way, limit=LIMIT, speed=0.005)
-        stand = place.move(law)
-        assert stand.state is State.LATCHED
-        assert cause in stand.cause
-        assert place.states == {HOLDING}
-        assert np.max(place.tensions) < 1.02 * LIMIT
-        stopped = next(r.cycle for r in place.records if r.state is State.SECURING)
-        assert stopped <= next(e.cycle for e in place.events if e.code in FINDINGS) + 1
-        after = [r.targets for r in place.records if r.cycle >= stopped - 1]
+@pytest.mark.parametrize(("length", "cause"), [(-0.005, "more than"), (0.005, "went slack")])
+def test_on_a_taut_platform_one_cable_alone_is_stopped(length: float, cause: str) -> None:
+    with after_power_loss(None) as bench:
+        law = CableStep(
+            bench.as_set_up, bench.counts, cable=2, length=length, limit=LIMIT, speed=0.005
+        )
+        result = bench.move(law)
+        assert result.state is State.LATCHED
+        assert cause in result.cause
+        assert bench.states == {HOLDING}
+        assert np.max(bench.tensions) < 1.02 * LIMIT
+        stopped = next(r.cycle for r in bench.records if r.state is State.SECURING)
+        assert stopped <= next(e.cycle for e in bench.events if e.code in FINDINGS) + 1
+        after = [r.targets for r in bench.records if r.cycle >= stopped - 1]
         assert len(set(after)) == 1, "it stops where it is"
 
 
-def test_drives_that_hold_more_are_not_told_to_let_it_slip() -> None:
-    with after_power_loss(lost(1, on_a_stand=True)) as place:
-        assert place.take_up().state is State.FINISHED
-        bus = place.group._bus  # type: ignore[attr-defined]
-        held = read_drives(place.rig, bus, place.rehearsal.pump)
-        carried = place.rehearsal.tensions
-        require_below(place.rig, held, float(carried.max()) + 1.0)
+def test_drives_that_hold_more_get_no_limit_that_lets_it_slip() -> None:
+    with after_power_loss(lost(1, on_a_stand=True)) as bench:
+        assert bench.take_up().state is State.FINISHED
+        bus = bench.group._bus  # type: ignore[attr-defined]
+        held = read_drives(bench.rig, bus, bench.rehearsal.pump)
+        carried = bench.rehearsal.tensions
+        require_below(bench.rig, held, float(carried.max()) + 1.0)
         worst = int(carried.argmax()) + 1
         with pytest.raises(Refused, match=rf"cable {worst} \(drive {worst}\) carries"):
-            require_below(place.rig, held, float(carried.max()) - 0.5)
-        stood = [drive.motor.position for drive in place.rehearsal.drives]
+            require_below(bench.rig, held, float(carried.max()) - 0.5)
+        stood = [drive.motor.position for drive in bench.rehearsal.drives]
         # What would happen otherwise: so it is refused before anything is written.
-        place.group.close()
+        bench.group.close()
         weak = make_drive_group(
-            place.as_set_up, bus, place.rehearsal.pump, max_tension=0.5 * float(carried.min())
+            bench.as_set_up, bus, bench.rehearsal.pump, max_tension=0.5 * float(carried.min())
         )
         weak.configure()
         for _ in range(50):
             weak.send_cycle([0] * 8)
             weak.receive(0.0)
-        slipped = [d.motor.position for d in place.rehearsal.drives] - np.array(stood)
-        paid_out = slipped / [w.counts_per_metre for w in place.rig.winches]
+        slipped = [d.motor.position for d in bench.rehearsal.drives] - np.array(stood)
+        paid_out = slipped / [w.counts_per_metre for w in bench.rig.winches]
         assert paid_out.max() > 1e-5
-        assert place.rehearsal.tensions.max() < carried.max()
+        assert bench.rehearsal.tensions.max() < carried.max()
         weak.close()
 
 
@@ -397,25 +401,27 @@ def test_winches_without_a_platform_move_below_what_would_balance_it() -> None:
     """40 N hold no platform of this rig; light weights on the cables ask for no more."""
     rig = load_rig(HALL)
     loose = PowerLoss(np.zeros(rig.cable_count), np.full(rig.cable_count, 0.02), on_a_stand=True)
-    with after_power_loss(loose, rig, limit=40.0, speed=0.005) as place:
-        law = CableStep(place.as_set_up, place.counts, cable=0, way=0.002, limit=40.0, speed=0.005)
-        stand = place.move(law)
-        assert stand.state is State.FINISHED, stand.cause
-        assert {d.objects[0x6072, 0] for d in place.rehearsal.drives} == {
+    with after_power_loss(loose, rig, limit=40.0, speed=0.005) as bench:
+        law = CableStep(
+            bench.as_set_up, bench.counts, cable=0, length=0.002, limit=40.0, speed=0.005
+        )
+        result = bench.move(law)
+        assert result.state is State.FINISHED, result.cause
+        assert {d.objects[0x6072, 0] for d in bench.rehearsal.drives} == {
             int(np.ceil(1000.0 * 1.2 * 40.0 / w.torque_constant)) for w in rig.winches
         }
 
 
 @pytest.mark.parametrize("speed", [0.0001, 0.0002])
-def test_the_slowest_motion_is_no_jump_of_a_coarse_encoder(speed: float) -> None:
+def test_the_slowest_motion_is_not_a_jump_of_a_coarse_encoder(speed: float) -> None:
     rig = load_rig(HALL)
     loose = PowerLoss(np.zeros(rig.cable_count), np.full(rig.cable_count, 0.02), on_a_stand=True)
-    with after_power_loss(loose, rig, limit=400.0, speed=speed) as place:
+    with after_power_loss(loose, rig, limit=400.0, speed=speed) as bench:
         law = CableStep(
-            place.as_set_up, place.counts, cable=0, way=-0.00005, limit=400.0, speed=speed
+            bench.as_set_up, bench.counts, cable=0, length=-0.00005, limit=400.0, speed=speed
         )
-        stand = place.move(law)
-        assert stand.state is State.FINISHED, stand.cause
+        result = bench.move(law)
+        assert result.state is State.FINISHED, result.cause
 
 
 def test_no_winch_is_faster_than_its_rig_file_says() -> None:
@@ -423,93 +429,93 @@ def test_no_winch_is_faster_than_its_rig_file_says() -> None:
     begin = [0] * rig.cable_count
     fastest = np.array([winch.max_speed for winch in rig.winches])
     assert (wind_in_speed(rig, TARGET, LIMIT, 10.0) <= fastest).all()
-    law = CableStep(rig, begin, cable=1, way=0.05, limit=LIMIT, speed=10.0)
+    law = CableStep(rig, begin, cable=1, length=0.05, limit=LIMIT, speed=10.0)
     sent, per_metre = [begin], rig.winches[1].counts_per_metre
     while not law.done:
         sent.append(list(law.next(1.0, [0.0] * rig.cable_count)[0]))
     assert np.abs(np.diff(np.array(sent)[:, 1])).max() / per_metre <= fastest[1] * 0.01 + 2e-6
 
 
-def test_an_end_that_cannot_be_kept_is_a_fault_that_is_told(
+def test_an_end_that_cannot_be_kept_is_a_fault_that_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def full(*_args: object, **_more: object) -> None:
         raise Refused("the latch cannot be written", where="latched.json", why="disk full")
 
-    with after_power_loss(lost(1, on_a_stand=True)) as place:
+    with after_power_loss(lost(1, on_a_stand=True)) as bench:
         monkeypatch.setattr(MotionInterlock, "end", full)
-        stand = place.take_up()
-        assert stand.state is State.LATCHED
-        assert "disk full" in stand.cause
-        assert np.isfinite(stand.counts).all()
-        assert (place.events[-1].code, place.states) == ("recorder", {HOLDING})
+        result = bench.take_up()
+        assert result.state is State.LATCHED
+        assert "disk full" in result.cause
+        assert np.isfinite(result.counts).all()
+        assert (bench.events[-1].code, bench.states) == ("recorder", {HOLDING})
 
 
-def moved_by_hand(place: Place) -> None:
-    place.rehearsal.drives[3].motor.position += 0.0002 * place.rig.winches[3].counts_per_metre
-    place.rehearsal.drives[3].motor.demand = place.rehearsal.drives[3].motor.position
+def moved_by_hand(bench: Bench) -> None:
+    bench.rehearsal.drives[3].motor.position += 0.0002 * bench.rig.winches[3].counts_per_metre
+    bench.rehearsal.drives[3].motor.demand = bench.rehearsal.drives[3].motor.position
 
 
 @pytest.mark.parametrize(
-    ("happens", "told"),
+    ("happens", "expected"),
     [
-        (lambda _place: None, None),
+        (lambda _bench: None, None),
         (moved_by_hand, r"cable 4 \(drive 4\) moved by 0.20 mm"),
         (loses_all_torque, "lost its torque: switch on disabled"),
         (fails, "drive 7"),
     ],
 )
-def test_what_happens_while_the_camera_looks_is_noticed(
-    happens: Callable[[Place], None], told: str | None
+def test_what_happens_while_the_camera_measures_is_noticed(
+    happens: Callable[[Bench], None], expected: str | None
 ) -> None:
-    with after_power_loss(lost(1, on_a_stand=True)) as place:
-        stand = place.take_up()
-        assert stand.state is State.FINISHED
-        happens(place)
-        if told is None:
-            require_held(place.rig, stand, place.group.read_positions())
+    with after_power_loss(lost(1, on_a_stand=True)) as bench:
+        result = bench.take_up()
+        assert result.state is State.FINISHED
+        happens(bench)
+        if expected is None:
+            require_held(bench.rig, result, bench.group.read_positions())
             return
-        with pytest.raises(Fault, match=told):
-            require_held(place.rig, stand, place.group.read_positions())
+        with pytest.raises(Fault, match=expected):
+            require_held(bench.rig, result, bench.group.read_positions())
 
 
-def no_more_heard(place: Place) -> None:
-    place.rehearsal.drives[5].silent = True
+def no_more_heard(bench: Bench) -> None:
+    bench.rehearsal.drives[5].silent = True
 
 
 @pytest.mark.parametrize("rehome", [True, False])
 @pytest.mark.parametrize(
-    ("happens", "told", "counts"),
+    ("happens", "expected", "counts"),
     [
         (moved_by_hand, "moved by 0.20 mm", True),
         (loses_all_torque, "lost its torque: switch on disabled", False),
         (no_more_heard, "no answer after", True),
     ],
 )
-def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
-    rehome: bool, happens: Callable[[Place], None], told: str, counts: bool
+def test_what_is_found_wrong_after_the_motion_is_latched_and_reported(
+    rehome: bool, happens: Callable[[Bench], None], expected: str, counts: bool
 ) -> None:
-    """The reference of before counts only where every cable was held, and none is made."""
+    """The previous reference stays valid only if every cable was held; no new one is made."""
     rig = load_rig(RIG)
     bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can7"})
     kept = rig_from_document(rig.document.model_copy(update={"bus": bus}))
     interlock = MotionInterlock(kept)
-    with after_power_loss(lost(1, on_a_stand=True)) as place:
+    with after_power_loss(lost(1, on_a_stand=True)) as bench:
         tensions = np.full(rig.cable_count, TARGET)
-        begin = np.array(place.counts)
+        begin = np.array(bench.counts)
         interlock.take(reference_at(kept, kept.home, begin, tensions, "stated pose", 0.0))
 
-        def at_rest(stand: WinchesStand) -> HomingReference:
-            happens(place)
-            return reference_at(kept, kept.home, stand.counts, tensions, "new", 0.0)
+        def at_rest(result: WinchResult) -> HomingReference:
+            happens(bench)
+            return reference_at(kept, kept.home, result.counts, tensions, "new", 0.0)
 
-        place.interlock, place.at_rest, place.rehome = interlock, at_rest, rehome
-        with pytest.raises(CdprError, match=told):
-            place.take_up()
-        assert place.events[-1].code == "not_held"
-        assert told in place.events[-1].text
-        moved = [drive.motor.position for drive in place.rehearsal.drives]
-    with pytest.raises(Refused, match=told):
+        bench.interlock, bench.at_rest, bench.rehome = interlock, at_rest, rehome
+        with pytest.raises(CdprError, match=expected):
+            bench.take_up()
+        assert bench.events[-1].code == "not_held"
+        assert expected in bench.events[-1].text
+        moved = [drive.motor.position for drive in bench.rehearsal.drives]
+    with pytest.raises(Refused, match=expected):
         interlock.require_free()
     reference = interlock.kept_reference()
     assert reference is not None
@@ -521,7 +527,7 @@ def test_what_is_found_wrong_after_the_motion_is_latched_and_told(
 
 
 def test_a_record_that_is_full_by_then_leaves_the_cause_and_the_latch() -> None:
-    """An event that cannot be kept takes the place of neither."""
+    """An event that cannot be recorded replaces neither the result nor the error."""
     full = Fault("events.jsonl cannot be written: No space left on device")
 
     class Full(list[LoopEvent]):
@@ -533,26 +539,26 @@ def test_a_record_that_is_full_by_then_leaves_the_cause_and_the_latch() -> None:
     rig = load_rig(RIG)
     bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can8"})
     interlock = MotionInterlock(rig_from_document(rig.document.model_copy(update={"bus": bus})))
-    with after_power_loss(lost(1, on_a_stand=True)) as place:
+    with after_power_loss(lost(1, on_a_stand=True)) as bench:
 
-        def at_rest(_stand: WinchesStand) -> None:
-            loses_all_torque(place)
+        def at_rest(_result: WinchResult) -> None:
+            loses_all_torque(bench)
 
-        place.interlock, place.at_rest, place.events = interlock, at_rest, Full()
+        bench.interlock, bench.at_rest, bench.events = interlock, at_rest, Full()
         with pytest.raises(CdprError, match="lost its torque: switch on disabled"):
-            place.take_up()
-        assert place.events[-1].code == "not_held"
+            bench.take_up()
+        assert bench.events[-1].code == "not_held"
     with pytest.raises(Refused, match="lost its torque: switch on disabled"):
         interlock.require_free()
 
 
 def test_a_stop_before_anything_is_enabled_leaves_all_as_it_was() -> None:
-    with after_power_loss(lost(1, on_a_stand=True)) as place:
-        place.board.ask_stop()
+    with after_power_loss(lost(1, on_a_stand=True)) as bench:
+        bench.board.ask_stop()
         with pytest.raises(StoppedByOperator, match="before anything moved"):
-            place.take_up()
-        assert place.states.isdisjoint({DriveState.OPERATION_ENABLED, HOLDING})
-        assert not place.records
+            bench.take_up()
+        assert bench.states.isdisjoint({DriveState.OPERATION_ENABLED, HOLDING})
+        assert not bench.records
 
 
 def test_a_pose_that_is_not_known_well_is_refused() -> None:
@@ -581,12 +587,12 @@ def test_the_hall_robot_is_taken_up_too() -> None:
         group = make_drive_group(counted, near, rehearsal.pump, max_tension=400.0)
         group.configure()
         law = PretensionLaw(limited, counts, target=60.0, limit=400.0, reach=0.05, speed=0.002)
-        stand = move_winches(
+        result = move_winches(
             mover(limited, law, group, LocalRequests()), rig, MotionInterlock(rig),
-            Told(lambda _record: None, lambda _event: None),
-            record=Path("nowhere"), rehome=True, at_rest=lambda _stand, _true_pose: None,
+            Records(lambda _record: None, lambda _event: None),
+            record=Path("nowhere"), rehome=True, at_rest=lambda _result, _true_pose: None,
         )  # fmt: skip
-        assert stand.state is State.FINISHED, stand.cause
+        assert result.state is State.FINISHED, result.cause
         assert rehearsal.tensions.min() >= 0.7 * 60.0
 
 
@@ -612,10 +618,10 @@ def hangs(stage: Stage) -> None:
     ("happens", "holding"),
     [(stops, True), (hangs, True), (emergency_stop, False), (one_fails, False)],
 )
-def test_a_run_tells_whether_a_cable_was_let_go(
+def test_a_run_tells_whether_a_cable_was_released(
     prepared: PreparedRun, tmp_path: Path, happens: Callable[[Stage], None], holding: bool
 ) -> None:
-    """On it hangs whether the reference still counts: see `executor.interlock.interlock`."""
+    """It decides whether the reference stays valid: see `executor.interlock.interlock`."""
     with staged(prepared, tmp_path / "run", at(120, happens)) as stage:
         outcome = stage.run()
     assert outcome.state is (State.STOPPED if happens is stops else State.LATCHED)

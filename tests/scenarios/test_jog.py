@@ -1,4 +1,4 @@
-"""Jogging: a short, slow, straight run from where the platform stands, denied by default."""
+"""Jogging: a short, slow, straight run from the present pose, denied by default."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from tests.cli.plans import RIG
 from tests.cli.program import call, one_message
 from tests.scenarios.test_real_time import drives_on
 
-WAY = ("--by-mm", "6", "0", "8")
+BY = ("--by-mm", "6", "0", "8")
 
 
-def test_a_jog_is_a_slow_straight_run_from_where_the_platform_stands(tmp_path: Path) -> None:
+def test_a_jog_is_a_slow_straight_run_from_where_the_platform_is(tmp_path: Path) -> None:
     run = tmp_path / "jog"
-    answer = call("jog", RIG, *WAY, "--no-scene", "--fast", "-o", run, "--json")
+    answer = call("jog", RIG, *BY, "--no-scene", "--fast", "-o", run, "--json")
     assert answer.code == 0, answer
     summary = json.loads(answer.out)
     assert summary["verdict"] == "PASSED"
@@ -42,13 +42,13 @@ def test_a_jog_is_a_slow_straight_run_from_where_the_platform_stands(tmp_path: P
         (("--by-mm", "30", "30", "30", "--no-scene"), 3, "exceeds 50 mm"),
         (("--by-mm", "0", "0", "0", "--no-scene"), 2, "jog distance is zero"),
         (("--by-mm", "nan", "0", "0", "--no-scene"), 2, "must be a finite number"),
-        (WAY, 2, "obstacles are not given"),
-        ((*WAY, "--no-scene", "--scene", "scene.yaml"), 2, "obstacles are not given"),
-        ((*WAY, "--no-scene", "--fast", "--interface", "udp_multicast"), 2, "--fast"),
+        (BY, 2, "obstacles are not given"),
+        ((*BY, "--no-scene", "--scene", "scene.yaml"), 2, "obstacles are not given"),
+        ((*BY, "--no-scene", "--fast", "--interface", "udp_multicast"), 2, "--fast"),
         (("--fast",), 2, "no motion given"),
-        (("--to-home", *WAY), 2, "no motion given"),
+        (("--to-home", *BY), 2, "no motion given"),
         (("--to-home",), 2, "obstacles are not given"),
-        ((*WAY, "--no-scene", "--limit-n", "20"), 2, "no effect here: --limit-n"),
+        ((*BY, "--no-scene", "--limit-n", "20"), 2, "no effect here: --limit-n"),
     ],
 )
 def test_what_is_not_clearly_allowed_is_denied(
@@ -72,7 +72,7 @@ ONE = ("--cable", "3", "--mm", "1")
         (("--cable", "3", "--mm", "nan"), 2, "must be a finite number"),
         (("--cable", "3", "--mm", "51"), 3, "exceeds the limit of 50 mm"),
         ((*ONE, "--limit-n", "101"), 3, "limit of 101 N"),
-        ((*ONE, *WAY), 2, "no effect here: --by-mm"),
+        ((*ONE, *BY), 2, "no effect here: --by-mm"),
         ((*ONE, "--to-home", "--scene", "none.yaml"), 2, "no effect here: --to-home, --scene"),
         ((*ONE, "--no-scene", "--clearance-mm", "0"), 2, "--no-scene, --clearance-mm"),
         ((*ONE, "-o", "run"), 2, "no effect here: --output"),
@@ -93,7 +93,7 @@ HELD = ("--hold-to-run", "--one-cable")
         (("--one-cable",), 2, "--one-cable needs --hold-to-run"),
         ((*HELD, "--keys"), 2, "without --keys"),
         ((*HELD, "--limit-n", "101"), 3, "limit of 101 N"),
-        ((*HELD, *WAY), 2, "no effect here: --by-mm"),
+        ((*HELD, *BY), 2, "no effect here: --by-mm"),
         ((*HELD, "--no-scene"), 2, "no effect here: --no-scene"),
         ((*HELD, "--fast"), 2, "no effect here: --fast"),
         (("--hold-to-run", "--no-scene", "--limit-n", "20"), 2, "no effect here: --limit-n"),
@@ -123,7 +123,7 @@ def test_a_jog_into_an_obstacle_is_denied(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_on_a_bus_it_begins_where_the_drives_stand_and_is_not_home(
+def test_on_a_bus_it_begins_where_the_drives_are_and_is_not_home(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.24:{20000 + (os.getpid() * 13) % 20000}"

@@ -1,4 +1,4 @@
-"""A run whose program was killed: its cycles are on disk, and its report says what is known."""
+"""A run whose program was killed: its cycles are on disk, and its report states what is known."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ENDED = (*(name for name in NEEDED if name not in KEPT),)
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """What is there when the program is killed while the platform moves."""
+    """The folder when the program is killed during motion."""
     folder = fake_run.write(RUN, tmp_path_factory.mktemp("killed") / "run", pictures=False)
     folder.append_event(RunEvent(99.0, "pass", "an der Säule vorbei – ¾"))
     context = RUN.context
@@ -49,7 +49,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 def cut(killed: RunFolder, path: Path, **kept: int) -> RunFolder:
-    """A copy of which only so many bytes of some files are left."""
+    """A copy with some files truncated."""
     shutil.rmtree(path, ignore_errors=True)
     shutil.copytree(killed.path, path)
     for name, size in kept.items():
@@ -108,16 +108,16 @@ def test_the_report_of_a_killed_run_shows_what_there_is(
     assert answer.code == 0, answer
     assert "did not finish" in folder.report.read_text()
     assert len(RunFolder.open(folder.path).cycles()) == max(0, lines - 1)
-    # Made once, it is a run folder as any other; but from where it ended nothing is planned.
+    # Once completed it is an ordinary run folder; but no plan may start from its end.
     assert call("report", folder.path).code == 0
     with pytest.raises(Refused, match="did not finish"):
         run_end(RunFolder.open(folder.path))
 
 
-def test_cycles_that_are_not_on_record_are_told_of_a_run_whose_end_is(
+def test_cycles_that_are_not_on_record_are_reported_of_a_run_whose_end_is(
     killed: RunFolder, tmp_path: Path
 ) -> None:
-    """The disk was full: its end is in the room that was kept for it, its last cycles are not."""
+    """The disk was full: its end is in the reserved space, its last cycles are missing."""
     folder = cut(killed, tmp_path / "run")
     there = len(folder.cycles())
     course = replace(folder.course(), final_state="finished", cause="", cycles=there + 7)
@@ -226,7 +226,7 @@ def test_a_killed_run_without_a_cycle_file_has_a_report_too(
     assert "did not finish" in folder.report.read_text()
 
 
-def test_a_run_that_is_under_way_has_no_report_yet(killed: RunFolder, tmp_path: Path) -> None:
+def test_a_run_that_is_active_has_no_report_yet(killed: RunFolder, tmp_path: Path) -> None:
     folder = cut(killed, tmp_path / "run")
     with folder.held():
         one_message(call("report", folder.path), 2, "still in progress")
@@ -296,7 +296,7 @@ def test_a_folder_that_is_removed_while_drives_move_ends_in_a_latched_fault(
 
 
 def wait_until(enough: Callable[[dict[str, float]], bool]) -> float:
-    """Until the run says so, or ends; how long it had lasted when it was last heard, [s]."""
+    """Waits until the run reports it, or ends; returns its last reported time, [s]."""
     elapsed = 0.0
     while True:
         with find_runs() as runs:

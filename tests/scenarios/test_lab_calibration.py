@@ -1,4 +1,4 @@
-"""A lab's way from the printed board to a good verdict, step by step as the page says."""
+"""A lab's steps from the printed board to a good verdict, as on the documentation page."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def print_of(pdf: Path) -> tuple[np.ndarray, np.ndarray]:
     assert seen is not None
     corners = (seen.corners + 0.5) / PER_MM / 1e3
     across, down = corners[8] - corners[0], corners[-9] - corners[0]
-    if across[0] < 0.0 or down[1] < 0.0:  # found turned by 180°: the same print
+    if across[0] < 0.0 or down[1] < 0.0:  # found rotated by 180°: the same print
         page, corners = np.ascontiguousarray(page[::-1, ::-1]), None
         seen = Chessboard(9, 6, 0.025).find(page)
         assert seen is not None
@@ -40,10 +40,10 @@ def as_the_page_says(count: int) -> list[Pose]:
     """Near the edges and corners and in the middle, tilted up to 40° in every direction."""
     middle = Chessboard(9, 6, 0.025).points().mean(axis=0)
     rng = np.random.default_rng(6)
-    places = [(x, y) for x in (-0.13, 0.0, 0.13) for y in (-0.1, 0.0, 0.1)]
+    positions = [(x, y) for x in (-0.13, 0.0, 0.13) for y in (-0.1, 0.0, 0.1)]
     poses = []
     while len(poses) < count:
-        x, y = places[len(poses) % len(places)]
+        x, y = positions[len(poses) % len(positions)]
         turn = matrix_from_rotation_vector([*rng.uniform(-0.6, 0.6, 2), rng.uniform(-0.2, 0.2)])
         pose = Pose(np.array([x, y, rng.uniform(0.5, 0.6)]) - turn @ middle, turn)
         points = pose.apply(Chessboard(9, 6, 0.025).points())
@@ -66,11 +66,11 @@ def test_from_the_print_to_a_good_verdict(tmp_path: Path) -> None:
     options = (*BOARD, "--name", "front", "-o", tmp_path / "calibration", "--json")
     answer = call("calibrate", "camera", folder, *options)
     assert answer.code == 0, answer
-    told = json.loads(answer.out)
-    assert told["good_enough"]
-    assert told["verdict"].startswith("good enough for")
+    result = json.loads(answer.out)
+    assert result["good_enough"]
+    assert result["verdict"].startswith("good enough for")
     for name, truth in (("fx_px", MATRIX[0, 0]), ("fy_px", MATRIX[1, 1])):
-        low, high = told["intervals"][name]
+        low, high = result["intervals"][name]
         assert low - 0.3 < truth < high + 0.3
     written = sorted(path.suffix for path in (tmp_path / "calibration").iterdir())
     assert written == [".html", ".yaml"]

@@ -1,4 +1,4 @@
-"""The latch of a bus: what ended badly, or not at all, prevents motion until it is reset."""
+"""The fault latch: a run that ended badly, or not at all, prevents motion until a reset."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BUS = BusSettings("socketcan", "can0")
 
 
 def wait_until_beyond(path_mm: float) -> None:
-    """Until the run has come so far along its path, or ended."""
+    """Waits until the run has progressed this far along its path, or ended."""
     while True:
         with find_runs() as runs:
             (answer,) = ask_all(runs, "status")
@@ -67,7 +67,7 @@ def test_a_run_that_never_came_to_its_end_is_a_fault(tmp_path: Path) -> None:
         FaultLatch(BUS).require_disengaged()
 
 
-def test_a_run_under_way_is_told_apart_from_a_fault(tmp_path: Path) -> None:
+def test_a_run_active_is_distinguished_from_a_fault(tmp_path: Path) -> None:
     """To every user of the folder, who may not reach the other's run; and only until it ends."""
     running = FaultLatch(BUS)
     running.engage("rig", tmp_path)
@@ -80,7 +80,7 @@ def test_a_run_under_way_is_told_apart_from_a_fault(tmp_path: Path) -> None:
         FaultLatch(BUS).require_disengaged()
 
 
-def test_nobody_sees_a_latch_that_does_not_say_its_cause_yet(
+def test_no_reader_sees_a_latch_that_does_not_say_its_cause_yet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen, hold = [], FaultLatch._hold
@@ -97,7 +97,7 @@ def test_nobody_sees_a_latch_that_does_not_say_its_cause_yet(
 def test_of_two_that_begin_at_once_one_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("executor.interlock.fault_latch.LOOKS_WITHIN", 0.05)
+    monkeypatch.setattr("executor.interlock.fault_latch.LOCK_TIMEOUT", 0.05)
     first = FaultLatch(BUS)
     first.path.parent.mkdir(parents=True)
     first._hold()  # it is about to write why
@@ -171,7 +171,7 @@ def test_a_latch_file_that_cannot_be_read_counts_as_engaged(tmp_path: Path, cont
         latch.require_disengaged()
 
 
-def test_without_a_place_for_the_latch_nothing_moves(
+def test_without_a_folder_for_the_latch_nothing_moves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
@@ -222,9 +222,9 @@ def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
         assert rehearsal.drives[2].state is DriveState.FAULT
         answer = call("reset", slow_rig, *bus, "--yes", "--json")
         assert answer.code == 0, answer
-        told = json.loads(answer.out)
-        assert told["was_latched"] is True
-        assert "fault" not in told["drives"]
+        result = json.loads(answer.out)
+        assert result["was_latched"] is True
+        assert "fault" not in result["drives"]
         assert DriveState.FAULT not in {drive.state for drive in rehearsal.drives}
         assert [drive.motor.position for drive in rehearsal.drives] == stood
     latch.require_disengaged()
@@ -253,7 +253,7 @@ def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
 
 
 @pytest.mark.slow
-def test_after_a_crash_nothing_moves_until_reset_and_then_only_from_where_it_stands(
+def test_after_a_crash_nothing_moves_until_reset_and_then_only_from_where_it_is(
     slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
     with moving_over_udp(slow_run, slow_rig, short_plan, tmp_path / "run", 5) as (

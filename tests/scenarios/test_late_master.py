@@ -1,4 +1,4 @@
-"""F4, densely: however late a cycle is, no drive that stopped by itself is enabled again by it.
+"""F4, densely: for any lateness, no drive that stopped on its own is enabled again.
 
 The drives leave quick stop by level, as CiA 402 allows: "enable operation" alone does it.
 """
@@ -29,7 +29,7 @@ FINE = 0.0005
 
 
 class LateClock:
-    """Simulated time in which one cycle may begin late, or be held up before its SYNC."""
+    """Simulated time in which one cycle may begin late, or be delayed before its SYNC."""
 
     def __init__(self, cycle: float) -> None:
         self.cycle, self.now, self.time = cycle, 0.0, 0.0
@@ -88,7 +88,7 @@ class Late:
             self.rehearsal.advance(FINE)
 
     def cycle(self) -> None:
-        """As the loop does it."""
+        """As in the loop."""
         lateness = self.master.begin()
         if self.master.rule.may_enable(1.0 + lateness):
             self.master.exchange(self.group.targets.tolist())
@@ -150,7 +150,7 @@ def test_no_lateness_enables_a_drive_again(cycle_ms: float, held_up: str) -> Non
 
 @pytest.mark.parametrize("held_up", [1.6, 2.5, 4.0])
 def test_a_master_held_up_after_its_last_look_stops_the_drives_at_once(held_up: float) -> None:
-    """Nothing can be taken back then; the stop follows before another SYNC does."""
+    """Nothing can be revoked then; the stop follows before another SYNC."""
     with enabled_drives(10.0) as late:
         late.enable()
         late.cycle()
@@ -174,8 +174,8 @@ def test_a_master_held_up_after_its_last_look_stops_the_drives_at_once(held_up: 
         assert {drive.state for drive in late.rehearsal.drives} == {HOLDING}
 
 
-def test_lateness_that_enables_nothing_is_no_fault() -> None:
-    """Drives that are only looked at, or hold by themselves, take no harm from a late SYNC."""
+def test_lateness_that_enables_nothing_is_not_a_fault() -> None:
+    """Drives that are only read, or hold on their own, are not affected by a late SYNC."""
     with enabled_drives(10.0) as late:
         late.pass_time(2.0 * late.clock.cycle)
         late.clock.now += 2.0 * late.clock.cycle

@@ -1,4 +1,4 @@
-"""Eight drives of each make in real time: every verb of a day, without a report of any drive."""
+"""Eight drives of each maker in real time: every verb of a day, without a fault of any drive."""
 
 from __future__ import annotations
 

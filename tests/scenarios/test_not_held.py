@@ -1,4 +1,4 @@
-"""Drives that let go when they are left after a run, and a bus that is gone by then."""
+"""Drives that release after the end of a run, and a bus that is lost by then."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def fails_once_left(drive: SimulatedDrive) -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_that_lets_go_after_a_run_is_latched_and_told_with_exit_code_1(
+def test_a_drive_that_releases_after_a_run_is_latched_and_reported_with_exit_code_1(
     slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.41:{20000 + (os.getpid() * 31) % 20000}"
@@ -52,19 +52,19 @@ def test_a_drive_that_lets_go_after_a_run_is_latched_and_told_with_exit_code_1(
         states = [drive.state for drive in rehearsal.drives]
     assert answer.code == 1, answer
     assert "\nFAILED " in answer.out
-    told = "cable 6 (drive 6) went from quick stop active to fault"
-    assert told in answer.out
+    message = "cable 6 (drive 6) went from quick stop active to fault"
+    assert message in answer.out
     assert states.count(DriveState.QUICK_STOP_ACTIVE) == 7, "the others hold"
     summary = RunFolder.open(tmp_path / "run").summary()
     assert (summary["verdict"], summary["final_state"]) == ("FAILED", "latched")
     (event,) = (each for each in summary["events"] if each["code"] == "not_held")
-    assert told in event["text"]
+    assert message in event["text"]
     assert "held" not in [each["code"] for each in summary["events"]]
     with pytest.raises(Refused, match="went from quick stop active to fault"):
         FaultLatch(BusSettings("udp_multicast", channel)).require_disengaged()
 
 
-def test_a_drive_that_lets_go_after_a_fault_is_told_beside_its_cause(
+def test_a_drive_that_releases_after_a_fault_is_reported_besides_its_cause(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     def fault(stage: Stage) -> None:
@@ -82,7 +82,7 @@ def test_a_drive_that_lets_go_after_a_fault_is_told_beside_its_cause(
     assert "cable 4" not in events[-1].text
 
 
-def test_a_second_drive_that_lets_go_after_a_fault_is_told_although_the_first_does_not_hold(
+def test_a_second_drive_that_releases_after_a_fault_is_reported_although_the_first_does_not_hold(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     def fault(stage: Stage) -> None:
@@ -99,7 +99,7 @@ def test_a_second_drive_that_lets_go_after_a_fault_is_told_although_the_first_do
     assert "drive 5" not in events[-1].text
 
 
-def test_a_drive_that_died_before_the_stop_is_not_told_again_at_the_end(
+def test_a_drive_that_died_before_the_stop_is_not_reported_again_at_the_end(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     def fault(stage: Stage) -> None:
@@ -142,7 +142,7 @@ OF_THE_LIBRARY = can.CanOperationError("Network is down [Error Code 100]")
 
 
 @pytest.mark.parametrize("error", [THREE_LINES, OF_THE_LIBRARY])
-def test_a_bus_that_is_gone_after_the_stop_is_told_in_one_line(
+def test_a_bus_that_is_gone_after_the_stop_is_reported_in_one_line(
     prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     def gone(*_: object) -> None:

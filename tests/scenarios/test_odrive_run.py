@@ -51,7 +51,7 @@ def prepared(plan: Path) -> PreparedRun:
 
 @dataclass
 class Seen:
-    """Every cycle of a run: which axes are enabled, and what they were told."""
+    """Every cycle of a run: which axes are enabled, and their set-points."""
 
     enabled: list[tuple[bool, ...]] = field(default_factory=list)
     targets: list[tuple[int, ...]] = field(default_factory=list)
@@ -123,13 +123,13 @@ def test_an_operators_stop_ends_on_the_brakes(prepared: PreparedRun, tmp_path: P
 
 @dataclass(frozen=True)
 class Case:
-    """What happens to drive 3 in cycle `CRUISING`, and how it must be told.
+    """A fault of drive 3 in cycle `CRUISING`, and the required report.
 
     Attributes:
         happens: Called at the beginning of the cycle.
-        code: Of the event that tells what the drive says, or does not.
+        code: Of the event that reports the drive's fault, or its silence.
         words: In it.
-        within: Cycles from there until the others are told to stay where they are.
+        within: Cycles from there until the others are commanded to hold.
     """
 
     happens: Callable[[Any], object]
@@ -151,7 +151,7 @@ CASES = {
     "emergency stop of one": Case(
         lambda stage: stage.drives[2].receive(2, b""), "drive_fault", "emergency stop", 7
     ),
-    "starts anew": Case(
+    "restarts": Case(
         lambda stage: stage.drives[2].power_on(), "drive_fault", "(drive 3) disarmed itself", 7
     ),
     "no heartbeat": Case(
@@ -179,7 +179,7 @@ def test_a_fault_of_one_drive_is_a_hold_of_all_and_then_their_brakes(
         outcome = stage.run()
         assert outcome.state is State.LATCHED
         assert "drive 3" in outcome.cause or "cable 3" in outcome.cause
-        # That a cable lost its tension is seen before the drive's next heartbeat says why.
+        # The loss of tension is detected before the drive's next heartbeat gives the reason.
         first = next(event for event in stage.events() if event.time_s >= CRUISING * 0.01)
         assert any(e.code == case.code and case.words in e.text for e in stage.events())
         # A drive whose bus cable is pulled is disarmed by its own watchdog.
@@ -243,8 +243,8 @@ def test_the_doctor_names_the_extra_and_the_files_that_odrives_need(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def answer(rig: Path) -> dict[str, Any]:
-        told = json.loads(call("doctor", rig, "--json").out)
-        return next(entry for entry in told if entry["name"] == "drives")
+        checks = json.loads(call("doctor", rig, "--json").out)
+        return next(entry for entry in checks if entry["name"] == "drives")
 
     assert answer(ODRIVE)["good"]
     lost = answer(changed_rig(tmp_path, endpoints=str(tmp_path / "none.json")))

@@ -58,7 +58,7 @@ def test_all_drives_slow_down_together_along_the_path(
     states = np.array(table.state)
     moving = np.isin(states, [State.MOVING.value, State.STOPPING.value])
     index, inexact, off = path_indices(prepared, table.set_counts[moving])
-    assert off.max() <= 2.0, "every drive is told the same place of the path, to whole counts"
+    assert off.max() <= 2.0, "all drives are at the same path index, to whole counts"
     rates = np.diff(index)
     blur = (inexact[1:] + inexact[:-1])[:-1]
     assert (rates[1:] > -blur).all(), "never backwards"

@@ -42,15 +42,15 @@ def states(outcome: Outcome) -> list[str]:
 
 
 def rates_on_path(prepared: PreparedRun, outcome: Outcome) -> tuple[np.ndarray, np.ndarray]:
-    """Rows a cycle, measured from what was sent, and how inexact each is."""
+    """Rows per cycle from the set-points sent, and their uncertainty."""
     table = outcome.log.table()
     on_path = np.isin(table.state, ["moving", "holding", "stopping"])
     index, inexact, off = path_indices(prepared, table.set_counts[on_path])
-    assert off.max() <= 2.0, "every drive is told the same place of the path, to whole counts"
+    assert off.max() <= 2.0, "all drives are at the same path index, to whole counts"
     return np.diff(index), inexact[1:] + inexact[:-1]
 
 
-def test_a_hold_rests_on_the_path_under_power_and_a_resume_goes_on_to_the_goal(
+def test_a_hold_rests_on_the_path_under_power_and_a_resume_continues_to_the_goal(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     seen: list[tuple[DriveState, ...]] = []
@@ -81,8 +81,8 @@ def test_a_hold_rests_on_the_path_under_power_and_a_resume_goes_on_to_the_goal(
 def test_speeds_are_kept_and_change_smoothly(prepared: PreparedRun, tmp_path: Path) -> None:
     stage, outcome = run(prepared, tmp_path, c100=speed(50), c250=speed(10), c400=speed(100))
     assert outcome.state is State.FINISHED
-    told = [event.text for event in stage.events() if event.code == "speed"]
-    assert [text.split(": ")[1] for text in told] == [
+    reported = [event.text for event in stage.events() if event.code == "speed"]
+    assert [text.split(": ")[1] for text in reported] == [
         f"{share} of the planned speed" for share in ("50%", "10%", "100%")
     ]
     rates, _ = rates_on_path(prepared, outcome)
@@ -94,7 +94,7 @@ def test_speeds_are_kept_and_change_smoothly(prepared: PreparedRun, tmp_path: Pa
     assert np.nanmax(records.following_error) < 2e-3
 
 
-def test_a_speed_that_was_wished_while_holding_counts_from_the_resume_on(
+def test_a_speed_that_was_requested_while_holding_counts_from_the_resume_on(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     stage, outcome = run(prepared, tmp_path, c150=HOLD, c200=speed(20), c260=RESUME)
@@ -105,7 +105,7 @@ def test_a_speed_that_was_wished_while_holding_counts_from_the_resume_on(
     assert [e.code for e in stage.events()] == ["enabled", "moving", "hold", "resume", "held"]
 
 
-def test_a_hold_that_was_wished_before_the_motion_rests_at_its_start(
+def test_a_hold_that_was_requested_before_the_motion_rests_at_its_start(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     _, outcome = run(prepared, tmp_path, c0=HOLD, c200=STOP)

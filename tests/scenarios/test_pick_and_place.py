@@ -1,4 +1,4 @@
-"""The ready pick-and-place scene from the file to the verdict; and half of it, twice."""
+"""The example scene with a pick and a put-down, from the file to the verdict; and its halves."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.cli.plans import CONFIGS, rig_with_two_pictures_a_second
 from tests.cli.program import call
 
 SCENE = CONFIGS / "pick_and_place.yaml"
-#: What hangs on the platform from leg to leg, [kg].
+#: Payload of each leg, [kg].
 CARRIED = [0.0, 1.2, 1.2, 0.0, 0.5, 0.0]
 
 
@@ -36,13 +36,13 @@ def test_the_ready_scene_is_planned_checked_and_run_with_the_camera(tmp_path: Pa
     assert summary["verdict"] == "PASSED"
     assert list(dict.fromkeys(cycles.leg.tolist())) == [1, 2, 3, 4, 5, 6]
     scene = load_plan(plan).scene
-    for stop, told in zip(scene.stops, summary["stops"], strict=True):
-        assert told["name"] == stop.name
-        stood = told["left_s"] - told["reached_s"]
+    for stop, times in zip(scene.stops, summary["stops"], strict=True):
+        assert times["name"] == stop.name
+        stood = times["left_s"] - times["reached_s"]
         assert stood == pytest.approx(stop.dwell, abs=0.011)
         there = np.array(cycles.stop) == stop.name
         assert np.linalg.norm(cycles.encoder[there] - stop.pose.position, axis=1).max() < 1e-4
-    # The drives' torques hold what hangs there: platform and payload, by the vertical force.
+    # The drives' torques hold platform and payload: compare the vertical force.
     outlets = rig.outlets
     for leg, mass in enumerate(CARRIED, start=1):
         rows = np.flatnonzero((cycles.leg == leg) & (np.array(cycles.stop) == ""))

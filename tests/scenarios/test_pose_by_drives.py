@@ -1,4 +1,4 @@
-"""While a run goes on, cameras are told where the drives put the platform, at the right time."""
+"""During a run, cameras receive the encoder pose of the right time."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ from model.pose import Pose
 from tests.scenarios.stage import staged
 
 
-def test_each_picture_comes_with_the_drives_pose_of_its_own_time(
+def test_each_image_comes_with_the_drives_pose_of_its_own_time(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
-    """The table of the whole run is made otherwise: all cycles at once, each near its plan."""
-    told: list[tuple[float, Pose | None]] = []
+    """The table of the whole run is computed differently: all cycles at once, near the plan."""
+    requests: list[tuple[float, Pose | None]] = []
 
-    def trigger(time: float, asked: float, true_pose: Pose | None, by_drives: Pose | None) -> None:
-        told.append((time, by_drives))
+    def trigger(
+        time: float, asked: float, true_pose: Pose | None, encoder_pose: Pose | None
+    ) -> None:
+        requests.append((time, encoder_pose))
 
     with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
         cycles = stage.run(trigger=trigger).log.table()
-    assert len(told) > 20
-    rows = np.searchsorted(cycles.time, [time - 1e-6 for time, _ in told])
+    assert len(requests) > 20
+    rows = np.searchsorted(cycles.time, [time - 1e-6 for time, _ in requests])
     following = np.isfinite(cycles.following_error[rows])
     assert following.sum() > 20
     for k in np.flatnonzero(following):
-        row, (time, pose) = rows[k], told[k]
+        row, (time, pose) = rows[k], requests[k]
         assert abs(cycles.time[row] - time) < 1e-9
         assert pose is not None
         assert np.linalg.norm(pose.position - cycles.encoder[row]) < 1e-6

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 def program(
     *arguments: str | Path, within: float = ENDS_WITHIN_S
 ) -> Iterator[subprocess.Popen[str]]:
-    """`cdpr ARGUMENTS` in a process of its own, which does not outlive the block."""
+    """`cdpr ARGUMENTS` in a separate process, which does not outlive the block."""
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, *map(str, arguments)],
         stdin=subprocess.DEVNULL,
@@ -52,14 +52,14 @@ def program(
 
 
 def finished(*arguments: str | Path) -> tuple[int, str, str]:
-    """Exit code and what it said, of a process that ends by itself."""
+    """Exit code and output of a process that ends on its own."""
     with program(*arguments) as process:
         out, err = process.communicate()
         return process.returncode, out, err
 
 
 def over_udp(rig: Path, plan: Path, run: Path, port: int) -> tuple[int, dict[str, Any], str]:
-    """One run with the drives in another process; exit code, summary, last words of the drives."""
+    """One run with the drives in another process; exit code, summary, last status words."""
     bus = ("--interface", "udp_multicast", "--channel", f"239.74.163.21:{port}")
     with program("sim", rig, *bus, "--plan", plan) as drives:
         assert drives.stdout is not None
@@ -109,7 +109,7 @@ def test_a_run_with_the_drives_in_another_process_loses_no_frame(
 
 
 def waited_for(events: Path, code: str, process: subprocess.Popen[str]) -> None:
-    """Until the run has written an event, or ended."""
+    """Waits until the run has written an event, or ended."""
     while process.poll() is None:
         if events.is_file() and f'"{code}"' in events.read_text():
             return
@@ -117,8 +117,8 @@ def waited_for(events: Path, code: str, process: subprocess.Popen[str]) -> None:
     pytest.fail(f"the run ended before {code!r}: {process.communicate()}")
 
 
-def told(command: str, percent: int | None = None) -> None:
-    """Said to the run from here: another terminal takes longer to start than the path lasts."""
+def send(command: str, percent: int | None = None) -> None:
+    """Sends a command from here: another terminal takes longer to start than the path lasts."""
     with find_runs() as runs:
         (answer,) = ask_all(runs, command, percent)
     assert answer.status is not None
@@ -130,7 +130,7 @@ def test_stop_from_another_terminal_ends_a_run_along_its_path(
     run = tmp_path / "run"
     with program("run", short_plan, "--rig", slow_rig, "-o", run, "--no-camera") as moving:
         waited_for(run / "events.jsonl", "moving", moving)
-        told("speed", 1)
+        send("speed", 1)
         code, out, err = finished("stop", "--json")
         assert (code, err) == (0, "")
         assert json.loads(out) == {"stopped_processes": [moving.pid], "silent_processes": []}

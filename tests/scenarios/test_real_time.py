@@ -1,4 +1,4 @@
-"""The real-time process and its supervisor: either may die or hang, and the platform rests."""
+"""The real-time process and its supervisor: if either dies or hangs, the platform stops."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from executor.trajectory.prepare import PreparedRun
 from model.rig import rig_from_document
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.ground_truth import PowerLoss
-from tests.scenarios.test_processes import finished, program, told, waited_for
+from tests.scenarios.test_processes import finished, program, send, waited_for
 
 pytestmark = pytest.mark.slow
 
@@ -43,7 +43,7 @@ def real_time_process(supervisor: int) -> int:
 
 
 def gone(process: int) -> bool:
-    """Ended, also when nobody has waited for it yet."""
+    """Whether it ended, also before it was waited for."""
     try:
         state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
     except OSError:
@@ -84,7 +84,7 @@ def drives_on(
 
 
 def _serve(rehearsal: SimulatedCia402Rig, over: threading.Event) -> None:
-    """Answers in time also on a busy host, where the host allows it: a real drive would."""
+    """Answers in time even on a busy host, if the host allows it, like a real drive."""
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(40))  # of this thread alone
     rehearsal.serve(over.is_set)
@@ -94,7 +94,7 @@ def _serve(rehearsal: SimulatedCia402Rig, over: threading.Event) -> None:
 def moving_over_udp(
     slow_run: PreparedRun, slow_rig: Path, plan: Path, run: Path, number: int
 ) -> Iterator[tuple[subprocess.Popen[str], SimulatedCia402Rig]]:
-    """A run whose drives are in this process; it is under way."""
+    """An active run whose drives are in this process."""
     channel = f"239.74.163.22:{20000 + (os.getpid() * 7 + number) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
     rest = ("-o", run, *bus, "--no-camera", "--yes", "--without-real-time")
@@ -130,7 +130,7 @@ def test_the_death_of_the_supervisor_ends_in_a_stop_by_the_real_time_process(
         wait_until_all_hold(rehearsal)
 
 
-def test_the_death_of_the_real_time_process_is_told_and_the_drives_stop_by_themselves(
+def test_the_death_of_the_real_time_process_is_reported_and_the_drives_stop_on_their_own(
     slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
@@ -162,7 +162,7 @@ def falls_silent(rehearsal: SimulatedCia402Rig) -> None:
     ("breaks", "number", "words"),
     [(lets_go, 5, "(drive 6) is in fault"), (falls_silent, 6, "drive 6")],
 )
-def test_drives_are_asked_how_they_stand_once_their_process_has_died(
+def test_drives_are_asked_for_their_state_once_their_process_has_died(
     slow_run: PreparedRun,
     slow_rig: Path,
     short_plan: Path,
@@ -185,10 +185,10 @@ def test_drives_are_asked_how_they_stand_once_their_process_has_died(
     assert any(words in reason for reason in summary["reasons"])
 
 
-def test_a_real_time_process_that_hangs_is_ended_and_told(
+def test_a_real_time_process_that_hangs_is_ended_and_reported(
     slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
-    """Suspended for good, it would otherwise be waited for without end."""
+    """Suspended for good, it would otherwise be waited for forever."""
     run = tmp_path / "run"
     with moving_over_udp(slow_run, slow_rig, short_plan, run, 4) as (process, rehearsal):
         child = real_time_process(process.pid)
@@ -209,7 +209,7 @@ def test_a_supervisor_that_hangs_is_noticed(
     run = tmp_path / "run"
     with moving_over_udp(slow_run, slow_rig, short_plan, run, 3) as (process, rehearsal):
         child = real_time_process(process.pid)
-        told("speed", 5)
+        send("speed", 5)
         process.send_signal(signal.SIGSTOP)
         wait_until_gone(child)
         wait_until_all_hold(rehearsal)
@@ -228,9 +228,9 @@ def test_a_supervisor_that_hangs_is_noticed(
     assert any(cause in reason for reason in summary["reasons"] for cause in causes)
 
 
-def codes(told: dict[str, Any]) -> list[str]:
+def codes(status: dict[str, Any]) -> list[str]:
     """Of its events; that a user may be without real-time rights is beside the question."""
-    return [event["code"] for event in told["events"] if event["code"] != "no_real_time"]
+    return [event["code"] for event in status["events"] if event["code"] != "no_real_time"]
 
 
 def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
@@ -239,7 +239,7 @@ def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
     run = tmp_path / "run"
     with program("run", short_plan, "--rig", slow_rig, "-o", run, "--no-camera") as moving:
         waited_for(run / "events.jsonl", "moving", moving)
-        told("hold")
+        send("hold")
         waited_for(run / "events.jsonl", "hold", moving)
         code, out, err = finished("monitor", "--once", "--json")
         status = json.loads(out)
@@ -270,7 +270,7 @@ def test_hold_speed_resume_and_monitor_reach_a_run_from_other_terminals(
 def test_winches_without_a_path_are_moved_by_the_real_time_process_too(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its death is a fault that is told and latched, and the drives hold by themselves."""
+    """Its death is reported and latched as a fault, and the drives hold on their own."""
     channel = f"239.74.163.28:{20000 + (os.getpid() * 17) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
     monkeypatch.chdir(tmp_path)

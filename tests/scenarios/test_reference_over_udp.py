@@ -1,4 +1,4 @@
-"""Drives without absolute encoders: no run before homing, none after one was switched on."""
+"""Drives without absolute encoders: no run before homing, none after a power cycle."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         start = [f"{x:.6f}" for x in slow_run.scene.start.position * 1000.0]
         homed = call("home", rig, "--pose-mm", *start, *bus, "--json")
         assert homed.code == 0, homed
-        told = json.loads(homed.out)
+        result = json.loads(homed.out)
         events = (tmp_path / "runs/home/events.jsonl").read_text().splitlines()
         assert json.loads(events[-1])["code"] == "held"
         with (tmp_path / "runs/home/winches.csv").open() as stream:
@@ -53,17 +53,17 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         moved = [int(rows[-1][f"counts_{k}"]) - int(rows[0][f"counts_{k}"]) for k in range(1, 9)]
         assert any(moved)
         assert all(int(rows[-1][f"torque_per_mille_{k}"]) > 0 for k in range(1, 9))
-        assert Path(told["file"]).is_file()
-        assert told["home_counts"] != [0] * 8
+        assert Path(result["file"]).is_file()
+        assert result["home_counts"] != [0] * 8
         second = call(*run, "-o", tmp_path / "second")
         assert second.code == 0, second
-        assert told["file"] in second.out.replace("\n", "").replace("  ", "")
+        assert result["file"] in second.out.replace("\n", "").replace("  ", "")
         assert rehearsal.pose.distance_to(slow_run.scene.goal) < 0.1e-3
         stood = [drive.motor.position for drive in rehearsal.drives]
-        # A program that was killed noted nothing; a reset does, where all drives held.
-        kept = json.loads(Path(told["file"]).read_text())
+        # A killed program recorded nothing; a reset does, if all drives held.
+        kept = json.loads(Path(result["file"]).read_text())
         elsewhere = {**kept, "stands_at": [count + 10**6 for count in kept["stands_at"]]}
-        Path(told["file"]).write_text(json.dumps(elsewhere))
+        Path(result["file"]).write_text(json.dumps(elsewhere))
         killed = call(*run, "-o", tmp_path / "killed")
         assert (killed.code, "from its last known position" in killed.err) == (3, True)
         reset = call("reset", rig, *bus[:5], "--json")
@@ -71,7 +71,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         after = json.loads(reset.out)
         assert (after["restarted"], after["reference"]["counts"]) == ([], True)
         assert after["reference"]["made"] == kept["made"]
-        assert json.loads(Path(told["file"]).read_text()) == kept
+        assert json.loads(Path(result["file"]).read_text()) == kept
         rehearsal.drives[5].power_on()
         third = call(*run, "-o", tmp_path / "third")
         assert third.code == 3
@@ -87,10 +87,10 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
         assert jogged.code == 3
         assert "cable 6 (drive 6): power-cycled" in jogged.err.replace("\n", " ").replace("  ", "")
         assert [drive.motor.position for drive in rehearsal.drives] == stood
-        Path(told["file"]).write_text("{")
-        anew = call("home", rig, "--pose-mm", *start, *bus, "--json")
-        assert anew.code == 0, anew
-        assert json.loads(Path(told["file"]).read_text())["lost"] == ""
+        Path(result["file"]).write_text("{")
+        rehomed = call("home", rig, "--pose-mm", *start, *bus, "--json")
+        assert rehomed.code == 0, rehomed
+        assert json.loads(Path(result["file"]).read_text())["lost"] == ""
 
 
 @pytest.mark.slow
@@ -118,7 +118,7 @@ def test_a_run_whose_end_cannot_be_kept_leaves_its_whole_record(
 
 
 def test_the_executor_itself_refuses_a_latched_bus(prepared: PreparedRun, tmp_path: Path) -> None:
-    """Whoever calls it: nothing is started, no drive is asked for anything."""
+    """For any caller: nothing is started, no drive is read."""
     settings = BusSettings("socketcan", "can7")
     document = prepared.rig.document.bus.model_copy(
         update={"interface": settings.interface, "channel": settings.channel}
@@ -135,6 +135,6 @@ def test_the_executor_itself_refuses_a_latched_bus(prepared: PreparedRun, tmp_pa
             nothing,
             pose_every=0,
             need_real_time=False,
-            look_again=nothing,
+            check_drives=nothing,
             before_motion=lambda _denied: pytest.fail("it was about to move"),
         )

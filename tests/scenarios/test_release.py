@@ -1,4 +1,4 @@
-"""`cdpr release`: brakes close and the torque goes, of all drives together."""
+"""`cdpr release`: brakes close, then the torque of all drives is switched off together."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ def test_no_drive_has_torque_afterwards_and_nothing_has_moved(
         assert call("reset", file, *bus, "--yes").code == 0
         answer = call("release", file, *bus, "--yes", "--without-real-time", "--json")
         assert answer.code == 0, answer
-        told = json.loads(answer.out)
-        assert told["drives"] == ["ready to switch on"] * 8
+        result = json.loads(answer.out)
+        assert result["drives"] == ["ready to switch on"] * 8
         assert {drive.state for drive in rehearsal.drives} == {DriveState.READY_TO_SWITCH_ON}
         assert [round(drive.motor.position) for drive in rehearsal.drives] == stood
         assert all(word & 0x02 for word in words), "disable voltage frees cables at once"
-        assert told["reference"]["counts"] is braked
+        assert result["reference"]["counts"] is braked
         if not braked:
-            assert "released by the operator" in told["reference"]["why_not"]
+            assert "released by the operator" in result["reference"]["why_not"]
     FaultLatch(BusSettings("udp_multicast", channel)).require_disengaged()
 
 
@@ -140,7 +140,7 @@ def test_a_drive_that_does_not_go_along_leaves_a_latched_fault(
 
 
 @pytest.mark.slow
-def test_ctrl_c_on_the_way_stops_all_and_says_what_is_left(
+def test_ctrl_c_during_release_stops_all_and_says_what_is_left(
     slow_run: PreparedRun, slow_rig: Path
 ) -> None:
     channel = f"239.74.163.34:{20000 + (os.getpid() * 29) % 20000}"

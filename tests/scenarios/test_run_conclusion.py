@@ -1,4 +1,4 @@
-"""The end of a run: first what happened and its exit code, then its files."""
+"""The end of a run: first the verdict and exit code, then the files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def run(
 
 
 def stopping(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The operator wants a stop after so many looks at the board."""
+    """The operator requests a stop after a number of reads of the board."""
     looks = iter(range(10**6))
     monkeypatch.setattr(
         LocalRequests, "read", lambda _self: OperatorRequests(next(looks) > 150, False, 1.0)
@@ -59,7 +59,7 @@ def stopping(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def gone_in_the_middle(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Somebody removes the run folder while the platform moves."""
+    """The run folder is removed while the platform moves."""
     append = RunFolder.append_cycles
 
     def removing(self: RunFolder, lines: str, *, fsync: bool) -> None:
@@ -70,8 +70,8 @@ def gone_in_the_middle(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RunFolder, "append_cycles", removing)
 
 
-def told(answer: Answer, end: str) -> None:
-    """The verdict is the first word on standard output after the facts, and the code is its own."""
+def assert_verdict(answer: Answer, end: str) -> None:
+    """The verdict is the first word on standard output after the facts, with its exit code."""
     word, code = ENDS[end]
     assert answer.code == code, answer
     assert f"\n{word} " in answer.out, answer
@@ -101,14 +101,14 @@ def test_a_full_disk_at_the_end_changes_neither_verdict_nor_exit_code(
 
     monkeypatch.setattr(executor.runner, "write_end", write_end)
     answer = run(end)
-    told(answer, end)
+    assert_verdict(answer, end)
     assert said_first
     assert all(said_first)
     assert "No space left on device" in answer.err
     assert "cycles.csv" in answer.err
     assert "report:" not in answer.out
     monkeypatch.undo()
-    # With space again the report is made from what is there; how it ended had room on the disk.
+    # With free space again the report is made from the remaining files; the end was recorded.
     again = call("report", tmp_path / "run", "--json")
     assert again.code == 0, again
     summary = json.loads(again.out)
@@ -120,7 +120,7 @@ def test_a_run_folder_that_is_removed_meanwhile_is_a_fault_of_the_record_with_a_
     run: Callable[..., Answer], tmp_path: Path
 ) -> None:
     answer = run("fault")
-    told(answer, "fault")
+    assert_verdict(answer, "fault")
     assert "recording failed" in answer.out
     assert "No such file or directory" in answer.err
     assert not (tmp_path / "run").exists()
@@ -130,7 +130,7 @@ def test_a_run_folder_that_is_removed_meanwhile_is_a_fault_of_the_record_with_a_
     ("end", "error"),
     [("goal", MemoryError()), ("stop", ImportError("no module 'x'")), ("fault", MemoryError())],
 )
-def test_a_run_that_cannot_be_evaluated_has_a_verdict_that_says_so(
+def test_a_run_that_cannot_be_evaluated_has_a_verdict_that_reports_it(
     run: Callable[..., Answer], monkeypatch: pytest.MonkeyPatch, error: Exception, end: str
 ) -> None:
     def fails(*_: object) -> None:
@@ -153,13 +153,13 @@ def test_a_page_that_cannot_be_made_leaves_all_other_files(
 
     monkeypatch.setattr(executor.evaluation, "build_report", no_memory)
     answer = run("goal")
-    told(answer, "goal")
+    assert_verdict(answer, "goal")
     assert "report.html: MemoryError" in answer.err
     assert RunFolder.open(tmp_path / "run").summary()["verdict"] == "PASSED"
 
 
 def test_what_the_end_needs_is_loaded_before_anything_moves(tmp_path: Path) -> None:
-    """Once the platform moved, a module may be missing, or memory for it."""
+    """Once the platform has moved, a module may be missing, or memory for it."""
     code = f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
@@ -181,14 +181,14 @@ print([name for name in set(sys.modules) - before if name.split(".")[0] in ours]
 
 
 class Left(BaseException):
-    """Stands for the end of the process."""
+    """Represents the end of the process."""
 
 
 @pytest.mark.parametrize("end", ENDS)
 def test_ctrl_c_while_the_report_is_made_ends_with_the_verdict_of_the_run(
     run: Callable[..., Answer], monkeypatch: pytest.MonkeyPatch, end: str
 ) -> None:
-    """Before the verdict it is not heard; then the files are left out; then the program is left."""
+    """Ignored before the verdict; then it leaves out the files; then it ends the program."""
     summarize = executor.recording.summary.summarize
 
     def pressed_before(*arguments: object) -> object:
@@ -202,7 +202,7 @@ def test_ctrl_c_while_the_report_is_made_ends_with_the_verdict_of_the_run(
     monkeypatch.setattr(executor.evaluation, "summarize", pressed_before)
     monkeypatch.setattr(RunFolder, "write_poses", pressed)
     answer = run(end)
-    told(answer, end)
+    assert_verdict(answer, end)
     assert "fused.csv, run.mcap, report.html: interrupted" in answer.err
 
 

@@ -1,4 +1,4 @@
-"""Runs with two cameras: one pose, each camera's alone, and one that sees nothing or hangs."""
+"""Runs with two cameras: fused and single poses, and a camera that detects nothing or hangs."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def with_two_cameras(path: Path, looks_away: bool = False) -> Path:
     data = yaml.safe_load(RIG.read_text())
     (front,) = load_rig(RIG).cameras
     quarter = matrix_from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
-    place = front.world_from_camera
-    side = Pose(quarter @ place.position, quarter @ place.rotation)
+    pose = front.world_from_camera
+    side = Pose(quarter @ pose.position, quarter @ pose.rotation)
     where = {
         "position_mm": (side.position * 1e3).tolist(),
         "rotation_wxyz": [1.0, 0.0, 0.0, 0.0] if looks_away else side.quaternion.tolist(),
@@ -94,8 +94,8 @@ def test_all_cameras_of_the_rig_file_look_and_each_is_on_record(
     ]
     assert [set(tags.split()) for tags in together.tags] == numbers
     summary = folder.summary()
-    told = [(c["name"], c["pictures"], c["poses"], c["failed"]) for c in summary["cameras"]]
-    assert told == [(name, len(together), len(together), "") for name in ("front", "side")]
+    reported = [(c["name"], c["pictures"], c["poses"], c["failed"]) for c in summary["cameras"]]
+    assert reported == [(name, len(together), len(together), "") for name in ("front", "side")]
     assert all(c["measuring_ms"] > 0.0 for c in summary["cameras"])
     page = folder.report.read_text()
     assert "side alone" in page
@@ -120,17 +120,17 @@ def test_each_camera_has_its_own_channels(answer_and_folder: tuple[Answer, RunFo
     assert counts["/pictures/side"] == kept["side"] > 0
 
 
-def test_the_kept_pictures_of_each_camera_have_the_drives_poses(
+def test_the_kept_images_of_each_camera_have_the_drives_poses(
     answer_and_folder: tuple[Answer, RunFolder],
 ) -> None:
-    """With these `cdpr calibrate extrinsics --camera side --poses RUNDIR` finds its place."""
+    """With these `cdpr calibrate extrinsics --camera side --poses RUNDIR` finds its pose."""
     _, folder = answer_and_folder
     kept = [Path(name).name for name in folder.poses_by_camera()["side"].picture if name]
     poses = poses_of_run(folder.path, "side")
     assert set(kept[1:-1]) <= poses.keys() <= set(kept)
-    with pytest.raises(BadInput, match="camera 'back' took no images") as told:
+    with pytest.raises(BadInput, match="camera 'back' took no images") as reported:
         poses_of_run(folder.path, "back")
-    assert "front, side" in told.value.next_step
+    assert "front, side" in reported.value.next_step
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_cameras_are_chosen_as_they_are_named(
         (["front=0", "--no-camera"], ["--camera and --no-camera contradict"]),
     ],
 )
-def test_cameras_that_are_not_said_clearly_are_refused(
+def test_cameras_that_are_not_named_clearly_are_refused(
     rig_file: Path, plan: Path, tmp_path: Path, cameras: list[str], parts: list[str]
 ) -> None:
     wanted = [w for c in cameras for w in ((c,) if c.startswith("--") else ("--camera", c))]
@@ -180,7 +180,7 @@ def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_report")
-def test_a_camera_that_looks_away_is_told_and_the_other_measures(
+def test_a_camera_that_faces_away_is_reported_and_the_other_measures(
     plan: Path, tmp_path: Path
 ) -> None:
     rig = with_two_cameras(tmp_path / "rig.yaml", looks_away=True)
@@ -198,7 +198,7 @@ def test_a_camera_that_looks_away_is_told_and_the_other_measures(
 
 
 def camera_of(name: str) -> int:
-    """The process of a camera of the run that goes on in this one."""
+    """The process of a camera of the run in this process."""
     (child,) = (c for c in multiprocessing.active_children() if c.name == f"cdpr-camera-{name}")
     assert child.pid is not None
     return child.pid
@@ -226,12 +226,12 @@ def stop_in_motion(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     return stop
 
 
-def told_of(folder: RunFolder, code: str) -> list[dict[str, Any]]:
+def events_of(folder: RunFolder, code: str) -> list[dict[str, Any]]:
     return [event for event in folder.summary()["events"] if event["code"] == code]
 
 
 @pytest.mark.usefixtures("no_report")
-def test_a_camera_that_hangs_is_told_and_the_run_goes_on_with_the_other(
+def test_a_camera_that_hangs_is_reported_and_the_run_continues_with_the_other(
     rig_file: Path, plan: Path, tmp_path: Path, stop_in_motion: Callable[[str], None]
 ) -> None:
     stop_in_motion("side")
@@ -239,13 +239,13 @@ def test_a_camera_that_hangs_is_told_and_the_run_goes_on_with_the_other(
     answer = call("run", plan, "--rig", rig_file, "-o", run, "--fast")
     assert answer.code == 0, answer
     folder = RunFolder.open(run)
-    hangs, end = told_of(folder, "camera_sees_nothing"), told_of(folder, "camera")
+    hangs, end = events_of(folder, "camera_sees_nothing"), events_of(folder, "camera")
     assert [e["text"] for e in hangs] == [
         "camera side did not answer for 2 s; clearance is measured by front"
     ]
     assert "camera side failed (no answer since 0." in end[0]["text"]
     moved = [e["time_s"] for e in folder.summary()["events"] if e["code"] == "held"]
-    assert hangs[0]["time_s"] < moved[0], "told while it moves"
+    assert hangs[0]["time_s"] < moved[0], "reported during motion"
     assert folder.poses().ok.all()
     alone = folder.poses_by_camera()
     assert len(alone["front"]) == len(folder.poses()) > len(alone["side"]) > 1
@@ -254,7 +254,7 @@ def test_a_camera_that_hangs_is_told_and_the_run_goes_on_with_the_other(
     assert side["dropped"] > 10
     assert side["failed"]
     assert not front["failed"]
-    assert "(no answer since" in answer.out, "told at the end"
+    assert "(no answer since" in answer.out, "reported at the end"
 
 
 @pytest.mark.usefixtures("no_report")
@@ -268,7 +268,7 @@ def test_a_run_whose_only_camera_hangs_comes_to_its_end_and_does_not_pass(
     folder = RunFolder.open(run)
     summary = folder.summary()
     assert summary["final_state"] == "finished"
-    (hangs,) = told_of(folder, "camera_sees_nothing")
+    (hangs,) = events_of(folder, "camera_sees_nothing")
     assert hangs["text"] == "camera front did not answer for 2 s; clearance is not measured"
     assert any("Camera front failed: no answer" in reason for reason in summary["reasons"])
     assert folder.poses().ok[:-1].all(), "what was measured before is on record"
@@ -294,13 +294,13 @@ def test_a_camera_that_dies_leaves_the_run_to_the_other(
     answer = call("run", plan, "--rig", rig_file, "-o", run, "--fast")
     assert answer.code == 0, answer
     folder = RunFolder.open(run)
-    (event,) = told_of(folder, "camera")
+    (event,) = events_of(folder, "camera")
     assert "the process of camera front ended" in event["text"]
     assert event["text"].endswith("clearance is measured by side")
     assert folder.poses().ok.all()
     assert len(folder.poses_by_camera()["side"]) == len(folder.poses())
 
 
-def test_silence_is_told_after_the_time_that_the_docs_say() -> None:
+def test_silence_is_reported_after_the_time_that_the_docs_say() -> None:
     page = (Path(__file__).parents[2] / "docs" / "faults" / "camera_sees_nothing.md").read_text()
     assert f"did not answer for {camera_sight.SILENCE:g} s" in page

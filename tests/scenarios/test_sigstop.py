@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.quiet]
 def test_no_drive_that_stopped_is_enabled_again(
     prepared: PreparedRun, short_plan: Path, tmp_path: Path, milliseconds: int
 ) -> None:
-    """Drives stop by themselves 30 ms after a SYNC: 28 ms begin before, and end after that."""
+    """Drives stop on their own 30 ms after a SYNC: 28 ms begin before, and end after that."""
     run = tmp_path / "run"
     channel = f"239.74.163.36:{20000 + (os.getpid() * 7 + milliseconds) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)

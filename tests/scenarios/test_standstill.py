@@ -1,4 +1,4 @@
-"""Release and reset: whatever happens on the way, no drive is left following set-points."""
+"""Release and reset: under any fault, no drive is left following set-points."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FOLLOWING, HOLDING = DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE
 
 
 class Held:
-    """Drives that hold and count from anywhere."""
+    """Drives that hold, unreferenced."""
 
     def __init__(self, rehearsal: SimulatedCia402Rig, group: DriveGroup) -> None:
         self.drives, self.group = rehearsal.drives, group
@@ -39,14 +39,14 @@ class Held:
     def do(
         self, kind: type[Standstill], each_cycle: Callable[[int], bool] = lambda _cycle: False
     ) -> Standstill:
-        """Does it; ``each_cycle`` says whether the operator wants to stop."""
+        """Runs it; ``each_cycle`` returns whether the operator requests a stop."""
         cycles = itertools.count()
 
-        def wishes() -> OperatorRequests:
+        def requests() -> OperatorRequests:
             return OperatorRequests(stop=each_cycle(next(cycles)))
 
         rig, records = load_rig(RIG), list[CycleRecord]()
-        procedure = kind(rig, SyncMaster(rig, self.group, self.clock), wishes, records.append)
+        procedure = kind(rig, SyncMaster(rig, self.group, self.clock), requests, records.append)
         procedure.arm()
         self.ended = procedure.run()
         return procedure
@@ -140,7 +140,7 @@ def test_a_drive_that_falls_silent_stops_the_others() -> None:
         assert FOLLOWING not in {drive.state for drive in bench.drives if not drive.silent}
 
 
-def test_a_drive_that_stopped_by_itself_is_not_enabled_again() -> None:
+def test_a_drive_that_stopped_on_its_own_is_not_enabled_again() -> None:
     enabled: list[int] = []
     after: list[DriveState] = []
 
@@ -197,14 +197,14 @@ def test_a_drive_in_fault_stays_so_while_others_hold_the_platform() -> None:
 
 
 @pytest.mark.parametrize("kind", [Release, FaultReset])
-def test_a_drive_that_does_not_stay_as_it_was_left_is_told(kind: type[Standstill]) -> None:
-    """As one that takes the end of SYNC and heartbeat as a fault, whatever it was told."""
+def test_a_drive_that_does_not_stay_as_it_was_left_is_reported(kind: type[Standstill]) -> None:
+    """A drive that treats the end of SYNC and heartbeat as a fault despite its settings."""
     with held() as bench:
         bench.drives[5].objects.changed = _fails_unwatched(bench.drives[5])  # type: ignore[method-assign]
         error = error_of(bench.do(kind))
         assert "drives left the state they held in" in error.what
-        told = next(each for each in error.what.split(", ") if "cable 6 (drive 6)" in each)
-        assert told.endswith("to fault")
+        message = next(each for each in error.what.split(", ") if "cable 6 (drive 6)" in each)
+        assert message.endswith("to fault")
         assert bench.ended is State.LATCHED
 
 

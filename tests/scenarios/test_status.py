@@ -1,4 +1,4 @@
-"""`cdpr status`: what is on file and what the drives tell, without touching either."""
+"""`cdpr status`: state on file and state of the drives, without changing either."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def kept(drive: SimulatedDrive) -> dict[Any, Any]:
 
 
 @pytest.mark.slow
-def test_it_tells_how_the_rig_stands_and_leaves_everything_as_it_was(
+def test_it_shows_the_state_of_the_rig_and_leaves_everything_as_it_was(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.28:{20000 + (os.getpid() * 23) % 20000}"
@@ -39,16 +39,16 @@ def test_it_tells_how_the_rig_stands_and_leaves_everything_as_it_was(
         before = [kept(drive) for drive in rehearsal.drives]
         answer = call("status", slow_rig, *bus, "--json")
         assert answer.code == 0, answer
-        told = json.loads(answer.out)
-        assert told["latched"] is told["run"] is None
-        assert told["reference"]["counts"] is True
-        assert [drive["set_up"] for drive in told["drives"]] == [False] * 8
-        assert {drive["state"] for drive in told["drives"]} == {"switch on disabled"}
-        assert [d["position_counts"] for d in told["drives"]] == [
+        result = json.loads(answer.out)
+        assert result["latched"] is result["run"] is None
+        assert result["reference"]["counts"] is True
+        assert [drive["set_up"] for drive in result["drives"]] == [False] * 8
+        assert {drive["state"] for drive in result["drives"]} == {"switch on disabled"}
+        assert [d["position_counts"] for d in result["drives"]] == [
             round(drive.motor.position) for drive in rehearsal.drives
         ]
         start = (slow_run.scene.start.position * 1e3).tolist()
-        assert told["pose"]["position_mm"] == pytest.approx(start, abs=0.5)
+        assert result["pose"]["position_mm"] == pytest.approx(start, abs=0.5)
         assert [kept(drive) for drive in rehearsal.drives] == before
         assert not state_file("latched", settings).parent.exists()
 
@@ -62,11 +62,13 @@ def test_it_tells_how_the_rig_stands_and_leaves_everything_as_it_was(
             r"latched fault +none; process \d+ is moving or resetting the rig", answer.out
         )
         assert "never homed: cable 1 (drive 1)" in answer.out.replace("\n", " ")
-        assert "switch on disabled" not in answer.out, "who runs them must not be disturbed"
+        assert "switch on disabled" not in answer.out, "an active run must not be disturbed"
 
 
 @pytest.mark.slow
-def test_what_is_on_file_is_told_although_no_drive_answers(slow_rig: Path, tmp_path: Path) -> None:
+def test_what_is_on_file_is_reported_although_no_drive_answers(
+    slow_rig: Path, tmp_path: Path
+) -> None:
     channel = f"239.74.163.29:{20000 + (os.getpid() * 23) % 20000}"
     latch = FaultLatch(BusSettings("udp_multicast", channel))
     latch.engage("rig", tmp_path)
@@ -78,7 +80,7 @@ def test_what_is_on_file_is_told_although_no_drive_answers(slow_rig: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_drives_that_somebody_sets_up_are_not_asked(slow_run: PreparedRun, slow_rig: Path) -> None:
+def test_drives_in_configuration_are_not_read(slow_run: PreparedRun, slow_rig: Path) -> None:
     channel = f"239.74.163.27:{20000 + (os.getpid() * 23) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
     with (
@@ -87,8 +89,8 @@ def test_drives_that_somebody_sets_up_are_not_asked(slow_run: PreparedRun, slow_
     ):
         answer = call("status", slow_rig, *bus, "--json")
         assert answer.code == 0, answer
-        told = json.loads(answer.out)
-        assert (told["being_set_up"], told["drives"], told["run"]) == (True, None, None)
+        result = json.loads(answer.out)
+        assert (result["being_set_up"], result["drives"], result["run"]) == (True, None, None)
         assert "preparing a motion" in call("status", slow_rig, *bus).out.replace("\n", " ")
         assert rehearsal.cycles == 0
 
@@ -97,10 +99,10 @@ def test_who_sets_drives_up_waits_for_who_asks_and_does_so_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     settings = BusSettings("socketcan", "can6")
-    monkeypatch.setattr(set_up_lock, "ASKED_WITHIN", 0.05)
+    monkeypatch.setattr(set_up_lock, "READ_TIMEOUT", 0.05)
     with SetUpLock(settings).tried() as alone:
         assert alone
-        assert not state_file("set-up", settings).parent.exists(), "who looks makes no file"
+        assert not state_file("set-up", settings).parent.exists(), "reading creates no file"
     with SetUpLock(settings).held():
         with SetUpLock(settings).tried() as alone:
             assert not alone
@@ -119,5 +121,5 @@ def test_who_sets_drives_up_waits_for_who_asks_and_does_so_alone(
         pass
 
 
-def test_a_bus_of_one_process_has_nothing_to_tell() -> None:
+def test_a_bus_of_one_process_has_nothing_to_report() -> None:
     assert call("status", RIG).code == 2

@@ -1,4 +1,4 @@
-"""The ready scene with a tilted goal: planned, proved, run with a camera and judged."""
+"""The example scene with a tilted goal: planned, checked, run with a camera and judged."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.root
 
 
 class User:
-    """A program of a user, that does one thing after another."""
+    """A user's program that executes actions in sequence."""
 
     def __init__(self, number: int) -> None:
         context = multiprocessing.get_context("fork")
@@ -33,7 +33,7 @@ class User:
         self.process.start()
 
     def does(self, what: Callable[[FaultLatch], object]) -> str:
-        """What it says: nothing when all went well."""
+        """Its output: empty if all went well."""
         self._link.send(what)
         return str(self._link.recv())
 
@@ -80,7 +80,7 @@ def resets(latch: FaultLatch) -> None:
 
 @pytest.fixture
 def users(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[User, User]]:
-    """Ann and Ben share the folder that `docs/safety.md` tells to make."""
+    """Ann and Ben share the folder described in `docs/safety.md`."""
     shared = Path(tempfile.mkdtemp(dir="/tmp"))  # not below a folder that is closed to others
     os.chown(shared, 0, GROUP)
     shared.chmod(0o2775)
@@ -101,9 +101,9 @@ def test_what_one_user_moves_the_other_leaves_alone_and_what_is_left_of_it_he_ma
     for act in (would_move, would_reset, moves):
         assert f"(process {ann.process.pid}) is in progress" in ben.does(act)
     ann.killed()
-    told = ben.does(would_move)
-    assert "did not finish" in told
-    assert "cdpr reset RIG" in told
+    message = ben.does(would_move)
+    assert "did not finish" in message
+    assert "cdpr reset RIG" in message
     assert ben.does(would_reset) == ""
     assert ben.does(resets) == ""
     assert ben.does(would_move) == ""

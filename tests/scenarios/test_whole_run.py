@@ -1,4 +1,4 @@
-"""A whole run through the real program: what it leaves is whole and agrees with itself."""
+"""A complete run with the real program: its files are complete and consistent."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def answer_and_folder(
     short_plan: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Answer, RunFolder]:
     """The run with the synthetic camera."""
-    path = tmp_path_factory.mktemp("a place") / "a run"
+    path = tmp_path_factory.mktemp("a folder") / "a run"
     answer = call("run", short_plan, "--rig", RIG, "-o", path, "--fast")
     return answer, RunFolder.open(path)
 
@@ -42,7 +42,7 @@ def summary(folder: RunFolder) -> dict[str, Any]:
 
 
 def lengths_of(rig: Rig, folder: RunFolder) -> np.ndarray:
-    """Free lengths that the drives' counts stand for, computed from the winches' data alone."""
+    """Free lengths of the drives' counts, computed from the winches' data alone."""
     cycles, winches = folder.cycles(), WinchMap(rig)
     counts_per_metre = np.array([w.counts_per_metre for w in rig.winches])
     change = cycles.actual_counts / counts_per_metre
@@ -52,7 +52,7 @@ def lengths_of(rig: Rig, folder: RunFolder) -> np.ndarray:
     return np.asarray(whole - there)
 
 
-def test_the_verdict_is_told_with_the_place_of_the_report(
+def test_the_verdict_is_reported_with_the_path_of_the_report(
     answer_and_folder: tuple[Answer, RunFolder],
 ) -> None:
     answer, folder = answer_and_folder
@@ -86,9 +86,7 @@ def test_the_plan_in_the_folder_is_the_plan_that_was_run(
     assert folder.rig().hash == load_rig(RIG).hash == summary["rig_hash"]
 
 
-def test_cycles_events_and_summary_tell_the_same(
-    folder: RunFolder, summary: dict[str, Any]
-) -> None:
+def test_cycles_events_and_summary_agree(folder: RunFolder, summary: dict[str, Any]) -> None:
     cycles, events = folder.cycles(), folder.events()
     assert len(cycles) == summary["cycles"]
     assert np.allclose(np.diff(cycles.time), 0.010), "a cycle every 10 ms of simulated time"
@@ -126,16 +124,16 @@ def test_the_platform_follows_within_a_tenth_of_a_millimetre(
 
 
 @pytest.mark.parametrize("which", ["short", "hall"])
-def test_poses_from_drive_positions_agree_with_an_independent_way(
+def test_poses_from_drive_positions_agree_with_an_independent_method(
     request: pytest.FixtureRequest, which: str
 ) -> None:
     """Counts → lengths by the winches' data; lengths ← the logged pose by inverse kinematics."""
     folder = request.getfixturevalue("folder" if which == "short" else "hall_folder")
     rig, cycles = folder.rig(), folder.cycles()
     anchors = cycles.encoder[:, None, :] + rig.anchors
-    told = cables_to(rig, anchors).lengths
+    lengths = cables_to(rig, anchors).lengths
     following = np.array(cycles.state) == "moving"
-    assert np.abs(lengths_of(rig, folder) - told)[following].max() < 2e-4
+    assert np.abs(lengths_of(rig, folder) - lengths)[following].max() < 2e-4
     assert np.abs(cycles.lengths - lengths_of(rig, folder))[following].max() < 1e-6
 
 
@@ -184,14 +182,14 @@ def fused_rows(folder: RunFolder) -> Any:
     return np.genfromtxt(folder.path / "fused.csv", delimiter=",", names=True)
 
 
-def test_drives_and_camera_together_tell_a_pose_every_cycle(folder: RunFolder) -> None:
+def test_drives_and_camera_together_give_a_pose_every_cycle(folder: RunFolder) -> None:
     rows, cycles, poses = fused_rows(folder), folder.cycles(), folder.poses()
     first = poses.time[poses.ok][0]
     assert first <= rows["time_s"][0] <= first + 0.011
     assert rows["time_s"][-1] == pytest.approx(cycles.time[-1])
-    place = np.column_stack([rows[f"{axis}_mm"] for axis in "xyz"])
+    position = np.column_stack([rows[f"{axis}_mm"] for axis in "xyz"])
     planned = cycles.planned[-len(rows) :] * 1e3
-    assert np.linalg.norm(place - planned, axis=1).max() < 1.0
+    assert np.linalg.norm(position - planned, axis=1).max() < 1.0
     assert rows["age_s"].max() < 0.5
 
 
@@ -260,7 +258,7 @@ def test_ten_drives_with_pulleys_and_payload_run_without_a_camera(hall_folder: R
 
 
 def test_the_drives_carry_platform_and_payload(hall_folder: RunFolder) -> None:
-    """Measured tensions times the cables' directions hold 15 kg up, in every tenth cycle."""
+    """Measured tensions times the cables' directions hold up 15 kg, in every tenth cycle."""
     rig, cycles = hall_folder.rig(), hall_folder.cycles()
     following = np.flatnonzero(np.isfinite(cycles.tensions).all(axis=1))[20::10]
     anchors = cycles.encoder[following, None, :] + rig.anchors

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from executor.cameras.multi_camera import NEAR_PICTURES, ClearanceMonitor
+from executor.cameras.multi_camera import NEAR_IMAGES, ClearanceMonitor
 from executor.recording.clearance import ClearanceRow, clearance_table
 from executor.recording.verdict import distances
 from model.clearance import Nearest
@@ -49,9 +49,9 @@ def test_the_run_stops_exactly_when_one_obstacle_is_certainly_too_near(
     obstacles_mm: list[tuple[float, float]],
 ) -> None:
     watch = ClearanceMonitor(LIMIT_MM / 1e3)
-    messages = [watch.take(measured(obstacles_mm)) for _ in range(NEAR_PICTURES)]
-    assert not any(messages[:-1])
-    assert bool(messages[-1]) is certainly_too_near(obstacles_mm)
+    told = [watch.take(measured(obstacles_mm)) for _ in range(NEAR_IMAGES)]
+    assert not any(told[:-1])
+    assert bool(told[-1]) is surely_too_near(obstacles_mm)
 
 
 @given(obstacles_mm=OBSTACLES)

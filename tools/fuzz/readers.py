@@ -100,10 +100,10 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
 def _message(path: Path) -> None:
     """Parses a message to the console or a command line; only their own errors are allowed."""
     from cdpr.console.commands import NotAMessage, parse_message
-    from executor.remote.protocol import NotACommand, parse_command
+    from executor.remote.protocol import InvalidCommand, parse_command
 
     content = path.read_bytes()
-    with suppress(NotACommand):
+    with suppress(InvalidCommand):
         parse_command(content)
     with suppress(NotAMessage):
         parse_message(content.decode(errors="replace"))

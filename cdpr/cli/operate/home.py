@@ -26,9 +26,9 @@ from executor import homing
 from executor.drives import is_simulated, require_own_time
 from executor.homing import (
     FASTEST,
-    FEWEST_PICTURES,
+    FEWEST_IMAGES,
     FURTHEST,
-    MOST_PICTURES,
+    MOST_IMAGES,
     PICTURES,
     REACH,
     SLACK,
@@ -59,7 +59,7 @@ class WindingOptions:
     ] = SPEED_MM_S
     pictures: Annotated[
         int,
-        typer.Option(min=FEWEST_PICTURES, max=MOST_PICTURES, help="number of images for the pose"),
+        typer.Option(min=FEWEST_IMAGES, max=MOST_IMAGES, help="number of images for the pose"),
     ] = PICTURES
     simulated_slack_mm: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="largest slack of simulated cables")

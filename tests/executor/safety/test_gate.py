@@ -32,7 +32,7 @@ HOLD = replace(MOVE, purpose=Purpose.HOLD)
 FIRST_HOLD = replace(HOLD, previous=None, enabled=False, armed=False)
 
 each_drive = pytest.mark.parametrize("drive", DRIVES)
-each_way = pytest.mark.parametrize("sign", [-1, 1])
+both_signs = pytest.mark.parametrize("sign", [-1, 1])
 
 
 def _put(values: tuple[int, ...], drive: int, value: object) -> tuple[int, ...]:
@@ -56,7 +56,7 @@ def test_a_move_that_keeps_everything_is_allowed():
 
 
 @each_drive
-@each_way
+@both_signs
 def test_a_step_may_be_the_limit_and_not_a_count_more(drive, sign):
     limit = LIMITS.largest_step[drive]
     for previous in (HERE, (0, 250, 2300)):
@@ -82,7 +82,7 @@ def test_a_target_may_be_the_end_of_its_range_and_not_a_count_more(drive, side, 
 
 
 @each_drive
-@each_way
+@both_signs
 @pytest.mark.parametrize("request_", [MOVE, FIRST_HOLD], ids=["move", "hold"])
 def test_a_target_may_lag_by_the_limit_and_not_a_count_more(drive, sign, request_):
     limit = LIMITS.largest_lag[drive]
@@ -165,7 +165,7 @@ def test_a_wrong_number_of_entries_is_denied(field, values, request_):
 @pytest.mark.parametrize(
     "value", [float("nan"), float("inf"), 200.0, True, None, "200", np.int64(200)]
 )
-def test_what_is_no_whole_number_is_denied_wherever_it_stands(drive, field, value):
+def test_a_non_integer_is_denied_wherever_it_is(drive, field, value):
     """NaN is neither below nor above a limit, so comparing alone would let it pass."""
     for request in (MOVE, HOLD, FIRST_HOLD):
         if getattr(request, field) is None:

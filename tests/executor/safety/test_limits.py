@@ -1,4 +1,4 @@
-"""The limits that gate and watches judge by, against numbers computed by hand from the rig file."""
+"""Limits of gate and monitors, against values computed by hand from the rig file."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ def test_where_cables_may_hang_slack_the_watch_says_nothing_of_it():
         now = watch
         for _ in range(10):
             seen = Observation(True, [0.0] * 2, [tension, 20.0], [False] * 2, [], 0.0)
-            now, findings = now.look(seen)
-        return {finding.code for finding in findings}
+            now, alarms = now.update(seen)
+        return {alarm.code for alarm in alarms}
 
     assert found(0.0) == found(-1.0) == set()
     assert found(103.0) == {"over_tension"}
     assert "cable_loose" in found(float("nan"))
 
 
-def test_how_long_a_drive_may_stand_still_is_in_the_rig_file():
+def test_how_long_a_drive_may_stall_is_in_the_rig_file():
     rig = load_rig(RIG)
     assert np.ceil([0.02 * PER_MM, 0.07 * PER_MM]).tolist() == [13, 45]
     assert stuck_limits(rig, 0.01) == (StuckLimits(least=13, travel=45),) * 8
@@ -72,7 +72,7 @@ def test_counts_that_fall_when_cable_is_paid_out_have_the_same_limits():
     assert gate_limits(mirrored, rows, 0.01) == gate_limits(rig, rows, 0.01)
 
 
-def test_rounding_to_counts_is_never_a_drive_that_stands_still():
+def test_rounding_to_counts_is_never_a_stalled_drive():
     rig = load_rig(RIG)
     coarse = rig.document.model_copy(
         update={

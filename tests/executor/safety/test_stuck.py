@@ -1,4 +1,4 @@
-"""Drives that stand still while their set-points go on, told apart from noise."""
+"""Drives that stall while their set-points advance, distinguished from noise."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ LIMITS = StuckLimits(least=10, travel=100)
 
 
 def look(cycles, limits=LIMITS):
-    """What is found in the last of some cycles."""
+    """Alarms in the last of some cycles."""
     watch, found = StuckWatch.fresh((limits, limits), NAMES), ()
     for cycle in cycles:
-        watch, found = watch.look(*cycle)
+        watch, found = watch.update(*cycle)
     return found
 
 
 def steps(positions, demands, drive=0, missing=(), following=True):
     """One drive at these positions; the other one rests."""
     for k, (position, demand) in enumerate(zip(positions, demands, strict=True)):
-        places, wanted = [7, 7], [7, 7]
-        places[drive], wanted[drive] = position, demand
+        row, wanted = [7, 7], [7, 7]
+        row[drive], wanted[drive] = position, demand
         lost = [False, False]
         lost[drive] = k in missing
-        yield following, places, wanted, lost
+        yield following, row, wanted, lost
 
 
 def first_found(positions, demands, limits=LIMITS):
-    """The cycle of the first stop, and its text; None where there is none."""
+    """Cycle and text of the first stop; None without one."""
     watch = StuckWatch.fresh((limits,), NAMES[:1])
     for k, (position, demand) in enumerate(zip(positions, demands, strict=True)):
-        watch, found = watch.look(True, (position,), (demand,), (False,))
+        watch, found = watch.update(True, (position,), (demand,), (False,))
         if any(each.code == "drive_stuck" for each in found):
             return k
     return None
@@ -64,13 +64,13 @@ def test_a_slow_drive_is_judged_over_the_whole_travel():
     """Ten cycles of ten counts; it is found when its set-points went on by 100 without it."""
     demands = [10 * k for k in range(40)]
     positions = [min(demand, 200) for demand in demands]
-    # A stretch of which less than a quarter was made: 80 of 100 counts without it.
+    # A window of which less than a quarter was travelled: 80 of 100 counts without motion.
     assert first_found(positions, demands) == 28
     assert look(list(steps(positions, demands))[:29])[0].text == STOP.format(NAMES[0], 10)
 
 
 @pytest.mark.parametrize(("travel", "found"), [(200, 4), (201, 5), (300, 5), (301, 6)])
-def test_the_travel_decides_how_long_a_drive_may_stand_still(travel, found):
+def test_the_travel_decides_how_long_a_drive_may_stall(travel, found):
     demands = [100 * k for k in range(10)]
     positions = [0, 100, 200, 300, 400, *[400] * 5]
     at = first_found(positions, demands, StuckLimits(10, travel))
@@ -84,7 +84,7 @@ def test_a_single_step_is_noted_only_where_it_is_larger_than_noise(travel, noted
 
 
 @pytest.mark.parametrize(("least", "found"), [(100, 1), (101, 0)])
-def test_slow_set_points_say_nothing(least, found):
+def test_slow_set_points_are_not_judged(least, found):
     cycles = steps([0, 100, 200, 200], [0, 100, 200, 300])
     assert len(look(cycles, StuckLimits(least, 100))) == found
 
@@ -96,10 +96,10 @@ def test_a_slow_step_ends_the_stretch():
 
 
 def test_set_points_that_turn_round_end_the_stretch():
-    """They return to where the drive is, and it is not known yet whether it follows this way."""
+    """They return to the drive's position; whether it follows in this direction is unknown."""
     assert look(steps([0, 100, 200, 200, 200, 200], [0, 100, 200, 300, 200, 100])) == ()
-    turned = [0, 100, 200, 300, 200, 100, 100, 100]
-    (stop,) = look(steps(turned, [0, 100, 200, 300, 200, 100, 0, -100]))
+    reversed_path = [0, 100, 200, 300, 200, 100, 100, 100]
+    (stop,) = look(steps(reversed_path, [0, 100, 200, 300, 200, 100, 0, -100]))
     assert stop.code == "drive_stuck"
 
 
@@ -132,7 +132,7 @@ def test_a_quarter_of_a_step_is_not_missing_it(moved, noted):
 
 @pytest.mark.parametrize(("moved", "found"), [(49, 0), (50, 1), (-100, 0)])
 def test_only_a_drive_that_followed_is_judged(moved, found):
-    """At the begin of a motion a servo lags; against friction it may not move at all."""
+    """At the start of a motion a servo lags; against friction it may not move at all."""
     begun = [0, moved, 2 * moved, 2 * moved, 2 * moved]
     assert len(look(steps(begun, [0, 100, 200, 300, 400]))) == found
     assert look(steps([0, 0, 0, 0, 0], [0, 100, 200, 300, 400])) == ()
@@ -147,9 +147,9 @@ def test_one_step_alone_does_not_show_that_a_drive_follows():
 
 def test_before_the_whole_travel_it_is_not_known_whether_a_drive_follows():
     drive = Drive(StuckLimits(least=1, travel=100))
-    for place in range(0, 100, 10):
-        drive = drive.seen(place, place)
-        assert (drive.followed, drive.standing) == (False, 0)
+    for position in range(0, 100, 10):
+        drive = drive.seen(position, position)
+        assert (drive.followed, drive.stalled) == (False, 0)
     assert drive.seen(100, 100).followed
 
 
@@ -159,12 +159,12 @@ def test_a_drive_that_follows_again_is_forgiven():
     assert note.code == "set_point_missed"
 
 
-def test_a_drive_that_crawls_and_then_stands_still_is_found():
+def test_a_drive_that_crawls_and_then_stalls_is_found():
     crawling = [0, 100, 200, 230, 260, 260, 260]
     assert first_found(crawling, [0, 100, 200, 300, 400, 500, 600]) == 5
 
 
-def test_a_reply_that_is_missing_says_nothing_new():
+def test_a_missing_reply_gives_no_information():
     positions, demands = [0, 100, 200, 200, 200, 200], [0, 100, 200, 300, 400, 500]
     assert look(list(steps(positions, demands, missing={4}))[:5]) == ()
     (stop,) = look(steps(positions, demands, missing={4}))
@@ -177,41 +177,39 @@ def test_drives_that_follow_nothing_are_not_judged():
     cycles = list(steps([0, 100, 200, 200], [0, 100, 200, 300]))
     resting = list(steps([200], [300], following=False))
     assert look([*cycles[:3], *resting, *cycles[3:]]) == ()
-    assert look([*cycles[:3], *resting]) == (), "it would be standing still if it were to follow"
+    assert look([*cycles[:3], *resting]) == (), "it would be stalled still if it were to follow"
     assert Drive(LIMITS, ((0, 0), (1, 1)), True, 3).forgotten() == Drive(LIMITS)
 
 
 def test_an_entry_is_needed_for_every_drive():
     watch = StuckWatch.fresh((LIMITS, LIMITS), NAMES)
-    for place in (1, 2, 3):
+    for position in (1, 2, 3):
         short = list(HERE)
-        short[place] = short[place][:1]
+        short[position] = short[position][:1]
         with pytest.raises(ValueError, match="zip"):
-            watch.look(*short)
+            watch.update(*short)
 
 
 def test_no_more_replies_are_kept_than_are_needed():
     drive = Drive(StuckLimits(least=1, travel=10))
-    for place in range(100):
-        drive = drive.seen(place, place)
+    for position in range(100):
+        drive = drive.seen(position, position)
     assert len(drive.replies) == 11
     fast = Drive(StuckLimits(least=1, travel=10))
-    for place in range(0, 1000, 50):
-        fast = fast.seen(place, place)
+    for position in range(0, 1000, 50):
+        fast = fast.seen(position, position)
     assert fast.replies == ((850, 850), (900, 900), (950, 950))
 
 
 NOISE_SHARE = 3 / 8
 runs = st.lists(st.tuples(st.integers(-300, 300), st.integers(1, 12)), max_size=6)
 demanded = runs.map(lambda found: [step for step, count in found for _ in range(count)])
-"""Steps of set-points that go on for a while."""
+"""Steps of set-points that advance for a while."""
 
 
 @given(demanded, st.randoms(use_true_random=False), st.integers(3, 400))
-def test_noise_within_three_eighths_of_the_travel_is_never_a_drive_that_stands_still(
-    changes, dice, travel
-):
-    """Whatever the set-points do, and however the noise falls."""
+def test_noise_within_three_eighths_of_the_travel_is_never_a_stalled_drive(changes, dice, travel):
+    """For any set-points and any noise."""
     noise = int(NOISE_SHARE * travel)
     demands = [sum(changes[:k]) for k in range(len(changes) + 1)]
     positions = [demand + dice.choice((-noise, noise)) for demand in demands]

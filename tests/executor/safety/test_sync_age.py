@@ -1,4 +1,4 @@
-"""No drive is told to follow when it may have stopped by itself."""
+"""No drive is commanded to follow when it may have stopped on its own."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_the_usual_drive_gets_no_set_point_from_two_and_a_half_periods_on() -> N
 
 
 def test_the_motion_stops_along_its_path_when_a_whole_period_was_missed() -> None:
-    """Before the usual drive stops by itself, and before 0Fh is kept from it."""
+    """Before the usual drive stops on its own, and before 0Fh is withheld from it."""
     assert LATE_AGE == 2.0
     assert SyncAge().may_enable(LATE_AGE)
 

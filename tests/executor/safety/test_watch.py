@@ -1,4 +1,4 @@
-"""The watch: silent within the limits, loud one step beyond, and never fooled by NaN or gaps."""
+"""The monitor: silent within the limits, an alarm one step beyond, robust to NaN and gaps."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def _put(values: tuple[object, ...], drive: int, value: object) -> tuple[object,
 
 
 def _look(*cycles: Observation) -> tuple[Alarm, ...]:
-    """What is found in the last of some cycles."""
+    """Alarms in the last of some cycles."""
     watch, found = Monitor.fresh(LIMITS, NAMES), ()
     for seen in cycles:
-        watch, found = watch.look(seen)
+        watch, found = watch.update(seen)
     return found
 
 
 def _codes(*cycles: Observation) -> list[tuple[str, StopReaction]]:
-    return [(finding.code, finding.reaction) for finding in _look(*cycles)]
+    return [(alarm.code, alarm.reaction) for alarm in _look(*cycles)]
 
 
 def _with(field: str, drive: int, value: object) -> Observation:
@@ -82,13 +82,13 @@ def test_replies_are_counted_for_each_drive_alone(drive):
     assert f"{NAMES[drive]} " in _look(_with("missing", drive, True))[0].text
 
 
-def test_a_watch_may_be_told_to_wait_longer_for_replies():
+def test_a_watch_may_be_set_to_wait_longer_for_replies():
     patient = replace(LIMITS, missing_cycles=4)
     watch, lost = Monitor.fresh(patient, NAMES), _with("missing", 0, True)
     found = []
     for _ in range(5):
-        watch, (finding,) = watch.look(lost)
-        found.append(finding)
+        watch, (alarm,) = watch.update(lost)
+        found.append(alarm)
     assert [f.reaction for f in found] == [StopReaction.NOTE] * 3 + [StopReaction.QUICK_STOP] * 2
     assert [f.text.split(" for ")[1] for f in found[:2]] == ["1 cycle", "2 cycles"]
 
@@ -112,15 +112,15 @@ def test_a_following_error_may_be_the_limit_and_not_more(drive, sign):
     )
 
 
-def test_a_following_error_is_told_in_millimetres():
+def test_a_following_error_is_reported_in_millimetres():
     wide = Monitor.fresh(replace(LIMITS, following_error=0.5), NAMES)
-    (found,) = wide.look(_with("following_errors", 0, 2.5))[1]
+    (found,) = wide.update(_with("following_errors", 0, 2.5))[1]
     assert found.text == "cable 1 is 2500.00 mm from its set-point, limit 500.00 mm"
 
 
 @each_drive
 @pytest.mark.parametrize("value", [NAN, float("inf"), -float("inf")])
-def test_a_following_error_that_is_no_number_stops(drive, value):
+def test_a_following_error_that_is_not_a_number_stops(drive, value):
     assert _codes(_with("following_errors", drive, value)) == [
         ("following_error", StopReaction.QUICK_STOP)
     ]
@@ -128,7 +128,7 @@ def test_a_following_error_that_is_no_number_stops(drive, value):
 
 @each_drive
 def test_a_drive_that_did_not_answer_is_not_judged_by_its_old_position(drive):
-    """One lost reply is a note; the others are judged all the same."""
+    """One lost reply is a note; the other drives are still judged."""
     seen = _with("missing", drive, True)
     old = replace(seen, following_errors=_put(FINE.following_errors, drive, NAN))
     assert _codes(old) == [("reply_lost", StopReaction.NOTE)]
@@ -180,7 +180,7 @@ def test_the_limits_of_tension_themselves_are_allowed(drive, tension):
 
 
 @each_drive
-def test_a_tension_that_is_no_number_is_none_and_too_much(drive):
+def test_a_tension_that_of_nan_counts_as_none_and_too_much(drive):
     assert _codes(*[_with("tensions", drive, NAN)] * 5) == [
         ("cable_loose", StopReaction.QUICK_STOP),
         ("over_tension", StopReaction.PATH_STOP),
@@ -253,7 +253,7 @@ def test_a_lateness_before_its_time_is_nothing():
     assert _look(replace(FINE, lateness=-0.5)) == ()
 
 
-def test_everything_is_told_at_once_gravest_first():
+def test_everything_is_reported_at_once_gravest_first():
     seen = Observation(
         following=True,
         following_errors=(0.0, 0.1, 0.0),
@@ -278,7 +278,7 @@ def test_an_observation_of_another_number_of_drives_is_an_error(field, count):
     """A row that is too short would hide the last drive."""
     values = (getattr(FINE, field) * 2)[:count]
     with pytest.raises(ValueError, match="entries for 3 drives"):
-        Monitor.fresh(LIMITS, NAMES).look(replace(FINE, **{field: values}))
+        Monitor.fresh(LIMITS, NAMES).update(replace(FINE, **{field: values}))
 
 
 @given(
@@ -293,7 +293,7 @@ def test_counts_are_runs_of_what_was_seen(cycles):
     missing = slack = loose = over = 0
     for following, tension, lost in cycles:
         seen = Observation(following, (0.0,), (tension,), (lost,), (), 0.0)
-        watch, found = watch.look(seen)
+        watch, found = watch.update(seen)
         missing = missing + 1 if lost else 0
         if not lost:
             slack = slack + 1 if following and tension < 5.0 else 0
@@ -313,14 +313,14 @@ def test_counts_are_runs_of_what_was_seen(cycles):
 
 def test_looking_leaves_the_watch_before_unchanged():
     watch = Monitor.fresh(LIMITS, NAMES)
-    watch.look(_with("missing", 0, True))
+    watch.update(_with("missing", 0, True))
     assert watch == Monitor.fresh(LIMITS, NAMES)
 
 
 def test_a_warning_changes_nothing_and_another_emergency_stops_the_path() -> None:
     seen = replace(FINE, warnings=[(1, "mild", False), (3, "hot", True)])
-    _, findings = Monitor.fresh(LIMITS, ("one", "two", "three")).look(seen)
-    assert findings == (
+    _, alarms = Monitor.fresh(LIMITS, ("one", "two", "three")).update(seen)
+    assert alarms == (
         Alarm(StopReaction.NOTE, "drive_warning", "mild", 1),
         Alarm(StopReaction.PATH_STOP, "drive_warning", "hot", 3),
     )

@@ -52,22 +52,22 @@ Script = Callable[["Bench"], object]
 
 
 class Killed(BaseException):
-    """The executor is dead from here on."""
+    """The executor was killed."""
 
 
 class Bench(ABC):
     """One run.
 
     Attributes:
-        prepared: What is run.
+        prepared: The run.
         rehearsal: Drives and platform.
         line: The drives' end of the bus.
         folder: The run folder.
         since: When the fault happened, on the drives' clock; None before.
         fault_cycle: SYNCs from the beginning until the fault.
         lost: Drives that were broken on purpose, from 0.
-        blur: What times are exact to, [s].
-        real_time: The executor's cycles may begin late by themselves.
+        blur: Accuracy of times, [s].
+        real_time: The executor's cycles may begin late without a fault.
         missed_start: See `samples.violations`.
     """
 
@@ -94,7 +94,7 @@ class Bench(ABC):
         return self.rehearsal.cycles
 
     def happens(self) -> None:
-        """From now on the time to the stop counts."""
+        """Marks the beginning of the fault."""
         if self.since is None:
             self.since = self.rehearsal.now
 
@@ -125,7 +125,7 @@ class Bench(ABC):
 
     @abstractmethod
     def ask_stop(self) -> None:
-        """The operator wants to stop."""
+        """Requests a stop as the operator."""
 
     @abstractmethod
     def run(self) -> State | None:
@@ -159,7 +159,7 @@ class SimulatedBench(Bench):
         self.stage.board.ask_stop()
 
     def late(self, cycles: float) -> None:
-        """The cycle that is about to begin is late; the drives' time passes all the same."""
+        """Delays the next cycle; the drives' time advances."""
         self.pass_time(cycles * self.prepared.checked.table.cycle)
         self.stage.lateness = cycles
 
@@ -232,10 +232,10 @@ def simulated(
 
 
 class LiveBench(Bench):
-    """The executor in a process of its own, the drives in a thread of this one; real time."""
+    """The executor in its own process, the drives in a thread of this one; real time."""
 
     real_time = True
-    blur = 0.005  # the fault happens anywhere between two looks of a drive at its time-outs
+    blur = 0.005  # the fault happens anywhere between two checks of a drive's time-outs
 
     def __init__(
         self,
@@ -280,10 +280,10 @@ class LiveBench(Bench):
                     os.kill(self.process, signal.SIGKILL)
                 over.set()
                 drives.join()
-        told = self.folder.path / "outcome.json"
-        if not told.is_file():
+        outcome_file = self.folder.path / "outcome.json"
+        if not outcome_file.is_file():
             return None
-        self.outcome = json.loads(told.read_text())
+        self.outcome = json.loads(outcome_file.read_text())
         return State(self.outcome["state"])
 
     def _wait(self) -> None:
@@ -379,5 +379,5 @@ def recorder_for(prepared: PreparedRun, folder: RunFolder, board: LocalRequests)
 
 
 def a_message(can_id: int, data: bytes = b"", *, error: bool = False) -> can.Message:
-    """Somebody else's frame."""
+    """A frame of another node."""
     return can.Message(arbitration_id=can_id, data=data, is_extended_id=False, is_error_frame=error)

@@ -37,11 +37,11 @@ class Fault:
     """One line of the table.
 
     Attributes:
-        script: Makes what is done, new for every run.
+        script: Makes the script, anew for every run.
         ends: How the run ends; None when its process is dead.
-        within: Cycles from the fault until no drive follows set-points; None where it goes on.
+        within: Cycles from the fault until no drive follows set-points; None if the run continues.
         late: Cycles more in real time, where the stop waits for a cycle that may begin late.
-        words: In the cause that is told.
+        words: In the reported cause.
         spread: Cycles from the first drive that stops to the last one.
         mixed: Cycles in which some drives may be enabled and others not.
         rows: Rows of the table that targets may lie apart; more only where frames are taken from a
@@ -66,12 +66,12 @@ class Fault:
     profile: Mapping[str, object] = field(default_factory=dict)
 
     def drives(self, base: DriveBehaviour = STRICT) -> DriveBehaviour:
-        """What the drives do in this row, beside what they do in all of them."""
+        """Behaviour of the drives in this row, in addition to that in all rows."""
         return behaviour_named(self.behaviour, base)
 
 
 def then(happens: Callable[[Bench], object]) -> Callable[[], Script]:
-    """At one moment of the run."""
+    """A fault at one time of the run."""
 
     def timed(bench: Bench) -> None:
         bench.happens()
@@ -81,7 +81,7 @@ def then(happens: Callable[[Bench], object]) -> Callable[[], Script]:
 
 
 def broken(*drives: int, by: Callable[[Bench], object]) -> Callable[[], Script]:
-    """At one moment drives break; the others have to stop."""
+    """Drives fail at one time; the others must stop."""
 
     def timed(bench: Bench) -> None:
         bench.breaks(*drives)
@@ -91,7 +91,7 @@ def broken(*drives: int, by: Callable[[Bench], object]) -> Callable[[], Script]:
 
 
 def from_then_on(each: Callable[[Bench], object]) -> Callable[[], Script]:
-    """In every cycle until the end."""
+    """A fault in every cycle until the end."""
 
     def script(bench: Bench) -> None:
         if bench.cycle >= bench.fault_cycle:
@@ -110,12 +110,12 @@ def late(cycles: float) -> Callable[[], Script]:
 
 
 def incoming(rule: Callable[[], object]) -> Callable[[], Script]:
-    """To the drives."""
+    """Frames to the drives."""
     return then(lambda bench: bench.line.incoming.append(rule()))  # type: ignore[arg-type]
 
 
 def outgoing(rule: Callable[[], object]) -> Callable[[], Script]:
-    """From the drives."""
+    """Frames from the drives."""
     return then(lambda bench: bench.line.outgoing.append(rule()))  # type: ignore[arg-type]
 
 
@@ -157,7 +157,7 @@ def comes(can_id: int, data: bytes = b"") -> Callable[[Bench], object]:
 
 
 def another_set_point(bench: Bench) -> None:
-    """It asks for nothing new: what two masters want is not the question."""
+    """It requests nothing new: conflicting commands are not tested here."""
     target = round(bench.drives[3]._target)
     data = make_set_point(ControlWord.ENABLE_OPERATION, target)
     bench.line.inject(a_message(RPDO1_BASE + 4, data))
@@ -195,14 +195,14 @@ def jam(bench: Bench) -> None:
 
 
 def jam_seen_by_the_drive(bench: Bench) -> None:
-    """The drive's own window is so narrow that it speaks first."""
+    """The drive's own window is so narrow that it reports first."""
     per_metre = bench.prepared.rig.winches[1].counts_per_metre
     bench.drives[1].objects[0x6065, 0] = round(abs(per_metre) * 1e-5)
     jam(bench)
 
 
 def slip(bench: Bench) -> None:
-    """3 mm run off a drum that then sticks; the drive's own watch is off."""
+    """3 mm run off a drum that then sticks; the drive's own monitoring is off."""
     per_metre = bench.prepared.rig.winches[1].counts_per_metre
     bench.drives[1].objects[0x6065, 0] = 0xFFFFFFFF
     bench.drives[1].motor.position += 0.003 * per_metre
@@ -229,7 +229,7 @@ def emergency_stop(bench: Bench) -> None:
 
 
 def deaf_drives(share: float, seed: int) -> Callable[[], Script]:
-    """Each drive misses SYNC by itself now and then."""
+    """Each drive misses SYNC independently now and then."""
 
     def make() -> Script:
         dice = random.Random(seed)
@@ -245,7 +245,7 @@ def deaf_drives(share: float, seed: int) -> Callable[[], Script]:
 
 
 def hangs(bench: Bench) -> None:
-    """Nothing of the executor reaches the drives for 200 ms; it goes on as if nothing had been."""
+    """No frame of the executor reaches the drives for 200 ms; it continues unaware."""
     assert isinstance(bench, SimulatedBench)
     bench.late(20.0)
 
@@ -271,14 +271,14 @@ The next `STUCK_CYCLES` replies each show the drive where it was; the quick stop
 beginning of the cycle after the last of them, and the drives obey at its SYNC.
 """
 
-TOLD_BY_DRIVE = 3.0
+REPORTED_BY_DRIVE = 3.0
 """Cycles: one until the error is over the window, one of time-out (6066h), one until the stop."""
 
 BELIEVED = 2.0
 """Cycles after a jump that the reply at its SYNC shows: the next one confirms it, then the stop."""
 
 MAY_BE_LATE = WatchLimits(0.0, 0.0, 0.0, 0.0).late_periods
-"""A cycle that begins less late than this ends no run, and a stop that waits for it is as late."""
+"""Lateness that ends no run; a stop that waits for such a cycle is as late."""
 
 
 def goes_on(script: Callable[[], Script], *, live: bool = True) -> Fault:
@@ -326,7 +326,7 @@ TABLE: dict[str, Fault] = {
     "F8 a drive in fault": Fault(
         broken(2, by=lambda bench: bench.drives[2].fail(0x2310)), within=3.0, words=("drive 3",)
     ),
-    "F9 a drive starts anew": Fault(
+    "F9 a drive restarts": Fault(
         broken(0, by=lambda bench: bench.drives[0].power_on()),
         within=3.0,
         words=("(drive 1) restarted",),
@@ -374,7 +374,7 @@ TABLE: dict[str, Fault] = {
     ),
     "F17 a winch jams, its drive tells": Fault(
         broken(1, by=jam_seen_by_the_drive),
-        within=TOLD_BY_DRIVE,
+        within=REPORTED_BY_DRIVE,
         late=MAY_BE_LATE,
         words=("drive 2", "following error"),
     ),
@@ -416,7 +416,7 @@ TABLE: dict[str, Fault] = {
 def complaints(
     fault: Fault, bench: Bench, ended: State | None, cause: str, cycle: float
 ) -> list[str]:
-    """What was not as the table says; ``cycle`` in [s]."""
+    """Deviations from the table; ``cycle`` in [s]."""
     found = bench.violations(fault.mixed, fault.rows)
     if ended is not fault.ends:
         found.append(f"the run ended {ended}, not {fault.ends}")
@@ -446,7 +446,7 @@ HELD_UP = {"drive_silent", "late"}
 
 
 def held_up(fault: Fault, bench: Bench, cause: str) -> bool:
-    """This computer held the simulated drives up, before or while the fault happened."""
+    """Whether this computer delayed the simulated drives, before or during the fault."""
     silent = "did not answer" in cause and not any(word in cause for word in fault.words)
     unasked = fault.ends is not State.LATCHED and HELD_UP & set(bench.codes())
     return bench.since is None or silent or bool(unasked) or "cycles late;" in cause

@@ -1,4 +1,4 @@
-"""Executors in processes of their own, for faults that only real ones have."""
+"""Executors in separate processes, for faults that only real processes have."""
 
 from __future__ import annotations
 
@@ -39,5 +39,5 @@ def masters(short_plan: Path, calm_rig: Path) -> Iterator[Masters]:
 
 @pytest.fixture(scope="session")
 def between_processes() -> BusSettings:
-    """A bus that no other test run on this machine hears."""
+    """A bus not used by other test runs on this machine."""
     return BusSettings("udp_multicast", f"239.74.163.25:{20000 + (os.getpid() * 13) % 20000}")

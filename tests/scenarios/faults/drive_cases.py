@@ -25,7 +25,7 @@ UNWATCHED = {"heartbeat_loss": "fault"}
 
 
 def nothing(_bench: Bench) -> None:
-    """The drives themselves are the fault."""
+    """Faults of the drives themselves."""
 
 
 def with_drives(
@@ -47,7 +47,7 @@ def with_drives(
 def stopped_by_rule(
     *behaviour: str, words: tuple[str, ...], profile: Mapping[str, object] | None = None
 ) -> Fault:
-    """At some time of the run."""
+    """A fault at some time of the run."""
     return Fault(
         lambda: Bench.happens,
         within=WHOLE_RUN,
@@ -93,7 +93,7 @@ DRIVES: dict[str, Fault] = {
         f"D a lost heartbeat is a fault, {name}": replace(
             TABLE[name], behaviour=LETS_GO, profile=UNWATCHED, live=False
         )
-        for name in ("F1 kill -9", "F7 a drive falls silent", "F9 a drive starts anew")
+        for name in ("F1 kill -9", "F7 a drive falls silent", "F9 a drive restarts")
     },
     "D PDOs mapped when operational": with_drives("maps-when-operational"),
     # In real time their set-up takes minutes, in turn.

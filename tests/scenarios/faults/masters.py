@@ -1,9 +1,9 @@
-"""Executors in processes of their own, forked from one that has imported everything once.
+"""Executors in separate processes, forked from one that has imported everything once.
 
     python -m tests.scenarios.faults.masters PLAN RIG
 
-reads a line a run (interface, channel, folder) and answers with the number of the process that
-runs it; `outcome.json` in the folder tells how it ended, if it came to its end.
+reads one line per run (interface, channel, folder) and answers with the ID of its process;
+`outcome.json` in the folder has the outcome, if the run ended.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PROGRAM = (
 
 
 def gone(process: int) -> bool:
-    """Ended, also when nobody has waited for it yet."""
+    """Whether it ended, also before it was waited for."""
     try:
         state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
     except OSError:
@@ -47,7 +47,7 @@ class StartsMasters(Protocol):
 
 
 class ForkedMasters:
-    """From this very process: where instructions are counted, to import all anew takes a minute."""
+    """Forks this process: with instruction counting, importing everything again takes a minute."""
 
     def __init__(self, prepared: PreparedRun) -> None:
         context = multiprocessing.get_context("fork")

@@ -1,4 +1,4 @@
-"""One executor that moves drives over a bus in real time, and writes down how it ended."""
+"""One executor that moves drives over a bus in real time, and records its outcome."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.scenarios.faults.bench import recorder_for
 
 
 class _Folder(RunFolder):
-    """Writes events down at the end: the loop of the program does not write files either."""
+    """Writes events at the end: the program's loop does not write files either."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -37,15 +37,15 @@ class _Folder(RunFolder):
 
 
 def run(prepared: PreparedRun, settings: BusSettings, path: Path) -> None:
-    """Arms and moves; SIGTERM is the wish to stop."""
+    """Arms and moves; SIGTERM requests a stop."""
     board = LocalRequests()
     signal.signal(signal.SIGTERM, lambda *_: board.ask_stop())
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     try:
-        told = _moved(prepared, settings, path, board)
+        outcome = _moved(prepared, settings, path, board)
     except CdprError as error:
-        told = {"state": "ready", "cause": str(error), "cycles": 0, "worst_late": 0.0, "lost": 0}
-    write_atomic(path / "outcome.json", json.dumps(told))
+        outcome = {"state": "ready", "cause": str(error), "cycles": 0, "worst_late": 0.0, "lost": 0}
+    write_atomic(path / "outcome.json", json.dumps(outcome))
 
 
 def _moved(

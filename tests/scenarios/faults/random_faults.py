@@ -1,4 +1,4 @@
-"""Faults by the dice: which, when, and one more while the first is dealt with."""
+"""Random faults: kind, time, and a second one while the first is handled."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from simulation.drives.behaviour import STRICT, DriveBehaviour
 from tests.scenarios.faults.bench import Bench, simulated
 from tests.scenarios.faults.cases import TABLE
 
-#: Without the drives' own SYNC time-outs nothing stops them soon.
+#: Without the drives' own SYNC time-outs nothing stops them quickly.
 LEFT_OUT = {"F7 a drive and the master fall silent"}
 NAMES = [name for name in TABLE if name not in LEFT_OUT]
-#: Two faults at once may take more of a drive than one does.
+#: Two simultaneous faults may affect a drive more than one.
 MIXED_CYCLES, ROWS = 8.0, 6.0
 
 
 @dataclass(frozen=True, slots=True)
 class RandomRun:
-    """What came of it."""
+    """Outcome of a run."""
 
     faults: tuple[str, ...]
     ended: State | None
@@ -56,9 +56,9 @@ def random_run(
 
 
 def _not_latched(bench: Bench) -> list[str]:
-    """After a fault no drive is told to move, whatever goes on on the bus.
+    """After a fault no drive is commanded to move, whatever happens on the bus.
 
-    A drum that its load turned against the torque limit may still come back to where it is held.
+    A drum rotated by its load against the torque limit may still return to its held position.
     """
     before = [drive.motor.demand for drive in bench.drives]
     bench.rehearsal.pump()

@@ -1,4 +1,4 @@
-"""Every state that simulated drives pass through, and what must be so in each of them."""
+"""All states of simulated drives, and the invariants of each."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ DISABLE_VOLTAGE, FAULT_RESET = 0x02, 0x80
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """All drives at one moment.
+    """All drives at one time.
 
     Attributes:
         time: Of the drives, [s].
         syncs: SYNCs so far.
-        states: One a drive.
-        targets: What each drive is to reach, [counts].
-        positions: Where it is, [counts].
+        states: One per drive.
+        targets: Of each drive, [counts].
+        positions: Of each drive, [counts].
     """
 
     time: float
@@ -46,7 +46,7 @@ class Sample:
 
 
 class WatchedRehearsal(SimulatedCia402Rig):
-    """Keeps a sample whenever a drive was given time or a SYNC.
+    """Keeps a sample at every time step or SYNC of a drive.
 
     Attributes:
         samples: In order.
@@ -92,8 +92,11 @@ class WatchedRehearsal(SimulatedCia402Rig):
         super()._handle(message)
 
     def _send(self, can_id: int, data: Frame) -> None:
-        if EMCY_BASE < can_id < EMCY_BASE + 128 and (told := parse_emergency(data)) is not None:
-            self.emergencies.append((self.now, can_id - EMCY_BASE, told.code))
+        if (
+            EMCY_BASE < can_id < EMCY_BASE + 128
+            and (emergency := parse_emergency(data)) is not None
+        ):
+            self.emergencies.append((self.now, can_id - EMCY_BASE, emergency.code))
         super()._send(can_id, data)
 
     def _advance(self, elapsed: float) -> None:
@@ -102,7 +105,7 @@ class WatchedRehearsal(SimulatedCia402Rig):
         self._keep(self.now)
 
     def _on_sync(self, data: Frame) -> None:
-        # Drives act when the SYNC comes; how long it takes to compute that is not theirs.
+        # Drives act at the SYNC; the computation time does not count.
         came = self.now
         self.on_cycle()
         heard = {i: self.drives[i] for i in self.deaf}
@@ -131,7 +134,7 @@ class WatchedRehearsal(SimulatedCia402Rig):
 
 @dataclass(frozen=True)
 class Limits:
-    """What may be, for one rig and run.
+    """Limits for one rig and run.
 
     Attributes:
         steps: Largest change of a target, one a drive, [counts].
@@ -161,19 +164,19 @@ def violations(
     lost: frozenset[int] = frozenset(),
     missed_start: bool = False,
 ) -> list[str]:
-    """What was not as it must be, at any sample.
+    """Violations at any sample.
 
     Args:
         rehearsal: After the run.
-        limits: What may be.
-        lost: Drives, from 0, that were broken on purpose; they cannot keep to anything.
+        limits: See `Limits`.
+        lost: Drives, from 0, that were broken on purpose; they keep no limits.
         missed_start: The frame that enables was taken from a drive on purpose.
     """
     samples = rehearsal.samples
     kept = [i for i in range(len(rehearsal.drives)) if i not in lost]
     return [
         *_step_violations(samples, limits, kept),
-        *_place_violations(samples, limits, kept, rehearsal.behaviour.position_noise),
+        *_index_violations(samples, limits, kept, rehearsal.behaviour.position_noise),
         *_mixture_violations(samples, limits, kept, missed_start),
         *_torque_violations(samples, kept),
         *_word_violations(rehearsal),
@@ -192,12 +195,12 @@ def _step_violations(samples: list[Sample], limits: Limits, kept: list[int]) -> 
     return found
 
 
-def _place_violations(
+def _index_violations(
     samples: list[Sample], limits: Limits, kept: list[int], noise: float
 ) -> list[str]:
-    """All targets are of one place of the table, give or take a row; from the first row on.
+    """All targets are at a common table index, within a row; from the first row on.
 
-    A drive begins from a position that it told with noise, [counts]: 4 standard deviations.
+    A drive begins from a position that it reported with noise, [counts]: 4 standard deviations.
     """
     moving = [s for s in samples if all(s.states[i] is ENABLED for i in kept)]
     if not moving or not kept:
@@ -214,8 +217,8 @@ def _place_violations(
     reach = limits.rows + np.minimum(blur, len(table))
     low, high = np.full(targets.shape, np.inf), np.full(targets.shape, -np.inf)
     for share in np.linspace(-1.0, 1.0, 9):
-        place = np.clip(index + share * reach, 0.0, len(table) - 1.0)
-        there = np.column_stack([np.interp(place, rows, column) for column in table.T])
+        common_index = np.clip(index + share * reach, 0.0, len(table) - 1.0)
+        there = np.column_stack([np.interp(common_index, rows, column) for column in table.T])
         low, high = np.minimum(low, there), np.maximum(high, there)
     off = np.maximum(low - targets, targets - high) - 1.5 - 4.0 * noise
     return [
@@ -245,7 +248,7 @@ def _mixture_violations(
 
 
 def _torque_violations(samples: list[Sample], kept: list[int]) -> list[str]:
-    """No drive lets go once it holds by its torque; without torque the brake holds the drum."""
+    """No drive releases once it holds by torque; without torque the brake holds the drum."""
     found = []
     for before, after in pairwise(samples):
         for i in kept:
@@ -268,7 +271,7 @@ def _word_violations(rehearsal: WatchedRehearsal) -> list[str]:
 def emergencies(
     rehearsal: WatchedRehearsal, until: float = float("inf"), allowed: int = 0
 ) -> list[str]:
-    """EMCY of any drive before a moment [s]; nothing that a master does may cause one.
+    """EMCY of any drive before a time [s]; no action of a master may cause one.
 
     Args:
         rehearsal: After the run.
@@ -283,7 +286,7 @@ def emergencies(
 
 
 def left_holding(rehearsal: WatchedRehearsal, but: Collection[int] = ()) -> list[str]:
-    """Drives that do not hold by themselves after the program is gone; but for some, from 0."""
+    """Drives, from 0, that do not hold on their own after the program ended, with exceptions."""
     return [
         f"drive {number} is in {drive.state.value} after the end"
         for number, drive in enumerate(rehearsal.drives, start=1)
@@ -306,13 +309,13 @@ def _return_violations(samples: list[Sample], kept: list[int]) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Stopped:
-    """How the drives came to a stop, from the moment of the fault.
+    """The stop of the drives after a fault.
 
     Attributes:
         time: Until the last of them no longer followed set-points, [s].
         spread: From the first to the last of them, [s].
         worst_step: Largest change of a target in the whole run, [m of cable].
-        travel: Farthest that a drum turned after the fault, [m of cable].
+        travel: Largest travel of a drum after the fault, [m of cable].
     """
 
     time: float
@@ -324,7 +327,7 @@ class Stopped:
 def stopped(
     rehearsal: WatchedRehearsal, rig: Rig, since: float, lost: frozenset[int] = frozenset()
 ) -> Stopped:
-    """The stop after a fault at a moment, [s]; of the drives that could stop."""
+    """The stop after a fault at a time, [s], of the drives that could stop."""
     samples = rehearsal.samples
     kept = [i for i in range(len(rehearsal.drives)) if i not in lost]
     per_metre = np.abs([w.counts_per_metre for w in rig.winches])[kept]
@@ -339,10 +342,10 @@ def stopped(
         if all(a.states[i] is b.states[i] is ENABLED for i in kept)
     ]
     where = [s.positions for s in samples if s.time >= since - 1e-9]
-    way = np.abs(np.array(where) - where[0])[:, kept] / per_metre if where else np.zeros(1)
+    travel = np.abs(np.array(where) - where[0])[:, kept] / per_metre if where else np.zeros(1)
     return Stopped(
         time=max(ends) - since,
         spread=max(ends) - min(ends),
         worst_step=float(np.max(steps)) if steps else 0.0,
-        travel=float(way.max()),
+        travel=float(travel.max()),
     )

@@ -1,6 +1,6 @@
 """The executor is suspended (SIGSTOP) for some milliseconds while the drives move.
 
-What the drives went through is told from their side: every set-point frame and every state.
+The effect is observed at the drives: every set-point frame and every state.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class Suspension:
         """Nothing happens yet.
 
         Args:
-            process: Whom, asked when it is time.
-            milliseconds: How long.
+            process: Returns the process to suspend.
+            milliseconds: Duration.
             after: From the SYNC until it begins, [s].
         """
         self._process, self._seconds, self._after = process, milliseconds / 1000.0, after
@@ -38,7 +38,7 @@ class Suspension:
         self.done = threading.Event()
 
     def begin(self) -> None:
-        """From the thread of the drives, which it does not hold up; once."""
+        """Called from the drives' thread, without delaying it; once."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._suspend)
             self._thread.start()
@@ -59,21 +59,21 @@ class Suspension:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the drives saw.
+    """Observations at the drives.
 
     Attributes:
         returned: Drives, from 1, that were enabled again after they had stopped.
-        told: Frames with "enable operation" that reached a drive which had stopped by itself.
+        enabled_after_stop: "Enable operation" frames that reached a drive after it had stopped.
         stopped: Drives that hold at the end.
     """
 
     returned: tuple[int, ...]
-    told: int
+    enabled_after_stop: int
     stopped: int
 
 
 def seen_by(rehearsal: WatchedRehearsal) -> Seen:
-    """From every sample and every frame of a run."""
+    """Evaluates all samples and frames of a run."""
     over: list[float | None] = [None] * len(rehearsal.drives)
     returned: set[int] = set()
     was = rehearsal.samples[0]
@@ -85,10 +85,10 @@ def seen_by(rehearsal: WatchedRehearsal) -> Seen:
                 returned.add(i + 1)
         was = sample
     first = {drive.node: over[i] for i, drive in enumerate(rehearsal.drives)}
-    told = sum(
+    enabled_after_stop = sum(
         1
         for at, node, word in rehearsal.words
         if (stop := first[node]) is not None and at > stop and word & 0x0F == ENABLE_OPERATION
     )
     stopped = sum(drive.state is HOLDING for drive in rehearsal.drives)
-    return Seen(tuple(sorted(returned)), told, stopped)
+    return Seen(tuple(sorted(returned)), enabled_after_stop, stopped)

@@ -1,4 +1,4 @@
-"""F1–F28: what is done to a run that moves; all drives stop in time, together, for good."""
+"""F1–F28: faults during motion; all drives stop in time, together, and stay stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""F14–F16, F24: what is wrong before anything is enabled is refused with place and cause."""
+"""F14–F16, F24: faults before anything is enabled are refused with location and cause."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_f24_set_points_that_were_changed_after_their_check_are_not_armed(
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "expected"),
     [
         ("absent=6007", "6007h:00"),
         ("absent=6085/06010000", "6085h:00"),
@@ -166,10 +166,10 @@ def test_f24_set_points_that_were_changed_after_their_check_are_not_armed(
     ],
 )
 def test_f14_drives_that_cannot_do_it_are_refused_and_sent_no_set_point(
-    prepared: PreparedRun, tmp_path: Path, name: str, told: str
+    prepared: PreparedRun, tmp_path: Path, name: str, expected: str
 ) -> None:
-    """Each a named behaviour of the simulated drives; those that can be lived with: drive_cases."""
+    """Each is a named behaviour of the simulated drives; tolerated ones: drive_cases."""
     bench = simulated(prepared, tmp_path / "run", nothing, behaviour=behaviour_named([name]))
     with pytest.raises((Refused, HardwareMissing)) as caught, bench:
         pass
-    assert told in str(caught.value)
+    assert expected in str(caught.value)

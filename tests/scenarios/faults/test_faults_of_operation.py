@@ -1,4 +1,4 @@
-"""F2, F3, F10, F20–F23, F25, F26: stops, restarts and what people and computers do meanwhile."""
+"""F2, F3, F10, F20–F23, F25, F26: stops, restarts, and events on people's and computers' side."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ T = 0.010
 
 
 def run_again(bench: SimulatedBench, path: Path, script: Script) -> Stage:
-    """A new executor for the same drives, ready to run; what cut the line before is gone."""
+    """A new executor for the same drives, ready to run; the line is restored."""
     bench.line.incoming.clear()
     near = bench.stage.group._bus  # type: ignore[attr-defined]
     group = make_drive_group(bench.prepared.rig, near, bench.rehearsal.pump)
@@ -58,10 +58,10 @@ def positions(bench: Bench) -> list[float]:
 
 
 @pytest.mark.slow
-def test_f2_a_suspended_master_that_goes_on_enables_nothing(
+def test_f2_a_suspended_master_that_continues_enables_nothing(
     calm_run: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
 ) -> None:
-    """SIGSTOP for real; SIGCONT after the drives have stopped by themselves."""
+    """Real SIGSTOP; SIGCONT after the drives have stopped on their own."""
     cycle = calm_run.checked.table.cycle
 
     def script(bench: Bench) -> None:
@@ -86,7 +86,7 @@ def test_f2_a_suspended_master_that_goes_on_enables_nothing(
     pytest.fail("this computer held the simulated drives up three times")
 
 
-def test_f3_a_restart_begins_where_the_drives_stand_and_moves_nothing(
+def test_f3_a_restart_begins_where_the_drives_are_and_moves_nothing(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     with simulated(prepared, tmp_path / "run", once(SimulatedBench.kill)) as bench:
@@ -157,9 +157,9 @@ def test_f20_a_stop_reaches_all_in_two_cycles_on_a_bus_full_of_others(
         bench.fault_cycle = cycle
         assert bench.run() is State.STOPPED, bench.cause
         assert bench.violations() == []
-        (told,) = [event for event in bench.events() if event.code == "stop"]
+        (outcome,) = [event for event in bench.events() if event.code == "stop"]
         begun = bench.events()[0].time_s
-        assert told.time_s >= begun
+        assert outcome.time_s >= begun
 
 
 def test_f20_a_stop_beside_a_dead_drive_waits_for_nothing(
@@ -195,7 +195,7 @@ def test_f21_drives_that_come_back_do_not_move(prepared: PreparedRun, tmp_path: 
 
 
 def test_f21_a_journal_that_was_cut_anywhere_is_read_up_to_there(tmp_path: Path) -> None:
-    """Power loss: whole lines count, the last one is left out where it was cut."""
+    """Power loss: complete lines count, a truncated last line is left out."""
     folder = RunFolder.create(tmp_path / "run")
     for k, code in enumerate(("enabled", "moving", "stop")):
         folder.append_event(RunEvent(0.1 * k, code, "größer als 2 mm"))
@@ -212,7 +212,7 @@ def test_f21_a_journal_that_was_cut_anywhere_is_read_up_to_there(tmp_path: Path)
         assert found == complete or whole[cut : cut + 1] == b"\n", "a whole line without its end"
 
 
-def test_f21_a_run_that_was_cut_off_declares_its_place_lost(
+def test_f21_a_run_that_was_cut_off_declares_its_pose_lost(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     with simulated(prepared, tmp_path / "run", once(SimulatedBench.kill)) as bench:
@@ -222,7 +222,7 @@ def test_f21_a_run_that_was_cut_off_declares_its_place_lost(
     assert "missing" in str(caught.value)
 
 
-def test_f22_after_a_winch_was_turned_by_hand_nothing_drives_back(
+def test_f22_after_a_winch_was_moved_by_hand_nothing_drives_back(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     with simulated(prepared, tmp_path / "run", once(lambda b: b.ask_stop())) as bench:
@@ -258,7 +258,7 @@ def test_f23_a_step_of_the_clock_changes_nothing(
 
 
 @pytest.mark.slow
-def test_f25_a_master_that_is_asked_to_end_stops_along_the_path(
+def test_f25_a_master_that_is_requested_to_end_stops_along_the_path(
     calm_run: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
 ) -> None:
     for attempt in range(3):
@@ -268,8 +268,8 @@ def test_f25_a_master_that_is_asked_to_end_stops_along_the_path(
                 continue
             assert bench.violations() == []
             assert bench.codes()[-2:] == ["stop", "held"]
-            told = json.loads((run / "outcome.json").read_text())
-            assert "stop requested" in told["cause"]
+            outcome = json.loads((run / "outcome.json").read_text())
+            assert "stop requested" in outcome["cause"]
             return
     pytest.fail("this computer held the simulated drives up three times")
 
@@ -294,7 +294,7 @@ def test_f25_a_recorder_that_fails_is_a_stop_along_the_path(
         assert {drive.state for drive in bench.drives} == {HOLDING}
 
 
-def test_f26_after_an_emergency_stop_nothing_is_commanded_and_the_place_is_asked_anew(
+def test_f26_after_an_emergency_stop_nothing_is_commanded_and_the_pose_is_asked_again(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
     """Without torque the platform sank by 4 mm of cable before the brakes held."""
