@@ -132,7 +132,7 @@ def abandoned_drives_fault(document: RigDocument) -> str:
         return ""
     time.sleep(ALONE)
     try:
-        snapshot = read_snapshot(rig, rig.home, nothing_in_the_way(rig).load)
+        snapshot = read_snapshot(rig, rig.home, empty_scene(rig).load)
     except CdprError as error:
         return f"state of the drives unknown: {error.what}"
     words = snapshot.status_words.tolist()
@@ -252,7 +252,7 @@ def resting_drives_of(
         to_reset: Also accepts drives in fault, to be reset.
     """
     rig = rig_from_document(document)
-    load = nothing_in_the_way(rig).load
+    load = empty_scene(rig).load
     configure_as = partial(set_up_here, rig)
     return open_drives(rig, rig.home, load, to_reset=to_reset, configure_as=configure_as)
 

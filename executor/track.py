@@ -321,6 +321,6 @@ def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Po
 def _rendered(
     rig: Rig, scene: Scene, camera: Camera, timed_poses: list[tuple[float, Pose]]
 ) -> Iterable[Picture]:
-    film = Film(make_synthetic_camera(rig, scene, camera))
+    film = ImageSequence(make_synthetic_camera(rig, scene, camera))
     for number, (at, pose) in enumerate(timed_poses):
         yield Frame(at, film.picture(at, pose, number), f"rendered {number}")

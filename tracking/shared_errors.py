@@ -86,10 +86,10 @@ class SharedErrors:
         if camera.lens_covariance is None:
             return
         self._lens = camera.lens_covariance
-        if camera.place_by_lens is None:
+        if camera.pose_by_lens is None:
             self._extrinsics_by_lens[3:] = implied_rotation(camera)
         else:
-            by_lens = self._extrinsics_by_lens = camera.place_by_lens
+            by_lens = self._extrinsics_by_lens = camera.pose_by_lens
             self._extrinsics = _positive(self._extrinsics - by_lens @ self._lens @ by_lens.T)
 
     def of(self, pose: Pose, views: Sequence[TagView]) -> Array:

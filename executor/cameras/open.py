@@ -145,7 +145,7 @@ def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> ImageSource:
         from simulation.camera.camera import ImageSequence
         from simulation.factory import make_synthetic_camera
 
-        return RenderedImages(Film(make_synthetic_camera(rig, scene, camera)))
+        return RenderedImages(ImageSequence(make_synthetic_camera(rig, scene, camera)))
     return LiveImages(LiveCamera(name, camera))
 
 
@@ -200,7 +200,7 @@ def measure_at_rest(
         listener: Receives the opening of the camera.
     """
     camera, source = camera_source
-    scene = nothing_in_the_way(rig).document
+    scene = empty_scene(rig).document
     make = partial(
         make_worker, rig.document, scene, camera.name, source, None, pictures, named=False
     )

@@ -223,7 +223,7 @@ class SyncMaster:
         return self.read_state()
 
     def read_state(self) -> CycleStatus:
-        """Reads the state of every drive without SYNC; see `DriveGroup.look`.
+        """Reads the state of every drive without SYNC; see `DriveGroup.read_state`.
 
         Raises:
             Fault: The bus failed.

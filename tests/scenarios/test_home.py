@@ -196,9 +196,7 @@ def test_home_then_run_then_the_tags_agree(tmp_path: Path) -> None:
         )
         bench.group.close()
         home = bench.rig.home.position
-        scene = nothing_in_the_way(rig).changed(
-            goal=Pose.level(home + np.array([0.012, -0.006, 0.015]))
-        )
+        scene = empty_scene(rig).changed(goal=Pose.level(home + np.array([0.012, -0.006, 0.015])))
         document = straight_plan(rig, scene, [tuple(home * 1e3), tuple(scene.goal.position * 1e3)])
         prepared = prepare(verify(plan_from_document(document), rig), rig)
         bus = bench.group._bus  # type: ignore[attr-defined]
@@ -241,10 +239,10 @@ def test_a_platform_that_hangs_free_is_referenced_by_its_tags_and_goes_home(
         reference = reference_at(
             bench.rig, seen.pose, result.counts, result.tensions, "tags", seen.uncertainty
         )
-        rig, load = referenced(bench.rig, reference), nothing_in_the_way(bench.rig).load
+        rig, load = referenced(bench.rig, reference), empty_scene(bench.rig).load
         found = current_pose(rig, result.counts, load)
         assert found.distance_to(true) < 4.0 * seen.uncertainty
-        home = plan_straight_move(rig, nothing_in_the_way(rig), found, rig.home)
+        home = plan_straight_move(rig, empty_scene(rig), found, rig.home)
         prepared = prepare(verify(plan_from_document(home), rig), rig)
         bus = bench.group._bus  # type: ignore[attr-defined]
         bench.group.close()

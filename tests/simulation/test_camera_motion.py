@@ -11,7 +11,7 @@ import pytest
 from model.pose import Array, PlatformMotion, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, load_rig
 from model.scene import Scene, empty_scene
-from simulation.camera.camera import Film, SyntheticCamera
+from simulation.camera.camera import ImageSequence, SyntheticCamera
 from simulation.ground_truth import Optics, camera_as_built
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

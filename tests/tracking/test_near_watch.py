@@ -51,7 +51,7 @@ def test_the_run_stops_exactly_when_one_obstacle_is_certainly_too_near(
     watch = ClearanceMonitor(LIMIT_MM / 1e3)
     told = [watch.take(measured(obstacles_mm)) for _ in range(NEAR_IMAGES)]
     assert not any(told[:-1])
-    assert bool(told[-1]) is surely_too_near(obstacles_mm)
+    assert bool(told[-1]) is certainly_too_near(obstacles_mm)
 
 
 @given(obstacles_mm=OBSTACLES)
