@@ -247,7 +247,7 @@ class Quick:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def look(self, trigger: FrameRequest) -> CameraSample:
+    def measure(self, trigger: FrameRequest) -> CameraSample:
         while self._silent and trigger.frame > 2:
             signal.pause()
         return seen_at(trigger)
