@@ -196,7 +196,7 @@ def test_too_few_tags_are_not_good_enough(rig: Rig, count: int, seen: str) -> No
     observations = observe(camera, rig.frame_tags[:count], {"a": truth.inverse()}, 0.02, rng)
     found = locate_by_frame_tags(rig, camera, observations, Survey(0.5e-3))
     verdict = judge_extrinsics(found, 1e-3)
-    assert f"{seen} seen; 3 are required" in verdict.reasons
+    assert f"{seen} visible; 3 are required" in verdict.reasons
     assert "survey more tags, all around the camera's view" in verdict.next_steps
 
 

@@ -136,7 +136,7 @@ def test_a_board_with_another_number_of_corners_is_reported(tmp_path) -> None:
 def test_a_wrong_size_of_squares_shows_in_the_distance_of_the_boards(folder) -> None:
     """Images alone do not show it: the camera is the same, everything is ten times as far."""
     answer = call("calibrate", "camera", folder, *BOARD[:-1], "250", "--wanted-mm", "10")
-    (line,) = (row for row in answer.out.splitlines() if row.split()[:2] == ["boards", "were"])
+    (line,) = (row for row in answer.out.splitlines() if row.split()[:2] == ["board", "distance"])
     near, far = line.split()[2], line.split()[4]
     assert 3.5 < float(near) < float(far) < 7.5  # they were 0.4 to 0.65 m away
     assert "if not, the sizes are wrong" in line

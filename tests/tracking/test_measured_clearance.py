@@ -159,7 +159,7 @@ def test_one_value_by_the_operator_replaces_all_shared_errors(rig: Rig, crowded:
     one = np.diag([1e-6] * 3 + [0.0] * 3)
     np.testing.assert_allclose(shared.of(pose, []), one, atol=1e-15)
     assert not shared.unstated
-    assert shared.whole == pytest.approx(1.96e-3)
+    assert shared.operator_error == pytest.approx(1.96e-3)
     half = looking(rig, error_mm=1.96, pose_covariance=np.eye(6).tolist())
     np.testing.assert_allclose(SharedErrors(rig, half).of(pose, []), one, atol=1e-15)
     sure = measurement(pose, np.zeros((6, 6)))

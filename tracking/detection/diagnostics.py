@@ -93,7 +93,7 @@ class EdgeFaults:
 
     @property
     def sharpened(self) -> bool:
-        """Whether the camera sharpened the image so much that edges are shifted."""
+        """Whether sharpening by the camera shifts the edges."""
         return self.spread < SHARP and self.overshoot > OVERSHOOT
 
     @property
