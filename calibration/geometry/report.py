@@ -16,12 +16,13 @@ from model.kinematics import cables_to
 from model.pages.charts import DOTTED, Chart, ChartLine, chart_grid, charts
 from model.pages.page import bullets, list_table, paragraph, tile, tiles
 from model.pages.scene import (
+    SCENE_SCRIPTS,
     Label,
     Moment,
     SceneFigure,
     arrows,
     grid_floor,
-    scene_data,
+    page_data,
     viewer,
 )
 from model.pose import Array
@@ -79,8 +80,8 @@ def rig_page(result: RigCalibration, quality: RigQuality, name: str, date: str) 
         quality.verdict,
         sections,
         tiles=_headline(result, quality),
-        scripts=("charts.js", "viewer.js", "playback.js"),
-        data={"scene-data": scene_data(scene)},
+        scripts=("charts.js", *SCENE_SCRIPTS),
+        data=page_data(scene),
     )
 
 

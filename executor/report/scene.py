@@ -130,7 +130,7 @@ def _paths(run: RunData) -> tuple[Stroke, ...]:
     path = np.array([pose.position for pose in run.plan.waypoints])
     driven, seen = run.cycles.encoder[_moments(run)], run.poses.position[run.poses.ok]
     return (
-        Stroke.along("seen", "tag", seen, 7.0, 0.35),
+        Stroke.along("seen", "tag", seen, 7.5, 0.6),
         Stroke.along("path", "ink", path, 4.5),
         Stroke.along("driven", "encoder", driven, 2.0),
         Stroke.along("raw", "raw", raw, 1.8),

@@ -6,9 +6,13 @@ page with `viewer`, `playback.js` moves the platform through its moments; the co
 
 from __future__ import annotations
 
+import base64
+import gzip
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from html import escape
 from string import Template
 from typing import Any
@@ -207,6 +211,30 @@ def viewer(
         hint=escape(hint),
         still=still(scene, label),
     )
+
+
+SCENE_SCRIPTS = ("viewer.js", "playback.js")
+"""Of a page with a scene, after `page_data`."""
+
+
+def page_data(scene: SceneFigure) -> dict[str, object]:
+    """What `SCENE_SCRIPTS` read, for `page`: the scene, and three.js."""
+    return {"scene-data": scene_data(scene), "three": _packed_three()}
+
+
+@cache
+def _packed_three() -> dict[str, str]:
+    """three.js with its licence, as a script that needs neither a server nor imports.
+
+    A page opened from a folder can import no file, and its policy allows only what is in it; so
+    the names that the module exports become those of a global object.
+    """
+    folder = "vendor/three/"
+    module, _, exported = resource(folder + "three.module.min.js").rpartition("export{")
+    names = re.sub(r"([\w$]+) as (\w+)", r"\2:\1", exported.rstrip().removesuffix(";"))
+    script = f'(()=>{{"use strict";{module}globalThis.THREE={{{names}}})()'
+    packed = gzip.compress(script.encode(), mtime=0)
+    return {"licence": resource(folder + "LICENSE"), "gzip": base64.b64encode(packed).decode()}
 
 
 def scene_data(scene: SceneFigure) -> dict[str, Any]:
