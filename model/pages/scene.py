@@ -22,7 +22,7 @@ import numpy as np
 from model.pages.page import resource
 from model.pose import Array
 
-AZIMUTH, ELEVATION = -58.0, 30.0
+AZIMUTH, ELEVATION = -58.0, 24.0
 """From where a scene is seen at first, [deg]."""
 _WIDTH = 1000.0
 """Of the still image's coordinates."""

@@ -55,8 +55,7 @@ void main() {
 }`;
 
 function sceneViewer(canvas, data, shown = () => true) {
-  const MARGIN = 24; // px, for texts beside points
-  const LINE = 14; // height of a text, px
+  const MARGIN = 24, LINE = 14; // px: around all, for texts beside points; the height of a text
   const UNFITTED = ["tree", "trail", "pick"]; // layers that may lie outside the picture
   const context = globalThis.THREE && canvas.getContext("webgl2", { alpha: false, antialias: true });
   if (!context) return withoutWebGL(canvas);
@@ -65,25 +64,24 @@ function sceneViewer(canvas, data, shown = () => true) {
   const renderer = new THREE.WebGLRenderer({ canvas, context });
   renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
   renderer.shadowMap.enabled = true;
-  const world = new THREE.Scene(), camera = new THREE.Camera();
+  renderer.debug.checkShaderErrors = false; // which would wait for the compiler
   const lamp = new THREE.DirectionalLight("white", 0.3 * Math.PI), sky = new THREE.HemisphereLight("white", "#a8aeb8", 0.84 * Math.PI);
-  const floor = new THREE.Mesh(new THREE.PlaneGeometry(1, 1), new THREE.ShadowMaterial({ depthWrite: false }));
-  const fixed = new THREE.Group(), robot = new THREE.Group();
-  Object.assign(floor, { receiveShadow: true, renderOrder: -3 });
   lamp.castShadow = true;
-  lamp.shadow.radius = 6;
+  lamp.shadow.radius = 5;
   lamp.shadow.mapSize.set(1024, 1024);
   sky.position.set(0, 0, 1);
+  const floor = new THREE.Mesh(new THREE.PlaneGeometry(), new THREE.ShadowMaterial({ depthWrite: false }));
+  Object.assign(floor, { receiveShadow: true, renderOrder: -3 }).userData.layer = "floor";
+  const robot = new THREE.Group(), world = new THREE.Scene().add(lamp, lamp.target, sky, floor, robot);
+  const camera = new THREE.Camera();
   camera.up.set(0, 0, 1);
-  world.add(lamp, lamp.target, sky, floor, fixed, robot);
 
   const first = { azimuth: data.view.azimuth, elevation: data.view.elevation, zoom: 1 };
-  const eye = { ...first };
-  const pane = { width: 0, height: 0 }; // of the canvas, CSS px
-  const uniforms = { view: { value: new THREE.Vector2() }, ratio: { value: 1 } }; // of all lines
-  const point = new THREE.Vector3(), centre = new THREE.Vector3();
+  const eye = { ...first }, pane = { width: 0, height: 0 }; // of the canvas, CSS px
+  const view = { value: new THREE.Vector2() }, ratio = { value: 1 }; // for the lines
+  const point = new THREE.Vector3(), centre = new THREE.Vector3(), box = new THREE.Box3();
   const surfaces = new Map(), strokes = [], ownStrokes = []; // what was made of the data
-  let seen = [], size = 1, distance = 1, perMm = 0; // of what is drawn; set by `update`
+  let seen = [], names = [], size = 1, distance = 1, perMm = 0; // of what is drawn; set by `update`
   let now = null, waiting = false, turned = true;
 
   // Colours: one object a role, which materials share.
@@ -97,34 +95,27 @@ function sceneViewer(canvas, data, shown = () => true) {
     redraw();
   }
 
-  // Lines.
+  // Lines, and surfaces: faces with light, and edges.
   function makeLines(front = false) {
-    const geometry = new THREE.InstancedBufferGeometry();
-    geometry.setIndex([0, 2, 1, 1, 2, 3]);
-    geometry.setAttribute("corner", new THREE.BufferAttribute(new Float32Array([0, -1, 0, 1, 1, -1, 1, 1]), 2));
-    const material = new THREE.ShaderMaterial({
-      vertexShader: LINE_VERTEX, fragmentShader: LINE_FRAGMENT, side: THREE.DoubleSide, depthTest: !front, alphaToCoverage: true,
-      uniforms: {
-        ...uniforms, colour: { value: null }, dash: { value: new THREE.Vector2() },
-        width: { value: 1 }, opacity: { value: 1 }, nearer: { value: 0 }, cap: { value: 1 },
-      },
-    });
-    return Object.assign(new THREE.Mesh(geometry, material), { frustumCulled: false, renderOrder: front ? 9 : 0 });
+    const geometry = new THREE.InstancedBufferGeometry(), corners = new Float32Array([0, -1, 0, 1, 1, -1, 1, 1]);
+    geometry.setIndex([0, 2, 1, 1, 2, 3]).setAttribute("corner", new THREE.BufferAttribute(corners, 2));
+    const own = { colour: null, dash: new THREE.Vector2(), width: 1, opacity: 1, nearer: 0, cap: 1 };
+    const uniforms = { view, ratio, ...Object.fromEntries(Object.entries(own).map(([name, value]) => [name, { value }])) };
+    const material = new THREE.ShaderMaterial({ uniforms, vertexShader: LINE_VERTEX, fragmentShader: LINE_FRAGMENT, side: THREE.DoubleSide, depthTest: !front });
+    return Object.assign(new THREE.Mesh(geometry, material), { frustumCulled: false });
   }
 
-  function style(mesh, { role, width, opacity = 1, dash, ahead, layer }) {
-    const { material } = mesh, { value: pattern } = material.uniforms.dash, solid = opacity >= 1;
-    pattern.set(dash?.[0] ?? 0, dash?.[1] ?? dash?.[0] ?? 0);
-    material.uniforms.colour.value = colourOf(role);
-    material.uniforms.width.value = width;
-    material.uniforms.opacity.value = opacity;
-    material.uniforms.cap.value = solid && !pattern.x ? 1 : 0;
+  function style(mesh, { role, width, opacity = 1, dash = null, ahead = false, layer }) {
+    const { material, material: { uniforms: its, depthTest } } = mesh, isFull = opacity >= 1;
+    its.colour.value = colourOf(role);
+    its.dash.value.set(dash?.[0] ?? 0, dash?.[1] ?? dash?.[0] ?? 0);
+    its.width.value = width;
+    its.opacity.value = opacity;
+    its.cap.value = isFull && !dash?.length ? 1 : 0;
     // A little nearer than it is, thin lines most: on the same track they cover the wide ones.
-    material.uniforms.nearer.value = perMm * size * (ahead ? 0.002 * (9 - width) : 0.0005);
-    if (material.depthTest) {
-      Object.assign(material, { transparent: !solid, depthWrite: solid, alphaToCoverage: solid });
-      mesh.renderOrder = layer === "floor" ? -2 : solid ? 0 : -1;
-    } else Object.assign(material, { transparent: true, alphaToCoverage: false });
+    its.nearer.value = perMm * size * (ahead ? 0.002 * (9 - width) : 0.0005);
+    Object.assign(material, { transparent: !isFull || !depthTest, depthWrite: isFull, alphaToCoverage: isFull && depthTest });
+    mesh.renderOrder = !depthTest ? 9 : layer === "floor" ? -2 : isFull ? 0 : -1;
     mesh.userData.layer = layer;
   }
 
@@ -133,54 +124,42 @@ function sceneViewer(canvas, data, shown = () => true) {
     let buffer = geometry.getAttribute("from")?.data;
     if (!buffer || buffer.count < segments.length) {
       geometry.dispose();
-      buffer = new THREE.InstancedInterleavedBuffer(new Float32Array(6 * Math.max(8, 1.5 * segments.length | 0)), 6);
-      buffer.setUsage(THREE.DynamicDrawUsage);
-      geometry.setAttribute("from", new THREE.InterleavedBufferAttribute(buffer, 3, 0));
-      geometry.setAttribute("to", new THREE.InterleavedBufferAttribute(buffer, 3, 3));
+      buffer = new THREE.InstancedInterleavedBuffer(new Float32Array(6 * Math.ceil(1 + 1.5 * segments.length)), 6).setUsage(THREE.DynamicDrawUsage);
+      ["from", "to"].forEach((name, k) => geometry.setAttribute(name, new THREE.InterleavedBufferAttribute(buffer, 3, 3 * k)));
     }
     for (let k = 0; k < segments.length; k++) buffer.array.set(segments[k], 6 * k);
     buffer.needsUpdate = true;
     geometry.instanceCount = segments.length;
   }
 
-  /** As many meshes as strokes; those whose stroke is another one take it over, with their buffers. */
+  /** A mesh a stroke: one that had another stroke takes this over into its buffers. */
   function reconcile(meshes, wanted, front) {
-    while (meshes.length > wanted.length && !front) dispose(meshes.pop());
+    while (meshes.length > wanted.length) dispose(meshes.pop());
     wanted.forEach((stroke, k) => {
-      const mesh = (meshes[k] ??= makeLines(front));
-      if (!mesh.parent) world.add(mesh);
-      if (mesh.userData.stroke !== stroke) place(mesh, stroke.segments);
-      mesh.userData.stroke = stroke;
-      style(mesh, stroke);
+      if (k === meshes.length) world.add((meshes[k] = makeLines(front)));
+      if (meshes[k].userData.stroke !== stroke) place(meshes[k], stroke.segments);
+      meshes[k].userData.stroke = stroke;
+      style(meshes[k], stroke);
     });
-    for (const rest of meshes.slice(wanted.length)) rest.userData.stroke = rest.userData.layer = null;
   }
 
-  // Surfaces: faces with light, and edges.
   function makeSurface({ vertices, faces, edges, role, opacity, layer }) {
-    const group = new THREE.Group(), lines = makeLines();
-    const middle = [0, 1, 2].map((k) => vertices.reduce((sum, v) => sum + v[k], 0) / vertices.length); // by which far ones come first
-    const corners = faces.flatMap((face) => face.slice(2).flatMap((last, k) => [face[0], face[k + 1], last]));
-    const geometry = new THREE.BufferGeometry();
-    geometry.setAttribute("position", new THREE.Float32BufferAttribute(vertices.flatMap((v) => v.map((c, k) => c - middle[k])), 3));
-    geometry.setIndex(corners);
-    const material = new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide, transparent: opacity < 1, depthWrite: opacity >= 1, opacity });
-    material.color = colourOf(role);
-    const mesh = new THREE.Mesh(geometry, material);
-    mesh.position.fromArray(middle);
+    const geometry = new THREE.BufferGeometry(), lines = makeLines(), isFull = opacity >= 1;
+    const material = new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide, transparent: !isFull, depthWrite: isFull, opacity });
+    const mesh = new THREE.Mesh(geometry, Object.assign(material, { color: colourOf(role) }));
+    box.setFromArray(vertices.flat()).getCenter(mesh.position); // far ones are drawn first
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(vertices.flat(), 3));
+    geometry.translate(-mesh.position.x, -mesh.position.y, -mesh.position.z);
+    geometry.setIndex(faces.flatMap((face) => face.slice(2).flatMap((last, k) => [face[0], face[k + 1], last])));
     mesh.castShadow = true;
     style(lines, { role, width: 1.2, layer });
     place(lines, edges.map(([a, b]) => [...vertices[a], ...vertices[b]]));
-    group.userData.layer = layer;
-    return group.add(mesh, lines);
+    return Object.assign(new THREE.Group().add(mesh, lines), { userData: { layer } });
   }
 
   function dispose(object) {
     object.removeFromParent();
-    object.traverse(({ geometry, material }) => {
-      geometry?.dispose();
-      material?.dispose();
-    });
+    object.traverse(({ geometry, material }) => [geometry, material].forEach((part) => part?.dispose()));
   }
 
   // What is drawn.
@@ -193,14 +172,14 @@ function sceneViewer(canvas, data, shown = () => true) {
         surfaces.delete(surface);
       }
     for (const surface of data.surfaces) if (!surfaces.has(surface)) surfaces.set(surface, makeSurface(surface));
-    fixed.add(...surfaces.values());
+    world.add(...surfaces.values());
     reconcile(strokes, data.strokes, false);
     redraw();
   }
 
   /** What must be in the picture; the camera, the light and the floor go by it. */
   function bound() {
-    const reach = [0, 1, 2].map((k) => Math.max(...data.platform.vertices.map((v) => Math.abs(v[k]))));
+    const reach = box.setFromArray(data.platform.vertices.flat()).getSize(point).toArray().map((v) => v / 2);
     const every = Math.max(1, Math.floor(data.moments.length / 20));
     seen = [
       ...data.surfaces.flatMap((surface) => surface.vertices),
@@ -208,22 +187,21 @@ function sceneViewer(canvas, data, shown = () => true) {
       ...data.labels.map((label) => label.at),
       ...data.moments.filter((_, k) => k % every === 0).flatMap(({ p }) => [-1, 1].map((sign) => p.map((v, k) => v + sign * reach[k]))),
     ];
-    const box = new THREE.Box3().setFromArray(seen.flat());
+    names = data.surfaces.filter((surface) => surface.name).map(({ name, layer, vertices }) => {
+      const top = Math.max(...vertices.map((v) => v[2])), upper = vertices.filter((v) => v[2] > top - 0.01);
+      return { layer, text: name, at: box.setFromArray(upper.flat()).getCenter(point).toArray() };
+    });
+    size = box.setFromArray(seen.flat()).getSize(point).length();
     box.getCenter(centre);
-    size = box.getSize(point).length();
     distance = 2.2 * size;
-    perMm = (2 * 0.4 * 2) / (1.6 * distance); // of depth as the graphics card counts it, at the centre
+    perMm = 1 / distance; // of depth as the graphics card counts it, at the centre
     lamp.target.position.copy(centre);
     lamp.position.set(-0.25, -0.35, 1).multiplyScalar(size).add(centre);
-    Object.assign(lamp.shadow.camera, { left: -size / 2, right: size / 2, top: size / 2, bottom: -size / 2, near: 0.1 * size, far: 2.5 * size });
-    lamp.shadow.camera.updateProjectionMatrix();
-    const ground = data.strokes.find((stroke) => stroke.layer === "floor" && stroke.segments.length);
-    floor.userData.layer = ground ? "floor" : null;
-    if (ground) {
-      box.setFromArray(ground.segments.flat());
-      box.getCenter(floor.position);
-      floor.scale.set(...box.getSize(point).setZ(1).toArray());
-    }
+    Object.assign(lamp.shadow.camera, { left: -size / 2, right: size / 2, top: size / 2, bottom: -size / 2, near: 0.1 * size, far: 2.5 * size }).updateProjectionMatrix();
+    const ground = data.strokes.find((stroke) => stroke.layer === "floor")?.segments.flat() ?? [];
+    floor.material.visible = ground.length > 0;
+    if (ground.length) box.setFromArray(ground).getSize(floor.scale).setZ(1);
+    if (ground.length) box.getCenter(floor.position);
     turned = true;
   }
 
@@ -252,23 +230,20 @@ function sceneViewer(canvas, data, shown = () => true) {
   const cables = data.anchors.map(() => Object.assign(makeLines(), { segment: [[0, 0, 0, 0, 0, 0]], tint: new THREE.Color() }));
   const platform = makeSurface(data.platform);
   platform.matrixAutoUpdate = false;
-  robot.add(platform, ...cables);
-  robot.userData.layer = "robot";
+  robot.add(platform, ...cables).userData.layer = "robot";
 
   function placeRobot() {
     const { r, p, exits, tensions } = now, [low, high] = data.tension_limits || [0, 1];
     platform.matrix.set(r[0], r[1], r[2], p[0], r[3], r[4], r[5], p[1], r[6], r[7], r[8], p[2], 0, 0, 0, 1);
     cables.forEach((cable, i) => {
-      const [segment] = cable.segment, { uniforms: its } = cable.material, tension = tensions?.[i] ?? null;
-      for (let k = 0; k < 3; k++) segment[k] = exits[i][k];
-      point.fromArray(data.anchors[i]).applyMatrix4(platform.matrix).toArray(segment, 3);
-      place(cable, cable.segment);
+      const [segment] = cable.segment, tension = tensions?.[i] ?? null;
       const [from, to, at] = tension === null ? ["cable", "cable", 0] : tensionMix((tension - low) / (high - low));
       const beyond = from === "limit";
-      its.colour.value = cable.tint.lerpColors(colourOf(from), colourOf(to), at);
-      its.width.value = tension === null ? 2 : beyond ? 3.4 : 2.4;
-      its.dash.value.setScalar(beyond ? 5 : 0);
-      its.cap.value = beyond ? 0 : 1;
+      exits[i].forEach((v, k) => (segment[k] = v));
+      point.fromArray(data.anchors[i]).applyMatrix4(platform.matrix).toArray(segment, 3);
+      place(cable, cable.segment);
+      style(cable, { role: from, width: tension === null ? 2 : beyond ? 3.4 : 2.4, dash: beyond ? [5] : null, layer: "robot" });
+      cable.material.uniforms.colour.value = cable.tint.lerpColors(colourOf(from), colourOf(to), at);
     });
   }
 
@@ -278,9 +253,7 @@ function sceneViewer(canvas, data, shown = () => true) {
     if (turned) aim();
     if (now) placeRobot();
     reconcile(ownStrokes, now?.strokes ?? [], true);
-    for (const { children } of [world, fixed])
-      for (const object of children) if (object !== fixed && !object.isLight) object.visible = object.userData.layer !== null && shown(object.userData.layer);
-    robot.visible &&= now !== null;
+    for (const object of world.children) if (object.userData.layer) object.visible = shown(object.userData.layer) && (object !== robot || now !== null);
     renderer.render(world, camera);
     writeTexts();
   }
@@ -297,46 +270,41 @@ function sceneViewer(canvas, data, shown = () => true) {
   canvas.after(texts);
   const ruler = document.createElement("canvas").getContext("2d");
   ruler.font = "600 12px system-ui, sans-serif";
-  const written = []; // where texts stand already: [left, right, base]
+  const taken = []; // where texts stand already: [left, right, base]
+  let count = 0;
 
   function writeTexts() {
-    written.length = 0;
-    for (const { layer, text, at, mark } of data.labels) if (shown(layer)) write(text, point.fromArray(at), mark);
-    for (const { layer, text, at, mark } of now?.labels ?? []) if (shown(layer)) write(text, point.fromArray(at), mark);
-    for (const { name, layer, vertices } of data.surfaces)
-      if (name && shown(layer)) write(name, above(vertices));
+    taken.length = count = 0;
+    for (const list of [data.labels, now?.labels ?? [], names])
+      for (const { layer, text, at, mark } of list) if (shown(layer)) write(text, point.fromArray(at), mark);
     if (shown("numbers") && robot.visible)
       cables.forEach(({ segment: [s] }, i) => write(String(i + 1), point.fromArray(s).lerp({ x: s[3], y: s[4], z: s[5] }, 0.25)));
-    for (let k = written.length; k < texts.childElementCount; k++) texts.children[k].hidden = true;
-  }
-
-  function above(vertices) { // the middle of the uppermost vertices
-    const top = Math.max(...vertices.map((v) => v[2])), upper = vertices.filter((v) => v[2] > top - 0.01);
-    return point.set(...[0, 1, 2].map((k) => upper.reduce((sum, v) => sum + v[k], 0) / upper.length));
+    for (let k = count; k < texts.childElementCount; k++) texts.children[k].hidden = true;
   }
 
   function write(text, at, mark = "") {
     at.project(camera);
     const x = ((1 + at.x) * pane.width) / 2, y = ((1 - at.y) * pane.height) / 2;
-    const sign = texts.children[written.length] ?? texts.appendChild(document.createElement("span"));
+    const sign = texts.children[count++] ?? texts.appendChild(document.createElement("span"));
     const word = sign.firstChild ?? sign.appendChild(document.createElement("b"));
     if (word.textContent !== text) {
       word.textContent = text;
       sign.wide = ruler.measureText(text).width;
     }
-    const wide = sign.wide, [left, base] = free(mark ? x + 9 : x - wide / 2, mark ? y - 7 : y + 4, wide);
-    sign.hidden = !(x > -LINE && x < pane.width + LINE && y > -LINE && y < pane.height + LINE);
+    if (mark) taken.push([x - 6, x + 6, y + 5]);
+    const [left, base] = free(mark ? x + 9 : x - sign.wide / 2, mark ? y - 7 : y + 4, sign.wide);
+    sign.hidden = Math.abs(at.x) > 1 || Math.abs(at.y) > 1;
     sign.className = mark;
     sign.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
     word.style.transform = `translate(${(left - x).toFixed(1)}px, ${(base - 11 - y).toFixed(1)}px)`;
   }
 
-  function free(left, base, wide) { // within the picture, and beside what is written there already: some lines up or down
-    const start = Math.max(3, Math.min(left, pane.width - wide - 3));
-    const isFree = (at) => at > LINE && at < pane.height - 3 && written.every(([l, r, b]) => start + wide < l || start > r || Math.abs(at - b) >= LINE);
+  function free(wanted, base, wide) { // within the picture, and beside what is written there already: some lines up or down
+    const left = Math.max(3, Math.min(wanted, pane.width - wide - 3));
+    const isFree = (at) => at > LINE && at < pane.height - 3 && taken.every(([l, r, b]) => left + wide < l || left > r || Math.abs(at - b) >= LINE);
     const at = [0, -LINE, LINE, -2 * LINE, 2 * LINE].map((off) => base + off).find(isFree) ?? base;
-    written.push([start, start + wide, at]);
-    return [start, at];
+    taken.push([left, left + wide, at]);
+    return [left, at];
   }
 
   // What a pointer and keys do.
@@ -399,8 +367,8 @@ function sceneViewer(canvas, data, shown = () => true) {
     const [w, h] = exactly ? [exactly[0].inlineSize, exactly[0].blockSize] : [width, height].map((v) => Math.round(v * devicePixelRatio));
     Object.assign(pane, { width, height });
     renderer.setSize(w, h, false);
-    uniforms.view.value.set(width, height);
-    uniforms.ratio.value = w / width || 1;
+    view.value.set(width, height);
+    ratio.value = w / width || 1;
     turned = true;
     draw(); // at once: the new size has cleared the canvas
   }).observe(canvas, exact ? { box: "device-pixel-content-box" } : {});

@@ -14,14 +14,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, FloatRect, Page, expect, sync_playwright
 
 ROOT = Path(__file__).parents[2]
 ARGUMENTS = [
     "--headless",
     "--no-sandbox",
-    "--disable-gpu",
+    "--use-angle=swiftshader",  # WebGL without a graphics card
+    "--enable-unsafe-swiftshader",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
@@ -158,6 +161,25 @@ def _count(found: dict[str, Any], kind: str) -> int:
     return sum(m["kind"] == kind for m in found["received"])
 
 
+COLOUR = "role => getComputedStyle(document.documentElement).getPropertyValue(`--${role}`)"
+NO_WEBGL = """const known = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+  return kind.startsWith("webgl") ? null : known.call(this, kind, ...more);
+};"""
+
+
+def painted(page: Page, role: str, clip: FloatRect | None = None) -> int:
+    """Pixels of the scene, or of a part of the page, in about the colour of a role."""
+    box = clip or page.locator("#scene-canvas").bounding_box()
+    assert box
+    shot = np.frombuffer(page.screenshot(clip=box), np.uint8)
+    picture = cv2.imdecode(shot, cv2.IMREAD_COLOR)
+    assert picture is not None
+    red_green_blue = picture[:, :, ::-1].astype(int)
+    colour = list(bytes.fromhex(page.evaluate(COLOUR, role).strip().lstrip("#")))
+    return int((abs(red_green_blue - colour) < 30).all(axis=2).sum())
+
+
 def chromium() -> str:
     """The path of the system's Chromium; skips without one."""
     for name in ("chromium", "chromium-browser", "google-chrome"):
@@ -197,9 +219,12 @@ def fake_server() -> Iterator[Fake]:
 
 @contextlib.contextmanager
 def visit(
-    browser: Browser, fake: Fake, size: str = "desk", scheme: str = "light"
+    browser: Browser, fake: Fake, size: str = "desk", scheme: str = "light", script: str = ""
 ) -> Iterator[Visit]:
-    """A page in a fresh profile, at a server that is new; fails when the page logged an error."""
+    """A page in a fresh profile, at a server that is new; fails when the page logged an error.
+
+    `script` runs before the page's own.
+    """
     width, height = SIZES[size]
     fake.ask(renew=True)
     context = browser.new_context(
@@ -207,6 +232,7 @@ def visit(
         color_scheme="dark" if scheme == "dark" else "light",
         has_touch=size != "desk",
     )
+    context.add_init_script(script)
     page = context.new_page()
     found = Visit(page, fake)
     page.on("pageerror", lambda error: found.errors.append(str(error)))

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from model.pages.charts import Chart, ChartLine, Span, charts, ticks
 from model.pages.page import bullets, list_table, page, picture, resource, section, table, tile
 from model.pages.scene import (
+    SCENE_SCRIPTS,
     Label,
     Moment,
     SceneFigure,
@@ -21,7 +22,7 @@ from model.pages.scene import (
     Stroke,
     arrows,
     grid_floor,
-    scene_data,
+    page_data,
     still,
     viewer,
 )
@@ -85,8 +86,8 @@ def whole() -> str:
         charts(chart_of(np.arange(5.0))),
         viewer(scene, EVIL, [("path", EVIL, "ink", True)], EVIL),
     ]
-    data = {"scene-data": scene_data(scene)}
-    return page(EVIL, "".join(parts), scripts=("charts.js", "viewer.js", "playback.js"), data=data)
+    scripts = ("charts.js", *SCENE_SCRIPTS)
+    return page(EVIL, "".join(parts), scripts=scripts, data=page_data(scene))
 
 
 def test_bullets_show_commands_and_options_as_code() -> None:
@@ -144,9 +145,9 @@ def test_colours_are_defined_for_light_and_dark() -> None:
     assert light == dark - {"of"}
 
 
-def test_scripts_are_small_and_need_no_library() -> None:
+def test_scripts_are_small_and_ask_for_nothing() -> None:
     assert len(resource("charts.js").splitlines()) <= 150
-    for name in ("charts.js", "viewer.js", "playback.js"):
+    for name in ("charts.js", *SCENE_SCRIPTS):
         assert not re.findall(r"\b(fetch|import|XMLHttpRequest|eval|innerHTML)\b", resource(name))
 
 
