@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,8 @@ LAYERS = [
 ]
 #: Counts what is drawn, and buffers that are kept, of all WebGL on the page.
 COUNTED = """window.count = { drawn: 0, kept: 0 };
-for (const [name, of, by] of [["clear", "drawn", 1], ["createBuffer", "kept", 1], ["deleteBuffer", "kept", -1]]) {
+const watched = [["clear", "drawn", 1], ["createBuffer", "kept", 1], ["deleteBuffer", "kept", -1]];
+for (const [name, of, by] of watched) {
   const known = WebGL2RenderingContext.prototype[name];
   WebGL2RenderingContext.prototype[name] = function (...given) {
     count[of] += by;
@@ -35,6 +37,24 @@ for (const [name, of, by] of [["clear", "drawn", 1], ["createBuffer", "kept", 1]
   };
 }"""
 FRAMES = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+
+#: Buffers kept after each of six pictures, of a scene whose parts are replaced by others.
+REPLACED = """async () => {
+  const stage = document.createElement("div"), canvas = document.createElement("canvas");
+  stage.className = "stage";
+  document.body.append(stage);
+  stage.append(canvas);
+  const data = JSON.parse(document.getElementById("scene-data").textContent), kept = [];
+  const view = sceneViewer(canvas, data);
+  for (let k = 0; k < 6; k++) {
+    const { surfaces, strokes } = structuredClone(data);
+    view.update({ surfaces, strokes });
+    view.show(data.moments[k]);
+    await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+    kept.push(count.kept);
+  }
+  return kept;
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +70,8 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Moment(float(k), on_circle(k / 12), np.eye(3), RIG.outlets, f"moment {k}")
         for k in range(12)
     )
-    scene = figure(moments, path=True)
+    rig, plan = figure(moments), figure(path=True)
+    scene = replace(rig, strokes=(*rig.strokes, *plan.strokes), labels=plan.labels)
     body = viewer(scene, "The rig.", LAYERS)
     text = html_page("Scene", body, scripts=SCENE_SCRIPTS, data=page_data(scene))
     path = tmp_path_factory.mktemp("page of its own") / "report.html"
@@ -95,7 +116,7 @@ def test_a_layer_is_hidden_and_shown(browser: Browser, path: Path, title: str, r
         before = painted(page, role)
         page.get_by_role("checkbox", name=title).uncheck()
         page.evaluate(FRAMES)
-        assert painted(page, role) < before / 3
+        assert painted(page, role) < before / 2
         page.get_by_role("checkbox", name=title).check()
         page.evaluate(FRAMES)
         assert painted(page, role) == pytest.approx(before, rel=0.1)
@@ -137,29 +158,12 @@ def test_the_scene_is_drawn_only_when_something_changes(browser: Browser, path: 
         page.keyboard.press("ArrowLeft")
         page.evaluate(FRAMES)
         assert page.evaluate("count.drawn") > before
-        assert page.locator("#scene-canvas").evaluate("e => e.scrollTop === 0")
 
 
 def test_what_is_replaced_is_disposed_of(browser: Browser, path: Path) -> None:
     """The console puts plans into the scene for days."""
     with opened(browser, path) as page:
-        kept = page.evaluate(
-            f"""async () => {{
-              const stage = document.createElement("div"), canvas = document.createElement("canvas");
-              stage.className = "stage";
-              document.body.append(stage);
-              stage.append(canvas);
-              const data = JSON.parse(document.getElementById("scene-data").textContent), kept = [];
-              const view = sceneViewer(canvas, data), frames = {FRAMES};
-              for (let k = 0; k < 6; k++) {{
-                view.update({{ surfaces: structuredClone(data.surfaces), strokes: structuredClone(data.strokes) }});
-                view.show(data.moments[k]);
-                await frames();
-                kept.push(count.kept);
-              }}
-              return kept;
-            }}"""
-        )
+        kept = page.evaluate(REPLACED)
         assert kept[1:] == [kept[1]] * 5
 
 
