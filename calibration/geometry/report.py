@@ -11,20 +11,19 @@ from calibration.geometry.parameters import AXES
 from calibration.geometry.quality import RigQuality
 from calibration.report import Section, drawing, page_of, table_of
 from calibration.statistics import Interval
-from executor.report.scene import frame_surface, platform_surface
 from model.kinematics import cables_to
 from model.pages.charts import DOTTED, Chart, ChartLine, chart_grid, charts
 from model.pages.page import bullets, list_table, paragraph, tile, tiles
 from model.pages.scene import (
-    SCENE_SCRIPTS,
     Label,
     Moment,
     SceneFigure,
     arrows,
+    frame_surface,
     grid_floor,
-    page_data,
-    viewer,
+    platform_surface,
 )
+from model.pages.viewer import SCENE_SCRIPTS, page_data, viewer
 from model.pose import Array
 from model.rig import Rig
 

@@ -26,7 +26,7 @@ from executor.report.tiles import (
 )
 from model.pages.page import contents, paragraph, section
 from model.pages.page import page as html_page
-from model.pages.scene import SCENE_SCRIPTS, page_data
+from model.pages.viewer import SCENE_SCRIPTS, page_data
 from tracking.clearance import INTERVAL
 
 _HINT = (

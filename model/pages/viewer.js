@@ -144,14 +144,15 @@ function sceneViewer(canvas, data, shown = () => true) {
   }
 
   function makeSurface({ vertices, faces, edges, role, opacity, layer }) {
-    const geometry = new THREE.BufferGeometry(), lines = makeLines(), isFull = opacity >= 1;
-    const material = new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide, transparent: !isFull, depthWrite: isFull, opacity });
+    const geometry = new THREE.BufferGeometry(), lines = makeLines(), isFull = opacity >= 1, isSolid = faces.length < 1000;
+    const material = new THREE.MeshLambertMaterial({ flatShading: isSolid, side: THREE.DoubleSide, transparent: !isFull, depthWrite: isFull, opacity });
     const mesh = new THREE.Mesh(geometry, Object.assign(material, { color: colourOf(role) }));
     box.setFromArray(vertices.flat()).getCenter(mesh.position); // far ones are drawn first
     geometry.setAttribute("position", new THREE.Float32BufferAttribute(vertices.flat(), 3));
     geometry.translate(-mesh.position.x, -mesh.position.y, -mesh.position.z);
     geometry.setIndex(faces.flatMap((face) => face.slice(2).flatMap((last, k) => [face[0], face[k + 1], last])));
-    mesh.castShadow = true;
+    if (!isSolid) geometry.computeVertexNormals(); // it is smooth, such as the boundary of a region
+    mesh.castShadow = isSolid;
     style(lines, { role, width: 1.2, layer });
     place(lines, edges.map(([a, b]) => [...vertices[a], ...vertices[b]]));
     return Object.assign(new THREE.Group().add(mesh, lines), { userData: { layer } });

@@ -33,14 +33,15 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from cdpr.console.view import scene_of
-from executor.report.scene import frame_surface, platform_surface
 from model.pages.scene import (
     Label,
     Moment,
     SceneFigure,
     SceneSurface,
     Stroke,
+    frame_surface,
     grid_floor,
+    platform_surface,
     scene_data,
 )
 from model.pose import Array, Pose

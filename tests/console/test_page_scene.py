@@ -125,7 +125,7 @@ def test_a_goal_is_picked_where_the_pointer_is(desk: Visit, turned: int) -> None
         desk.page.keyboard.press("ArrowUp")
     for height in (300, 500):
         desk.page.locator("#pick-height").fill(str(height))
-        x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.45 * box["height"]
+        x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.38 * box["height"]
         desk.page.mouse.click(x, y)
         expect(desk.page.locator("#pick-text")).to_contain_text(f", {height} mm")
         # The ring about the goal.
@@ -140,7 +140,7 @@ def test_a_goal_is_picked_where_the_pointer_is(desk: Visit, turned: int) -> None
 
 def test_turning_the_view_picks_nothing_and_cancel_keeps_nothing(desk: Visit) -> None:
     box = begin_to_pick(desk)
-    x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.45 * box["height"]
+    x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.38 * box["height"]
     desk.page.mouse.move(x, y)
     desk.page.mouse.down()
     desk.page.mouse.move(x + 60, y, steps=4)

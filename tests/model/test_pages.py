@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from model.pages.charts import Chart, ChartLine, Span, charts, ticks
 from model.pages.page import bullets, list_table, page, picture, resource, section, table, tile
 from model.pages.scene import (
-    SCENE_SCRIPTS,
     Label,
     Moment,
     SceneFigure,
@@ -22,10 +21,8 @@ from model.pages.scene import (
     Stroke,
     arrows,
     grid_floor,
-    page_data,
-    still,
-    viewer,
 )
+from model.pages.viewer import SCENE_SCRIPTS, page_data, still_image, viewer
 from model.pose import Array
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)> & \"'"
@@ -193,7 +190,7 @@ def test_a_line_that_does_not_count_leaves_the_range_alone() -> None:
 
 def test_the_still_scene_holds_all_its_points() -> None:
     """Cropped at no side, with the platform at its first moment."""
-    text = still(scene_of("box"), "a box")
+    text = still_image(scene_of("box"), "a box")
     box = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', text)
     assert box
     width, height = map(float, box.groups())

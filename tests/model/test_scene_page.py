@@ -14,7 +14,8 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from model.pages.page import page as html_page
-from model.pages.scene import SCENE_SCRIPTS, Moment, page_data, viewer
+from model.pages.scene import Moment
+from model.pages.viewer import SCENE_SCRIPTS, page_data, viewer
 from tests.console import browsing
 from tests.console.browsing import NO_WEBGL, painted
 from tests.console.fake_server import RIG, figure, on_circle
