@@ -56,8 +56,9 @@ def page(title: str, lead: str, chapters: Sequence[Chapter]) -> str:
 def _section(number: int, chapter: Chapter) -> str:
     pictures = "".join(picture(name, text) for name, text in chapter.pictures)
     if chapter.scene:
-        drawn = {one.layer for one in (*chapter.scene.surfaces, *chapter.scene.strokes)}
-        layers = [one for one in chapter.layers if one[0] in drawn | {"robot", "numbers"}]
+        drawn = {one.layer for one in chapter.scene.surfaces} | {"robot", "numbers"}
+        drawn |= {one.layer for one in chapter.scene.strokes}
+        layers = [one for one in chapter.layers if one[0] in drawn]
         pictures = viewer(chapter.scene, chapter.title, layers, still=pictures)
     links = ", ".join(f'<a href="{escape(n)}">{escape(n)}</a>' for n in chapter.tables)
     numbers = f'<p class="quiet">Numbers: {links}</p>'
