@@ -270,7 +270,7 @@ def space_scene(maps: Maps) -> SceneFigure:
         triangles = zero_surface((x, y, z), field[np.ix_(*numbers)])
         points, corners = np.unique(triangles.reshape(-1, 3).round(4), axis=0, return_inverse=True)
         faces = corners.reshape(-1, 3).tolist()
-        surfaces.append(SceneSurface(layer, role, points, faces, (), 0.55))
+        surfaces.append(SceneSurface(layer, role, points, faces, (), 0.3))
     home = Pose(rig.home.position, maps.question.rotation)
     moment = Moment(0.0, home.position, home.rotation, cables_at(rig, home).exits)
     floor, _ = grid_floor(np.concatenate([surface.vertices for surface in surfaces]))
