@@ -201,8 +201,10 @@ function sceneViewer(canvas, data, shown = () => true) {
     Object.assign(lamp.shadow.camera, { left: -size / 2, right: size / 2, top: size / 2, bottom: -size / 2, near: 0.1 * size, far: 2.5 * size }).updateProjectionMatrix();
     const ground = data.strokes.find((stroke) => stroke.layer === "floor")?.segments.flat() ?? [];
     floor.material.visible = ground.length > 0;
-    if (ground.length) box.setFromArray(ground).getSize(floor.scale).setZ(1);
-    if (ground.length) box.getCenter(floor.position);
+    if (ground.length) {
+      box.setFromArray(ground).getCenter(floor.position);
+      box.getSize(floor.scale).setZ(1);
+    }
     turned = true;
   }
 
