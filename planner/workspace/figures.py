@@ -20,7 +20,6 @@ from model.pages.scene import (
     workspace_stroke,
 )
 from model.pose import Array, Pose
-from model.rig import Rig
 from planner.workspace.compute import VERDICTS, Maps
 from planner.workspace.grid import AXES, Grid, zero_surface
 from planner.workspace.report import SHOWN, Shown, limit_of, shown_in
@@ -211,7 +210,6 @@ def _normal(grid: Grid) -> int:
 
 
 _LIGHT = np.array([0.35, -0.5, 0.79])
-_FLAT = np.cos(np.radians(20.0))
 LEVELS = 6
 #: Of the scene: layer, name on the page, the colour's role, whether it is shown at first.
 SPACE_LAYERS = (
@@ -237,8 +235,9 @@ def space_figure(maps: Maps) -> Figure:
     for place, (title, field, colour) in enumerate(panels):
         axes: Any = figure.add_subplot(1, len(panels), place + 1, projection="3d")
         _draw_surface(axes, zero_surface(maps.grid.axes, field) * 1e3, colour)
-        _draw_edges(axes, frame_edges(maps.question.rig) * 1e3, FRAME, 1.4)
-        _draw_edges(axes, workspace_edges(maps.question.rig) * 1e3, MUTED, 0.8)
+        frame, box = frame_surface(maps.question.rig), workspace_stroke(maps.question.rig)
+        _draw_edges(axes, frame.vertices[np.array(frame.edges)] * 1e3, FRAME, 1.4)
+        _draw_edges(axes, box.segments * 1e3, MUTED, 0.8)
         share = float(np.mean(field > 0.0))
         axes.set_title(f"{title}: {share * 100:.1f} % of the region")
         for letter in "xyz":
@@ -320,41 +319,6 @@ def _allowed(maps: Maps) -> Array:
         fields.append(maps.values["obstacle_clearance"] - scene.obstacle_clearance)
     allowed: Array = np.min(fields, axis=0)
     return allowed
-
-
-def frame_edges(rig: Rig) -> Array:
-    """Edges of the frame that the outlets span, shape (k, 2, 3), [m].
-
-    Outlets all at one height are joined to the floor below them.
-    """
-    from scipy.spatial import ConvexHull, QhullError
-
-    points = rig.outlets
-    try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError):
-        points = np.vstack([points, points * [1.0, 1.0, 0.0]])
-        hull = ConvexHull(points)
-    found: dict[tuple[int, int], list[Array]] = {}
-    for triangle, plane in zip(hull.simplices, hull.equations, strict=True):
-        a, b, c = sorted(triangle.tolist())
-        for edge in ((a, b), (a, c), (b, c)):
-            found.setdefault(edge, []).append(plane[:3])
-    sharp = [edge for edge, (one, other) in found.items() if one @ other < _FLAT]
-    edges: Array = points[np.array(sharp)]
-    return edges
-
-
-def workspace_edges(rig: Rig) -> Array:
-    """Edges of the workspace box, shape (12, 2, 3), [m]."""
-    ends = np.stack([rig.workspace_lower, rig.workspace_upper])
-    numbers = np.array(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij")).reshape(3, 8).T
-    corners = ends[numbers, np.arange(3)]
-    pairs = [
-        (i, j) for i in range(8) for j in range(i) if np.abs(numbers[i] - numbers[j]).sum() == 1
-    ]
-    edges: Array = corners[np.array(pairs)]
-    return edges
 
 
 def _draw_surface(axes: Any, triangles: Array, colour: str) -> None:
