@@ -304,7 +304,7 @@ function sceneViewer(canvas, data, shown = () => true) {
 
   function free(wanted, base, wide) { // within the picture, and beside what is written there already: some lines up or down
     const left = Math.max(3, Math.min(wanted, pane.width - wide - 3));
-    const isFree = (at) => at > LINE && at < pane.height - 3 && taken.every(([l, r, b]) => left + wide < l || left > r || Math.abs(at - b) >= LINE);
+    const isFree = (at) => at > LINE && at < pane.height - 3 && taken.every(([l, r, b]) => left + wide + 4 < l || left > r + 4 || Math.abs(at - b) >= LINE);
     const at = [0, -1, 1, -2, 2, -3, 3].map((lines) => base + lines * LINE).find(isFree) ?? base;
     taken.push([left, left + wide, at]);
     return [left, at];
