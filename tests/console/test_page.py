@@ -285,6 +285,7 @@ def test_poses_are_taught_named_ordered_forgotten_and_planned(desk: Visit) -> No
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["one", "three", "two"])
     desk.page.get_by_role("button", name="Forget one").click()
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["three", "two"])
+    expect(desk.page.locator("#poses li")).to_have_count(2)
     desk.page.get_by_role("textbox", name="Name of pose 2").fill("home")
     desk.page.get_by_role("textbox", name="Name of pose 2").press("Enter")
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["three", "home"])
