@@ -23,14 +23,14 @@ ROOT = Path(__file__).parents[2]
 ARGUMENTS = [
     "--headless",
     "--no-sandbox",
-    "--use-angle=swiftshader",  # WebGL without a graphics card
-    "--enable-unsafe-swiftshader",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
 ]
+#: WebGL without a graphics card; it takes most of a core while the scene moves.
+WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 VIEWS = ("live", "operate", "jog", "teach", "events", "service")
 AUDITS = (Path(__file__).parent / "audits.js").read_text(encoding="utf-8")
 SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1400, 900)}
@@ -189,9 +189,10 @@ def chromium() -> str:
 
 
 @contextlib.contextmanager
-def browser_at(path: str) -> Iterator[Browser]:
+def browser_at(path: str, webgl: bool = True) -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
+        arguments = [*ARGUMENTS, *(WEBGL if webgl else ("--disable-gpu",))]
+        browser = playwright.chromium.launch(executable_path=path, args=arguments)
         yield browser
         browser.close()
 

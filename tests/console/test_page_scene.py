@@ -11,6 +11,7 @@ from playwright.sync_api import Browser, expect
 from tests.console.browsing import NO_WEBGL, Fake, Visit, painted, visit
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
+WEBGL = True
 
 
 def until_painted(desk: Visit, role: str, least: int) -> None:
