@@ -12,6 +12,7 @@ from cdpr.console import commands
 from tests.console.browsing import SIZES, VIEWS, Fake, Visit, visit
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
+WEBGL = True
 
 
 def state_of(**changes: Any) -> dict[str, Any]:
