@@ -294,7 +294,7 @@ function sceneViewer(canvas, data, shown = () => true) {
       word.textContent = text;
       sign.wide = ruler.measureText(text).width;
     }
-    if (mark) taken.push([x - 6, x + 6, y + 5]);
+    if (mark) taken.push([x - 4, x + 4, y + 5]);
     const [left, base] = free(mark ? x + 9 : x - sign.wide / 2, mark ? y - 7 : y + 4, sign.wide);
     sign.hidden = Math.abs(at.x) > 1 || Math.abs(at.y) > 1;
     sign.className = mark;
