@@ -241,6 +241,8 @@ def visit(
     page.on("request", lambda request: found.asked.append(request.url))
     page.goto(fake.address)
     expect(page.locator("#value-x")).to_contain_text(".")
+    expect(page.locator("#layers label")).not_to_have_count(0)  # the scene is there
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(done))")
     yield found
     context.close()
     unexpected = [text for text in found.errors if "WebSocket" not in text]

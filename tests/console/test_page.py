@@ -304,7 +304,7 @@ def test_a_name_being_typed_outlives_what_happens_to_the_other_poses(desk: Visit
     two.press("End")
     two.press("x")
     poses = [p for p in desk.fake.ask()["poses"] if p["name"] != "one"]
-    desk.fake.ask(poses=poses[::-1])
+    desk.fake.ask(set={"poses": poses[::-1]})
     expect(desk.page.locator("#poses li").first.locator("input")).to_have_value("three")
     desk.page.keyboard.press("y")
     desk.page.keyboard.press("Enter")
