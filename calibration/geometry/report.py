@@ -11,7 +11,6 @@ from calibration.geometry.parameters import AXES
 from calibration.geometry.quality import RigQuality
 from calibration.report import Section, drawing, page_of, table_of
 from calibration.statistics import Interval
-from executor.report.scene import frame_surface, platform_surface
 from model.kinematics import cables_to
 from model.pages.charts import DOTTED, Chart, ChartLine, chart_grid, charts
 from model.pages.page import bullets, list_table, paragraph, tile, tiles
@@ -20,10 +19,11 @@ from model.pages.scene import (
     Moment,
     SceneFigure,
     arrows,
+    frame_surface,
     grid_floor,
-    scene_data,
-    viewer,
+    platform_surface,
 )
+from model.pages.viewer import SCENE_SCRIPTS, page_data, viewer
 from model.pose import Array
 from model.rig import Rig
 
@@ -79,8 +79,8 @@ def rig_page(result: RigCalibration, quality: RigQuality, name: str, date: str) 
         quality.verdict,
         sections,
         tiles=_headline(result, quality),
-        scripts=("charts.js", "viewer.js", "playback.js"),
-        data={"scene-data": scene_data(scene)},
+        scripts=("charts.js", *SCENE_SCRIPTS),
+        data=page_data(scene),
     )
 
 

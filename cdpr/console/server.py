@@ -304,8 +304,8 @@ def _resource(name: str) -> str:
 async def _static(request: Request) -> Response:
     """Files of the page, and those shared with reports."""
     name = request.path_params["name"]
-    package = "model.pages" if name in ("base.css", "viewer.js") else "cdpr.console"
-    root = files(package) if package == "model.pages" else files(package).joinpath("static")
+    is_shared = name in ("base.css", "viewer.js") or name.startswith("vendor/")
+    root = files("model.pages") if is_shared else files("cdpr.console").joinpath("static")
     kind = _KINDS.get(Path(name).suffix)
     if kind is None or ".." in Path(name).parts or name.startswith("/"):
         raise HTTPException(404)

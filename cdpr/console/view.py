@@ -12,12 +12,19 @@ import numpy as np
 
 from executor.interlock.interlock import MotionInterlock
 from executor.recording.run_folder import RunFolder
-from executor.report.scene import frame_surface, obstacle_surfaces, platform_surface
 from executor.service import StatusResult
 from model.clearance import ClearanceModel, Nearest
 from model.errors import CdprError
 from model.kinematics import cables_at, forward_kinematics
-from model.pages.scene import SceneFigure, Stroke, grid_floor, scene_data
+from model.pages.scene import (
+    SceneFigure,
+    Stroke,
+    frame_surface,
+    grid_floor,
+    obstacle_surfaces,
+    platform_surface,
+    scene_data,
+)
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, empty_scene

@@ -26,7 +26,7 @@ from executor.report.tiles import (
 )
 from model.pages.page import contents, paragraph, section
 from model.pages.page import page as html_page
-from model.pages.scene import scene_data
+from model.pages.viewer import SCENE_SCRIPTS, page_data
 from tracking.clearance import INTERVAL
 
 _HINT = (
@@ -45,13 +45,13 @@ def page(run: RunData) -> str:
     parts += [section(name, text, body) for name, text, body in sections]
     parts.append(f"<footer>{escape(_footer(run))}</footer>")
     lead = chips(run.summary) + contents((name, text) for name, text, _ in sections)
-    scripts = ("charts.js", "viewer.js", "playback.js")
+    scripts = ("charts.js", *SCENE_SCRIPTS)
     return html_page(
         title,
         "\n".join(parts),
         lead=lead,
         scripts=scripts,
-        data={"scene-data": scene_data(view.scene)},
+        data=page_data(view.scene),
     )
 
 

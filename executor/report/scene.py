@@ -9,12 +9,20 @@ import numpy as np
 from executor.recording.clearance import ClearanceTable
 from executor.report.run_data import RunData
 from model.kinematics import cables_to
-from model.pages.scene import Label, Moment, SceneFigure, SceneSurface, Stroke, grid_floor, viewer
+from model.pages.scene import (
+    Label,
+    Moment,
+    SceneFigure,
+    Stroke,
+    frame_surface,
+    grid_floor,
+    obstacle_surfaces,
+    platform_surface,
+    workspace_stroke,
+)
+from model.pages.viewer import viewer
 from model.plan import Plan
-from model.pose import Array, Pose, matrix_from_quaternion
-from model.rig import Rig
-from model.scene import Scene
-from model.shapes import Obstacle, Solid, box_solid, convex_hull, solid_of
+from model.pose import Array, matrix_from_quaternion
 
 MOST_MOMENTS = 400
 MOST_BRANCHES = 4000
@@ -56,7 +64,7 @@ def run_scene(run: RunData) -> RunScene:
     tree, branches = _tree(run)
     obstacles = obstacle_surfaces(run.plan.scene)
     frame = frame_surface(run.rig)
-    strokes = (_workspace(run.rig), Stroke("tree", "tree", tree, 1.0, 0.75), *_paths(run))
+    strokes = (workspace_stroke(run.rig), Stroke("tree", "tree", tree, 1.0, 0.75), *_paths(run))
     fixed = [frame.vertices, *(one.vertices for one in obstacles)]
     fixed += [stroke.segments.reshape(-1, 3) for stroke in strokes]
     floor, step = grid_floor(np.concatenate(fixed))
@@ -80,40 +88,6 @@ def scene_viewer(run: RunData, view: RunScene) -> str:
     return viewer(scene, _alternative(run), layers, f"Floor grid {view.floor_step * 1e3:g} mm.")
 
 
-def _surface(layer: str, role: str, solid: Solid, opacity: float, name: str = "") -> SceneSurface:
-    return SceneSurface(layer, role, solid.vertices, solid.faces, solid.edges, opacity, name)
-
-
-def obstacle_surfaces(scene: Scene) -> tuple[SceneSurface, ...]:
-    """The obstacles, by their names."""
-    return tuple(
-        _surface("obstacles", "obstacle", solid_of(one), 0.62, one.name) for one in scene.obstacles
-    )
-
-
-def platform_surface(rig: Rig) -> SceneSurface:
-    """The platform in its own frame."""
-    return _surface("robot", "platform", box_solid(rig.half_size), 0.85)
-
-
-def frame_surface(rig: Rig) -> SceneSurface:
-    """The edges of the body that spans the outlets."""
-    try:
-        hull = convex_hull(rig.outlets)
-    except ValueError:  # all outlets at one height: the frame reaches down to the floor
-        hull = convex_hull(np.vstack([rig.outlets, rig.outlets * [1.0, 1.0, 0.0]]))
-    solid = solid_of(Obstacle("frame", hull, Pose.level(np.zeros(3))))
-    return SceneSurface("frame", "frame", solid.vertices, (), solid.edges)
-
-
-def _workspace(rig: Rig) -> Stroke:
-    """The box that the platform's origin keeps within."""
-    centre = (rig.workspace_upper + rig.workspace_lower) / 2.0
-    box = box_solid((rig.workspace_upper - rig.workspace_lower) / 2.0, Pose.level(centre))
-    edges = box.vertices[np.array(box.edges)]
-    return Stroke("workspace", "muted", edges, 1.0, 0.8, dash="4 4")
-
-
 def _tree(run: RunData) -> tuple[Array, int]:
     """Branches of the search, at most `MOST_BRANCHES`, shape (b, 2, 3), [m]; how many it had."""
     document = run.plan.document.tree
@@ -130,7 +104,7 @@ def _paths(run: RunData) -> tuple[Stroke, ...]:
     path = np.array([pose.position for pose in run.plan.waypoints])
     driven, seen = run.cycles.encoder[_moments(run)], run.poses.position[run.poses.ok]
     return (
-        Stroke.along("seen", "tag", seen, 7.0, 0.35),
+        Stroke.along("seen", "tag", seen, 7.5, 0.6),
         Stroke.along("path", "ink", path, 4.5),
         Stroke.along("driven", "encoder", driven, 2.0),
         Stroke.along("raw", "raw", raw, 1.8),

@@ -1,7 +1,8 @@
 "use strict";
 /* The scene of a page of its own: a slider and a button for the time, the layers' boxes, the view's buttons. */
-(() => {
-  const data = JSON.parse(document.getElementById("scene-data").textContent);
+(async () => {
+  const read = (id) => JSON.parse(document.getElementById(id).textContent);
+  const data = read("scene-data");
   const canvas = document.getElementById("scene-canvas");
   const slider = document.getElementById("scene-time");
   const play = document.getElementById("scene-play");
@@ -9,11 +10,20 @@
   const readout = document.getElementById("scene-readout");
   const boxes = [...document.querySelectorAll("[data-layer]")];
   document.documentElement.classList.add("scripted");
+  await unpack(read("three").gzip).catch(() => {}); // without it the viewer says what is missing
   const view = sceneViewer(canvas, data, (layer) => boxes.every((box) => box.dataset.layer !== layer || box.checked));
   let now = 0;
   let playing = false;
   let before = 0;
   let clock = 0;
+
+  /** Runs a packed script, which sets `THREE`. */
+  async function unpack(packed) {
+    const bytes = new Blob([Uint8Array.from(atob(packed), (sign) => sign.charCodeAt(0))]);
+    const script = document.createElement("script");
+    script.textContent = await new Response(bytes.stream().pipeThrough(new DecompressionStream("gzip"))).text();
+    document.head.append(script);
+  }
 
   function show(index) {
     now = Math.min(Math.max(index, 0), data.moments.length - 1);

@@ -1,5 +1,5 @@
 "use strict";
-/* A scene of scene.py on a canvas: drag to turn, two fingers or Ctrl and wheel to zoom.
+/* A scene of scene.py by three.js (`THREE`): drag to turn, two fingers or Ctrl and wheel to zoom.
 
 sceneViewer(canvas, data, shown) draws `data` (scene_data); `shown(layer)` says what is drawn. It returns
   show(moment)     the platform at a moment, or none (null); with `tensions` cables take their colours; `strokes`
@@ -7,263 +7,328 @@ sceneViewer(canvas, data, shown) draws `data` (scene_data); `shown(layer)` says 
   update(parts)    other surfaces, strokes, labels or moments, kept in view;
   zoom(factor), reset(), redraw(), size() in mm;
   pick(x, y, height)  the point at that height [mm] that is drawn at a pixel of the canvas; null where none is.
+The canvas is in a `.stage`, over which texts are laid. A picture is drawn when something changed, and only then.
 tensionColour(share) is a cable's colour, from 0 at the lower limit of its tension to 1 at the upper. */
 
 // Blue, grey and orange differ for every kind of colour vision; a cable beyond a limit is dashed as well.
-function tensionColour(share) {
-  const style = getComputedStyle(document.documentElement);
-  const hex = (role) => parseInt(style.getPropertyValue(`--${role}`).trim().slice(1), 16);
-  if (share < 0 || share > 1) return style.getPropertyValue("--limit").trim();
-  const [from, to] = share < 0.5 ? ["encoder", "cable"] : ["cable", "tag"], at = share < 0.5 ? 2 * share : 2 * share - 1;
-  const mix = (bits) => Math.round(((hex(from) >> bits) & 255) * (1 - at) + ((hex(to) >> bits) & 255) * at);
-  return `rgb(${mix(16)},${mix(8)},${mix(0)})`;
+function tensionMix(share) {
+  if (share < 0 || share > 1) return ["limit", "limit", 0];
+  return share < 0.5 ? ["encoder", "cable", 2 * share] : ["cable", "tag", 2 * share - 1];
 }
 
-function sceneViewer(canvas, data, shown = () => true) {
-  const context = canvas.getContext("2d");
-  const CABLE_PIECES = 10; // so that a cable can pass behind one obstacle and in front of another
-  const MARGIN = 24; // px, for texts beside points
-  const UNFITTED = ["tree", "trail", "pick"]; // layers that may lie outside the picture
-  const first = { azimuth: data.view.azimuth, elevation: data.view.elevation, zoom: 1 };
-  const eye = { ...first };
-  const reach = [0, 1, 2].map((k) => Math.max(...data.platform.vertices.map((v) => Math.abs(v[k]))));
-  let strokes, seenPoints, centre, size, distance; // of what is drawn; set by `update`
-  let now = null;
-  let waiting = false;
-  let colours = {};
+function tensionColour(share) {
+  const [from, to, at] = tensionMix(share);
+  return `color-mix(in srgb, var(--${to}) ${(100 * at).toFixed(1)}%, var(--${from}))`;
+}
 
-  function update(parts) {
-    data = { ...data, ...parts };
-    const placed = data.moments.filter((_, k) => k % Math.max(1, Math.floor(data.moments.length / 20)) === 0);
-    seenPoints = [ // all that must be in the picture
-      ...data.surfaces.flatMap((surface) => surface.vertices),
-      ...data.strokes.filter((s) => !UNFITTED.includes(s.layer)).flatMap((s) => s.segments.flatMap((b) => [b.slice(0, 3), b.slice(3)])),
-      ...data.labels.map((label) => label.at),
-      ...placed.flatMap(({ p }) => [-1, 1].map((sign) => p.map((v, k) => v + sign * reach[k]))),
-    ];
-    const bounds = [0, 1, 2].map((k) => [Math.min(...seenPoints.map((v) => v[k])), Math.max(...seenPoints.map((v) => v[k]))]);
-    centre = bounds.map(([low, high]) => (low + high) / 2);
-    size = Math.hypot(...bounds.map(([low, high]) => high - low));
-    distance = 2.2 * size;
-    strokes = data.strokes.map((stroke) =>
-      stroke.dash.length ? stroke : { ...stroke, segments: stroke.segments.flatMap((b) => pieces(b, size / 30)) });
+// Lines as wide as on paper: a quad for each segment, whose corners are laid out in pixels.
+const LINE_VERTEX = `
+attribute vec2 corner;
+attribute vec3 from, to;
+uniform vec2 view;
+uniform float width, nearer, cap;
+varying vec2 at;
+varying float far;
+void main() {
+  vec4 a = projectionMatrix * modelViewMatrix * vec4(from, 1.0), b = projectionMatrix * modelViewMatrix * vec4(to, 1.0);
+  vec3 p = a.xyz / a.w, q = b.xyz / b.w;
+  vec2 way = 0.5 * view * (q.xy - p.xy);
+  far = length(way);
+  vec2 ahead = far > 1e-6 ? way / far : vec2(1.0, 0.0);
+  float reach = 0.5 * width + 1.0;
+  at = vec2(mix(-cap * reach, far + cap * reach, corner.x), corner.y * reach);
+  vec2 px = ahead * at.x + vec2(-ahead.y, ahead.x) * at.y;
+  gl_Position = vec4(p.xy + 2.0 * px / view, mix(p.z, q.z, corner.x) - nearer, 1.0);
+}`;
+const LINE_FRAGMENT = `
+uniform vec3 colour;
+uniform vec2 dash;
+uniform float width, opacity, ratio;
+varying vec2 at;
+varying float far;
+void main() {
+  if (dash.x > 0.0 && mod(at.x, dash.x + dash.y) > dash.x) discard;
+  float off = length(vec2(max(max(-at.x, at.x - far), 0.0), at.y));
+  float alpha = clamp((0.5 * width - off) * ratio + 0.5, 0.0, 1.0);
+  if (alpha < 0.02) discard;
+  gl_FragColor = vec4(colour, alpha * opacity);
+}`;
+
+function sceneViewer(canvas, data, shown = () => true) {
+  const MARGIN = 24, LINE = 14; // px: around all, for texts beside points; the height of a text
+  const UNFITTED = ["tree", "trail", "pick"]; // layers that may lie outside the picture
+  const context = globalThis.THREE && canvas.getContext("webgl2", { alpha: false, antialias: true });
+  if (!context) return withoutWebGL(canvas);
+
+  THREE.ColorManagement.enabled = false; // colours are those of the page
+  const renderer = new THREE.WebGLRenderer({ canvas, context });
+  renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
+  renderer.shadowMap.enabled = true;
+  renderer.debug.checkShaderErrors = false; // which would wait for the compiler
+  const lamp = new THREE.DirectionalLight("white", 0.3 * Math.PI), sky = new THREE.HemisphereLight("white", "#a8aeb8", 0.84 * Math.PI);
+  lamp.castShadow = true;
+  lamp.shadow.radius = 5;
+  lamp.shadow.mapSize.set(1024, 1024);
+  sky.position.set(0, 0, 1);
+  const floor = new THREE.Mesh(new THREE.PlaneGeometry(), new THREE.ShadowMaterial({ depthWrite: false }));
+  Object.assign(floor, { receiveShadow: true, renderOrder: -3 }).userData.layer = "floor";
+  const robot = new THREE.Group(), world = new THREE.Scene().add(lamp, lamp.target, sky, floor, robot);
+  const camera = new THREE.Camera();
+  camera.up.set(0, 0, 1);
+
+  const first = { azimuth: data.view.azimuth, elevation: data.view.elevation, zoom: 1 };
+  const eye = { ...first }, pane = { width: 0, height: 0 }; // of the canvas, CSS px
+  const view = { value: new THREE.Vector2() }, ratio = { value: 1 }; // for the lines
+  const point = new THREE.Vector3(), centre = new THREE.Vector3(), box = new THREE.Box3();
+  const surfaces = new Map(), strokes = [], ownStrokes = []; // what was made of the data
+  let seen = [], names = [], size = 1, distance = 1, perMm = 0; // of what is drawn; set by `update`
+  let now = null, waiting = false, turned = true;
+
+  // Colours: one object a role, which materials share.
+  const colours = {};
+  const read = (role) => getComputedStyle(canvas).getPropertyValue(`--${role}`).trim() || "gray";
+  const colourOf = (role) => (colours[role] ??= new THREE.Color(read(role)));
+  function readColours() {
+    for (const role in colours) colours[role].set(read(role));
+    renderer.setClearColor(colourOf("surface"));
+    floor.material.opacity = matchMedia("(prefers-color-scheme: dark)").matches ? 0.4 : 0.13;
     redraw();
   }
 
-  function pieces(segment, longest) {
-    const start = segment.slice(0, 3), end = segment.slice(3);
-    const count = Math.max(1, Math.ceil(Math.hypot(...end.map((v, c) => v - start[c])) / longest));
-    const at = (i) => end.map((v, c) => start[c] + ((v - start[c]) * i) / count);
-    return Array.from({ length: count }, (_, i) => [...at(i), ...at(i + 1)]);
+  // Lines, and surfaces: faces with light, and edges.
+  function makeLines(front = false) {
+    const geometry = new THREE.InstancedBufferGeometry(), corners = new Float32Array([0, -1, 0, 1, 1, -1, 1, 1]);
+    geometry.setIndex([0, 2, 1, 1, 2, 3]).setAttribute("corner", new THREE.BufferAttribute(corners, 2));
+    const own = { colour: null, dash: new THREE.Vector2(), width: 1, opacity: 1, nearer: 0, cap: 1 };
+    const uniforms = { view, ratio, ...Object.fromEntries(Object.entries(own).map(([name, value]) => [name, { value }])) };
+    const material = new THREE.ShaderMaterial({ uniforms, vertexShader: LINE_VERTEX, fragmentShader: LINE_FRAGMENT, side: THREE.DoubleSide, depthTest: !front });
+    return Object.assign(new THREE.Mesh(geometry, material), { frustumCulled: false });
   }
 
-  function readColours() {
-    const style = getComputedStyle(document.documentElement);
-    for (const role of ["ink", "muted", "surface", "limit", "obstacle", "platform", "cable", "tree", "raw", "frame", "encoder", "tag"])
-      colours[role] = style.getPropertyValue("--" + role).trim();
+  function style(mesh, { role, width, opacity = 1, dash = null, ahead = false, layer }) {
+    const { material, material: { uniforms: its, depthTest } } = mesh, isFull = opacity >= 1;
+    its.colour.value = colourOf(role);
+    its.dash.value.set(dash?.[0] ?? 0, dash?.[1] ?? dash?.[0] ?? 0);
+    its.width.value = width;
+    its.opacity.value = opacity;
+    its.cap.value = isFull && !dash?.length ? 1 : 0;
+    // A little nearer than it is, thin lines most: on the same track they cover the wide ones.
+    its.nearer.value = perMm * size * (ahead ? 0.002 * (9 - width) : 0.0005);
+    Object.assign(material, { transparent: !isFull || !depthTest, depthWrite: isFull, alphaToCoverage: isFull && depthTest });
+    mesh.renderOrder = !depthTest ? 9 : layer === "floor" ? -2 : isFull ? 0 : -1;
+    mesh.userData.layer = layer;
   }
 
-  function shade(hex, light) {
-    const value = parseInt(hex.slice(1), 16);
-    const mix = (channel) => Math.round(light < 1 ? channel * light : 255 - (255 - channel) * (2 - light));
-    return `rgb(${mix(value >> 16)},${mix((value >> 8) & 255)},${mix(value & 255)})`;
+  function place(mesh, segments) { // each of six coordinates
+    const { geometry } = mesh;
+    let buffer = geometry.getAttribute("from")?.data;
+    if (!buffer || buffer.count < segments.length) {
+      geometry.dispose();
+      buffer = new THREE.InstancedInterleavedBuffer(new Float32Array(6 * Math.ceil(1 + 1.5 * segments.length)), 6).setUsage(THREE.DynamicDrawUsage);
+      ["from", "to"].forEach((name, k) => geometry.setAttribute(name, new THREE.InterleavedBufferAttribute(buffer, 3, 3 * k)));
+    }
+    for (let k = 0; k < segments.length; k++) buffer.array.set(segments[k], 6 * k);
+    buffer.needsUpdate = true;
+    geometry.instanceCount = segments.length;
   }
 
-  // Turned, and as seen from the eye, in mm on the plane through the centre; y is up.
-  function seer(eye) {
-    const a = (eye.azimuth * Math.PI) / 180, e = (eye.elevation * Math.PI) / 180;
-    const ca = Math.cos(a), sa = Math.sin(a), ce = Math.cos(e), se = Math.sin(e);
-    return (p) => {
-      const x = p[0] - centre[0], y = p[1] - centre[1], z = p[2] - centre[2];
-      const depth = distance - (ce * ca * x + ce * sa * y + se * z);
-      const k = distance / Math.max(depth, 0.05 * distance);
-      return [k * (-sa * x + ca * y), k * (-se * ca * x - se * sa * y + ce * z), depth];
-    };
+  /** A mesh a stroke: one that had another stroke takes this over into its buffers. */
+  function reconcile(meshes, wanted, front) {
+    while (meshes.length > wanted.length) dispose(meshes.pop());
+    wanted.forEach((stroke, k) => {
+      if (k === meshes.length) world.add((meshes[k] = makeLines(front)));
+      if (meshes[k].userData.stroke !== stroke) place(meshes[k], stroke.segments);
+      meshes[k].userData.stroke = stroke;
+      style(meshes[k], stroke);
+    });
   }
 
-  // Everything fits at every angle and size of the window; zooming in goes beyond that.
-  function fitted() {
-    const width = canvas.clientWidth, height = canvas.clientHeight;
-    const see = seer(eye), seen = seenPoints.map(see);
-    const [[left, right], [low, high]] = [0, 1].map((k) => [Math.min(...seen.map((p) => p[k])), Math.max(...seen.map((p) => p[k]))]);
-    const scale = eye.zoom * Math.min((width - 2 * MARGIN) / (right - left), (height - 2 * MARGIN) / (high - low));
-    return { see, scale, middle: [(left + right) / 2, (low + high) / 2], width, height };
+  function makeSurface({ vertices, faces, edges, role, opacity, layer }) {
+    const geometry = new THREE.BufferGeometry(), lines = makeLines(), isFull = opacity >= 1, isSolid = faces.length < 1000;
+    const material = new THREE.MeshLambertMaterial({ flatShading: isSolid, side: THREE.DoubleSide, transparent: !isFull, depthWrite: isFull, opacity });
+    const mesh = new THREE.Mesh(geometry, Object.assign(material, { color: colourOf(role) }));
+    box.setFromArray(vertices.flat()).getCenter(mesh.position); // far ones are drawn first
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(vertices.flat(), 3));
+    geometry.translate(-mesh.position.x, -mesh.position.y, -mesh.position.z);
+    geometry.setIndex(faces.flatMap((face) => face.slice(2).flatMap((last, k) => [face[0], face[k + 1], last])));
+    if (!isSolid) geometry.computeVertexNormals(); // it is smooth, such as the boundary of a region
+    mesh.castShadow = isSolid;
+    style(lines, { role, width: 1.2, layer });
+    place(lines, edges.map(([a, b]) => [...vertices[a], ...vertices[b]]));
+    return Object.assign(new THREE.Group().add(mesh, lines), { userData: { layer } });
   }
 
-  function projector() {
-    const { see, scale, middle, width, height } = fitted();
-    return (p) => {
-      const [x, y, depth] = see(p);
-      return [width / 2 + scale * (x - middle[0]), height / 2 - scale * (y - middle[1]), depth];
-    };
+  function dispose(object) {
+    object.removeFromParent();
+    object.traverse(({ geometry, material }) => [geometry, material].forEach((part) => part?.dispose()));
   }
 
-  // Along the ray from the eye through a pixel, to a horizontal plane before it.
-  function pick(x, y, level) {
-    const { scale, middle, width, height } = fitted();
-    const a = (eye.azimuth * Math.PI) / 180, e = (eye.elevation * Math.PI) / 180;
-    const ca = Math.cos(a), sa = Math.sin(a), ce = Math.cos(e), se = Math.sin(e);
-    const right = (x - width / 2) / scale + middle[0], up = (height / 2 - y) / scale + middle[1];
-    const share = (level - centre[2] - se * distance) / (ce * up - se * distance); // of the depth of the centre
-    if (!(share > 0.05 && share < 20)) return null;
-    const toward = distance * (1 - share);
-    return [
-      centre[0] + share * (-sa * right - se * ca * up) + ce * ca * toward,
-      centre[1] + share * (ca * right - se * sa * up) + ce * sa * toward,
-      level,
+  // What is drawn.
+  function update(parts) {
+    data = { ...data, ...parts };
+    bound();
+    for (const [surface, group] of surfaces)
+      if (!data.surfaces.includes(surface)) {
+        dispose(group);
+        surfaces.delete(surface);
+      }
+    for (const surface of data.surfaces) if (!surfaces.has(surface)) surfaces.set(surface, makeSurface(surface));
+    world.add(...surfaces.values());
+    reconcile(strokes, data.strokes, false);
+    redraw();
+  }
+
+  /** What must be in the picture; the camera, the light and the floor go by it. */
+  function bound() {
+    const reach = box.setFromArray(data.platform.vertices.flat()).getSize(point).toArray().map((v) => v / 2);
+    const every = Math.max(1, Math.floor(data.moments.length / 20));
+    seen = [
+      ...data.surfaces.flatMap((surface) => surface.vertices),
+      ...data.strokes.filter((s) => !UNFITTED.includes(s.layer)).flatMap((s) => s.segments.flatMap((b) => [b.slice(0, 3), b.slice(3)])),
+      ...data.labels.map((label) => label.at),
+      ...data.moments.filter((_, k) => k % every === 0).flatMap(({ p }) => [-1, 1].map((sign) => p.map((v, k) => v + sign * reach[k]))),
     ];
+    names = data.surfaces.filter((surface) => surface.name).map(({ name, layer, vertices }) => {
+      const top = Math.max(...vertices.map((v) => v[2])), upper = vertices.filter((v) => v[2] > top - 0.01);
+      return { layer, text: name, at: box.setFromArray(upper.flat()).getCenter(point).toArray() };
+    });
+    size = box.setFromArray(seen.flat()).getSize(point).length();
+    box.getCenter(centre);
+    distance = 2.2 * size;
+    perMm = 1 / distance; // of depth as the graphics card counts it, at the centre
+    lamp.target.position.copy(centre);
+    lamp.position.set(-0.25, -0.35, 1).multiplyScalar(size).add(centre);
+    Object.assign(lamp.shadow.camera, { left: -size / 2, right: size / 2, top: size / 2, bottom: -size / 2, near: 0.1 * size, far: 2.5 * size }).updateProjectionMatrix();
+    const ground = data.strokes.find((stroke) => stroke.layer === "floor")?.segments.flat() ?? [];
+    floor.material.visible = ground.length > 0;
+    if (ground.length) {
+      box.setFromArray(ground).getCenter(floor.position);
+      box.getSize(floor.scale).setZ(1);
+    }
+    turned = true;
+  }
+
+  /** Everything fits at every angle and size of the window; zooming in goes beyond that. */
+  function aim() {
+    turned = false;
+    const a = (eye.azimuth * Math.PI) / 180, e = (eye.elevation * Math.PI) / 180;
+    camera.position.set(Math.cos(e) * Math.cos(a), Math.cos(e) * Math.sin(a), Math.sin(e)).multiplyScalar(distance).add(centre);
+    camera.lookAt(centre);
+    camera.updateMatrixWorld();
+    let left = Infinity, right = -Infinity, low = Infinity, high = -Infinity;
+    for (const v of seen) {
+      point.fromArray(v).applyMatrix4(camera.matrixWorldInverse).multiplyScalar(distance / Math.max(-point.z, 0.05 * distance));
+      left = Math.min(left, point.x);
+      right = Math.max(right, point.x);
+      low = Math.min(low, point.y);
+      high = Math.max(high, point.y);
+    }
+    const scale = eye.zoom * Math.min((pane.width - 2 * MARGIN) / (right - left), (pane.height - 2 * MARGIN) / (high - low));
+    const x = (left + right) / 2, y = (low + high) / 2, wide = pane.width / 2 / scale, tall = pane.height / 2 / scale, near = 0.4;
+    camera.projectionMatrix.makePerspective(...[x - wide, x + wide, y + tall, y - tall].map((v) => near * v), near * distance, 2 * distance);
+    camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+  }
+
+  // The platform and its cables.
+  const cables = data.anchors.map(() => Object.assign(makeLines(), { segment: [[0, 0, 0, 0, 0, 0]], tint: new THREE.Color() }));
+  const platform = makeSurface(data.platform);
+  platform.matrixAutoUpdate = false;
+  robot.add(platform, ...cables).userData.layer = "robot";
+
+  function placeRobot() {
+    const { r, p, exits, tensions } = now, [low, high] = data.tension_limits || [0, 1];
+    platform.matrix.set(r[0], r[1], r[2], p[0], r[3], r[4], r[5], p[1], r[6], r[7], r[8], p[2], 0, 0, 0, 1);
+    cables.forEach((cable, i) => {
+      const [segment] = cable.segment, tension = tensions?.[i] ?? null;
+      const [from, to, at] = tension === null ? ["cable", "cable", 0] : tensionMix((tension - low) / (high - low));
+      const beyond = from === "limit";
+      exits[i].forEach((v, k) => (segment[k] = v));
+      point.fromArray(data.anchors[i]).applyMatrix4(platform.matrix).toArray(segment, 3);
+      place(cable, cable.segment);
+      style(cable, { role: from, width: tension === null ? 2 : beyond ? 3.4 : 2.4, dash: beyond ? [5] : null, layer: "robot" });
+      cable.material.uniforms.colour.value = cable.tint.lerpColors(colourOf(from), colourOf(to), at);
+    });
   }
 
   function draw() {
     waiting = false;
-    const ratio = window.devicePixelRatio || 1;
-    const width = canvas.clientWidth, height = canvas.clientHeight;
-    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
-      canvas.width = Math.round(width * ratio);
-      canvas.height = Math.round(height * ratio);
-    }
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, width, height);
-    context.lineCap = context.lineJoin = "round";
-    const project = projector(), items = collect(project);
-    items.sort((one, other) => other.depth - one.depth);
-    for (const item of items) paint(item);
-    texts(project);
-  }
-
-  function paint(item) {
-    context.globalAlpha = item.alpha;
-    context.setLineDash(item.dash || []);
-    context.beginPath();
-    context.moveTo(item.points[0][0], item.points[0][1]);
-    for (const p of item.points.slice(1)) context.lineTo(p[0], p[1]);
-    if (item.fill) {
-      context.closePath();
-      context.fillStyle = item.fill;
-      context.fill();
-    } else {
-      context.strokeStyle = item.stroke;
-      context.lineWidth = item.width;
-      context.stroke();
-    }
-    context.globalAlpha = 1;
-  }
-
-  function collect(project) {
-    const items = [];
-    const segment = (a, b, stroke, width, alpha = 1, dash = null) =>
-      items.push({ points: [a, b], depth: (a[2] + b[2]) / 2, stroke, width, alpha, dash });
-    const surface = (solid) => {
-      const seen = solid.vertices.map(project), colour = colours[solid.role];
-      for (const face of solid.faces) {
-        const points = face.map((k) => seen[k]);
-        const depth = points.reduce((sum, p) => sum + p[2], 0) / points.length;
-        items.push({ points, depth, alpha: solid.opacity, fill: shade(colour, light(face.map((k) => solid.vertices[k]))) });
-      }
-      for (const [a, b] of solid.edges) segment(seen[a], seen[b], colour, 1.2);
-    };
-    for (const solid of data.surfaces) if (shown(solid.layer)) surface(solid);
-    for (const stroke of strokes.filter((one) => shown(one.layer)))
-      for (const b of stroke.segments) {
-        segment(project(b.slice(0, 3)), project(b.slice(3)), colours[stroke.role], stroke.width, stroke.opacity, stroke.dash);
-        // A little nearer than it is, thin lines most: on the same track they cover the wide ones.
-        if (stroke.ahead) items[items.length - 1].depth -= 0.002 * size * (9 - stroke.width);
-        if (stroke.layer === "floor") items[items.length - 1].depth += size;
-      }
-    if (shown("robot") && now) robot(project, segment, surface);
-    for (const stroke of (now?.strokes ?? []).filter((one) => shown(one.layer)))
-      for (const b of stroke.segments) {
-        segment(project(b.slice(0, 3)), project(b.slice(3)), colours[stroke.role], stroke.width, 1, stroke.dash);
-        items[items.length - 1].depth = -1e9; // in front of everything
-      }
-    return items;
-  }
-
-  function light(corners) {
-    const [a, b, c] = corners;
-    const u = b.map((v, k) => v - a[k]), w = c.map((v, k) => v - a[k]);
-    const n = [u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0]];
-    const length = Math.hypot(...n) || 1;
-    return 0.82 + 0.34 * Math.abs(n[2] / length) + 0.12 * Math.abs(n[0] / length);
-  }
-
-  function cables() { // from outlet or pulley to anchor
-    const { r, p, exits } = now;
-    const place = (v) => [0, 1, 2].map((k) => p[k] + r[3 * k] * v[0] + r[3 * k + 1] * v[1] + r[3 * k + 2] * v[2]);
-    return { place, ends: data.anchors.map((anchor, i) => [exits[i], place(anchor)]) };
-  }
-
-  function robot(project, segment, surface) {
-    const { place, ends } = cables();
-    const [low, high] = data.tension_limits || [0, 1];
-    ends.forEach(([start, end], i) => {
-      const tension = now.tensions?.[i] ?? null, share = tension === null ? null : (tension - low) / (high - low);
-      const beyond = share < 0 || share > 1;
-      const [colour, width] = share === null ? [colours.cable, 1.4] : [tensionColour(share), beyond ? 3.4 : 2.2];
-      let last = project(start);
-      for (let k = 1; k <= CABLE_PIECES; k++) {
-        const next = project(start.map((v, c) => v + ((end[c] - v) * k) / CABLE_PIECES));
-        segment(last, next, colour, width, 1, beyond ? [5, 5] : null);
-        last = next;
-      }
-    });
-    surface({ ...data.platform, vertices: data.platform.vertices.map(place) });
-  }
-
-  const LINE = 14; // height of a text, px
-  let written = []; // where texts stand already: [left, right, base]
-
-  function texts(project) {
-    written = [];
-    for (const { layer, text, at, mark } of [...data.labels, ...(now?.labels ?? [])]) if (shown(layer)) write(text, project(at), mark);
-    for (const solid of data.surfaces.filter((one) => one.name && shown(one.layer))) {
-      const top = Math.max(...solid.vertices.map((v) => v[2]));
-      const upper = solid.vertices.filter((v) => v[2] > top - 0.01);
-      write(solid.name, project([0, 1, 2].map((k) => upper.reduce((sum, v) => sum + v[k], 0) / upper.length)));
-    }
-    if (shown("numbers") && shown("robot") && now)
-      cables().ends.forEach(([start, end], i) => write(String(i + 1), project(start.map((v, c) => v + 0.25 * (end[c] - v)))));
-  }
-
-  function placed(left, base, wide) { // beside what is written there already, one or two lines up or down
-    const free = (at) => written.every(([l, r, b]) => left + wide < l || left > r || Math.abs(at - b) >= LINE);
-    const at = [0, -LINE, LINE, -2 * LINE, 2 * LINE].map((off) => base + off).find(free) ?? base;
-    written.push([left, left + wide, at]);
-    return [left, at];
-  }
-
-  function write(text, [x, y], mark = "") {
-    context.font = "600 12px system-ui, sans-serif";
-    if (mark) {
-      context.beginPath();
-      context.arc(x, y, 5, 0, 2 * Math.PI);
-      Object.assign(context, { fillStyle: mark === "ring" ? colours.surface : colours.ink, strokeStyle: colours.ink, lineWidth: 2 });
-      context.fill();
-      context.stroke();
-    }
-    const wide = context.measureText(text).width, [left, base] = placed(mark ? x + 9 : x - wide / 2, mark ? y - 7 : y + 4, wide);
-    context.textAlign = "left";
-    Object.assign(context, { strokeStyle: colours.surface, fillStyle: colours.ink, lineWidth: 3 });
-    context.strokeText(text, left, base); // readable on lines and faces
-    context.fillText(text, left, base);
+    if (!(pane.width > 0 && pane.height > 0)) return;
+    if (turned) aim();
+    if (now) placeRobot();
+    reconcile(ownStrokes, now?.strokes ?? [], true);
+    for (const object of world.children) if (object.userData.layer) object.visible = shown(object.userData.layer) && (object !== robot || now !== null);
+    renderer.render(world, camera);
+    writeTexts();
   }
 
   function redraw() {
-    if (!waiting) {
-      waiting = true;
-      requestAnimationFrame(draw);
-    }
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(draw);
   }
 
+  // Texts keep their size: elements over the canvas.
+  const texts = document.createElement("div");
+  Object.assign(texts, { className: "texts", ariaHidden: "true" });
+  canvas.after(texts);
+  const ruler = document.createElement("canvas").getContext("2d");
+  ruler.font = "600 12px system-ui, sans-serif";
+  const taken = []; // where texts stand already: [left, right, base]
+  let count = 0;
+
+  function writeTexts() {
+    taken.length = count = 0;
+    for (const list of [data.labels, now?.labels ?? [], names])
+      for (const { layer, text, at, mark } of list) if (shown(layer)) write(text, point.fromArray(at), mark);
+    if (shown("numbers") && robot.visible)
+      cables.forEach(({ segment: [s] }, i) => write(String(i + 1), point.fromArray(s).lerp({ x: s[3], y: s[4], z: s[5] }, 0.25)));
+    for (let k = count; k < texts.childElementCount; k++) texts.children[k].hidden = true;
+  }
+
+  function write(text, at, mark = "") {
+    at.project(camera);
+    const x = ((1 + at.x) * pane.width) / 2, y = ((1 - at.y) * pane.height) / 2;
+    const sign = texts.children[count++] ?? texts.appendChild(document.createElement("span"));
+    const word = sign.firstChild ?? sign.appendChild(document.createElement("b"));
+    if (word.textContent !== text) {
+      word.textContent = text;
+      sign.wide = ruler.measureText(text).width;
+    }
+    if (mark) taken.push([x - 4, x + 4, y + 5]);
+    const [left, base] = free(mark ? x + 9 : x - sign.wide / 2, mark ? y - 7 : y + 4, sign.wide);
+    sign.hidden = Math.abs(at.x) > 1 || Math.abs(at.y) > 1;
+    sign.className = mark;
+    sign.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
+    word.style.transform = `translate(${(left - x).toFixed(1)}px, ${(base - 11 - y).toFixed(1)}px)`;
+  }
+
+  function free(wanted, base, wide) { // within the picture, and beside what is written there already: some lines up or down
+    const left = Math.max(3, Math.min(wanted, pane.width - wide - 3));
+    const isFree = (at) => at > LINE && at < pane.height - 3 && taken.every(([l, r, b]) => left + wide + 4 < l || left > r + 4 || Math.abs(at - b) >= LINE);
+    const at = [0, -1, 1, -2, 2, -3, 3].map((lines) => base + lines * LINE).find(isFree) ?? base;
+    taken.push([left, left + wide, at]);
+    return [left, at];
+  }
+
+  // What a pointer and keys do.
   function zoom(factor) {
     eye.zoom = Math.min(Math.max(eye.zoom * factor, 0.4), 8);
+    turned = true;
     redraw();
   }
 
   function turn(azimuth, elevation) {
     eye.azimuth += azimuth;
     eye.elevation = Math.min(Math.max(eye.elevation + elevation, -89), 89);
+    turned = true;
     redraw();
+  }
+
+  function pick(x, y, level) { // along the ray from the eye through a pixel
+    if (turned) aim();
+    point.set((2 * x) / pane.width - 1, 1 - (2 * y) / pane.height, 0).unproject(camera).sub(camera.position);
+    const share = (level - camera.position.z) / point.z;
+    return share > 0 && share < 20 * distance ? point.multiplyScalar(share).add(camera.position).setZ(level).toArray() : null;
   }
 
   const down = new Map(); // pointer → where it is
@@ -295,11 +360,21 @@ function sceneViewer(canvas, data, shown = () => true) {
     event.preventDefault();
     keys[event.key]();
   });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-    readColours();
-    redraw();
-  });
-  new ResizeObserver(redraw).observe(canvas);
+
+  canvas.addEventListener("webglcontextrestored", redraw);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", readColours);
+  addEventListener("beforeprint", draw);
+  const exact = "devicePixelContentBoxSize" in ResizeObserverEntry.prototype;
+  new ResizeObserver(([{ contentRect, devicePixelContentBoxSize: exactly }]) => {
+    const { width, height } = contentRect;
+    const [w, h] = exactly ? [exactly[0].inlineSize, exactly[0].blockSize] : [width, height].map((v) => Math.round(v * devicePixelRatio));
+    Object.assign(pane, { width, height });
+    renderer.setSize(w, h, false);
+    view.value.set(width, height);
+    ratio.value = w / width || 1;
+    turned = true;
+    draw(); // at once: the new size has cleared the canvas
+  }).observe(canvas, exact ? { box: "device-pixel-content-box" } : {});
   readColours();
   update({});
   return {
@@ -311,7 +386,18 @@ function sceneViewer(canvas, data, shown = () => true) {
     },
     reset: () => {
       Object.assign(eye, first);
-      redraw();
+      turn(0, 0);
     },
   };
+}
+
+/** Says so in the scene's place; whatever else the page has goes on. */
+function withoutWebGL(canvas) {
+  const text = document.createElement("p");
+  text.className = "without";
+  text.textContent = "The 3-D scene needs WebGL 2, which this browser lacks or has switched off.";
+  canvas.hidden = true;
+  canvas.after(text);
+  const nothing = () => {};
+  return { update: nothing, zoom: nothing, redraw: nothing, show: nothing, reset: nothing, pick: () => null, size: () => 0 };
 }

@@ -8,8 +8,18 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model.pose import Array
-from model.rig import Rig
+from model.kinematics import cables_at
+from model.pages.scene import (
+    Moment,
+    SceneFigure,
+    SceneSurface,
+    frame_surface,
+    grid_floor,
+    obstacle_surfaces,
+    platform_surface,
+    workspace_stroke,
+)
+from model.pose import Array, Pose
 from planner.workspace.compute import VERDICTS, Maps
 from planner.workspace.grid import AXES, Grid, zero_surface
 from planner.workspace.report import SHOWN, Shown, limit_of, shown_in
@@ -200,27 +210,34 @@ def _normal(grid: Grid) -> int:
 
 
 _LIGHT = np.array([0.35, -0.5, 0.79])
-_FLAT = np.cos(np.radians(20.0))
 LEVELS = 6
+#: Of the scene: layer, name on the page, the colour's role, whether it is shown at first.
+SPACE_LAYERS = (
+    ("closed", "Wrench closure", "series3", False),
+    ("feasible", "Wrench feasible", "series1", True),
+    ("free", "Collision free and feasible", "series5", True),
+    ("obstacles", "Obstacles", "obstacle", True),
+    ("robot", "Platform and cables at home", "platform", True),
+    ("numbers", "Cable numbers", "ink", False),
+    ("frame", "Frame of outlets", "frame", True),
+    ("workspace", "Workspace box", "muted", True),
+    ("floor", "Floor", "line", True),
+)
 
 
 def space_figure(maps: Maps) -> Figure:
     """Where wrenches can be balanced, where tensions suffice, and where nothing collides."""
     from matplotlib.ticker import MaxNLocator
 
-    panels = [
-        ("wrench closure", maps.values["closure_margin"], CLOSED),
-        ("wrench feasible", maps.values["capacity_margin"], FEASIBLE),
-    ]
-    if maps.question.scene is not None:
-        panels.append(("collision free and feasible", _allowed(maps), FREE))
+    panels = _regions(maps)
     figure = new_figure(4.4 * len(panels), 4.3, layout=None)
     figure.subplots_adjust(left=0.03, right=0.96, bottom=0.06, top=0.9, wspace=0.12)
     for index, (title, field, colour) in enumerate(panels, start=1):
         axes: Any = figure.add_subplot(1, len(panels), index, projection="3d")
         _draw_surface(axes, zero_surface(maps.grid.axes, field) * 1e3, colour)
-        _draw_edges(axes, frame_edges(maps.question.rig) * 1e3, FRAME, 1.4)
-        _draw_edges(axes, workspace_edges(maps.question.rig) * 1e3, MUTED, 0.8)
+        frame, box = frame_surface(maps.question.rig), workspace_stroke(maps.question.rig)
+        _draw_edges(axes, frame.vertices[np.array(frame.edges)] * 1e3, FRAME, 1.4)
+        _draw_edges(axes, box.segments * 1e3, MUTED, 0.8)
         share = float(np.mean(field > 0.0))
         axes.set_title(f"{title}: {share * 100:.1f} % of the region")
         for letter in "xyz":
@@ -229,6 +246,36 @@ def space_figure(maps: Maps) -> Figure:
         axes.set_aspect("equal")
         axes.view_init(elev=24.0, azim=-58.0)
     return figure
+
+
+def _regions(maps: Maps) -> list[tuple[str, Array, str]]:
+    """Title, field that is positive within, and colour; the largest region first."""
+    regions = [
+        ("wrench closure", maps.values["closure_margin"], CLOSED),
+        ("wrench feasible", maps.values["capacity_margin"], FEASIBLE),
+    ]
+    if maps.question.scene is not None:
+        regions.append(("collision free and feasible", _allowed(maps), FREE))
+    return regions
+
+
+def space_scene(maps: Maps) -> SceneFigure:
+    """The same in the scene of pages, every other point of the grid; `SPACE_LAYERS` are its."""
+    rig, scene = maps.question.rig, maps.question.scene
+    numbers = [np.union1d(np.arange(0, n, 2), n - 1) for n in maps.grid.shape]
+    x, y, z = (axis[k] for axis, k in zip(maps.grid.axes, numbers, strict=True))
+    surfaces = [frame_surface(rig), *(obstacle_surfaces(scene) if scene else ())]
+    for (layer, _, role, _), (_, field, _) in zip(SPACE_LAYERS, _regions(maps), strict=False):
+        triangles = zero_surface((x, y, z), field[np.ix_(*numbers)])
+        points, corners = np.unique(triangles.reshape(-1, 3).round(4), axis=0, return_inverse=True)
+        faces = corners.reshape(-1, 3).tolist()
+        surfaces.append(SceneSurface(layer, role, points, faces, (), 0.3))
+    home = Pose(rig.home.position, maps.question.rotation)
+    moment = Moment(0.0, home.position, home.rotation, cables_at(rig, home).exits)
+    floor, _ = grid_floor(np.concatenate([surface.vertices for surface in surfaces]))
+    strokes = (floor, workspace_stroke(rig))
+    platform = platform_surface(rig)
+    return SceneFigure(tuple(surfaces), strokes, (), rig.anchors, platform, (moment,))
 
 
 def level_figure(maps: Maps, quantity: Shown) -> Figure:
@@ -272,41 +319,6 @@ def _allowed(maps: Maps) -> Array:
         fields.append(maps.values["obstacle_clearance"] - scene.obstacle_clearance)
     allowed: Array = np.min(fields, axis=0)
     return allowed
-
-
-def frame_edges(rig: Rig) -> Array:
-    """Edges of the frame spanned by the outlets, shape (k, 2, 3), [m].
-
-    Outlets all at one height are joined to the floor below them.
-    """
-    from scipy.spatial import ConvexHull, QhullError
-
-    points = rig.outlets
-    try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError):
-        points = np.vstack([points, points * [1.0, 1.0, 0.0]])
-        hull = ConvexHull(points)
-    found: dict[tuple[int, int], list[Array]] = {}
-    for triangle, plane in zip(hull.simplices, hull.equations, strict=True):
-        a, b, c = sorted(triangle.tolist())
-        for edge in ((a, b), (a, c), (b, c)):
-            found.setdefault(edge, []).append(plane[:3])
-    sharp = [edge for edge, (one, other) in found.items() if one @ other < _FLAT]
-    edges: Array = points[np.array(sharp)]
-    return edges
-
-
-def workspace_edges(rig: Rig) -> Array:
-    """Edges of the workspace box, shape (12, 2, 3), [m]."""
-    ends = np.stack([rig.workspace_lower, rig.workspace_upper])
-    numbers = np.array(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij")).reshape(3, 8).T
-    corners = ends[numbers, np.arange(3)]
-    pairs = [
-        (i, j) for i in range(8) for j in range(i) if np.abs(numbers[i] - numbers[j]).sum() == 1
-    ]
-    edges: Array = corners[np.array(pairs)]
-    return edges
 
 
 def _draw_surface(axes: Any, triangles: Array, colour: str) -> None:

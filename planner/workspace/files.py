@@ -15,10 +15,12 @@ from model.scene import Scene
 from planner.workspace.compute import Maps
 from planner.workspace.figures import (
     SETTINGS,
+    SPACE_LAYERS,
     cost_figure,
     level_figure,
     slice_figure,
     space_figure,
+    space_scene,
     title_of,
 )
 from planner.workspace.maps import Question
@@ -82,9 +84,9 @@ def _chapter(folder: Path, maps: Maps) -> Chapter:
     title, text, figures = _content(maps)
     pictures = [_picture(folder, file, draw) for file, draw in figures]
     alternative = f"{title}: colour maps; the numbers are in the table below and in the files"
-    return Chapter(
-        title, text, tuple((p, alternative) for p in pictures), tuple(tables), summary_of(maps)
-    )
+    scene = space_scene(maps) if name == "frame" else None
+    shown = tuple((p, alternative) for p in pictures)
+    return Chapter(title, text, shown, tuple(tables), summary_of(maps), scene, SPACE_LAYERS)
 
 
 def _content(maps: Maps) -> tuple[str, str, list[tuple[str, Draw]]]:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from model.pages.page import page as html_page
 from model.pages.page import paragraph, picture, section, table
+from model.pages.scene import SceneFigure
+from model.pages.viewer import SCENE_SCRIPTS, page_data, viewer
 from planner.workspace.compute import VERDICTS, Maps
 from planner.workspace.grid import AXES
 
@@ -28,6 +30,8 @@ class Chapter:
         pictures: File names of the images, each with its alternative text.
         tables: File names of the numbers.
         summary: From `planner.workspace.report.summary_of`.
+        scene: In which the first image can be turned; at most one chapter of a page has one.
+        layers: Of the scene.
     """
 
     title: str
@@ -35,16 +39,27 @@ class Chapter:
     pictures: tuple[tuple[str, str], ...]
     tables: tuple[str, ...]
     summary: dict[str, Any]
+    scene: SceneFigure | None = None
+    layers: tuple[tuple[str, str, str, bool], ...] = ()
 
 
 def page(title: str, lead: str, chapters: Sequence[Chapter]) -> str:
     """The whole page."""
     body = "\n".join(_section(k, chapter) for k, chapter in enumerate(chapters, start=1))
-    return html_page(title, body, lead=paragraph(lead), files_beside=True)
+    scenes = [chapter.scene for chapter in chapters if chapter.scene]
+    scripts, data = (SCENE_SCRIPTS, page_data(scenes[0])) if scenes else ((), None)
+    return html_page(
+        title, body, lead=paragraph(lead), scripts=scripts, data=data, files_beside=True
+    )
 
 
 def _section(number: int, chapter: Chapter) -> str:
     pictures = "".join(picture(name, text) for name, text in chapter.pictures)
+    if chapter.scene:
+        drawn = {one.layer for one in chapter.scene.surfaces} | {"robot", "numbers"}
+        drawn |= {one.layer for one in chapter.scene.strokes}
+        layers = [one for one in chapter.layers if one[0] in drawn]
+        pictures = viewer(chapter.scene, chapter.title, layers, still=pictures)
     links = ", ".join(f'<a href="{escape(n)}">{escape(n)}</a>' for n in chapter.tables)
     numbers = f'<p class="quiet">Numbers: {links}</p>'
     parts = (paragraph(chapter.text), pictures, _table(chapter.summary), numbers)

@@ -14,20 +14,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, FloatRect, Page, expect, sync_playwright
 
 ROOT = Path(__file__).parents[2]
 ARGUMENTS = [
     "--headless",
     "--no-sandbox",
-    "--disable-gpu",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
 ]
+#: WebGL without a graphics card; it takes most of a core while the scene moves.
+WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 VIEWS = ("live", "operate", "jog", "teach", "events", "service")
 AUDITS = (Path(__file__).parent / "audits.js").read_text(encoding="utf-8")
 SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1400, 900)}
@@ -158,6 +161,25 @@ def _count(found: dict[str, Any], kind: str) -> int:
     return sum(m["kind"] == kind for m in found["received"])
 
 
+COLOUR = "role => getComputedStyle(document.documentElement).getPropertyValue(`--${role}`)"
+NO_WEBGL = """const known = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+  return kind.startsWith("webgl") ? null : known.call(this, kind, ...more);
+};"""
+
+
+def painted(page: Page, role: str, clip: FloatRect | None = None) -> int:
+    """Pixels of the scene, or of a part of the page, in about the colour of a role."""
+    box = clip or page.locator("#scene-canvas").bounding_box()
+    assert box
+    shot = np.frombuffer(page.screenshot(clip=box), np.uint8)
+    picture = cv2.imdecode(shot, cv2.IMREAD_COLOR)
+    assert picture is not None
+    red_green_blue = picture[:, :, ::-1].astype(int)
+    colour = list(bytes.fromhex(page.evaluate(COLOUR, role).strip().lstrip("#")))
+    return int((abs(red_green_blue - colour) < 30).all(axis=2).sum())
+
+
 def chromium() -> str:
     """The path of the system's Chromium; skips without one."""
     for name in ("chromium", "chromium-browser", "google-chrome"):
@@ -167,9 +189,10 @@ def chromium() -> str:
 
 
 @contextlib.contextmanager
-def browser_at(path: str) -> Iterator[Browser]:
+def browser_at(path: str, webgl: bool = True) -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
+        arguments = [*ARGUMENTS, *(WEBGL if webgl else ("--disable-gpu",))]
+        browser = playwright.chromium.launch(executable_path=path, args=arguments)
         yield browser
         browser.close()
 
@@ -197,9 +220,12 @@ def fake_server() -> Iterator[Fake]:
 
 @contextlib.contextmanager
 def visit(
-    browser: Browser, fake: Fake, size: str = "desk", scheme: str = "light"
+    browser: Browser, fake: Fake, size: str = "desk", scheme: str = "light", script: str = ""
 ) -> Iterator[Visit]:
-    """A page in a fresh profile, at a server that is new; fails when the page logged an error."""
+    """A page in a fresh profile, at a server that is new; fails when the page logged an error.
+
+    `script` runs before the page's own.
+    """
     width, height = SIZES[size]
     fake.ask(renew=True)
     context = browser.new_context(
@@ -207,6 +233,7 @@ def visit(
         color_scheme="dark" if scheme == "dark" else "light",
         has_touch=size != "desk",
     )
+    context.add_init_script(script)
     page = context.new_page()
     found = Visit(page, fake)
     page.on("pageerror", lambda error: found.errors.append(str(error)))
@@ -214,6 +241,8 @@ def visit(
     page.on("request", lambda request: found.asked.append(request.url))
     page.goto(fake.address)
     expect(page.locator("#value-x")).to_contain_text(".")
+    expect(page.locator("#layers label")).not_to_have_count(0)  # the scene is there
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(done))")
     yield found
     context.close()
     unexpected = [text for text in found.errors if "WebSocket" not in text]

@@ -12,8 +12,10 @@ from tests.console.browsing import Fake, Visit, visit
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with browsing.browser_at(browsing.chromium()) as browser:
+def browser(request: pytest.FixtureRequest) -> Iterator[Browser]:
+    """With WebGL where the module's ``WEBGL`` says so; elsewhere the page has no scene."""
+    webgl = getattr(request.module, "WEBGL", False)
+    with browsing.browser_at(browsing.chromium(), webgl) as browser:
         yield browser
 
 

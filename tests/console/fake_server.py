@@ -33,15 +33,15 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from cdpr.console.view import scene_of
-from executor.report.scene import frame_surface, platform_surface
-from model.pages.page import resource
 from model.pages.scene import (
     Label,
     Moment,
     SceneFigure,
     SceneSurface,
     Stroke,
+    frame_surface,
     grid_floor,
+    platform_surface,
     scene_data,
 )
 from model.pose import Array, Pose
@@ -460,7 +460,6 @@ class Fake:
 
 def application(fake: Fake) -> Starlette:
     """The routes of the console, and `/fake`."""
-    beside = {"base.css": "text/css", "viewer.js": "text/javascript"}
 
     async def index(request: Request) -> Response:
         text = (STATIC / "index.html").read_text(encoding="utf-8")
@@ -469,10 +468,10 @@ def application(fake: Fake) -> Starlette:
 
     async def static(request: Request) -> Response:
         name = request.path_params["name"]
-        if name in beside:
-            return Response(resource(name), media_type=beside[name])
-        path = (STATIC / name).resolve()
-        inside = path.is_relative_to(STATIC) and path.is_file()
+        is_shared = name in ("base.css", "viewer.js") or name.startswith("vendor/")
+        root = ROOT / "model" / "pages" if is_shared else STATIC
+        path = (root / name).resolve()
+        inside = path.is_relative_to(root) and path.is_file()
         return FileResponse(path) if inside else PlainTextResponse("no such file", 404)
 
     async def scene(request: Request) -> Response:

@@ -10,6 +10,7 @@ from playwright.sync_api import Browser, expect
 from tests.console.browsing import ROOT, SIZES, VIEWS, Fake, Visit, visit
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
+WEBGL = True
 STALE = re.compile("No data from the console’s server")
 
 
@@ -287,6 +288,7 @@ def test_poses_are_taught_named_ordered_forgotten_and_planned(desk: Visit) -> No
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["one", "three", "two"])
     desk.page.get_by_role("button", name="Remove one").click()
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["three", "two"])
+    expect(desk.page.locator("#poses li")).to_have_count(2)
     desk.page.get_by_role("textbox", name="Name of pose 2").fill("home")
     desk.page.get_by_role("textbox", name="Name of pose 2").press("Enter")
     desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["three", "home"])
@@ -304,7 +306,7 @@ def test_a_name_being_typed_outlives_what_happens_to_the_other_poses(desk: Visit
     two.press("End")
     two.press("x")
     poses = [p for p in desk.fake.ask()["poses"] if p["name"] != "one"]
-    desk.fake.ask(poses=poses[::-1])
+    desk.fake.ask(set={"poses": poses[::-1]})
     expect(desk.page.locator("#poses li").first.locator("input")).to_have_value("three")
     desk.page.keyboard.press("y")
     desk.page.keyboard.press("Enter")

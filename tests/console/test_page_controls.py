@@ -12,6 +12,7 @@ from cdpr.console import commands
 from tests.console.browsing import SIZES, VIEWS, Fake, Visit, visit
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
+WEBGL = True
 
 
 def state_of(**changes: Any) -> dict[str, Any]:
@@ -292,6 +293,7 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     page.locator("#pick-keep").click()
     expect(page.locator("#poses li")).to_have_count(3)
     page.get_by_role("button", name="Move pose 2 up").click()
+    expect(page.locator("#poses li").first.locator("input")).to_have_value("pose 2")
     page.get_by_role("textbox", name="Name of pose 1").fill("grip")
     page.get_by_role("textbox", name="Name of pose 1").press("Enter")
     page.locator("#plan-poses").click()

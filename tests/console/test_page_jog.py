@@ -121,7 +121,7 @@ def test_keys_jog_only_while_the_pad_has_the_focus(desk: Visit) -> None:
     desk.ready_to_jog()
     desk.page.locator("#jog-speed").focus()
     desk.page.keyboard.press("ArrowRight")
-    desk.page.locator("#scene-canvas").focus()
+    desk.page.locator("#scene-in").focus()
     desk.page.keyboard.press("PageUp")
     assert [m for m in desk.fake.let_pass(desk.page)["received"] if m["kind"] == "held"] == []
     desk.page.locator("#jog-pad").focus()

@@ -6,36 +6,19 @@ import re
 from typing import Any
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
-from tests.console.browsing import Visit
+from tests.console.browsing import NO_WEBGL, Fake, Visit, painted, visit
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-
-
-COUNT = """([role, x, y, width, height]) => {
-  const style = getComputedStyle(document.documentElement);
-  const value = parseInt(style.getPropertyValue(`--${role}`).trim().slice(1), 16);
-  const colour = [value >> 16, (value >> 8) & 255, value & 255];
-  const canvas = document.getElementById("scene-canvas"), context = canvas.getContext("2d");
-  const { data } = context.getImageData(x, y, width || canvas.width, height || canvas.height);
-  let count = 0;
-  for (let k = 0; k < data.length; k += 4)
-    count += data[k + 3] > 200 && colour.every((v, c) => Math.abs(data[k + c] - v) < 30);
-  return count;
-}"""
-
-
-def painted(desk: Visit, role: str) -> int:
-    """Pixels of the scene in about the colour of a role."""
-    return int(desk.page.evaluate(COUNT, [role, 0, 0, 0, 0]))
+WEBGL = True
 
 
 def until_painted(desk: Visit, role: str, least: int) -> None:
     """Waits until so many pixels of the scene have the colour; 0 for none at all."""
 
     def holds(_: dict[str, Any]) -> bool:
-        found = painted(desk, role)
+        found = painted(desk.page, role)
         return found >= least if least else found == 0
 
     desk.fake.wait(desk.page, holds)
@@ -44,7 +27,7 @@ def until_painted(desk: Visit, role: str, least: int) -> None:
 def without_layer(desk: Visit, title: str) -> None:
     desk.page.locator("#live summary", has_text="Layers").click()
     desk.page.get_by_role("checkbox", name=title).uncheck()
-    desk.page.evaluate("() => new Promise((done) => requestAnimationFrame(done))")
+    desk.page.locator("#live summary", has_text="Layers").click()  # it lies over the scene
 
 
 def test_the_closest_pair_is_drawn_and_can_be_hidden(desk: Visit) -> None:
@@ -101,14 +84,25 @@ def test_pictures_of_cameras_come_at_most_five_times_a_second(desk: Visit) -> No
     assert len(desk.fake.let_pass(desk.page, 10)["pictures"]) == count
 
 
+def test_without_webgl_the_console_says_so_and_works(browser: Browser, fake: Fake) -> None:
+    with visit(browser, fake, script=NO_WEBGL) as found:
+        expect(found.page.locator("#scene .without")).to_contain_text("needs WebGL 2")
+        expect(found.page.locator("#scene-canvas")).to_be_hidden()
+        found.take_control()
+        found.load()
+        found.run()
+        found.page.locator("#scene-in").click()
+        expect(found.page.locator("#measured-x")).to_contain_text("measured")
+        found.page.locator("#stop").click()
+        fake.wait(found.page, lambda state: bool(state["stops"] == 1))
+
+
 # Picking a goal, comparing plans.
 
 
 def near(desk: Visit, x: float, y: float, role: str) -> int:
     """Pixels in about the colour of a role within 8 px of a point of the page."""
-    box = desk.page.locator("#scene-canvas").bounding_box()
-    assert box
-    return int(desk.page.evaluate(COUNT, [role, x - box["x"] - 8, y - box["y"] - 8, 17, 17]))
+    return painted(desk.page, role, {"x": x - 8, "y": y - 8, "width": 17, "height": 17})
 
 
 def begin_to_pick(found: Visit) -> dict[str, Any]:
@@ -132,7 +126,7 @@ def test_a_goal_is_picked_where_the_pointer_is(desk: Visit, turned: int) -> None
         desk.page.keyboard.press("ArrowUp")
     for height in (300, 500):
         desk.page.locator("#pick-height").fill(str(height))
-        x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.45 * box["height"]
+        x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.38 * box["height"]
         desk.page.mouse.click(x, y)
         expect(desk.page.locator("#pick-text")).to_contain_text(f", {height} mm")
         # The ring about the goal.
@@ -147,7 +141,7 @@ def test_a_goal_is_picked_where_the_pointer_is(desk: Visit, turned: int) -> None
 
 def test_turning_the_view_picks_nothing_and_cancel_keeps_nothing(desk: Visit) -> None:
     box = begin_to_pick(desk)
-    x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.45 * box["height"]
+    x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.38 * box["height"]
     desk.page.mouse.move(x, y)
     desk.page.mouse.down()
     desk.page.mouse.move(x + 60, y, steps=4)

@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from executor.recording.run_folder import RunEvent
 from executor.report.tiles import event_table
 from model.pages.charts import spread, thinned, with_gaps
-from model.pages.scene import Eye
+from model.pages.viewer import Eye
 from model.pose import Pose
 from model.shapes import (
     Box,

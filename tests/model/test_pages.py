@@ -21,10 +21,8 @@ from model.pages.scene import (
     Stroke,
     arrows,
     grid_floor,
-    scene_data,
-    still,
-    viewer,
 )
+from model.pages.viewer import SCENE_SCRIPTS, page_data, still_image, viewer
 from model.pose import Array
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)> & \"'"
@@ -85,8 +83,8 @@ def whole() -> str:
         charts(chart_of(np.arange(5.0))),
         viewer(scene, EVIL, [("path", EVIL, "ink", True)], EVIL),
     ]
-    data = {"scene-data": scene_data(scene)}
-    return page(EVIL, "".join(parts), scripts=("charts.js", "viewer.js", "playback.js"), data=data)
+    scripts = ("charts.js", *SCENE_SCRIPTS)
+    return page(EVIL, "".join(parts), scripts=scripts, data=page_data(scene))
 
 
 def test_bullets_show_commands_and_options_as_code() -> None:
@@ -144,9 +142,9 @@ def test_colours_are_defined_for_light_and_dark() -> None:
     assert light == dark - {"of"}
 
 
-def test_scripts_are_small_and_need_no_library() -> None:
+def test_scripts_are_small_and_ask_for_nothing() -> None:
     assert len(resource("charts.js").splitlines()) <= 150
-    for name in ("charts.js", "viewer.js", "playback.js"):
+    for name in ("charts.js", *SCENE_SCRIPTS):
         assert not re.findall(r"\b(fetch|import|XMLHttpRequest|eval|innerHTML)\b", resource(name))
 
 
@@ -192,7 +190,7 @@ def test_a_line_that_does_not_fit_leaves_the_range_unchanged() -> None:
 
 def test_the_still_scene_holds_all_its_points() -> None:
     """Cropped at no side, with the platform at its first moment."""
-    text = still(scene_of("box"), "a box")
+    text = still_image(scene_of("box"), "a box")
     box = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', text)
     assert box
     width, height = map(float, box.groups())

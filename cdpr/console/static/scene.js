@@ -1,4 +1,4 @@
-/* The 3-D scene: the viewer of the report (viewer.js) with the live platform, the path it drove, and a loaded plan. */
+/* The 3-D scene: the viewer of reports (viewer.js, three.js) with the live platform, the path it drove, and a loaded plan. */
 
 import { address } from "./connection.js";
 import { at, duration, known, make, write } from "./elements.js";
@@ -72,6 +72,8 @@ export class Scene {
     const response = await fetch(address("/scene"));
     if (!response.ok) return write(at("scene-note"), `The scene cannot be read (${response.status}).`);
     this.#base = { moments: [], ...(await response.json()) };
+    // Loaded here, for STOP must not wait for it; without it the viewer says what is missing.
+    globalThis.THREE = await import("./vendor/three/three.module.min.js").catch(() => null);
     this.#view = globalThis.sceneViewer(at("scene-canvas"), this.#base, (layer) => !this.#hidden.has(layer));
     at("scene-out").addEventListener("click", () => this.#view.zoom(0.8));
     at("scene-in").addEventListener("click", () => this.#view.zoom(1.25));

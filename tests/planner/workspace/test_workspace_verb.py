@@ -13,9 +13,16 @@ from typer.testing import CliRunner
 
 from cdpr.cli.app import build_app
 from model.errors import BadInput
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.workspace.compute import map_workspace
+from planner.workspace.figures import space_scene
+from planner.workspace.files import write_maps
+from planner.workspace.grid import frame_box, volume
+from planner.workspace.maps import Question
 
 CONFIGS = Path(__file__).parents[3] / "configs"
-RIG = str(CONFIGS / "gachon_8_6.yaml")
+RIG, SCENE = str(CONFIGS / "gachon_8_6.yaml"), str(CONFIGS / "environment_1.yaml")
 
 
 def run(*arguments: str):
@@ -46,6 +53,22 @@ def test_the_page_shows_files_that_are_there_and_requests_nothing_from_the_netwo
     assert len(named) == 12
     assert all((folder / name).is_file() for name in named)
     assert "://" not in page
+
+
+def test_the_whole_frame_can_be_turned_on_the_page(tmp_path):
+    """Its regions are in the scene, within the frame; without scripts the picture is there."""
+    rig, scene = load_rig(Path(RIG)), load_scene(Path(SCENE))
+    question, (lower, upper) = Question.about(rig, scene), frame_box(rig)
+    made = map_workspace(question, [volume("frame", lower, upper, 0.25)], workers=1)
+    drawn = {one.layer: one.vertices for one in space_scene(made[0]).surfaces}
+    assert {"closed", "feasible", "free", "frame", "obstacles"} == set(drawn)
+    for layer in ("closed", "feasible", "free"):
+        assert np.all(lower - 1e-3 <= drawn[layer])
+        assert np.all(drawn[layer] <= upper + 1e-3)
+    write_maps(tmp_path, made, question, scene)
+    page = (tmp_path / "index.html").read_text()
+    assert page.count('id="scene-canvas"') == page.count('id="scene-data"') == 1
+    assert '<div class="still"><div class="scroll drawn"' in page
 
 
 def test_table_and_arrays_hold_the_same_numbers(folder):
