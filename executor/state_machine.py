@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
-
-from executor.safety.monitor import Alarm
 
 
 class State(Enum):
@@ -177,42 +174,3 @@ class LoopEvent:
     at: float
     code: str
     text: str
-
-
-#: Alarms that several drives raise at once for a common cause.
-_SHARED = frozenset({"drive_silent", "reply_lost"})
-
-
-def shared_causes(alarms: Sequence[Alarm], names: Sequence[str]) -> tuple[Alarm, ...]:
-    """The alarms of a cycle, with missing replies of several drives merged into one.
-
-    Args:
-        alarms: Of one cycle.
-        names: Of all drives, as the alarms name them.
-    """
-    merged: list[Alarm] = []
-    for alarm in alarms:
-        rest = _without_name(alarm, names)
-        same = [f for f in alarms if f.code == alarm.code and _without_name(f, names) == rest]
-        if alarm.code not in _SHARED or len(same) == 1:
-            merged.append(alarm)
-        elif alarm is same[0]:
-            which, cause = name_drives([names[f.drive - 1] for f in same], len(names))
-            merged.append(replace(alarm, text=f"{which} {rest}{cause}", drive=0))
-    return tuple(merged)
-
-
-def name_drives(failed: Sequence[str], drives: int) -> tuple[str, str]:
-    """Names of drives that fail alike, as the subject of a sentence, and a cause to append.
-
-    Args:
-        failed: Their names.
-        drives: Number of drives of the rig.
-    """
-    if len(failed) == drives:
-        return f"all {drives} drives", ": bus or supply"
-    return ", ".join(failed), ""
-
-
-def _without_name(alarm: Alarm, names: Sequence[str]) -> str:
-    return alarm.text.removeprefix(f"{names[alarm.drive - 1]} ") if alarm.drive else ""

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput
-from model.files.camera_file import FAMILIES
 from model.files.csv_table import CsvTable
 from model.pose import Array, Pose, read_only
 from model.rig import Camera
+from model.tag_families import FAMILIES
 from tracking.camera_model import Image
 from tracking.detection.detector import TagDetector
 from tracking.detection.diagnostics import diagnose_tags

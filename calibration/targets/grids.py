@@ -25,8 +25,8 @@ import cv2
 import numpy as np
 
 from calibration.targets.boards import LEAST_POINTS, DetectedBoard, generic_camera, require_board
-from model.files.camera_file import FAMILIES, tags_in
 from model.pose import Array
+from model.tag_families import FAMILIES, tags_in
 from tracking.camera_model import Image
 from tracking.detection.detector import TagDetector
 from tracking.detection.diagnostics import diagnose_tags

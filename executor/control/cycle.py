@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from drivers.drive_group import CycleStatus, GroupState
 from executor.control.sync_master import SyncMaster
+from executor.safety.fault_messages import Alarm, StopReaction
 from executor.safety.gate import ALLOWED, GateDecision, Purpose, Request, examine
 from executor.safety.limits import gate_limits, stuck_limits, watch_limits
-from executor.safety.monitor import Alarm, Monitor, Observation, StopReaction
+from executor.safety.monitor import Monitor, Observation
 from executor.safety.stall import StuckWatch
 from executor.trajectory.setpoints import CheckedSetpoints
 from executor.trajectory.time_scaling import speed_change

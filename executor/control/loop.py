@@ -17,17 +17,9 @@ from drivers.factory import stop_alone
 from executor.control.cycle import Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
 from executor.control.sync_master import SyncMaster, changed_states
+from executor.safety.fault_messages import Alarm, StopReaction, shared_causes
 from executor.safety.gate import Purpose
-from executor.safety.monitor import Alarm, StopReaction
-from executor.state_machine import (
-    ON_PATH,
-    CycleRecord,
-    Event,
-    LoopEvent,
-    Machine,
-    State,
-    shared_causes,
-)
+from executor.state_machine import ON_PATH, CycleRecord, Event, LoopEvent, Machine, State
 from executor.supervision import OperatorRequests
 from executor.trajectory.setpoints import CheckedSetpoints
 from executor.trajectory.time_scaling import smooth_step

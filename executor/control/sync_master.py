@@ -19,8 +19,9 @@ import numpy as np
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand
 from drivers.factory import drive_states
 from executor.realtime.scheduling import Clock
-from executor.safety.monitor import MISSING_CYCLES, USUAL_TIMEOUT, SyncAge
-from executor.state_machine import name_drives
+from executor.safety.fault_messages import name_drives
+from executor.safety.monitor import MISSING_CYCLES
+from executor.safety.sync_timeout import USUAL_TIMEOUT, SyncAge
 from model.errors import CdprError, Fault, HardwareMissing
 from model.rig import Rig
 

@@ -11,7 +11,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from executor.safety.monitor import Alarm, StopReaction
+from executor.safety.fault_messages import Alarm, StopReaction, over_tension
 from executor.trajectory.time_scaling import PEAK, smooth_step
 from model.kinematics import cable_lengths
 from model.pose import Array
@@ -53,12 +53,7 @@ class TensionHeadroom:
         if self._cycles < OVER_CYCLES:
             return []
         return [
-            Alarm(
-                StopReaction.PATH_STOP,
-                "over_tension",
-                f"cable {cable} carries {tension:.1f} N, more than {self._limit:.1f} N",
-                cable,
-            )
+            over_tension(cable, tension, self._limit)
             for cable, tension in enumerate(tensions, start=1)
             if not tension <= self._limit
         ]

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from executor.safety.gate import Limits
-from executor.safety.monitor import SyncAge, WatchLimits
+from executor.safety.monitor import WatchLimits
 from executor.safety.stall import StuckLimits
+from executor.safety.sync_timeout import SyncAge
 from model.rig import Rig
 
 #: A cable is slack below this share of the least planned tension. Plans reach the least tension

@@ -4,102 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 
-# Limit on the age of the last SYNC when drives are commanded to follow a set-point.
-#
-# A drive that misses SYNC stops on its own, and "enable operation" (0Fh) takes it out of that stop
-# again: CiA 402 transition 16 is level-triggered. So the sender of 0Fh must know that no drive has
-# stopped meanwhile. A drive stops `timeout` periods after the SYNC that it received last; the age
-# of that SYNC is measured here from just before it was sent, so it is never less than the drive's.
-#
-# The arithmetic, in periods, for a cycle that begins L periods late:
-#
-#     age = 1 + L                         the last SYNC belongs to the cycle before
-#     limit = timeout - margin            0Fh is not sent from this age on
-#     margin = min(1/2, (timeout - 1)/2)
-#
-# The margin covers what is not measured: the new SYNC waits for the set-points before it and for
-# one foreign frame, at most 0.7 periods at the largest bus load that arming allows minus the same
-# wait of the previous SYNC; and the drives' clocks. A drive that tolerates 1.5 periods leaves only
-# half a period in all; half of it is the margin.
-#
-# Source: CiA 301 (communication cycle period, 1006h), CiA 402-2 (transition 16). Pure.
-
-
-#: Periods without SYNC after which drives stop on their own unless their profile says otherwise.
-USUAL_TIMEOUT = 3.0
-#: Shortest time-out of a drive that can be kept enabled, in periods.
-LEAST_TIMEOUT = 1.1
-#: The largest margin, in periods.
-MARGIN = 0.5
-#: Age from which a late cycle is reported and causes a path stop, in periods.
-LATE_AGE = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class SyncAge:
-    """Limit on the age of SYNC for drives with a common time-out.
-
-    Attributes:
-        timeout: Periods without SYNC after which a drive stops on its own, at least 1.1.
-    """
-
-    timeout: float = USUAL_TIMEOUT
-
-    def __post_init__(self) -> None:
-        """Refuses a time-out that no cycle could meet.
-
-        Raises:
-            ValueError: It is not longer than one period by enough.
-        """
-        if not self.timeout >= LEAST_TIMEOUT:
-            raise ValueError(
-                f"drives that stop after {self.timeout} periods cannot be kept enabled"
-            )
-
-    @property
-    def margin(self) -> float:
-        """Margin before the time-out, in periods."""
-        return min(MARGIN, (self.timeout - 1.0) / 2.0)
-
-    @property
-    def limit(self) -> float:
-        """Age of the last SYNC from which no drive is commanded to follow, in periods."""
-        return self.timeout - self.margin
-
-    def may_enable(self, age: float) -> bool:
-        """Whether 0Fh may be sent with the next SYNC; False for NaN."""
-        return age < self.limit
-
+from executor.safety import fault_messages
+from executor.safety.fault_messages import Alarm
+from executor.safety.sync_timeout import LATE_AGE, SyncAge
 
 #: Consecutive missing replies that are a fault.
 MISSING_CYCLES = 2
-
-
-class StopReaction(IntEnum):
-    """Reaction that an alarm requires; the largest one wins."""
-
-    NOTE = 0
-    PATH_STOP = 1
-    QUICK_STOP = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Alarm:
-    """A condition found by a monitor.
-
-    Attributes:
-        reaction: Required reaction.
-        code: Stable code.
-        text: Condition, measured value and limit.
-        drive: Number of the cable and drive, from 1 as in the rig file; 0 for all.
-    """
-
-    reaction: StopReaction
-    code: str
-    text: str
-    drive: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,20 +116,16 @@ class Monitor:
         )
 
     def _replies(self, seen: Observation) -> list[Alarm]:
-        found = [
-            Alarm(StopReaction.QUICK_STOP, "drive_fault", text, number)
-            for number, text in seen.faults
+        found = [fault_messages.drive_fault(number, text) for number, text in seen.faults]
+        found += [
+            fault_messages.drive_warning(number, text, stops=stops)
+            for number, text, stops in seen.warnings
         ]
-        for number, text, stops in seen.warnings:
-            reaction = StopReaction.PATH_STOP if stops else StopReaction.NOTE
-            found.append(Alarm(reaction, "drive_warning", text, number))
-        for drive, count in enumerate(self.missing, start=1):
-            name = self.names[drive - 1]
-            text = f"{name} did not answer for {count} cycle{'s' if count > 1 else ''}"
-            if count >= self.limits.missing_cycles:
-                found.append(Alarm(StopReaction.QUICK_STOP, "drive_silent", text, drive))
-            elif count:
-                found.append(Alarm(StopReaction.NOTE, "reply_lost", text, drive))
+        most = self.limits.missing_cycles
+        for drive, (name, count) in enumerate(zip(self.names, self.missing, strict=True), start=1):
+            if count:
+                fault = count >= most
+                found.append(fault_messages.reply_missing(drive, name, count, fault=fault))
         return found
 
     def _following(self, seen: Observation) -> list[Alarm]:
@@ -228,35 +135,28 @@ class Monitor:
                 continue
             # "not ... <=", so that NaN counts as too large.
             if not abs(error) <= self.limits.following_error:
-                text = (
-                    f"cable {drive} is {error * 1000:.2f} mm from its set-point,"
-                    f" limit {self.limits.following_error * 1000:.2f} mm"
-                )
-                found.append(Alarm(StopReaction.QUICK_STOP, "following_error", text, drive))
+                limit = self.limits.following_error
+                found.append(fault_messages.following_error(drive, error, limit))
         return found
 
     def _tensions(self, seen: Observation) -> list[Alarm]:
-        found = []
+        limits, found = self.limits, []
         for drive, tension in enumerate(seen.tensions):
-            text = f"cable {drive + 1} carries {tension:.1f} N,"
-            if self.loose[drive] >= self.limits.loose_cycles:
-                loose = f"{text} no tension: it is broken or slack"
-                found.append(Alarm(StopReaction.QUICK_STOP, "cable_loose", loose, drive + 1))
-            elif self.slack[drive] >= self.limits.slack_cycles:
-                slack = f"{text} less than {self.limits.min_tension:.1f} N: it may be slack"
-                found.append(Alarm(StopReaction.PATH_STOP, "slack", slack, drive + 1))
-            if self.over[drive] >= self.limits.slack_cycles:
-                over = f"{text} more than {self.limits.max_tension:.1f} N"
-                found.append(Alarm(StopReaction.PATH_STOP, "over_tension", over, drive + 1))
+            cable = drive + 1
+            if self.loose[drive] >= limits.loose_cycles:
+                found.append(fault_messages.cable_loose(cable, tension))
+            elif self.slack[drive] >= limits.slack_cycles:
+                found.append(fault_messages.slack(cable, tension, limits.min_tension))
+            if self.over[drive] >= limits.slack_cycles:
+                found.append(fault_messages.over_tension(cable, tension, limits.max_tension))
         return found
 
     def lateness(self, cycles: float) -> list[Alarm]:
         """Alarms of a cycle that begins this late, before anything is sent in it."""
-        text = f"a cycle began {cycles:.1f} cycles late"
         if not cycles < self.limits.gone_periods:  # also for NaN
-            return [Alarm(StopReaction.QUICK_STOP, "late", text)]
+            return [fault_messages.late(cycles, too_late=True)]
         if cycles >= self.limits.late_periods:
-            return [Alarm(StopReaction.PATH_STOP, "late", text)]
+            return [fault_messages.late(cycles, too_late=False)]
         return []
 
 

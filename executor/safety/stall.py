@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from executor.safety.monitor import Alarm, StopReaction
+from executor.safety.fault_messages import Alarm, stuck
 
 #: A drive that moves by less than this share of its set-points' travel is stalled.
 STALLED_SHARE = 0.25
@@ -145,17 +145,10 @@ class StuckWatch:
             drive if silent else drive.seen(position, demand)
             for drive, position, demand, silent in rows
         )
+        each = zip(self.names, drives, missing, strict=True)
         found = [
-            _alarm(number, self.names[number - 1], drive.stalled)
-            for number, (drive, silent) in enumerate(zip(drives, missing, strict=True), start=1)
+            stuck(number, name, drive.stalled, fault=drive.stalled >= STUCK_CYCLES)
+            for number, (name, drive, silent) in enumerate(each, start=1)
             if drive.stalled and not silent
         ]
         return replace(self, drives=drives), tuple(found)
-
-
-def _alarm(number: int, name: str, cycles: int) -> Alarm:
-    text = f"{name} did not move for {cycles} cycle{'s' if cycles > 1 else ''}"
-    text += " while its set-points advanced"
-    if cycles < STUCK_CYCLES:
-        return Alarm(StopReaction.NOTE, "set_point_missed", text, number)
-    return Alarm(StopReaction.QUICK_STOP, "drive_stuck", text, number)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from model.files.camera_file import CameraDocument, TagsDocument, tags_in
+from model.files.camera_file import CameraDocument, TagsDocument
 from model.files.documents import (
     WHOLE_LARGEST,
     Document,
@@ -21,6 +21,7 @@ from model.files.documents import (
     Vector,
 )
 from model.files.simulation_file import SimulationDocument
+from model.tag_families import tags_in
 
 # The drives of the winches.
 

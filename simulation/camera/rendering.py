@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from model.files.camera_file import drawn_upside_down, opencv_dictionary
 from model.pose import Array, Pose
 from model.rig import Camera, Rig, Tag
 from model.scene import Scene
@@ -30,6 +29,7 @@ from model.shapes import (
     convex_hull,
     shape_points,
 )
+from model.tag_families import drawn_upside_down, opencv_dictionary
 from tracking.camera_model import pixels_of
 
 #: Samples per pixel along x and along y.

@@ -17,7 +17,7 @@ from executor.control.sync_master import (
     changed_states,
     late_fault,
 )
-from executor.safety.monitor import USUAL_TIMEOUT
+from executor.safety.sync_timeout import USUAL_TIMEOUT
 from model.errors import Fault, HardwareMissing
 from model.rig import load_rig
 from tests.cli.plans import RIG

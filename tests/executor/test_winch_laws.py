@@ -16,7 +16,7 @@ from executor.control.winch_laws import (
     tension_reserve,
     wind_in_speed,
 )
-from executor.safety.monitor import StopReaction
+from executor.safety.fault_messages import StopReaction
 from model.rig import load_rig
 from tests.cli.plans import HALL, RIG
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from executor.safety.limits import gate_limits, stuck_limits, tension_limits, watch_limits
-from executor.safety.monitor import Monitor, Observation, SyncAge
+from executor.safety.monitor import Monitor, Observation
 from executor.safety.stall import StuckLimits
+from executor.safety.sync_timeout import SyncAge
 from model.rig import load_rig, rig_from_document
 from tests.cli.plans import HALL, RIG
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.safety.monitor import Alarm, StopReaction
+from executor.safety.fault_messages import Alarm, StopReaction
 from executor.safety.stall import Drive, StuckLimits, StuckWatch
 
 HERE = (True, (0, 0), (0, 0), (False, False))

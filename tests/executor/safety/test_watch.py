@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.safety.monitor import Alarm, Monitor, Observation, StopReaction, WatchLimits
+from executor.safety.fault_messages import Alarm, StopReaction
+from executor.safety.monitor import Monitor, Observation, WatchLimits
 
 NAN = float("nan")
 LIMITS = WatchLimits(following_error=0.002, min_tension=5.0, max_tension=100.0, no_tension=0.5)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.safety.monitor import LATE_AGE, MARGIN, SyncAge
+from executor.safety.sync_timeout import LATE_AGE, MARGIN, SyncAge
 
 TIMEOUTS = st.floats(1.1, 100.0)
 NAN = float("nan")

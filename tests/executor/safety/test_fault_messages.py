@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from executor.recording.summary import summarize
-from executor.safety.monitor import Alarm, Monitor, Observation, StopReaction, WatchLimits
-from executor.state_machine import shared_causes
+from executor.safety.fault_messages import Alarm, StopReaction, shared_causes
+from executor.safety.monitor import Monitor, Observation, WatchLimits
 from tests.executor import fake_run
 
 NAMES = [f"cable {k} (drive {k + 10})" for k in range(1, 9)]

@@ -1,0 +1,132 @@
+"""Alarms of the running rig: how each is worded and what stop it requires."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+
+class StopReaction(IntEnum):
+    """Reaction that an alarm requires; the largest one wins."""
+
+    NOTE = 0
+    PATH_STOP = 1
+    QUICK_STOP = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """A condition found by a monitor.
+
+    Attributes:
+        reaction: Required reaction.
+        code: Stable code.
+        text: Condition, measured value and limit.
+        drive: Number of the cable and drive, from 1 as in the rig file; 0 for all.
+    """
+
+    reaction: StopReaction
+    code: str
+    text: str
+    drive: int = 0
+
+
+def _cycles(count: int) -> str:
+    return f"{count} cycle{'s' if count > 1 else ''}"
+
+
+def drive_fault(drive: int, text: str) -> Alarm:
+    """A drive, or with drive 0 the bus, reports a fault."""
+    return Alarm(StopReaction.QUICK_STOP, "drive_fault", text, drive)
+
+
+def drive_warning(drive: int, text: str, *, stops: bool) -> Alarm:
+    """A drive that stays enabled reports a warning."""
+    reaction = StopReaction.PATH_STOP if stops else StopReaction.NOTE
+    return Alarm(reaction, "drive_warning", text, drive)
+
+
+def reply_missing(drive: int, name: str, cycles: int, *, fault: bool) -> Alarm:
+    """A drive did not answer, in the last cycles."""
+    text = f"{name} did not answer for {_cycles(cycles)}"
+    if fault:
+        return Alarm(StopReaction.QUICK_STOP, "drive_silent", text, drive)
+    return Alarm(StopReaction.NOTE, "reply_lost", text, drive)
+
+
+def stuck(drive: int, name: str, cycles: int, *, fault: bool) -> Alarm:
+    """A drive did not follow its set-points, in the last cycles."""
+    text = f"{name} did not move for {_cycles(cycles)} while its set-points advanced"
+    if fault:
+        return Alarm(StopReaction.QUICK_STOP, "drive_stuck", text, drive)
+    return Alarm(StopReaction.NOTE, "set_point_missed", text, drive)
+
+
+def following_error(cable: int, error: float, limit: float) -> Alarm:
+    """A cable is too far from its set-point; both in cable length, [m]."""
+    text = f"cable {cable} is {error * 1000:.2f} mm from its set-point, limit {limit * 1000:.2f} mm"
+    return Alarm(StopReaction.QUICK_STOP, "following_error", text, cable)
+
+
+def cable_loose(cable: int, tension: float) -> Alarm:
+    """A cable has no tension, [N]."""
+    text = f"cable {cable} carries {tension:.1f} N, no tension: it is broken or slack"
+    return Alarm(StopReaction.QUICK_STOP, "cable_loose", text, cable)
+
+
+def slack(cable: int, tension: float, limit: float) -> Alarm:
+    """A cable has too little tension, [N]."""
+    text = f"cable {cable} carries {tension:.1f} N, less than {limit:.1f} N: it may be slack"
+    return Alarm(StopReaction.PATH_STOP, "slack", text, cable)
+
+
+def over_tension(cable: int, tension: float, limit: float) -> Alarm:
+    """A cable has too much tension, [N]."""
+    text = f"cable {cable} carries {tension:.1f} N, more than {limit:.1f} N"
+    return Alarm(StopReaction.PATH_STOP, "over_tension", text, cable)
+
+
+def late(cycles: float, *, too_late: bool) -> Alarm:
+    """A cycle began late; too late if drives may have stopped on their own meanwhile."""
+    reaction = StopReaction.QUICK_STOP if too_late else StopReaction.PATH_STOP
+    return Alarm(reaction, "late", f"a cycle began {cycles:.1f} cycles late")
+
+
+#: Alarms that several drives raise at once for a common cause.
+_SHARED = frozenset({"drive_silent", "reply_lost"})
+
+
+def shared_causes(alarms: Sequence[Alarm], names: Sequence[str]) -> tuple[Alarm, ...]:
+    """The alarms of a cycle, with missing replies of several drives merged into one.
+
+    Args:
+        alarms: Of one cycle.
+        names: Of all drives, as the alarms name them.
+    """
+    merged: list[Alarm] = []
+    for alarm in alarms:
+        rest = _without_name(alarm, names)
+        same = [f for f in alarms if f.code == alarm.code and _without_name(f, names) == rest]
+        if alarm.code not in _SHARED or len(same) == 1:
+            merged.append(alarm)
+        elif alarm is same[0]:
+            which, cause = name_drives([names[f.drive - 1] for f in same], len(names))
+            merged.append(replace(alarm, text=f"{which} {rest}{cause}", drive=0))
+    return tuple(merged)
+
+
+def name_drives(failed: Sequence[str], drives: int) -> tuple[str, str]:
+    """Names of drives that fail alike, as the subject of a sentence, and a cause to append.
+
+    Args:
+        failed: Their names.
+        drives: Number of drives of the rig.
+    """
+    if len(failed) == drives:
+        return f"all {drives} drives", ": bus or supply"
+    return ", ".join(failed), ""
+
+
+def _without_name(alarm: Alarm, names: Sequence[str]) -> str:
+    return alarm.text.removeprefix(f"{names[alarm.drive - 1]} ") if alarm.drive else ""
