@@ -19,7 +19,7 @@ from executor.control.preconditions import counted_here, require_below, set_up_h
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
 from executor.kernels import ready_to_simulate
-from executor.realtime.job import ReadyDrives
+from executor.realtime.child import ReadyDrives
 from model.errors import BadInput, CdprError, Fault, Refused
 from model.files.rig_file import RigDocument
 from model.kinematics import forward_kinematics

@@ -15,7 +15,7 @@ from executor.drives import abandoned_drives_fault, is_simulated, unreferenced_d
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.kernels import ready_for_simulating_process
-from executor.realtime.job import Armed, Ended, MotionTask, ReadyDrives
+from executor.realtime.child import Armed, Ended, MotionTask, ReadyDrives
 from executor.realtime.process import RealTimeProcess, real_time_process
 from executor.realtime.scheduling import Clock, SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
@@ -275,7 +275,7 @@ _CUT_SHORT = Ended(State.LATCHED, "the program was terminated", holding=False, t
 
 
 class Unrecorded:
-    """Discards records of cycles without motion; see `executor.realtime.job.Records`."""
+    """Discards records of cycles without motion; see `executor.realtime.child.Records`."""
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
         """Discards it."""

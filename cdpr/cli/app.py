@@ -85,10 +85,10 @@ PANELS: dict[str, tuple[Verb, ...]] = {
         "operate.requests:stop,hold,resume,speed",
         "operate.console:console",
         "operate.monitor:monitor",
-        "operate.service:status,reset",
+        "operate.requests:status,reset",
         "operate.home:home",
         "operate.jog:jog",
-        "operate.service:release",
+        "operate.requests:release",
     ),
     "Set up": (
         *_verbs("doctor:doctor", "sim:sim"),
@@ -96,7 +96,7 @@ PANELS: dict[str, tuple[Verb, ...]] = {
     ),
     "Measure": _verbs("track:track"),
     "Analyse": (
-        *_verbs("report:report", "explain:explain", "studies:workspace"),
+        *_verbs("report:report,explain", "studies:workspace"),
         Verb("bench", verbs=BENCH, about="Measure the planner."),
     ),
 }

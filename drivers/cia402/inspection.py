@@ -12,15 +12,6 @@ import numpy as np
 
 from drivers.cia402.configure import is_still_set_up, require_answers
 from drivers.cia402.error_codes import abort_text
-from drivers.cia402.expected_objects import (
-    BEFORE,
-    MODE_DISPLAY,
-    Expectation,
-    expected_by,
-    how_to_set,
-    identifiers,
-    identity,
-)
 from drivers.cia402.object_dictionary import (
     HEARTBEAT_CONSUMERS,
     Setting,
@@ -28,7 +19,14 @@ from drivers.cia402.object_dictionary import (
     stated_absent,
 )
 from drivers.cia402.profile import (
+    BEFORE,
+    MODE_DISPLAY,
+    Expectation,
+    expected_by,
     for_unused_pdos,
+    how_to_set,
+    identifiers,
+    identity,
     load_profile,
     profile_names,
     profile_of,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from executor.control.preconditions import require_capabilities
 from executor.control.sync_master import ReplyTimeout, SyncMaster, changed_states, late_fault
-from executor.realtime.job import ReadyDrives
+from executor.realtime.child import ReadyDrives
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import OperatorRequests
 from model.errors import CdprError, Fault, StoppedByOperator

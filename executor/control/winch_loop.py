@@ -19,7 +19,7 @@ from executor.control.loop import Loop
 from executor.control.preconditions import with_reduced_limits
 from executor.control.sync_master import SyncMaster
 from executor.control.winch_laws import WinchLaw
-from executor.realtime.job import Armed, Ended, MotionTask, Procedure, ReadyDrives, Records
+from executor.realtime.child import Armed, Ended, MotionTask, Procedure, ReadyDrives, Records
 from executor.realtime.scheduling import Clock
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, LoopEvent, State

@@ -20,7 +20,7 @@ from executor.control.loop import SETTLING
 from executor.control.winch_loop import WinchMover
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
-from executor.realtime.job import Ended, Records
+from executor.realtime.child import Ended, Records
 from executor.recording.run_folder import EVENTS
 from executor.state_machine import CycleRecord, LoopEvent, State
 from model.errors import BadInput, CdprError, Fault

@@ -27,7 +27,7 @@ from executor.control.winch_laws import (
     tension_reserve,
 )
 from executor.hold_to_run.presses import CablePress, Press, PressReader, PressState
-from executor.realtime.job import ReadyDrives
+from executor.realtime.child import ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, LoopEvent, State
@@ -198,7 +198,7 @@ class CableLoop(Loop):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CableMotion:
-    """A session of jogs of single cables; see `MotionTask` in `executor.realtime.job`.
+    """A session of jogs of single cables; see `MotionTask` in `executor.realtime.child`.
 
     Attributes:
         cables: Number of cables.

@@ -18,7 +18,7 @@ from executor.control.sync_master import SyncMaster
 from executor.hold_to_run.line import Piece, PieceRing
 from executor.hold_to_run.presses import PressReader, PressState
 from executor.interlock.reference import HomingReference
-from executor.realtime.job import ReadyDrives
+from executor.realtime.child import ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, LoopEvent, State
@@ -135,7 +135,7 @@ def _meet(row: Setpoints, others: Sequence[int]) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JogMotion:
-    """A session of jogs; see `MotionTask` in `executor.realtime.job`.
+    """A session of jogs; see `MotionTask` in `executor.realtime.child`.
 
     Attributes:
         rig: The rig file, with the jog speed.

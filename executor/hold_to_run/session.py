@@ -29,7 +29,7 @@ from executor.hold_to_run.presses import PressBoard
 from executor.interlock.interlock import MotionInterlock
 from executor.jogging import FASTEST, LONGEST_MM, measured_pose, with_speed
 from executor.proposals import CablesProposal, JogProposal, require_confirmed
-from executor.realtime.job import MotionTask, ReadyDrives
+from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedMemory, SharedRequests
 from executor.recording.record_files import free_folder

@@ -10,8 +10,7 @@ from functools import partial
 from multiprocessing.connection import wait
 
 from drivers.drive_group import CycleStatus
-from executor.realtime.child import serve
-from executor.realtime.job import (
+from executor.realtime.child import (
     CYCLE_SLOTS,
     EVENT_SLOTS,
     Armed,
@@ -23,6 +22,7 @@ from executor.realtime.job import (
     MotionTask,
     ReadDrives,
     Records,
+    serve,
 )
 from executor.realtime.scheduling import interrupts_blocked, one_thread
 from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedRequests, unpack_event

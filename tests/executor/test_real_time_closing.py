@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from executor.realtime import process as real_time_process
-from executor.realtime.job import Armed, Ended
+from executor.realtime.child import Armed, Ended
 from executor.realtime.shared_memory import SharedRequests
 from executor.state_machine import State
 

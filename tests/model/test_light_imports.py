@@ -107,7 +107,7 @@ def test_verbs_that_must_be_fast_are_light(module: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["cdpr.cli.check", "cdpr.cli.explain", "executor.trajectory.prepare"]
+    "module", ["cdpr.cli.check", "cdpr.cli.report", "executor.trajectory.prepare"]
 )
 def test_what_neither_searches_nor_measures_nor_sends_loads_no_library_for_it(module: str) -> None:
     assert not loaded_by(f"import {module}") & {"numba", "scipy", "cv2", "can"}
@@ -115,5 +115,5 @@ def test_what_neither_searches_nor_measures_nor_sends_loads_no_library_for_it(mo
 
 def test_the_real_time_process_of_a_real_bus_loads_no_compiler_and_no_camera() -> None:
     """It loads everything before the drives are set up, while the operator waits."""
-    code = "import executor.realtime.child, executor.control.path_job, executor.drives"
+    code = "import executor.realtime.child, executor.control.path_runs, executor.drives"
     assert not loaded_by(code) & {"numba", "cv2", "matplotlib", "mcap"}

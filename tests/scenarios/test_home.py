@@ -26,7 +26,7 @@ from executor.drives import current_pose
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at, referenced
 from executor.jogging import plan_straight_move
-from executor.realtime.job import ReadyDrives
+from executor.realtime.child import ReadyDrives
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import CycleRecord, LoopEvent, State

@@ -17,7 +17,7 @@ from calibration.procedures import (
 from calibration.results import require_file_name
 from calibration.targets.boards import Board
 from cdpr.cli.calibrate.boards import BoardOptions
-from cdpr.cli.calibrate.output import (
+from cdpr.cli.calibrate.results import (
     DEFAULT_RESULT,
     CameraOption,
     ResultOptions,

@@ -14,7 +14,7 @@ from calibration.extrinsics.surveyed_tags import Survey
 from calibration.pictures import DEFAULT_IMAGES, DEFAULT_TAG_IMAGES, ImageSet, open_source
 from calibration.procedures import locate_camera, locate_tags
 from cdpr.cli.calibrate.boards import BoardOptions
-from cdpr.cli.calibrate.output import (
+from cdpr.cli.calibrate.results import (
     DEFAULT_RESULT,
     CameraOption,
     PicturesOption,

@@ -13,7 +13,7 @@ import typer
 
 from calibration.geometry.pose_selection import measurement_poses
 from calibration.procedures import calibrate_rig
-from cdpr.cli.calibrate.output import DEFAULT_RESULT, ResultOptions, WantedOption
+from cdpr.cli.calibrate.results import DEFAULT_RESULT, ResultOptions, WantedOption
 from cdpr.cli.options import (
     CalibrationOption,
     JsonOption,
