@@ -13,9 +13,10 @@ from model.lazy import lazy_names
 if TYPE_CHECKING:
     from model.clearance import ClearanceModel
     from model.errors import CdprError
-    from model.kinematics import PosedRig, forward_kinematics
+    from model.kinematics import forward_kinematics
     from model.plan import Plan, load_plan
     from model.pose import Pose
+    from model.posed_rig import PosedRig
     from model.rig import Rig, load_rig
     from model.scene import Scene, load_scene
     from model.statics.gravity import working_tensions
@@ -45,9 +46,10 @@ if not TYPE_CHECKING:
         {
             "model.clearance": "ClearanceModel",
             "model.errors": "CdprError",
-            "model.kinematics": "PosedRig forward_kinematics",
+            "model.kinematics": "forward_kinematics",
             "model.plan": "Plan load_plan",
             "model.pose": "Pose",
+            "model.posed_rig": "PosedRig",
             "model.rig": "Rig load_rig",
             "model.scene": "Scene load_scene",
             "model.statics.gravity": "working_tensions",

@@ -1,4 +1,4 @@
-"""Kinematics of the platform: cable lengths, structure matrix, forward kinematics, posed rigs.
+"""Kinematics of the platform: cable lengths, structure matrix, forward kinematics.
 
 Source: paper, section 2, Eqs. 1–3 with the corrections of docs/paper.md.
 """
@@ -13,17 +13,10 @@ from numpy.typing import NDArray
 
 from model.errors import BadInput, Fault
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
-from model.statics.feasibility import WrenchBox, capacity_margin
-from model.statics.gravity import weight_wrench, working_tensions
-from model.statics.tension_distribution import TensionInfeasible
-from model.statics.wrench_sets import condition_number, rms_anchor_radius
+from model.statics.wrench_sets import rms_anchor_radius
 
 if TYPE_CHECKING:
     from model.rig import Rig
-if TYPE_CHECKING:
-    from model.rig import Rig
-    from model.scene import Load
-
 
 # Cables between outlets and anchors: exit points, lengths and directions.
 #
@@ -289,92 +282,3 @@ def _residual(rig: Rig, pose: Pose, lengths: Array) -> Array | None:
 def _moved(pose: Pose, step: Array) -> Pose:
     """The pose after a small twist, shape (6,): translation [m], rotation in the world [rad]."""
     return Pose(pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PosedRig:
-    """Kinematics and statics of a rig at one pose; the arrays are read-only.
-
-    Attributes:
-        rig: The robot with m cables.
-        pose: ``world_from_platform``.
-        exits: Where the cables leave outlet or pulley, world frame, shape (m, 3), [m].
-        anchors: The platform's anchors, world frame, shape (m, 3), [m].
-        lengths: Free cable lengths from outlet to anchor, shape (m,), [m].
-        structure_matrix: J of J t + w = 0 for tensions t and the external wrench w, shape (6, m);
-            force rows [-], moment rows about the platform's origin [m].
-        tensions: Commanded tensions, shape (m,), [N]; NaN where no tensions within the limits hold
-            the weight.
-        capacity_margin: Distance of the required wrenches from the boundary of the available set,
-            [N]; negative outside it, minus infinity where the cables act in too few directions.
-        condition_number: σ_max / σ_min of the structure matrix, moments divided by the RMS anchor
-            radius; 1 at best, infinite where it is rank-deficient.
-    """
-
-    rig: Rig
-    pose: Pose
-    exits: Array
-    anchors: Array
-    lengths: Array
-    structure_matrix: Array
-    tensions: Array
-    capacity_margin: float
-    condition_number: float
-
-    @property
-    def is_wrench_feasible(self) -> bool:
-        """Whether tensions within the limits hold the weight and the load's wrench box."""
-        return self.capacity_margin >= 0.0
-
-    @property
-    def dexterity(self) -> float:
-        """Reciprocal of the condition number, between 0 (singular) and 1 (isotropic)."""
-        return 1.0 / self.condition_number
-
-    def __repr__(self) -> str:
-        """Position, feasibility and margins."""
-        x, y, z = self.pose.position * 1000.0
-        held = "feasible" if self.is_wrench_feasible else "not feasible"
-        return (
-            f"<PosedRig {self.rig.name} at [{x:.1f}, {y:.1f}, {z:.1f}] mm: {held},"
-            f" capacity margin {self.capacity_margin:.1f} N, dexterity {self.dexterity:.3f}>"
-        )
-
-
-def posed_rig(rig: Rig, pose: Pose, load: Load | None = None) -> PosedRig:
-    """Kinematics and statics of a rig at one pose.
-
-    Args:
-        rig: The robot.
-        pose: ``world_from_platform``.
-        load: Payload and external wrenches; only the platform's weight when left out.
-
-    Raises:
-        NoCable: A cable has no path at this pose.
-    """
-    cables = cables_at(rig, pose)
-    matrix = structure_matrix_of(cables, pose.position)
-    radius = rms_anchor_radius(rig.anchors)
-    weight = weight_wrench(rig, pose, load)
-    box = np.zeros(6) if load is None else np.concatenate([load.force, load.moment])
-    margin = capacity_margin(
-        matrix, rig.min_tension, rig.max_tension, WrenchBox(weight, box), radius
-    )
-    return PosedRig(
-        rig=rig,
-        pose=pose,
-        exits=read_only(cables.exits),
-        anchors=read_only(cables.anchors),
-        lengths=read_only(cables.lengths),
-        structure_matrix=read_only(matrix),
-        tensions=read_only(_tensions(rig, pose, load)),
-        capacity_margin=float(margin),
-        condition_number=float(condition_number(matrix, radius)),
-    )
-
-
-def _tensions(rig: Rig, pose: Pose, load: Load | None) -> Array:
-    try:
-        return working_tensions(rig, pose, load).tensions
-    except TensionInfeasible:
-        return np.full(rig.cable_count, np.nan)

@@ -14,9 +14,9 @@ from model.cameras import Camera, Tag, camera_from, tag_from
 from model.errors import BadInput
 from model.files.documents import document_hash, key_path, load_yaml, millimetres
 from model.files.rig_file import MotionDocument, RigDocument, WinchDocument
-from model.kinematics import PosedRig, posed_rig
 from model.pages.page import html_table
 from model.pose import Array, Pose, read_only
+from model.posed_rig import PosedRig, posed_rig
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

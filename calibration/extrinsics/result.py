@@ -13,7 +13,7 @@ from pydantic import Field
 from scipy.stats import t as student
 
 from calibration.intrinsics.result import camera_named, with_camera
-from calibration.result_files import Section, page_of, table_of
+from calibration.report import Section, page_of, table_of
 from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import CONFIDENCE, Interval, rms_bound
 from model.cameras import Z_95

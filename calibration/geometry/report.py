@@ -9,7 +9,7 @@ import numpy as np
 from calibration.geometry.calibrate import RigCalibration
 from calibration.geometry.parameters import AXES
 from calibration.geometry.quality import RigQuality
-from calibration.result_files import Section, drawing, page_of, table_of
+from calibration.report import Section, drawing, page_of, table_of
 from calibration.statistics import Interval
 from model.kinematics import cables_to
 from model.pages.charts import DOTTED, Chart, ChartLine, chart_grid, charts

@@ -20,7 +20,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import t as student
 
 from calibration.intrinsics.result import camera_named, with_camera
-from calibration.result_files import Section, interval_rows, page_of, table_of
+from calibration.report import Section, interval_rows, page_of, table_of
 from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import CONFIDENCE, Interval
 from calibration.tag_map.observations import TagObservations

@@ -23,7 +23,7 @@ from calibration.intrinsics.quality import (
     image_grid,
     pixel_uncertainty,
 )
-from calibration.result_files import Section, drawing, interval_rows, page_of, table_of
+from calibration.report import Section, drawing, interval_rows, page_of, table_of
 from calibration.results import ResultDocument, common_keys
 from calibration.targets.boards import DetectedBoard
 from model.errors import BadInput

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from calibration.extrinsics.result import AXES, SCALES, pose_rows
-from calibration.result_files import Section, page_of, table_of
+from calibration.report import Section, page_of, table_of
 from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import Interval
 from calibration.tag_map.bundle_adjustment import TagLayout

@@ -25,9 +25,10 @@ from planner.campaign.page import change_text
 from planner.campaign.studies import Finding, findings
 from planner.campaign.trial import OWN
 from planner.workspace.compute import map_workspace, workspace_grids
+from planner.workspace.files import write_maps
 from planner.workspace.grid import parsed_slice
 from planner.workspace.maps import Question
-from planner.workspace.report import summary_facts, write_maps
+from planner.workspace.report import summary_facts
 
 WorkersOption = Annotated[
     int | None, typer.Option(min=1, help="number of processes (default: one per core)", metavar="N")

@@ -14,6 +14,20 @@ from drivers.can_errors import (
     combined_refusal,
 )
 from drivers.cia402.error_codes import abort_text
+from drivers.cia402.expected_objects import (
+    BEFORE,
+    MODE_DISPLAY,
+    count_heartbeats,
+    expected_by,
+    identifiers,
+    identity,
+    number_text,
+    require_absent,
+    require_expected,
+    require_idle,
+    require_there,
+    wrong_value,
+)
 from drivers.cia402.object_dictionary import (
     PDO_IDENTIFIER,
     PDO_INVALID,
@@ -24,23 +38,7 @@ from drivers.cia402.object_dictionary import (
     stated_absent,
 )
 from drivers.cia402.pdo import NmtCommand
-from drivers.cia402.profile import (
-    BEFORE,
-    MODE_DISPLAY,
-    count_heartbeats,
-    expected_by,
-    for_unused_pdos,
-    identifiers,
-    identity,
-    number_text,
-    profile_of,
-    require_absent,
-    require_expected,
-    require_idle,
-    require_there,
-    used_pdos,
-    wrong_value,
-)
+from drivers.cia402.profile import for_unused_pdos, profile_of, used_pdos
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork, silent
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.drive_group import OnRestarted, Pump

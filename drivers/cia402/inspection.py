@@ -12,25 +12,22 @@ import numpy as np
 
 from drivers.cia402.configure import is_still_set_up, require_answers
 from drivers.cia402.error_codes import abort_text
+from drivers.cia402.expected_objects import (
+    BEFORE,
+    MODE_DISPLAY,
+    Expectation,
+    expected_by,
+    how_to_set,
+    identifiers,
+    identity,
+)
 from drivers.cia402.object_dictionary import (
     HEARTBEAT_CONSUMERS,
     Setting,
     settings_for,
     stated_absent,
 )
-from drivers.cia402.profile import (
-    BEFORE,
-    MODE_DISPLAY,
-    Expectation,
-    expected_by,
-    for_unused_pdos,
-    how_to_set,
-    identifiers,
-    identity,
-    load_profile,
-    profile_names,
-    profile_of,
-)
+from drivers.cia402.profile import for_unused_pdos, load_profile, profile_names, profile_of
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power

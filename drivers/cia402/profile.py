@@ -1,24 +1,18 @@
-"""Drive profiles: those shipped, your own, and the objects that a drive must hold by its profile.
+"""Drive profiles: those shipped with cdpr, your own, and the one of a rig file.
 
-A profile is a YAML file (`model.files.drive_profile_file`).
+A profile is a YAML file (`model.files.drive_profile_file`) in ``drivers/cia402/profiles`` or
+elsewhere; ``drives.profile`` of the rig file names it.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from drivers.can_errors import in_fault, moved_by_another, wrong_setting
-from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, Setting
-from drivers.cia402.sdo import NOT_NOW, SetupNetwork
-from drivers.cia402.sdo_jobs import CSP_MODE, OBJECT_DOES_NOT_EXIST
-from drivers.cia402.state_machine import FAULTED, DriveState, state_of
-from model.errors import BadInput, Refused
+from model.errors import BadInput
 from model.files.documents import load_yaml
-from model.files.drive_profile_file import ProfileDocument, object_key
+from model.files.drive_profile_file import ProfileDocument
 from model.files.rig_file import Cia402Document
 from model.rig import Rig
 
@@ -110,190 +104,3 @@ def for_unused_pdos(profile: ProfileDocument, is_there: Callable[[int], bool]) -
         for index in indices:
             if not is_there(index) and index >= first + STANDARD_PDOS:
                 break
-
-
-@dataclass(frozen=True, slots=True)
-class Expectation:
-    """One object to read: ``value & mask`` must be ``expected``; optional ones may be absent."""
-
-    index: int
-    sub: int
-    mask: int
-    expected: int
-    name: str
-    why: str
-    optional: bool = False
-
-    def __str__(self) -> str:
-        """Index, sub-index and name."""
-        return f"{self.index:04X}h:{self.sub:02X} {self.name}"
-
-
-#: Requirements of a drive before anything is written to it.
-BEFORE = (
-    Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are supported"),
-    Expectation(
-        *(0x6502, 0, 0x80, 0x80, "supported drive modes"),
-        "cyclic synchronous position (CSP), bit 7; Technosoft iPOS and Pilz PRBT do not have it",
-    ),
-)
-
-
-def identifiers(node: int) -> tuple[Expectation, ...]:
-    """Identifiers on which a drive receives SYNC and sends emergencies; CiA 301, 7.5.2."""
-    sync, emergency = (
-        "SYNC is sent as 80h, without a counter",
-        "emergencies are received as 80h + node",
-    )
-    return (
-        Expectation(0x1005, 0, 0x7FF, 0x80, "COB-ID SYNC", sync, optional=True),
-        Expectation(0x1014, 0, 0x800007FF, 0x80 + node, "COB-ID EMCY", emergency, optional=True),
-        Expectation(0x1019, 0, 0xFF, 0, "synchronous counter overflow", sync, optional=True),
-    )
-
-
-def identity(rig: Rig) -> tuple[Expectation, ...]:
-    """Vendor and product that the rig file requires, if any (1018h)."""
-    drives = rig.document.drives
-    if not isinstance(drives, Cia402Document):
-        return ()
-    named = ((1, drives.vendor_id, "vendor id"), (2, drives.product_code, "product code"))
-    why = "the rig file requires this drive"
-    return tuple(
-        Expectation(0x1018, sub, 0xFFFFFFFF, value, name, why)
-        for sub, value, name in named
-        if value is not None
-    )
-
-
-MODE_DISPLAY = Expectation(
-    0x6061, 0, 0xFF, CSP_MODE, "mode of operation display", "the mode must be active"
-)
-"""Required mode after the configuration, or once enabled (`ProfileDocument`)."""
-
-
-def expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
-    """Values that the profile requires and the program does not write, such as units."""
-    return tuple(
-        Expectation(*object_key(each.object), 0xFFFFFFFF, each.value, each.name, each.why)
-        for each in profile.expect
-    )
-
-
-def how_to_set(expected: Expectation) -> str:
-    """The next step for a wrong value."""
-    if expected.index == 0x6502:
-        return (
-            "none: a drive without cyclic synchronous position (CSP) cannot be used; Technosoft"
-            " iPOS and Pilz PRBT do not have it"
-        )
-    if expected.index in (0x1000, 0x1018):
-        return "check the node id, and vendor_id and product_code of the rig file"
-    return "set it with the manufacturer's tool and store it"
-
-
-# Checks of one drive before anything is written.
-
-
-def require_expected(network: SetupNetwork, node: int, expected: Expectation) -> None:
-    """Requires that an object holds the expected value, or is optional and absent.
-
-    Raises:
-        Refused: It holds another value, or is missing.
-    """
-    try:
-        data = network.client(node).read(expected.index, expected.sub, expected.name)
-    except Refused as error:
-        if expected.optional and error.values.get("abort_code") not in (None, *NOT_NOW):
-            return
-        raise
-    value = int.from_bytes(data, "little")
-    if value & expected.mask != expected.expected:
-        found, wanted = f"{value:X}h", f"{expected.expected:X}h"
-        raise wrong_value(node, str(expected), found, wanted, expected.why)
-
-
-def require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
-    """Requires that an object exists, so that all missing ones are reported before any write.
-
-    Raises:
-        Refused: The drive lacks a required object.
-    """
-    if setting.optional or setting.transient:
-        return
-    try:
-        network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
-    except Refused as error:
-        if error.values.get("abort_code") in OBJECT_DOES_NOT_EXIST:
-            raise
-
-
-def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
-    """Requires that an object declared absent is absent, or holds the required value.
-
-    Raises:
-        Refused: It exists, with another value.
-    """
-    try:
-        data = network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
-    except Refused as error:
-        if error.values.get("abort_code") in (None, *NOT_NOW):
-            raise
-        return
-    if not setting.is_kept(data):
-        found = number_text(data, setting.form)
-        raise Refused(
-            f"the profile declares it absent; the drive has it with {found},"
-            f" {setting.value} is required",
-            where=f"drive {node}, object {setting}",
-            next_step="remove the object from `absent` in the drive profile",
-            values={"node": node, "object": str(setting), "found": found},
-        )
-
-
-_STATUS_WORD = "object 6041h:00 status word"
-
-
-def require_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
-    """Refuses an enabled drive, which another master controls; quick stop is accepted.
-
-    Raises:
-        Refused: It is enabled, or in fault without ``to_reset``.
-    """
-    data = network.client(node).read(0x6041, 0, "status word", 2)
-    state = state_of(int.from_bytes(data, "little"))
-    if state in FAULTED and not to_reset:
-        why = "it stopped itself; its display or the manufacturer's tool shows the cause"
-        raise in_fault(node, "", _STATUS_WORD, why)
-    if state is DriveState.OPERATION_ENABLED:
-        raise moved_by_another(node, "enabled already", _STATUS_WORD)
-
-
-def count_heartbeats(
-    network: SetupNetwork, node: int, profile: ProfileDocument, entries: list[int]
-) -> None:
-    """Appends the drive's number of usable entries of 1016h.
-
-    Raises:
-        Refused: It has none, and the profile requires one.
-    """
-    name, needed = "consumer heartbeat entries", profile.watches_heartbeats
-    client = network.client(node)
-    read = client.read if needed else client.read_if_there
-    data = read(HEARTBEAT_CONSUMERS, 0, name, 1) if profile.has(HEARTBEAT_CONSUMERS, 1) else None
-    count, most = int.from_bytes(data or b"", "little"), profile.heartbeat_entries
-    if count < 1 and needed:
-        raise wrong_value(node, f"1016h:00 {name}", "0", "1 or more", "watch the master")
-    entries.append(count if most is None else min(count, most))
-
-
-def number_text(data: bytes, form: str) -> str:
-    """A value as text by its `struct` format, or the bytes if the length is wrong."""
-    if len(data) != struct.calcsize(form):
-        return f"{len(data)} bytes ({data.hex()})"
-    return str(struct.unpack(form, data)[0])
-
-
-def wrong_value(node: int, name: str, found: str, wanted: str, why: str) -> Refused:
-    """An object of a drive holds a wrong value."""
-    return wrong_setting(node, f"object {name}", found, wanted, why, "the drive's manual")

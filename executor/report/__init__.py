@@ -20,7 +20,8 @@ def build_report(folder: RunFolder) -> Path:
     Raises:
         BadInput: A file of the run is missing or was changed, or the folder cannot be written to.
     """
-    from executor.report.page import page, read_run
+    from executor.report.page import page
+    from executor.report.run_data import read_run
 
     write_atomic(folder.report, page(read_run(folder)))
     return folder.report

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from executor.recording.clearance import ClearanceTable
-from executor.report.page import RunData
+from executor.report.run_data import RunData
 from model.pages.charts import (
     DASH_DOTTED,
     DASHED,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from executor.recording.clearance import ClearanceTable
-from executor.report.page import RunData
+from executor.report.run_data import RunData
 from model.kinematics import cables_to
 from model.pages.scene import (
     Label,

@@ -11,7 +11,7 @@ import numpy as np
 from drivers.cameras.live import is_too_large
 from executor.recording.tables import PoseTable
 from executor.recording.verdict import faults_among, page_of, page_text
-from executor.report.page import RunData, markdown
+from executor.report.run_data import RunData, markdown
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
 from model.pages.page import known, list_table, prose, table, tile, tiles
 from model.scene import legs_of

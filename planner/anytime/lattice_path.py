@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.anytime.problem import KINEMATIC, LENGTH, PathProblem, edge_allowed, interpolated
-from planner.anytime.state import State, uniform
+from planner.anytime.random import State, uniform
 from planner.collision.edges import row_of
 from planner.kernels.jit import kernel
 from planner.kernels.primitives import Vector, minus, norm

@@ -23,7 +23,7 @@ from planner.anytime.problem import (
     edge_lows,
     gained,
 )
-from planner.anytime.state import State, below, direction, uniform
+from planner.anytime.random import State, below, direction, uniform
 from planner.collision.edges import row_of
 from planner.kernels.jit import leaf
 from planner.kernels.primitives import Vector, along, dot, minus

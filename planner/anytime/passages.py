@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.anytime.problem import PathProblem, edge_allowed
-from planner.anytime.state import State, below, direction, uniform
+from planner.anytime.random import State, below, direction, uniform
 from planner.collision.edges import row_of
 from planner.kernels.jit import inlined, leaf
 from planner.kernels.primitives import Vector, along, cross, dot, minus, norm

@@ -35,7 +35,8 @@ from planner.anytime.problem import (
     problem_of,
     set_weights,
 )
-from planner.anytime.state import BEST, KEPT, AnytimeSearch, Handle, new_search, uniform
+from planner.anytime.random import uniform
+from planner.anytime.state import BEST, KEPT, AnytimeSearch, Handle, new_search
 from planner.costs import KinematicCost
 from planner.kernels.jit import kernel, leaf
 from planner.path import LEAST_ROUNDS_WITH_LIMIT, LengthLimit, Progress, Route

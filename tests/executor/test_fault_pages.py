@@ -12,7 +12,7 @@ import pytest
 
 from drivers.can_errors import BusFault
 from executor.recording.verdict import ORDINARY, fault_codes, faults_among, page_of, page_text
-from executor.report.page import markdown
+from executor.report.run_data import markdown
 from model.files.scene_file import StopDocument
 from tests.cli.program import call, one_message
 

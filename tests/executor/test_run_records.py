@@ -12,7 +12,7 @@ import pytest
 
 from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunFolder
-from executor.report.page import read_run
+from executor.report.run_data import read_run
 from model.errors import BadInput, InvalidFile
 from tests.executor import fake_run
 

@@ -34,7 +34,7 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "model/statics/feasibility.py",
         "planner/campaign/page.py",
         "planner/kernels/gjk.py",
-        "planner/workspace/report.py",
+        "planner/workspace/files.py",
         "planner/workspace/figures.py",
     },
     "of several protocols, back ends or planners one is loaded": {

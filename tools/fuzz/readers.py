@@ -145,7 +145,7 @@ def _cut(path: Path) -> object:
 def _run_part(name: str) -> Callable[[Path], object]:
     """Reads a run folder as `cdpr report` does."""
     from executor.recording.run_folder import RunFolder
-    from executor.report.page import read_run
+    from executor.report.run_data import read_run
     from executor.report.tiles import (
         camera_table,
         chips,

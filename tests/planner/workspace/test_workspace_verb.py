@@ -17,9 +17,9 @@ from model.rig import load_rig
 from model.scene import load_scene
 from planner.workspace.compute import map_workspace
 from planner.workspace.figures import space_scene
+from planner.workspace.files import write_maps
 from planner.workspace.grid import frame_box, volume
 from planner.workspace.maps import Question
-from planner.workspace.report import write_maps
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 RIG, SCENE = str(CONFIGS / "gachon_8_6.yaml"), str(CONFIGS / "environment_1.yaml")

@@ -1,0 +1,126 @@
+"""Images, tables and page of maps, as files in a folder."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from model.scene import Scene
+from planner.workspace.compute import Maps
+from planner.workspace.figures import (
+    SETTINGS,
+    SPACE_LAYERS,
+    cost_figure,
+    level_figure,
+    slice_figure,
+    space_figure,
+    space_scene,
+    title_of,
+)
+from planner.workspace.maps import Question
+from planner.workspace.report import Chapter, arrays_of, csv_of, page, shown_in, summary_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Draw = Callable[[], "Figure"]
+PAGE = "index.html"
+SUMMARY = "summary.json"
+_LEVELS_OF = (
+    "capacity_margin",
+    "dexterity_cost",
+    "wrench_cost",
+    "self_clearance",
+    "obstacle_clearance",
+)
+
+
+def write_maps(
+    folder: Path, made: list[Maps], question: Question, scene: Scene | None = None
+) -> dict[str, Any]:
+    """Writes all files and returns the summaries by name of grid.
+
+    Args:
+        folder: An existing folder.
+        made: Maps of slices, of a volume named ``frame`` for the image of the whole space, and of
+            other volumes.
+        question: Rig, scene, orientation and quantities of the maps.
+        scene: With the obstacles.
+    """
+    where = f" in {scene.name}" if scene else ""
+    title = f"Workspace of {question.rig.name}{where}"
+    chapters = [_chapter(folder, maps) for maps in made]
+    (folder / PAGE).write_text(page(title, _lead(question), chapters), encoding="utf-8")
+    summary = {m.grid.name: c.summary for m, c in zip(made, chapters, strict=True)}
+    (folder / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    return summary
+
+
+def _lead(question: Question) -> str:
+    """First sentence of the page."""
+    rig = question.rig
+    rotated = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform rotated"
+    return (
+        f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
+        f" {question.length * 1e3:.1f} mm in the condition number{rotated}."
+    )
+
+
+def _chapter(folder: Path, maps: Maps) -> Chapter:
+    name = maps.grid.name
+    tables = [f"{name}.npz"]
+    packed = io.BytesIO()
+    np.savez_compressed(packed, allow_pickle=False, **arrays_of(maps))
+    (folder / tables[0]).write_bytes(packed.getvalue())
+    if maps.grid.normal is not None:
+        tables.append(f"{name}.csv")
+        (folder / tables[1]).write_text(csv_of(maps), encoding="utf-8")
+    title, text, figures = _content(maps)
+    pictures = [_picture(folder, file, draw) for file, draw in figures]
+    alternative = f"{title}: colour maps; the numbers are in the table below and in the files"
+    scene = space_scene(maps) if name == "frame" else None
+    shown = tuple((p, alternative) for p in pictures)
+    return Chapter(title, text, shown, tuple(tables), summary_of(maps), scene, SPACE_LAYERS)
+
+
+def _content(maps: Maps) -> tuple[str, str, list[tuple[str, Draw]]]:
+    """Heading, sentence and images of a grid."""
+    name = maps.grid.name
+    if maps.grid.normal is not None:
+        figures: list[tuple[str, Draw]] = [
+            (name, partial(slice_figure, maps)),
+            (f"{name}_costs", partial(cost_figure, maps)),
+        ]
+        text = (
+            "Red lines: where a limit is reached. Colours leave out the most extreme 1 %"
+            " at each end. The two surfaces are the paper's Fig. 7."
+        )
+        return f"Slice {title_of(maps.grid)}", text, figures
+    if name == "frame":
+        text = (
+            "The paper's Fig. 6: where the cables can balance any wrench, and where the tension"
+            " limits suffice; red: frame of the outlets, grey: workspace box."
+        )
+        return "The whole frame", text, [(name, partial(space_figure, maps))]
+    chosen = [quantity for quantity in shown_in(maps) if quantity.name in _LEVELS_OF]
+    levels: list[tuple[str, Draw]] = [
+        (f"{name}_{quantity.name}", partial(level_figure, maps, quantity)) for quantity in chosen
+    ]
+    return "The workspace, level by level", "Red lines: where a limit is reached.", levels
+
+
+def _picture(folder: Path, name: str, draw: Draw) -> str:
+    """Writes a figure as PNG and SVG; returns the name of the PNG."""
+    import matplotlib
+
+    with matplotlib.rc_context(SETTINGS):
+        figure = draw()
+        figure.savefig(folder / f"{name}.png", metadata={"Software": None})
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None, "Creator": None})
+    return f"{name}.png"
