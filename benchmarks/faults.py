@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from drivers.can_bus import BusSettings  # noqa: E402
-from executor.trajectory.prepare import (  # noqa: E402
+from executor.trajectory.setpoints import (  # noqa: E402
     PreparedRun,
     prepare,
 )

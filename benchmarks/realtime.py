@@ -36,7 +36,7 @@ from executor.realtime.shared_memory import SharedRequests
 from executor.recording.recorder import Recorder
 from executor.recording.run_folder import RunFolder
 from executor.remote.status import RunStatus
-from executor.trajectory.prepare import PreparedRun, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import BadInput, CdprError
 from model.files.examples import PAPER_RIG, ready_folder
 from model.plan import load_plan, save_plan

@@ -33,7 +33,7 @@ from drivers.can_bus import (  # noqa: E402
     BusSettings,
     open_bus,
 )
-from executor.trajectory.prepare import (  # noqa: E402
+from executor.trajectory.setpoints import (  # noqa: E402
     PreparedRun,
     prepare,
 )

@@ -42,7 +42,7 @@ from executor.recording.tables import OK, CycleTable, PoseTable, fused_table, no
 from executor.recording.verdict import HARMLESS, NOT_ENDED, ORDINARY, judge_without_tables
 from executor.report import build_report
 from executor.state_machine import SIMULATED, State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.clearance import ClearanceModel
 from model.errors import BadInput, CdprError, Fault
 from model.plan import Plan

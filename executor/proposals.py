@@ -15,7 +15,7 @@ from model.rig import Camera, Rig
 from model.scene import Scene
 
 if TYPE_CHECKING:
-    from executor.trajectory.prepare import PreparedRun  # loads the planner's check
+    from executor.trajectory.setpoints import PreparedRun  # loads the planner's check
 
 Facts = list[tuple[str, str]]
 """Human-readable names and values."""

@@ -39,7 +39,7 @@ from executor.remote.status import RunStatus
 from executor.run_result import RunResult
 from executor.state_machine import LoopEvent, State
 from executor.supervision import LocalRequests, Supervisor
-from executor.trajectory.prepare import PreparedRun, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import BadInput, CdprError
 from model.plan import Plan, require_same_rig
 from model.pose import Pose

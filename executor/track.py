@@ -16,7 +16,7 @@ from drivers.cameras.live import Frame, LiveCamera, VideoFile
 from executor.cameras.sources import SYNTHETIC, require_camera_source
 from executor.kernels import ready_to_measure
 from executor.recording.mcap import write_track_mcap
-from executor.trajectory.prepare import prepare
+from executor.trajectory.setpoints import prepare
 from model.clearance import ClearanceModel
 from model.errors import BadInput
 from model.plan import Plan, require_same_rig

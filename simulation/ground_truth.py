@@ -20,7 +20,7 @@ from model.files.simulation_file import (
 )
 from model.pose import Array, read_only
 from model.rig import Camera, Rig, rig_from_document
-from simulation.drives.motion import Motor
+from simulation.drives.power import Motor
 from simulation.plant import Plant
 
 # Effects of the synthetic camera's lens and sensor.

@@ -19,8 +19,7 @@ from model.rig import Rig
 from model.scene import Load
 from model.statics.gravity import STANDARD_GRAVITY, working_tensions
 from model.winches import WinchMap
-from simulation.equilibrium.hanging import Hanging
-from simulation.equilibrium.newton import hang_still
+from simulation.equilibrium.newton import Hanging, hang_still
 
 # A platform on elastic cables that only pull, under gravity: energy and its derivatives.
 #

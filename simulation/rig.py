@@ -21,7 +21,7 @@ from model.rig import Rig
 from model.scene import Load
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
-from simulation.drives.motion import Motor
+from simulation.drives.power import Motor
 from simulation.ground_truth import (
     rig_as_built,
     simulation_of,

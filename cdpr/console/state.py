@@ -18,9 +18,9 @@ import numpy as np
 from cdpr.console.view import measured_data, scene_figure
 from executor.jogging import FASTEST
 from executor.recording.record_files import RUNS
-from executor.report.scene import plan_labels
+from executor.report.page import plan_labels
 from executor.runner import prepare_plan
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.clearance import ClearanceModel
 from model.errors import BadInput, CdprError, Refused
 from model.kinematics import cables_at

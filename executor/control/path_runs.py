@@ -22,8 +22,7 @@ from executor.recording.recorder import Recorder, RunLog
 from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State
 from executor.supervision import OperatorRequests, RequestBoard
 from executor.trajectory.dwell import Schedule, load_changes
-from executor.trajectory.prepare import PreparedRun
-from executor.trajectory.setpoints import CheckedSetpoints, checked_setpoints_of
+from executor.trajectory.setpoints import CheckedSetpoints, PreparedRun, checked_setpoints_of
 from model.errors import CdprError
 from model.files.rig_file import RigDocument
 from model.pose import Pose

@@ -17,8 +17,7 @@ from executor.recording.tables import CycleTable, quaternions_of
 from executor.remote.status import RunStatus
 from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State
 from executor.trajectory.dwell import legs_at, stop_events
-from executor.trajectory.prepare import PreparedRun
-from executor.trajectory.setpoints import CheckedTrajectory
+from executor.trajectory.setpoints import CheckedTrajectory, PreparedRun
 from model.errors import CdprError, Fault
 from model.kinematics import forward_kinematics, poses_near
 from model.pose import Array, Pose

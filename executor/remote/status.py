@@ -40,7 +40,7 @@ from drivers.factory import drive_states
 from executor.recording.run_folder import RunEvent
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import RequestBoard
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.pose import Pose
 from model.rig import Rig
 from tracking.clearance import MeasuredClearance

@@ -1,9 +1,13 @@
-"""The page of a run: one HTML file that needs neither a server nor a network."""
+"""The page of a run and its 3-D scene: one HTML file that needs neither a server nor a network."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from html import escape
 
+import numpy as np
+
+from executor.recording.clearance import ClearanceTable
 from executor.report.figures import (
     clearance_figure,
     length_figure,
@@ -12,7 +16,6 @@ from executor.report.figures import (
     timing_figure,
 )
 from executor.report.run_data import RunData
-from executor.report.scene import RunScene, run_scene, scene_viewer
 from executor.report.tiles import (
     camera_table,
     chips,
@@ -24,10 +27,163 @@ from executor.report.tiles import (
     stop_table,
     verdict_banner,
 )
+from model.kinematics import cables_to
 from model.pages.page import contents, paragraph, section
 from model.pages.page import page as html_page
-from model.pages.viewer import SCENE_SCRIPTS, page_data
+from model.pages.scene import (
+    Label,
+    Moment,
+    SceneFigure,
+    Stroke,
+    frame_surface,
+    grid_floor,
+    obstacle_surfaces,
+    platform_surface,
+    workspace_stroke,
+)
+from model.pages.viewer import SCENE_SCRIPTS, page_data, viewer
+from model.plan import Plan
+from model.pose import Array, matrix_from_quaternion
 from tracking.clearance import INTERVAL
+
+MOST_MOMENTS = 400
+MOST_BRANCHES = 4000
+#: Layer, its name on the page, the colour's role, whether it is shown at first.
+_LAYERS = (
+    ("obstacles", "Obstacles", "obstacle", True),
+    ("robot", "Platform and cables", "platform", True),
+    ("numbers", "Cable numbers", "ink", True),
+    ("frame", "Frame of outlets", "frame", True),
+    ("floor", "Floor", "line", True),
+    ("workspace", "Workspace", "muted", True),
+    ("tree", "Search tree", "tree", True),
+    ("raw", "Raw path", "raw", True),
+    ("path", "Final path", "ink", True),
+    ("driven", "Driven path", "encoder", True),
+    ("seen", "Seen by the camera", "tag", True),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunScene:
+    """The scene of a run.
+
+    Attributes:
+        scene: What is drawn.
+        floor_step: Distance of the floor's lines, [m].
+        branches: Of the search tree that are drawn.
+        all_branches: That the search had.
+    """
+
+    scene: SceneFigure
+    floor_step: float
+    branches: int
+    all_branches: int
+
+
+def run_scene(run: RunData) -> RunScene:
+    """The scene of a run, with the platform at its start."""
+    tree, branches = _tree(run)
+    obstacles = obstacle_surfaces(run.plan.scene)
+    frame = frame_surface(run.rig)
+    strokes = (workspace_stroke(run.rig), Stroke("tree", "tree", tree, 1.0, 0.75), *_paths(run))
+    fixed = [frame.vertices, *(one.vertices for one in obstacles)]
+    fixed += [stroke.segments.reshape(-1, 3) for stroke in strokes]
+    floor, step = grid_floor(np.concatenate(fixed))
+    scene = SceneFigure(
+        surfaces=(frame, *obstacles),
+        strokes=(floor, *strokes),
+        labels=plan_labels(run.plan),
+        anchors=run.rig.anchors,
+        platform=platform_surface(run.rig),
+        moments=_motion(run),
+    )
+    return RunScene(scene, step, len(tree), branches)
+
+
+def scene_viewer(run: RunData, view: RunScene) -> str:
+    """The viewer with its still image; HTML."""
+    scene = view.scene
+    drawn = {stroke.layer for stroke in scene.strokes if len(stroke.segments)}
+    drawn |= {surface.layer for surface in scene.surfaces} | {"robot", "numbers"}
+    layers = [layer for layer in _LAYERS if layer[0] in drawn]
+    return viewer(scene, _alternative(run), layers, f"Floor grid {view.floor_step * 1e3:g} mm.")
+
+
+def _tree(run: RunData) -> tuple[Array, int]:
+    """Branches of the search, at most `MOST_BRANCHES`, shape (b, 2, 3), [m]; how many it had."""
+    document = run.plan.document.tree
+    positions = np.asarray(document.positions_mm, dtype=np.float64).reshape(-1, 3) / 1e3
+    parents = np.asarray(document.parents, dtype=np.int64)
+    children = np.flatnonzero(parents >= 0)
+    branches = np.stack([positions[parents[children]], positions[children]], axis=1)
+    every = max(1, -(-len(branches) // MOST_BRANCHES))
+    return branches[::every], len(branches)
+
+
+def _paths(run: RunData) -> tuple[Stroke, ...]:
+    raw = np.array([pose.position for pose in run.plan.raw_path])
+    path = np.array([pose.position for pose in run.plan.waypoints])
+    driven, seen = run.cycles.encoder[_moments(run)], run.poses.position[run.poses.ok]
+    return (
+        Stroke.along("seen", "tag", seen, 7.5, 0.6),
+        Stroke.along("path", "ink", path, 4.5),
+        Stroke.along("driven", "encoder", driven, 2.0),
+        Stroke.along("raw", "raw", raw, 1.8),
+    )
+
+
+def plan_labels(plan: Plan) -> tuple[Label, ...]:
+    """Start, stops and goal."""
+    points = plan.waypoints
+    stops = tuple(Label("path", s.name, s.pose.position, "dot") for s in plan.scene.stops)
+    start = Label("path", "start", points[0].position, "ring")
+    return (start, *stops, Label("path", "goal", points[-1].position, "dot"))
+
+
+def _moments(run: RunData) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    """Cycles at which the platform is drawn, shape (k,)."""
+    known = np.isfinite(run.cycles.encoder).all(axis=1)
+    known &= np.isfinite(run.cycles.encoder_rotation).all(axis=1)
+    rows = np.flatnonzero(known)
+    if len(rows) <= MOST_MOMENTS:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, MOST_MOMENTS).astype(np.int64)]
+
+
+def _motion(run: RunData) -> tuple[Moment, ...]:
+    cycles, rig = run.cycles, run.rig
+    by_tags, by_drives = run.clearance.of("tag"), run.clearance.of("encoder")
+    clearance = by_tags if len(by_tags) else by_drives
+    found = []
+    for row in _moments(run).tolist():
+        time, position = float(cycles.time[row]), cycles.encoder[row]
+        turn = matrix_from_quaternion(cycles.encoder_rotation[row])
+        exits = rig.outlets
+        if rig.pulley_radius:  # the cable leaves a pulley at another point in every pose
+            exits = cables_to(rig, position + rig.anchors @ turn.T).exits
+        found.append(Moment(time, position, turn, exits, _nearest(clearance, time)))
+    return tuple(found)
+
+
+def _nearest(clearance: ClearanceTable, time: float) -> str:
+    if not len(clearance):
+        return ""
+    near = int(np.argmin(np.abs(clearance.time - time)))
+    distance = float(clearance.distance[near]) * 1e3
+    return f"clearance {distance:.1f} mm ({clearance.body[near]} – {clearance.obstacle[near]})"
+
+
+def _alternative(run: RunData) -> str:
+    plan = run.plan
+    names = ", ".join(o.name for o in plan.scene.obstacles) or "none"
+    start, end = (np.round(p.position * 1e3) for p in (plan.waypoints[0], plan.waypoints[-1]))
+    return (
+        f"The frame with {run.rig.cable_count} cables, the obstacles ({names}), the search tree and"
+        f" the path from {start.tolist()} to {end.tolist()} mm, with the platform where the run"
+        " began."
+    )
+
 
 _HINT = (
     "Charts: point or tap for values; drag, pinch or turn the wheel with Ctrl to zoom in time;"

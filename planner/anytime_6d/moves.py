@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.collision.swept_pair import points_distance, put_corners
-from planner.kernels.exit_points import exit_point
 from planner.kernels.jit import kernel
 from planner.kernels.primitives import Vector, dot, plus, rotated, row
-from planner.kernels.scene_arrays import World, anchor
+from planner.kernels.scene_arrays import World, anchor, exit_point
 
 Array = NDArray[np.float64]
 Quaternion = tuple[float, float, float, float]

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.collision.swept_pair import points_apart, points_distance, put_corners
-from planner.kernels.exit_points import exit_point, exit_travel
 from planner.kernels.jit import kernel
 from planner.kernels.primitives import Vector, along, cross, dot, minus, norm, plus, rotated, row
-from planner.kernels.scene_arrays import World, anchor, half_size
+from planner.kernels.scene_arrays import World, anchor, exit_point, exit_travel, half_size
 
 Array = NDArray[np.float64]
 

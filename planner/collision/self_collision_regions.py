@@ -23,7 +23,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.kernels.exit_points import exit_point, exit_travel
 from planner.kernels.jit import kernel, leaf
 from planner.kernels.primitives import (
     Vector,
@@ -38,7 +37,7 @@ from planner.kernels.primitives import (
     segment_box_between,
     segment_pair_between,
 )
-from planner.kernels.scene_arrays import World, anchor, half_size
+from planner.kernels.scene_arrays import World, anchor, exit_point, exit_travel, half_size
 
 # Cells of the workspace box, each with a bit for each comparison that is still open in it.
 #

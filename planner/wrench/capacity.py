@@ -19,10 +19,9 @@ from model.scene import Scene
 from model.statics.gravity import STANDARD_GRAVITY
 from model.statics.wrench_sets import rms_anchor_radius
 from planner.costs import external_wrenches
-from planner.kernels.exit_points import exit_point
 from planner.kernels.jit import kernel
 from planner.kernels.primitives import Vector, cross, minus, norm, plus, rotated
-from planner.kernels.scene_arrays import World, anchor
+from planner.kernels.scene_arrays import World, anchor, exit_point
 
 # The structure matrix with scaled moments, and its factors: pseudo-inverse and null space.
 

@@ -17,10 +17,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.kernels.exit_points import exit_point
 from planner.kernels.jit import kernel
 from planner.kernels.primitives import Vector, along, dot, minus, norm, plus, rotated, row
-from planner.kernels.scene_arrays import World, anchor, feed, outlet
+from planner.kernels.scene_arrays import World, anchor, exit_point, feed, outlet
 from planner.wrench.capacity import LoadArrays, factored, structure_columns
 
 Array = NDArray[np.float64]

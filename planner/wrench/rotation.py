@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from planner.collision.rotating_edges import rotated_by
 from planner.collision.self_collision_regions import OPEN, PROVED, REFUTED
-from planner.kernels.exit_points import exit_point
 from planner.kernels.jit import kernel
 from planner.kernels.primitives import Vector, along, cross, dot, minus, norm, plus, rotated
-from planner.kernels.scene_arrays import World, anchor, feed, outlet
+from planner.kernels.scene_arrays import World, anchor, exit_point, feed, outlet
 from planner.wrench.capacity import LoadArrays, factored, load_at, margin_of, structure_columns
 from planner.wrench.feasibility_proof import inner_tensions, levers, missing_wrench, tensions_stay
 

@@ -26,13 +26,6 @@ from drivers.cia402.pdo import (
 from drivers.cia402.state_machine import FAULTED, DriveState
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.eds_file import Eds, Key, profile_path, read_eds
-from simulation.drives.motion import (
-    ACCELERATION_UNIT,
-    POSITION_UNIT,
-    VELOCITY_UNIT,
-    Motor,
-    counts_in,
-)
 from simulation.drives.object_dictionary import (
     NO_DUPLICATE_CONSUMER,
     OUT_OF_RANGE,
@@ -53,7 +46,17 @@ from simulation.drives.pdo import (
     ProcessData,
     ReceivePdo,
 )
-from simulation.drives.power import MODE_FOLLOWS, NO_WINDOW, WARNING_CHANGES, PowerStage
+from simulation.drives.power import (
+    ACCELERATION_UNIT,
+    MODE_FOLLOWS,
+    NO_WINDOW,
+    POSITION_UNIT,
+    VELOCITY_UNIT,
+    WARNING_CHANGES,
+    Motor,
+    PowerStage,
+    counts_in,
+)
 
 Frame = bytes | bytearray
 Send = Callable[[int, Frame], None]

@@ -36,7 +36,7 @@ from model.files.rig_file import OdriveDocument
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Load
-from simulation.drives.motion import Motor
+from simulation.drives.power import Motor
 from simulation.rig import SimulatedRig
 
 Frame = bytes | bytearray

@@ -39,7 +39,7 @@ for module in (
     "drivers.cia402.group",
     "executor.report.page",
     "executor.runner",
-    "executor.trajectory.prepare",
+    "executor.trajectory.setpoints",
     "mcap.writer",
     "scipy.optimize",
     "simulation.drives.cia402_rig",

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.can_bus import BusSettings
-from executor.trajectory.prepare import PreparedRun, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.plan import load_plan
 from model.rig import load_rig
 from planner.check import verify

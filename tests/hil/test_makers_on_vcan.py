@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from drivers.can_bus import BusSettings
-from executor.trajectory.prepare import prepare
+from executor.trajectory.setpoints import prepare
 from model.plan import load_plan
 from model.rig import load_rig
 from planner.check import verify

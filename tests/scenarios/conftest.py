@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from executor.trajectory.prepare import PreparedRun, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.files.documents import millimetres
 from model.plan import load_plan, save_plan
 from model.pose import Pose

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from drivers.can_bus import BusSettings
 from drivers.cia402.state_machine import DriveState
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.plan import save_plan
 from model.rig import load_rig
 from model.scene import Scene

@@ -23,7 +23,7 @@ from executor.recording.recorder import FrameTrigger, Recorder
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.status import RunStatus
 from executor.supervision import LocalRequests
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.pose import Array, Pose
 from simulation.drives.cia402 import SimulatedDrive
 from simulation.drives.cia402_rig import SimulatedCia402Rig

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.cia402.state_machine import DriveState
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from tests.scenarios.stage import Stage, at, staged
 
 CRUISING = 150

@@ -16,7 +16,7 @@ from executor.cameras.process import CameraWorker, FrameRequest
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State
 from executor.supervision import StopReason
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.clearance import ClearanceModel
 from model.files.scene_file import SceneDocument
 from model.kinematics import cable_lengths

@@ -17,8 +17,7 @@ from executor import evaluation as run_module
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun, prepare
-from executor.trajectory.setpoints import Trajectory
+from executor.trajectory.setpoints import PreparedRun, Trajectory, prepare
 from model.errors import Fault, Refused
 from model.files.drive_profile_file import ProfileDocument
 from model.files.rig_file import RigDocument

@@ -14,7 +14,7 @@ import yaml
 from executor.recording.resume import remaining_scene, run_end
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.files.scene_file import Payload
 from model.kinematics import cable_lengths
 from model.plan import load_plan, plan_from_document

@@ -31,7 +31,7 @@ from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests
-from executor.trajectory.prepare import PreparedRun, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import CdprError, Fault, Refused, StoppedByOperator
 from model.plan import plan_from_document
 from model.pose import Array, Pose

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.cia402.state_machine import DriveState
 from executor.recording.run_folder import RunFolder
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.rig import load_rig
 from tests.cli.plans import RIG
 from tests.cli.program import call, one_message

@@ -24,7 +24,7 @@ from executor.recording.resume import run_end
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.remote.client import ask_all
 from executor.remote.command_socket import find_runs
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.errors import BadInput, Refused
 from tests.cli.plans import RIG
 from tests.cli.program import call, one_message

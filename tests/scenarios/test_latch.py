@@ -16,7 +16,7 @@ from executor.interlock.fault_latch import FaultLatch
 from executor.remote.client import ask_all
 from executor.remote.command_socket import find_runs
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.errors import Refused
 from tests.cli.plans import RIG
 from tests.cli.program import call

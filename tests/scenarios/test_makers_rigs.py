@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from drivers.can_bus import BusSettings
-from executor.trajectory.prepare import PreparedRun, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.rig import load_rig
 from tests.scenarios.faults.samples import WatchedRehearsal
 from tests.scenarios.makers import MAKERS, STEPS, Day, HeldUp, a_day, plan_back, rig_of

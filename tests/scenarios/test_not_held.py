@@ -14,7 +14,7 @@ from drivers.cia402.state_machine import DriveState
 from executor.interlock.fault_latch import FaultLatch
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.errors import Fault, Refused
 from simulation.drives.cia402 import SimulatedDrive
 from tests.cli.program import call

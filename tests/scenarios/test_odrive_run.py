@@ -19,7 +19,7 @@ from drivers.factory import make_drive_group
 from drivers.odrive.messages import AxisError, AxisState
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import Refused
 from model.plan import load_plan, save_plan
 from model.rig import load_rig

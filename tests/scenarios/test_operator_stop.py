@@ -14,7 +14,7 @@ from drivers.cia402.state_machine import DriveState
 from executor.control.path_runs import Outcome
 from executor.realtime.scheduling import SimulatedClock
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import call, nothing_written

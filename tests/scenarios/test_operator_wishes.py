@@ -12,7 +12,7 @@ import pytest
 from drivers.cia402.state_machine import DriveState
 from executor.control.path_runs import Outcome
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from tests.scenarios.stage import Stage, path_indices, staged
 
 Does = Callable[[Stage], object]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.pose import Pose
 from tests.scenarios.stage import staged
 

@@ -18,7 +18,7 @@ from drivers.can_bus import BusSettings, open_bus
 from drivers.cia402.state_machine import DriveState
 from executor.interlock.fault_latch import FaultLatch
 from executor.recording.run_folder import RunFolder
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.rig import rig_from_document
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.ground_truth import PowerLoss

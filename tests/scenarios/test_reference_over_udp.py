@@ -14,7 +14,7 @@ from drivers.can_bus import BusSettings
 from executor.control.path_runs import run_in_real_time
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock
-from executor.trajectory.prepare import PreparedRun, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import Refused
 from model.rig import rig_from_document
 from simulation.ground_truth import PowerLoss

@@ -16,7 +16,7 @@ from drivers.cia402.state_machine import DriveState
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import as_in_the_file
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.rig import Rig
 from simulation.drives.cia402 import SimulatedDrive
 from simulation.ground_truth import PowerLoss

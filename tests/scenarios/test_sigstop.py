@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from executor.recording.run_folder import RunFolder
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from tests.cli.plans import RIG
 from tests.scenarios.faults.samples import WatchedRehearsal
 from tests.scenarios.faults.suspension import Suspension, seen_by

@@ -15,7 +15,7 @@ from executor.interlock import locks as set_up_lock
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.locks import SetUpLock, state_file
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.errors import Refused
 from simulation.drives.cia402 import SimulatedDrive
 from tests.cli.plans import RIG

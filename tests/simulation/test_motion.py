@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from simulation.drives.motion import Motor
+from simulation.drives.power import Motor
 
 SPEEDS = st.floats(-1e7, 1e7, allow_nan=False)
 

@@ -18,8 +18,7 @@ from model.statics.gravity import weight_wrench, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
 from model.winches import WinchMap
 from simulation import plant as plant_module
-from simulation.equilibrium.hanging import Strained, bend, slope, strain
-from simulation.equilibrium.newton import is_positive, solve
+from simulation.equilibrium.newton import Strained, bend, is_positive, slope, solve, strain
 from simulation.plant import Plant, Suspension
 
 WEIGHT = 0.4 * 9.80665

@@ -22,7 +22,7 @@ CALL_S, SILENT_S, LONG_S = 10, 25, 6
 
 PRELOADED = (
     "calibration.result_files",
-    "executor.trajectory.prepare",
+    "executor.trajectory.setpoints",
     "executor.report.page",
     "planner.planning",
     "simulation.factory",

@@ -16,7 +16,7 @@ from model.rig import Rig, load_rig
 from planner.collision.edges import edge_clearance, edge_free
 from planner.collision.rotating_edges import rotated_by, turning_edge_free
 from planner.collision.world import build_world
-from planner.kernels.exit_points import exit_point, exit_travel
+from planner.kernels.scene_arrays import exit_point, exit_travel
 from tests.planner.collision.sampled_oracle import KINDS, CoalScene, random_scene
 
 CONFIGS = Path(__file__).parents[3] / "configs"

@@ -29,7 +29,7 @@ from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.status import RunStatus
 from executor.state_machine import State
 from executor.supervision import LocalRequests
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.files.rig_file import Cia402Document
 from model.rig import Rig, rig_from_document
 from simulation.drives.behaviour import STRICT, DriveBehaviour

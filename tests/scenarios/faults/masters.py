@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Protocol
 
 from drivers.can_bus import BusSettings
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 
 ROOT = Path(__file__).parents[3]
 PROGRAM = (
@@ -93,7 +93,7 @@ class Masters:
 
 def serve() -> None:
     """What the process does."""
-    from executor.trajectory.prepare import prepare
+    from executor.trajectory.setpoints import prepare
     from model.plan import load_plan
     from model.rig import load_rig
     from planner.check import verify

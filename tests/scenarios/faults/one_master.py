@@ -14,7 +14,7 @@ from executor.control.path_runs import run_in_process
 from executor.realtime.scheduling import RealClock, real_time
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.supervision import LocalRequests
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.errors import CdprError
 from model.files.documents import write_atomic
 from model.rig import rig_from_document

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from tests.scenarios.faults.bench import Bench, simulated
 from tests.scenarios.faults.cases import TABLE

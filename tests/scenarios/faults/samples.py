@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.cia402.pdo import EMCY_BASE, RPDO1_BASE, parse_emergency, parse_set_point
 from drivers.cia402.state_machine import TORQUE_ON, DriveState
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Load

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.can_bus import BusSettings
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from tests.scenarios.faults.bench import SimulatedBench, live, once, simulated
 from tests.scenarios.faults.cases import complaints, held_up
 from tests.scenarios.faults.drive_cases import ROWS

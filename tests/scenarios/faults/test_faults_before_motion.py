@@ -12,7 +12,7 @@ from drivers.cia402.configure import configure_drives
 from drivers.cia402.object_dictionary import settings_for
 from drivers.cia402.state_machine import DriveState
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.errors import HardwareMissing, Refused
 from model.files.rig_file import Cia402Document
 from model.rig import rig_from_document

@@ -18,7 +18,7 @@ from drivers.cia402.state_machine import DriveState
 from drivers.factory import make_drive_group
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.state_machine import State
-from executor.trajectory.prepare import PreparedRun
+from executor.trajectory.setpoints import PreparedRun
 from model.errors import BadInput, Refused
 from tests.scenarios.faults.bench import (
     Bench,
