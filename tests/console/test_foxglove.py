@@ -67,9 +67,11 @@ def seen_by_a_client(run_status: dict[str, Any]) -> dict[str, Any]:
                 channels |= {one["id"]: one for one in message["channels"]}
         wanted = [{"id": number, "channelId": number} for number in channels]
         client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-        while len(found) < len(TOPICS):
+        for _ in range(100):
+            if len(found) == len(TOPICS):
+                break
             stream._scene_at = float("-inf")  # the client may have subscribed after the first
-            stream._told = []
+            stream._sent_events = []
             stream.take(run_status, robot)
             for data in _received(client):
                 _, number, _ = _DATA.unpack_from(data)
