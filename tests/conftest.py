@@ -30,7 +30,7 @@ from hypothesis import settings  # noqa: E402
 ROOT = Path(__file__).parents[1]
 GRACE_S = 2.0  # for a thread that was told to end and is just returning
 
-settings.register_profile("ci", derandomize=True, deadline=None, print_blob=True)
+settings.register_profile("ci", derandomize=True, deadline=None, max_examples=40, print_blob=True)
 settings.register_profile("explore", deadline=None, max_examples=1000, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 

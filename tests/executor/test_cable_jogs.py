@@ -28,6 +28,7 @@ from model.errors import Fault, Refused, StoppedByOperator
 from model.pose import Array
 from model.rig import Rig, load_rig, rig_from_document
 from tests.cli.plans import RIG
+from tests.effort import cases
 
 SPEED = 0.020
 #: Time from the jog speed to rest, [s].
@@ -176,7 +177,7 @@ HOMES = st.tuples(st.integers(-15, 15), st.integers(-15, 15), st.integers(25, 55
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=cases(60), deadline=None)
 @given(presses=COMMANDS, home=HOMES, soft=st.sampled_from([1.0, 0.02, 0.002]))
 def test_nothing_moves_unless_held_and_no_tension_is_beyond_the_limit(
     presses: list[tuple[int, bool, float | None, int, bool]],

@@ -28,6 +28,7 @@ from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene
 from model.winches import WinchMap
 from tests.cli.plans import RIG
+from tests.effort import cases
 
 STEPS = tuple(step / 1000.0 for step in STEPS_MM)
 AXES = [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
@@ -151,7 +152,7 @@ def test_it_comes_to_rest_before_an_obstacle_as_near_as_it_may() -> None:
     assert max(b - a for a, b in pairwise(rates)) < 0.5
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=cases(30), deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(0, 5), st.integers(0, 4), st.integers(1, 12), st.booleans()),

@@ -1,4 +1,4 @@
-"""Twenty thousand random edges, a part of them grazing, in scenes of all shapes."""
+"""Random edges, a part of them grazing, in scenes of all shapes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from model.rig import load_rig
 from planner.collision.edges import edge_free, edges_free
 from planner.collision.world import build_world
 from planner.kernels.scene_arrays import World
+from tests.effort import cases
 from tests.planner.collision.sampled_oracle import CoalScene, random_scene
 
 GACHON = load_rig(Path(__file__).parents[3] / "configs" / "gachon_8_6.yaml")
 CLEARANCE = 0.01
-SCENES, EDGES, GRAZING = 125, 140, 20
+SCENES, EDGES, GRAZING = cases(125), 140, 20
 POSES, POSES_GRAZING = 2, 5
 """Poses checked along an edge; a grazing one touches somewhere, any other seldom comes near."""
 COAL = 1e-7
@@ -37,9 +38,9 @@ def grazing(world: World, free_edge: tuple[Array, Array], other: Array) -> tuple
 
 
 @pytest.mark.slow
-def test_no_accepted_edge_of_twenty_thousand_violates_its_clearance_anywhere() -> None:
+def test_no_accepted_edge_violates_its_clearance_anywhere() -> None:
     rng = np.random.default_rng(2026)
-    cases = accepted = 0
+    accepted = 0
     for _ in range(SCENES):
         scene = random_scene(rng, GACHON, int(rng.integers(1, 4)))
         world, oracle = build_world(GACHON, scene, np.eye(3), CLEARANCE), CoalScene(scene)
@@ -55,11 +56,9 @@ def test_no_accepted_edge_of_twenty_thousand_violates_its_clearance_anywhere() -
             for k in range(GRAZING):
                 touching = grazing(world, edges[k % len(edges)], blocked[k % len(blocked)])
                 looked_at.append((touching, np.linspace(0.0, 1.0, POSES_GRAZING)))
-        cases += EDGES + GRAZING
         accepted += len(looked_at)
         for (start, end), shares in looked_at:
             for share in shares:
                 pose = Pose.level(start + share * (end - start))
                 assert oracle.pose_distance(GACHON, pose) >= CLEARANCE - COAL
-    assert cases >= 20_000
-    assert accepted > 2_000
+    assert accepted > 16 * SCENES
