@@ -1,6 +1,6 @@
 """Making a path cheaper by small random changes, each checked exactly.
 
-A change takes about a microsecond to check, so many simple ones are tried: cutting a corner
+A change takes about a microsecond to check, that many simple ones are tried: cutting a corner
 between two positions on the path, moving one or two vertices by any distance, and moving a vertex
 away and pulling it tight again, which lets it slide along what it touches.
 """

@@ -41,6 +41,25 @@ WENT = {
     "come to its end": "finish",
     "came to its end": "finished",
 }
+#: Words with a plain meaning, such as "in place", that once stood for twenty others.
+RARE = [
+    "tell",
+    "tells",
+    "told",
+    "way",
+    "ways",
+    "place",
+    "places",
+    "placed",
+    "stand",
+    "stands",
+    "stood",
+    "turned",
+    "anew",
+    "nobody",
+]
+MOST_LINES_OF_RARE = 60
+_RARE = re.compile(rf"\b({'|'.join(RARE)})\b", re.IGNORECASE)
 _WENT = re.compile(rf"\b({'|'.join(sorted(WENT, key=len, reverse=True))})\b", re.IGNORECASE)
 _QUOTED = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
 
@@ -88,3 +107,9 @@ def test_a_word_that_went_is_found_in_messages_docstrings_and_pages() -> None:
     assert sorted(found) == [(2, "tells"), (3, "so many"), (3, "told")]
     assert refused("see `anew` and ```\ntell\n```, retold, mending") == []
     assert refused("begun\nanew") == ["anew"]
+
+
+def test_words_that_meant_anything_stay_rare() -> None:
+    files = [file for package in PACKAGES for file in (ROOT / package).rglob("*.py")]
+    lines = [line for file in files for line in file.read_text().splitlines() if _RARE.search(line)]
+    assert len(lines) <= MOST_LINES_OF_RARE, "\n".join(lines)
