@@ -45,7 +45,7 @@ def test_an_edited_plan_is_not_used(short_plan: Path, tmp_path: Path, verb: str)
     [
         ("missing", None, "no such file"),
         ("empty", "", "the file is empty"),
-        ("cut off", '{"kind": "cdpr-plan", "waypoi', "cut off or edited"),
+        ("cut off", '{"kind": "cdpr-plan", "waypoi', "truncated or edited"),
         ("something else", '{"kind": "shopping list"}', "this is not a plan file"),
         ("a list", "[]", "this is not a plan file"),
         ("a later version", '{"kind": "cdpr-plan", "schema_version": 7}', "schema version 7"),

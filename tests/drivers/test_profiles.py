@@ -425,7 +425,7 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
         ("abscent: []", "absent"),
         ('absent: ["605Ah:00"]', "required for a safe run"),
         ('absent: ["1006h:00"]', "heartbeat"),
-        ('heartbeat_loss: fault\nmonitoring: heartbeat\nabsent: ["1006h:00"]', "torque off"),
+        ('heartbeat_loss: fault\nmonitoring: heartbeat\nabsent: ["1006h:00"]', "remove torque"),
         ('absent: ["6072h:00"]', "torque_limit"),
         ('absent: ["6085h:00"]', "required for a safe run"),
         ('absent: ["1006h:00", "1016h:01"]\nmonitoring: heartbeat', "needs 1016h:01"),

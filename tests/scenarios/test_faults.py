@@ -130,7 +130,7 @@ CASES = {
     "a drive is never enabled": Case(
         lambda stage: setattr(stage.drives[4], "_command_enable", lambda: None),
         "drive_fault",
-        ("(drive 5) is in switched on on the way",),
+        ("(drive 5) is in switched on instead of operation enabled",),
         cycle=0,
         within=110,
     ),

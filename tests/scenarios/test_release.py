@@ -133,7 +133,7 @@ def test_a_drive_that_does_not_go_along_leaves_a_latched_fault(
         stuck._command_shutdown = lambda: None  # type: ignore[method-assign]
         answer = call("release", slow_rig, *bus, "--yes", "--without-real-time")
     assert answer.code == 1
-    assert "cable 4 (drive 4) is in switched on on the way" in answer.err
+    assert "cable 4 (drive 4) is in switched on instead of ready to switch on" in answer.err
     latched = FaultLatch(BusSettings("udp_multicast", channel)).read()
     assert latched is not None
     assert "while releasing the drives" in latched.cause

@@ -117,7 +117,7 @@ def test_a_camera_without_images_or_of_another_size_is_released(
     queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     queue.unplug()
-    with pytest.raises(HardwareMissing, match="delivered no image"):
+    with pytest.raises(HardwareMissing, match="failed to deliver an image"):
         LiveCamera("0", camera, queue.clock)
     assert queue.released
     monkeypatch.setattr(queue, "released", False)
