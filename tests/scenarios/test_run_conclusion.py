@@ -164,11 +164,11 @@ def test_what_the_end_needs_is_loaded_before_anything_moves(tmp_path: Path) -> N
 import sys
 sys.path.insert(0, {str(ROOT)!r})
 from pathlib import Path
-from executor.runner import _load_what_the_end_needs
+from executor.runner import _preload_results
 from executor.recording.run_folder import RunFolder
 from tests.executor import fake_run
 run = fake_run.make(1.0, 50)
-_load_what_the_end_needs()
+_preload_results()
 before = set(sys.modules)
 folder = fake_run.write(run, Path({str(tmp_path / "run")!r}))
 from executor.report import build_report
