@@ -50,8 +50,7 @@ from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
 from model.winches import WinchMap
-from tracking.clearance import MeasuredClearance, clearance_of
-from tracking.measurement import NoPose, PoseMeasurement
+from tracking.measurement import MeasuredClearance, NoPose, PoseMeasurement, clearance_of
 
 #: Clearances from drive positions are computed this often along a run, [Hz].
 CLEARANCE_RATE = 10.0

@@ -12,9 +12,8 @@ from model.rig import Rig
 from model.scene import Scene
 from planner.collision.edges import edge_clearance, in_workspace, obstacles_free
 from planner.collision.rotating_edges import turning_edge_free
-from planner.collision.self_collision import build_robot, self_edge_free, self_turning_edge_free
 from planner.collision.self_collision_regions import Robot
-from planner.collision.world import build_world
+from planner.collision.world import build_robot, build_world, self_edge_free, self_turning_edge_free
 from planner.kernels.jit import kernel
 from planner.kernels.scene_arrays import World
 from planner.wrench.capacity import LoadArrays, build_load

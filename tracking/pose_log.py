@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from model.files.documents import write_atomic
-from tracking.clearance import MeasuredClearance
-from tracking.measurement import NoPose, Observation
+from tracking.measurement import MeasuredClearance, NoPose, Observation
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")

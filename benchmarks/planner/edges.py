@@ -19,7 +19,7 @@ from model.pose import Array
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene
 from planner.collision.edges import edges_free
-from planner.collision.self_collision import self_edges_free
+from planner.collision.world import self_edges_free
 from planner.edge_checks import ExactChecks
 from planner.wrench.translation import edges_held
 

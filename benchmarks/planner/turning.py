@@ -22,7 +22,7 @@ from planner.anytime_6d.moves import matrix_of, put_rotated, turn_between
 from planner.anytime_6d.path import RotatingSearch, turning_problem
 from planner.anytime_6d.problem import RotatingProblem, move_allowed
 from planner.collision.rotating_edges import turning_edge_free
-from planner.collision.self_collision import self_turning_edge_free
+from planner.collision.world import self_turning_edge_free
 from planner.costs import KinematicCost
 from planner.settings import OBJECTIVES
 from planner.space import PoseSpace

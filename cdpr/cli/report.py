@@ -1,4 +1,4 @@
-"""`cdpr report` rewrites the report of a run; `cdpr explain` explains a fault."""
+"""`cdpr report`: rewrites the report of a run from its folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import typer
 from cdpr.cli.output import Terminal, show_json, show_line
 from executor.evaluation import rewrite_report
 from executor.recording.run_folder import RunFolder
-from executor.recording.verdict import fault_titles, page_of_fault
 
 
 def report(
@@ -33,23 +32,3 @@ def report(
         show_json(folder.summary())
         return
     show_line(f"report: {folder.report}")
-
-
-def explain(
-    code: Annotated[
-        str | None, typer.Argument(help="code of the fault, such as drive_silent", metavar="CODE")
-    ] = None,
-) -> None:
-    """Explain a fault that a run reported: meaning, likely cause, state of the machine, next step.
-
-    Without a code, lists all of them.
-
-    [dim]Example:[/dim]
-
-      cdpr explain drive_silent
-    """
-    if code is None:
-        for known, title in fault_titles().items():
-            show_line(f"  {known:<22} {title}")
-        return
-    show_line(page_of_fault(code).rstrip())

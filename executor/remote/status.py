@@ -43,8 +43,7 @@ from executor.supervision import RequestBoard
 from executor.trajectory.setpoints import PreparedRun
 from model.pose import Pose
 from model.rig import Rig
-from tracking.clearance import MeasuredClearance
-from tracking.measurement import PoseMeasurement
+from tracking.measurement import MeasuredClearance, PoseMeasurement
 
 #: Number of newest events reported.
 EVENTS_SHOWN = 12

@@ -15,9 +15,8 @@ from model.pose import Array
 from model.rig import Rig
 from model.scene import Scene
 from planner.collision.edges import edge_clearance, in_workspace, obstacles_free
-from planner.collision.self_collision import build_robot, is_open, self_edge_free
 from planner.collision.self_collision_regions import Robot
-from planner.collision.world import build_world
+from planner.collision.world import build_robot, build_world, is_open, self_edge_free
 from planner.costs import KinematicCost
 from planner.kernels.jit import inlined, kernel, leaf, stored
 from planner.kernels.primitives import Vector, along, minus, norm

@@ -23,8 +23,7 @@ from planner.anytime_6d.connect import connect
 from planner.anytime_6d.local_search import Line, copied, line_length, measure, new_line, polish
 from planner.anytime_6d.moves import move_length
 from planner.anytime_6d.problem import RotatingProblem, build_objective, set_weights
-from planner.collision.self_collision import build_robot
-from planner.collision.world import build_world
+from planner.collision.world import build_robot, build_world
 from planner.costs import KinematicCost
 from planner.edge_checks import REASONS
 from planner.path import LEAST_ROUNDS_WITH_LIMIT, LengthLimit, Progress, Route

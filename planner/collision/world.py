@@ -1,4 +1,4 @@
-"""Rig and scene as plain arrays for compiled functions.
+"""Rig and scene as plain arrays for compiled functions, with the proofs of self clearance.
 
 Pairs of a body and a piece have planes in position space: `planner.collision.separating_planes`.
 """
@@ -6,12 +6,30 @@ Pairs of a body and a piece have planes in position space: `planner.collision.se
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from model.clearance import SelfModel
 from model.errors import BadInput
 from model.pose import Array
 from model.rig import Rig
 from model.scene import Scene
+from planner.collision.rotating_edges import rotated_by
+from planner.collision.self_collision_regions import (
+    CELLS,
+    PROVED,
+    REFUTED,
+    WORD,
+    Masks,
+    Robot,
+    box_proved,
+    compared,
+    mark_open_cells,
+    open_along,
+    words_for,
+)
 from planner.collision.separating_planes import bodies_of, planes_of, sum_of_boxes
+from planner.kernels.jit import inlined, kernel
+from planner.kernels.primitives import Vector, along, minus
 from planner.kernels.scene_arrays import ConvexPiece, Integers, World, pieces_of
 
 ROUND_OFF = 1e-12
@@ -85,3 +103,197 @@ def _extent(rig: Rig, pieces: tuple[ConvexPiece, ...]) -> float:
 
 def _starts(counts: list[int]) -> Integers:
     return np.concatenate([[0], np.cumsum(np.array(counts, dtype=np.int64))]).astype(np.int64)
+
+
+_MOST_PIECES = 4096
+_DEEPEST = 64
+_FINEST = 1e-9
+
+
+def build_robot(rig: Rig, world: World, clearance: float) -> Robot:
+    """The comparisons on a rig, proved over its workspace as far as possible.
+
+    Args:
+        rig: The robot.
+        world: Built from it for one orientation; its obstacles are not used.
+        clearance: Smallest allowed distance between cables and of cables to the platform, [m].
+
+    Raises:
+        BadInput: The clearance is negative or not finite.
+    """
+    robot = unproved_robot(rig, world, clearance)
+    count = len(robot.pairs)
+    open_pairs = [k for k in range(count) if not box_proved(world, robot, k)]
+    cables = range(rig.cable_count)
+    open_cables = [k for k in cables if not box_proved(world, robot, count + k)]
+    left = [*open_pairs, *(count + k for k in open_cables)]
+    return robot._replace(
+        open_pairs=np.array(open_pairs, dtype=np.int64),
+        open_cables=np.array(open_cables, dtype=np.int64),
+        open_cells=_open_cells(world, robot, left),
+    )
+
+
+def unproved_robot(rig: Rig, world: World, clearance: float) -> Robot:
+    """As `build_robot`, with nothing proved; only for edges with rotation.
+
+    Args:
+        rig: The robot.
+        world: Built from it for one orientation; its obstacles are not used.
+        clearance: Smallest allowed distance between cables and of cables to the platform, [m].
+
+    Raises:
+        BadInput: The clearance is negative or not finite.
+    """
+    if not 0.0 <= clearance < np.inf:
+        raise BadInput(
+            f"the self clearance must be 0 mm or more (it is {clearance * 1000.0:g} mm)",
+            where="exact edge checks",
+        )
+    model = SelfModel(rig)
+    guard = ROUND_OFF * float(max(np.abs(rig.outlets).max(), np.abs(world.limits).max()))
+    return Robot(
+        pairs=np.array(model.pairs),
+        stubs=np.column_stack([_stubs(rig.anchors, model), _stubs(rig.outlets, model)]),
+        stub=float(model.stub),
+        pair_needed=clearance + 2.0 * rig.cable_radius + guard,
+        platform_needed=clearance + rig.cable_radius + guard,
+        open_pairs=np.arange(len(model.pairs)),
+        open_cables=np.arange(rig.cable_count),
+        open_cells=np.zeros((CELLS, CELLS, CELLS, 0), dtype=np.uint64),
+    )
+
+
+def _open_cells(world: World, robot: Robot, left: list[int]) -> Masks:
+    """Bit masks of the comparisons that are open in each cell of the workspace."""
+    masks = np.zeros((CELLS, CELLS, CELLS, words_for(len(left))), dtype=np.uint64)
+    for number, which in enumerate(left):
+        word, bit = number // WORD, np.uint64(1 << (number % WORD))
+        mark_open_cells(world, robot, which, masks, word, bit)
+    return masks
+
+
+def _stubs(ends: Array, model: SelfModel) -> Array:
+    """Lengths left out where two cables share an end, shape (q,); as in `model.clearance`."""
+    apart = np.linalg.norm(ends[model.pairs[:, 0]] - ends[model.pairs[:, 1]], axis=-1)
+    stubs: Array = np.where(apart < model.stub, model.stub, 0.0)
+    return stubs
+
+
+@kernel
+def self_edge_free(world: World, robot: Robot, start: Array, end: Array) -> bool:
+    """Whether the cables keep the self clearance under a translation.
+
+    Comparisons proved over the cells that the edge passes are skipped, so both ends must lie in the
+    workspace.
+
+    Args:
+        world: Rig and orientation.
+        robot: Required distances.
+        start: World frame, shape (3,), [m].
+        end: World frame, shape (3,), [m].
+    """
+    pairs, rotation, still = len(robot.pairs), world.platform[:3], np.zeros(3)
+    before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
+    # Most comparisons are decided over the whole edge.
+    ends, middle = np.empty((2, 3)), along(before, minus(after, before), 0.5)
+    ends[0], ends[1] = before, after
+    count = len(robot.open_pairs)
+    for word in range(robot.open_cells.shape[3]):
+        mask, k = open_along(robot.open_cells, world.limits, before, after, word), word * WORD
+        while mask != np.uint64(0):
+            if mask & np.uint64(1):
+                which = robot.open_pairs[k] if k < count else pairs + robot.open_cables[k - count]
+                found = compared(world, robot, which, rotation, ends, middle, 0.0)
+                if found == REFUTED:
+                    return False
+                if found != PROVED and not _clear(
+                    world, robot, which, before, after, rotation, still
+                ):
+                    return False
+            mask, k = mask >> np.uint64(1), k + 1
+    return True
+
+
+@inlined
+def is_open(world: World, robot: Robot, start: Vector, end: Vector) -> bool:
+    """Whether any comparison is open along a translation within the workspace."""
+    for word in range(robot.open_cells.shape[3]):
+        if open_along(robot.open_cells, world.limits, start, end, word) != np.uint64(0):
+            return True
+    return False
+
+
+@kernel
+def self_turning_edge_free(
+    world: World, robot: Robot, start: Array, end: Array, rotation: Array, turn: Array
+) -> bool:
+    """Whether the cables keep the self clearance while the platform is moved and rotated.
+
+    Args:
+        world: Rig and obstacles; its own orientation is not used.
+        robot: Required distances.
+        start: World frame, shape (3,), [m].
+        end: World frame, shape (3,), [m].
+        rotation: ``world_from_platform`` at the start, shape (3, 3).
+        turn: Rotation vector from start to end, platform frame, shape (3,), [rad].
+    """
+    before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
+    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    # Most comparisons are decided over the whole edge, whose middle is then computed only once.
+    ends, there = np.empty((2, 3)), rotated_by(rotation, turn, 0.5)
+    ends[0], ends[1] = before, after
+    middle = along(before, minus(after, before), 0.5)
+    for which in range(len(robot.pairs) + len(world.cables)):
+        found = compared(world, robot, which, there, ends, middle, angle / 2.0)
+        if found == REFUTED:
+            return False
+        if found != PROVED and not _clear(world, robot, which, before, after, rotation, turn):
+            return False
+    return True
+
+
+@kernel
+def _clear(
+    world: World,
+    robot: Robot,
+    which: int,
+    before: Vector,
+    after: Vector,
+    rotation: Array,
+    turn: Array,
+) -> bool:
+    """One comparison along an edge, bisected until decided; ``which`` as in `compared`."""
+    delta = minus(after, before)
+    angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+    size = np.sqrt(delta[0] ** 2 + delta[1] ** 2 + delta[2] ** 2) + angle
+    lows, highs, ends = np.empty(_DEEPEST), np.empty(_DEEPEST), np.empty((2, 3))
+    lows[0], highs[0] = 0.0, 1.0
+    waiting, tried = 1, 0
+    while waiting > 0:
+        waiting -= 1
+        low, high, tried = lows[waiting], highs[waiting], tried + 1
+        middle = (low + high) / 2.0
+        ends[0], ends[1] = along(before, delta, low), along(before, delta, high)
+        at, there = along(before, delta, middle), rotated_by(rotation, turn, middle)
+        off = angle * (high - low) / 2.0
+        found = compared(world, robot, which, there, ends, at, off)
+        if found == PROVED:
+            continue
+        if found == REFUTED or tried >= _MOST_PIECES or waiting + 2 > _DEEPEST:
+            return False
+        if size * (high - low) < _FINEST:
+            return False
+        lows[waiting], highs[waiting] = middle, high
+        lows[waiting + 1], highs[waiting + 1] = low, middle
+        waiting += 2
+    return True
+
+
+@kernel
+def self_edges_free(world: World, robot: Robot, starts: Array, ends: Array) -> NDArray[np.bool_]:
+    """`self_edge_free` for many edges, shape (k, 3) each, [m]; shape (k,)."""
+    free = np.empty(len(starts), dtype=np.bool_)
+    for i in range(len(starts)):
+        free[i] = self_edge_free(world, robot, starts[i], ends[i])
+    return free

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cdpr.cli.app import check_arguments
+from cdpr.cli.arguments import check_arguments
 from model.errors import BadInput
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import call, nothing_written, one_message

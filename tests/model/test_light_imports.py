@@ -86,6 +86,7 @@ def test_completion_of_a_verb_imports_no_verb(words: str) -> None:
     assert "cdpr.cli.app" in loaded
     assert {name for name in loaded if name.startswith("cdpr.cli.")} <= {
         "cdpr.cli.app",
+        "cdpr.cli.arguments",
     }
     assert loaded.isdisjoint({"numpy", *HEAVY})
 
@@ -106,7 +107,7 @@ def test_verbs_that_must_be_fast_are_light(module: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["cdpr.cli.check", "cdpr.cli.report", "executor.trajectory.setpoints"]
+    "module", ["cdpr.cli.check", "cdpr.cli.explain", "executor.trajectory.setpoints"]
 )
 def test_what_neither_searches_nor_measures_nor_sends_loads_no_library_for_it(module: str) -> None:
     assert not loaded_by(f"import {module}") & {"numba", "scipy", "cv2", "can"}

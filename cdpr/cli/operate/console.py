@@ -1,4 +1,4 @@
-"""`cdpr console`: the operator's page in a browser."""
+"""`cdpr console`: the operator's page in a browser; `cdpr demo`: all steps on simulated drives."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from cdpr import console as page  # loads the server where it is asked for
+from cdpr.cli.operate.run import agreement, show, show_files
+from cdpr.cli.operate.supervision import RunSupervisor
 from cdpr.cli.options import (
     DEFAULT_BUS,
     BusOptions,
@@ -15,9 +17,18 @@ from cdpr.cli.options import (
     WithoutRealTimeOption,
     with_option_groups,
 )
-from cdpr.cli.output import show_line
+from cdpr.cli.output import Terminal, out, show_facts, show_line
 from cdpr.console.session import Console, ConsoleFiles
+from executor import runner
+from executor.recording.record_files import free_folder
+from executor.recording.run_folder import RunFolder
 from model.errors import BadInput, HardwareMissing
+from model.files.examples import PAPER_RIG, ready_folder
+from model.plan import plan_facts, plan_from_document, save_plan
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.planning import plan_path
+from planner.settings import OptimalSettings
 
 #: Addresses that only a browser on this machine reaches.
 _LOCAL = ("127.0.0.1", "::1", "localhost")
@@ -122,3 +133,56 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
         show_line("Ctrl-C ends the console; a run continues")
 
     run_server(shown, host, port, show_address)
+
+
+def demo(
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="folder to create", metavar="DIR")
+    ] = None,
+    environment: Annotated[
+        int, typer.Option(min=1, max=3, help="number of the paper's environment")
+    ] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="random seed of the planner")] = 0,
+    console: Annotated[
+        bool,
+        typer.Option("--console", help="load it into the operator's page, in real time"),
+    ] = False,
+) -> None:
+    """Plan, check, run on simulated drives, track with a synthetic camera, and report.
+
+    With --console the plan is loaded into the operator's page at the printed address, with drives
+    and cameras simulated in real time: take control there, then run, jog or teach.
+
+    [dim]Examples:[/dim]
+
+      cdpr demo --environment 3
+
+      cdpr demo --console
+    """
+    folder = output or free_folder("demo")
+    RunFolder.require_free(folder)
+    rig = load_rig(ready_folder() / PAPER_RIG)
+    scene_file = ready_folder() / f"environment_{environment}.yaml"
+    scene = load_scene(scene_file)
+    document = plan_path(rig, scene, OptimalSettings(seed=seed), Terminal())
+    show_facts("plan", plan_facts(document))
+    if console:
+        folder.mkdir(parents=True)
+        plan = folder / "plan.json"
+        save_plan(document, plan)
+        files = ConsoleFiles(ready_folder() / PAPER_RIG, rig, (), (), (), scene_file, False, False)
+        serve(files, plan, "127.0.0.1", 0)
+        return
+    with RunSupervisor(lambda result: show(result, False)) as supervisor:
+        result = runner.run(
+            plan_from_document(document),
+            rig,
+            folder=folder,
+            realtime=False,
+            listener=Terminal(),
+            confirm=agreement(supervisor, rig, False, False),
+            supervisor=supervisor,
+        )
+        show_files(result, False)
+    out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
+    raise typer.Exit(result.exit_code)

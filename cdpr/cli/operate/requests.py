@@ -1,24 +1,13 @@
-"""An operator's requests: to a run in progress, and `status`, `reset`, `release` without one."""
+"""`cdpr stop`, `hold`, `resume`, `speed`: an operator's requests to a run in progress."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Annotated
 
 import typer
 
-from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
-from cdpr.cli.options import (
-    DEFAULT_BUS,
-    BusOptions,
-    JsonOption,
-    NoQuestionOption,
-    RigArgument,
-    WithoutRealTimeOption,
-    with_option_groups,
-)
-from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
-from executor import service
+from cdpr.cli.options import JsonOption
+from cdpr.cli.output import out, show_json, show_line
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
 from executor.state_machine import State
 
@@ -108,100 +97,3 @@ def _request(verb: str, process: int | None, as_json: bool, percent: int | None 
     )
     if verb == "speed" and status["wished"]["hold"]:
         out.print("it is on hold: the speed applies after `cdpr resume`")
-
-
-@with_option_groups
-def status(
-    rig: RigArgument,
-    bus: BusOptions = DEFAULT_BUS,
-    as_json: JsonOption = False,
-) -> None:
-    """Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.
-
-    Drives are not queried while a run is in progress or being prepared; `cdpr monitor` shows them.
-
-    [dim]Example:[/dim]
-
-      cdpr status configs/gachon_8_6.yaml --interface socketcan --channel can0
-    """
-    the_rig = bus.rig(rig)
-    result = service.status(the_rig)
-    if as_json:
-        show_json(result.as_dict())
-    else:
-        show_facts("state of the rig", result.facts(rig))
-        for line in result.drive_lines(the_rig.drive_names):
-            show_line(f"  {line}")
-    if result.missing is not None:
-        raise result.missing
-
-
-# `cdpr reset`: the only command that releases a latched fault.
-
-
-@with_option_groups
-def reset(
-    rig: RigArgument,
-    bus: BusOptions = DEFAULT_BUS,
-    yes: NoQuestionOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Release a latched fault once its cause is removed: reset drives in fault, move nothing.
-
-    Drives that hold keep holding. A drive in fault is not reset while others hold the platform.
-    The next run must start at the platform's present pose.
-
-    [dim]Example:[/dim]
-
-      cdpr reset configs/gachon_8_6.yaml --interface socketcan --channel can0
-    """
-    the_rig = bus.rig(rig)
-    result = service.reset(
-        the_rig,
-        confirm=confirmation(asks=not yes, as_json=as_json),
-        listener=Terminal(quiet=as_json),
-    )
-    if as_json:
-        show_json(asdict(result))
-        return
-    show_line(f"drives: {', '.join(sorted(set(result.drives)))}")
-    if result.restarted:
-        names = ", ".join(the_rig.drive_names[node] for node in result.restarted)
-        show_line(f"power-cycled since their last configuration: {names}")
-    show_line(f"reference: {result.reference}")
-    latch_now = "the fault latch is released" if result.was_latched else "no fault was latched"
-    out.print(f"{latch_now}; the next run must start from the platform's present pose")
-
-
-# `cdpr release`: close all brakes, then remove the torque of all drives.
-
-
-@with_option_groups
-def release(
-    rig: RigArgument,
-    bus: BusOptions = DEFAULT_BUS,
-    yes: NoQuestionOption = False,
-    without_real_time: WithoutRealTimeOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Release the drives with the platform on a support: close brakes, remove torque.
-
-    All drives are released together, without motion commands. Winches without brakes pay out
-    their cables, so home the rig again afterwards.
-
-    [dim]Example:[/dim]
-
-      cdpr release configs/gachon_8_6.yaml --interface socketcan --channel can0
-    """
-    result = service.release(
-        bus.rig(rig),
-        need_real_time_rights=not without_real_time,
-        listener=Terminal(quiet=as_json),
-        confirm=confirmation(asks=not yes, as_json=as_json),
-        supervisor=SignalSupervisor(),
-    )
-    if as_json:
-        show_json(asdict(result))
-        return
-    out.print(f"torque removed from all drives: {', '.join(sorted(set(result.drives)))}")
-    show_line(f"reference: {result.reference}")

@@ -16,13 +16,13 @@ from model.errors import BadInput
 from model.kinematics import cables_to
 from model.pose import Array
 from model.rig import Rig, load_rig
-from planner.collision.self_collision import (
+from planner.collision.world import (
     build_robot,
+    build_world,
     self_edge_free,
     self_edges_free,
     self_turning_edge_free,
 )
-from planner.collision.world import build_world
 from planner.kernels.primitives import segment_pair_squared
 from tests.planner.collision.sampled_oracle import changed_rig, random_scene
 

@@ -13,14 +13,14 @@ from model.clearance import ClearanceModel
 from model.errors import CdprError
 from model.pose import Array
 from model.rig import Rig
-from planner.collision.self_collision import (
+from planner.collision.self_collision_regions import PROVED, REFUTED, compared
+from planner.collision.world import (
     build_robot,
+    build_world,
     self_edges_free,
     self_turning_edge_free,
     unproved_robot,
 )
-from planner.collision.self_collision_regions import PROVED, REFUTED, compared
-from planner.collision.world import build_world
 from tests.planner.collision.random_builds import GACHON, Build, random_build, rig_of
 from tests.planner.collision.sampled_oracle import changed_rig, random_scene
 

@@ -10,9 +10,8 @@ import numpy as np
 from model.pose import Array
 from model.rig import load_rig
 from model.scene import load_scene
-from planner.collision.self_collision import build_robot, self_edges_free
 from planner.collision.self_collision_regions import CELLS, open_along
-from planner.collision.world import build_world
+from planner.collision.world import build_robot, build_world, self_edges_free
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")

@@ -1,0 +1,116 @@
+"""Checks of every verb's arguments, before the verb opens or writes anything.
+
+Invalid paths, outputs that would overwrite an input or each other, and numbers beyond any machine
+are refused here, for all verbs.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+from model.errors import BadInput
+from model.files.output import file_identity, refuse_overwriting
+from model.files.reading import shown
+
+OUTPUTS = ("output", "mcap", "overlay")
+"""The arguments that name what a verb writes; every other path is read."""
+
+MOST, MOST_WHOLE, MOST_SEED = 1e9, 2**31 - 1, 2**63 - 1
+"""Largest absolute value of a number, of an integer, and of a random seed."""
+MOST_OF = {"seed": MOST_SEED, "workers": 1024, "columns": 1000, "rows": 1000, "size_px": 16384}
+"""Largest integer of single arguments, overriding `MOST_WHOLE`."""
+LONGEST_TEXT = 100
+"""Of a name that becomes part of a file name, [bytes]."""
+NAMES = ("name", "channel", "interface")
+
+
+def check_arguments(arguments: Mapping[str, object]) -> None:
+    """Refuses arguments that are invalid for every verb.
+
+    Args:
+        arguments: The verb's arguments, by parameter name.
+
+    Raises:
+        BadInput: A path or number is invalid, or an output is also an input or another output.
+    """
+    given = dict(_single(arguments))
+    for name, values in given.items():
+        for value in values:
+            _check(name, value)
+    outputs = {_option(n): p for n in OUTPUTS for p in _paths(n, given.get(n, ()))}
+    inputs = [p for n, values in given.items() if n not in OUTPUTS for p in _inputs(values)]
+    refuse_overwriting(outputs, inputs)
+
+
+def _single(arguments: Mapping[str, object]) -> Iterator[tuple[str, list[object]]]:
+    """Each argument's values; a dataclass of options counts as its fields."""
+    for name, value in arguments.items():
+        if is_dataclass(value) and not isinstance(value, type):
+            yield from _single({field.name: getattr(value, field.name) for field in fields(value)})
+        elif isinstance(value, (list, tuple)):
+            yield name, list(value)
+        else:
+            yield name, [value]
+
+
+def _check(name: str, value: object) -> None:
+    match value:
+        case bool() | None:
+            return
+        case int():
+            _check_whole(name, value)
+        case float():
+            _check_number(name, value)
+        case Path():
+            file_identity(value)
+        case str():
+            _check_text(name, value)
+
+
+def _check_whole(name: str, value: int) -> None:
+    most = MOST_OF.get(name, MOST_WHOLE)
+    if abs(value) > most:
+        what = f"{_option(name)} is {str(value)[:40]}; the limit is {most}"
+        raise BadInput(what, where="command line", next_step="give a smaller number")
+
+
+def _check_number(name: str, value: float) -> None:
+    if not math.isfinite(value) or abs(value) > MOST:
+        what = f"{_option(name)} is {value:g}; it must be a finite number, at most {MOST:g}"
+        raise BadInput(
+            what, where="command line", next_step="give a smaller number, in the option's unit"
+        )
+
+
+def _check_text(name: str, text: str) -> None:
+    if "\0" in text or (name in NAMES and len(os.fsencode(text)) > LONGEST_TEXT):
+        what = f"{_option(name)} has {len(text)} characters and is not a valid name"
+        hint = f"give a name of {LONGEST_TEXT} bytes at most"
+        raise BadInput(what, where=shown(text), next_step=hint)
+    if "://" not in text:
+        file_identity(Path(text))
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _paths(name: str, values: Iterable[object]) -> list[Path]:
+    """Paths of an output; a folder of results may also be read, as result names are unique."""
+    found = [value for value in values if isinstance(value, Path)]
+    return [path for path in found if name == "overlay" or not path.is_dir()]
+
+
+def _inputs(values: Iterable[object]) -> Iterator[Path]:
+    """Paths that are read, also in texts such as ``front=video.avi``, if the file exists."""
+    for value in values:
+        if isinstance(value, Path):
+            yield value
+        elif isinstance(value, str):
+            for text in {value, value.partition("=")[2]} - {""}:
+                if os.path.exists(text):
+                    yield Path(text)
