@@ -50,7 +50,8 @@ from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
 from model.winches import WinchMap
-from tracking.measurement import MeasuredClearance, NoPose, PoseMeasurement, clearance_of
+from tracking.clearance import MeasuredClearance, clearance_of
+from tracking.measurement import NoPose, PoseMeasurement
 
 #: Clearances from drive positions are computed this often along a run, [Hz].
 CLEARANCE_RATE = 10.0

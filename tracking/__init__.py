@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 from model.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from tracking.clearance import MeasuredClearance, clearance_of
     from tracking.estimator import TrackerSettings
     from tracking.fusion import MultiCameraFusion
-    from tracking.measurement import MeasuredClearance, NoPose, PoseMeasurement, clearance_of
+    from tracking.measurement import NoPose, PoseMeasurement
     from tracking.pose_log import write_pose_log
     from tracking.shared_errors import CameraMoved
     from tracking.tracker import Tracker
@@ -30,9 +31,10 @@ if not TYPE_CHECKING:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
+            "tracking.clearance": "MeasuredClearance clearance_of",
             "tracking.estimator": "TrackerSettings",
             "tracking.fusion": "MultiCameraFusion",
-            "tracking.measurement": "MeasuredClearance NoPose PoseMeasurement clearance_of",
+            "tracking.measurement": "NoPose PoseMeasurement",
             "tracking.pose_log": "write_pose_log",
             "tracking.shared_errors": "CameraMoved",
             "tracking.tracker": "Tracker",

@@ -1,4 +1,4 @@
-"""Measurement of the platform in one image: pose, extrapolation in time, measured clearance."""
+"""Measurement of the platform in one image, and its extrapolation in time."""
 
 from __future__ import annotations
 
@@ -6,17 +6,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from model.cameras import Z_95
-from model.clearance import ClearanceModel, Nearest, cable_name
-from model.errors import BadInput
-from model.kinematics import Cables, cables_at
 from model.pose import (
     Array,
     Pose,
     matrix_from_rotation_vector,
     read_only,
     rotation_vector_from_matrix,
-    skew,
 )
 
 
@@ -139,133 +134,3 @@ def rates(pictures_per_second: float | None, measuring_ms: float | None, tags: i
     fast = "–" if pictures_per_second is None else f"{pictures_per_second:.1f}"
     long = "–" if measuring_ms is None else f"{measuring_ms:.1f}"
     return f"{fast} images/s, {long} ms, {tags} tag{'' if tags == 1 else 's'}"
-
-
-COVERAGE = 0.95
-"""Share of true distances that lie within the stated uncertainty."""
-INTERVAL = f"{100.0 * COVERAGE:.0f} % interval"
-"""Its name in verdict, report and messages."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredClearance:
-    """Distances to every obstacle at a measured pose.
-
-    Attributes:
-        nearest: In the order of the scene's obstacles.
-        uncertainties: Half widths of each distance's interval with `COVERAGE`, from the measured
-            pose, outlets and anchors; shape (k,), [m].
-    """
-
-    nearest: tuple[Nearest, ...]
-    uncertainties: Array
-
-    @property
-    def distance(self) -> float:
-        """The smallest distance, [m]."""
-        return min(n.distance for n in self.nearest)
-
-    @property
-    def uncertainty(self) -> float:
-        """`distance` minus the lower bound of the smallest true distance, [m].
-
-        It exceeds the nearest obstacle's own uncertainty if one slightly farther away is less
-        certain.
-        """
-        lows = [n.distance - u for n, u in zip(self.nearest, self.uncertainties, strict=True)]
-        return self.distance - float(min(lows))
-
-    @property
-    def worst_case_obstacle(self) -> int:
-        """Index of the obstacle that determines `at_most`."""
-        return int(np.argmin(self._highs))
-
-    @property
-    def at_most(self) -> float:
-        """Upper bound of the smallest true distance, [m].
-
-        Each obstacle counts with its own uncertainty.
-        """
-        return float(np.min(self._highs))
-
-    @property
-    def _highs(self) -> Array:
-        return np.array([n.distance for n in self.nearest]) + self.uncertainties
-
-
-def clearance_of(model: ClearanceModel, measurement: PoseMeasurement) -> MeasuredClearance | None:
-    """Clearance to every obstacle at a measurement; None in a scene without obstacles.
-
-    Covariances of lens, extrinsics, tags, outlets, anchors and pose are propagated to each
-    distance.
-
-    Raises:
-        BadInput: A part of these is not stated.
-    """
-    if measurement.unstated:
-        raise BadInput(
-            "the error of this pose is unknown, so the clearance has no interval",
-            next_step="calibrate, or state `error_mm` of the camera in the rig file",
-        )
-    covariance = measurement.covariance + measurement.shared
-    return clearance_at(model, measurement.pose, covariance, 0.0, measurement.cable_error)
-
-
-def clearance_at(
-    model: ClearanceModel,
-    pose: Pose,
-    covariance: Array,
-    allowance: float,
-    cable_error: float = 0.0,
-) -> MeasuredClearance | None:
-    """Clearance to every obstacle at a measured pose; None in a scene without obstacles.
-
-    The pose's covariance is propagated to the distance by its gradient: the robot's nearest point
-    moves with the platform (fully on it, in proportion along a cable), and the distance changes by
-    that motion along the line to the obstacle; sliding of the nearest points has no first-order
-    effect.
-
-    Args:
-        model: Robot and scene.
-        pose: ``world_from_platform``.
-        covariance: Of position and rotation vector about world axes, shape (6, 6), [m, rad].
-        allowance: Added for errors outside the covariance, [m].
-        cable_error: Error of cable exits, 95 %, [m]; 0 to use the rig's `outlet_error` and
-            `anchor_error`.
-    """
-    nearest = model.obstacles(pose)
-    if not nearest:
-        return None
-    cables = cables_at(model.rig, pose)
-    names = {cable_name(i): i for i in range(model.rig.cable_count)}
-    at_ends = (model.rig.outlet_error or 0.0, model.rig.anchor_error or 0.0)
-    ends = np.array((cable_error, 0.0) if cable_error > 0.0 else at_ends) / Z_95
-    variances = [_variance(n, names.get(n.first), cables, pose, covariance, ends) for n in nearest]
-    return MeasuredClearance(nearest, read_only(Z_95 * np.sqrt(variances) + allowance))
-
-
-def _variance(
-    nearest: Nearest,
-    cable: int | None,
-    cables: Cables,
-    pose: Pose,
-    spread: Array,
-    ends: Array,
-) -> float:
-    """Variance of one distance, [m²]; ``ends``: deviations of outlets and anchors, [m]."""
-    share, point, own = 1.0, nearest.first_point, 0.0
-    if cable is not None:
-        start, end = cables.exits[cable], cables.anchors[cable]
-        length = float(np.linalg.norm(end - start))
-        share = float(np.clip((point - start) @ (end - start) / length**2, 0.0, 1.0))
-        point = end
-        own = ((1.0 - share) * ends[0]) ** 2 + (share * ends[1]) ** 2
-    arm = point - pose.position
-    by_pose = share * np.hstack([np.eye(3), -skew(arm)])
-    covariance = by_pose @ spread @ by_pose.T
-    line = nearest.first_point - nearest.second_point
-    length = float(np.linalg.norm(line))
-    if length < 1e-9:  # contact: the direction is unknown, so the worst counts
-        return own + float(np.linalg.eigvalsh(covariance)[-1])
-    direction = line / length
-    return own + float(direction @ covariance @ direction)

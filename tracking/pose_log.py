@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from model.files.documents import write_atomic
-from tracking.measurement import MeasuredClearance, NoPose, Observation
+from tracking.clearance import MeasuredClearance
+from tracking.measurement import NoPose, Observation
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")

@@ -18,18 +18,12 @@ from model.errors import BadInput
 from model.pose import Array, Pose
 from model.rig import Camera, Rig
 from tracking.camera_model import Image, pixels_of
+from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
 from tracking.detection.tags import tag_corners
 from tracking.estimator import UNCERTAIN, UNSHARP
 from tracking.fusion import MultiCameraFusion, synchronize_frames
-from tracking.measurement import (
-    MeasuredClearance,
-    NoPose,
-    Observation,
-    PoseMeasurement,
-    clearance_of,
-    rates,
-)
+from tracking.measurement import NoPose, Observation, PoseMeasurement, rates
 from tracking.pose_log import LoggedPicture
 from tracking.shared_errors import require_stated_errors
 from tracking.tracker import Tracker

@@ -38,9 +38,10 @@ from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector
 from model.rig import Camera, Rig, Tag, load_rig
 from model.scene import Scene, load_scene
 from tracking.camera_model import undistort_pixels
+from tracking.clearance import clearance_of
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
-from tracking.measurement import PoseMeasurement, clearance_of
+from tracking.measurement import PoseMeasurement
 from tracking.pnp import TagView, solve_pnp
 from tracking.shared_errors import SharedErrors
 

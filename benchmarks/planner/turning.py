@@ -18,9 +18,14 @@ from model.files.scene_file import SceneDocument
 from model.pose import Array
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene, scene_from_document
-from planner.anytime_6d.moves import matrix_of, put_rotated, turn_between
 from planner.anytime_6d.path import RotatingSearch, turning_problem
-from planner.anytime_6d.problem import RotatingProblem, move_allowed
+from planner.anytime_6d.problem import (
+    RotatingProblem,
+    matrix_of,
+    move_allowed,
+    put_rotated,
+    turn_between,
+)
 from planner.collision.rotating_edges import turning_edge_free
 from planner.collision.world import self_turning_edge_free
 from planner.costs import KinematicCost

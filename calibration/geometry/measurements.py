@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.results import data_hash
-from model.files.reading import CsvTable
+from model.files.csv_table import CsvTable
 from model.pose import Array, Pose, matrix_from_quaternion, read_only, skew
 from model.rig import Rig
 from model.statics.gravity import PRETENSION_SHARE, STANDARD_GRAVITY, working_tensions

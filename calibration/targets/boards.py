@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput
-from model.files.reading import CsvTable
+from model.files.csv_table import CsvTable
 from model.pose import Array, Pose, read_only
 from model.rig import Camera
 from model.tag_families import FAMILIES

@@ -14,8 +14,9 @@ from executor.supervision import RequestBoard, StopReason
 from model.clearance import ClearanceModel
 from model.pose import Pose
 from model.progress import SILENT, Listener
+from tracking.clearance import INTERVAL, MeasuredClearance, clearance_of
 from tracking.fusion import MultiCameraFusion
-from tracking.measurement import INTERVAL, MeasuredClearance, PoseMeasurement, clearance_of, rates
+from tracking.measurement import PoseMeasurement, rates
 
 # Monitoring of measured clearance: its upper bound against the limit.
 

@@ -24,7 +24,8 @@ from executor.recording.run_folder import RunFolder
 from model.errors import CdprError, Fault
 from model.pose import Pose
 from model.rig import Camera, Rig
-from tracking.measurement import MeasuredClearance, NoPose, Observation
+from tracking.clearance import MeasuredClearance
+from tracking.measurement import NoPose, Observation
 from tracking.tracker import EncoderExtrapolator, Tracker
 
 # The camera worker: takes an image on request and measures the pose in it.

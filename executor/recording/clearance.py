@@ -14,7 +14,7 @@ from model.kinematics import cable_lengths, structure_matrix
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.winches import WinchMap
-from tracking.measurement import MeasuredClearance, clearance_at
+from tracking.clearance import MeasuredClearance, clearance_at
 
 _MM = 1e3
 _FACTS = 8

@@ -32,7 +32,8 @@ from executor.recording.run_folder import PLAN, RIG, RunFolder
 from executor.recording.summary import RunContext
 from executor.recording.tables import OK, CycleTable, FusedTable, PoseTable
 from model.errors import Fault
-from tracking.measurement import COVERAGE, MeasuredClearance, NoPose
+from tracking.clearance import COVERAGE, MeasuredClearance
+from tracking.measurement import NoPose
 from tracking.pose_log import LoggedPicture
 
 # Camera messages of ``run.mcap``: poses, reasons for missing poses, kept images.

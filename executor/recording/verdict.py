@@ -20,7 +20,7 @@ from executor.state_machine import ON_PATH
 from model.errors import BadInput
 from model.rig import Rig
 from model.scene import Scene
-from tracking.measurement import INTERVAL
+from tracking.clearance import INTERVAL
 
 PASSED, FAILED, STOPPED = "PASSED", "FAILED", "STOPPED"
 #: Final state of a run without a recorded end: its program was killed, or the disk was full.

@@ -43,7 +43,8 @@ from executor.supervision import RequestBoard
 from executor.trajectory.setpoints import PreparedRun
 from model.pose import Pose
 from model.rig import Rig
-from tracking.measurement import MeasuredClearance, PoseMeasurement
+from tracking.clearance import MeasuredClearance
+from tracking.measurement import PoseMeasurement
 
 #: Number of newest events reported.
 EVENTS_SHOWN = 12

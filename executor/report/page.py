@@ -44,7 +44,7 @@ from model.pages.scene import (
 from model.pages.viewer import SCENE_SCRIPTS, page_data, viewer
 from model.plan import Plan
 from model.pose import Array, matrix_from_quaternion
-from tracking.measurement import INTERVAL
+from tracking.clearance import INTERVAL
 
 MOST_MOMENTS = 400
 MOST_BRANCHES = 4000

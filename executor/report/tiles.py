@@ -15,7 +15,7 @@ from executor.report.run_data import RunData, markdown
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
 from model.pages.page import known, list_table, prose, table, tile, tiles
 from model.scene import legs_of
-from tracking.measurement import INTERVAL
+from tracking.clearance import INTERVAL
 
 _CLASS = {"PASSED": "pass", "STOPPED": "stop"}
 

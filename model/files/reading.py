@@ -1,4 +1,4 @@
-"""The reader of input files and CSV tables: refuses anything irregular, too large or too deep.
+"""The reader of input files, with limits: refuses anything irregular, too large or too deep.
 
 Every file that a user names is read here, so that a device, a pipe or a malicious file ends in one
 message before it costs memory or time.
@@ -13,14 +13,11 @@ import json
 import os
 import stat
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
-import numpy as np
-
 from model.errors import BadInput
-from model.pose import Array
 
 MEGABYTE = 1_000_000
 TEXT_LIMIT = 256 * MEGABYTE
@@ -220,78 +217,3 @@ def _rows(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:
             why="a quote is not closed, or this is not a CSV file",
             next_step="write a header line, then comma-separated lines of values",
         ) from None
-
-
-class CsvTable:
-    """Named columns of text and numbers.
-
-    Attributes:
-        names: Of the columns, in order.
-    """
-
-    def __init__(self, path: Path) -> None:
-        """Reads a file with a header line and at least one line of values.
-
-        Raises:
-            BadInput: It cannot be read, names a column twice, or a line has more or fewer values
-                than there are columns.
-        """
-        self._path = path
-        file = CsvFile(path)
-        self.names = tuple(name.strip() for name in file.rows[0]) if file.rows else ()
-        self._rows, self._lines = file.rows[1:], file.lines[1:]
-        if not self._rows:
-            raise self.bad("the file holds no values", "write a header line, then lines of values")
-        twice = {name for name in self.names if self.names.count(name) > 1}
-        if twice:
-            raise self.bad(f"the column {min(twice)!r} appears twice", "name each column once")
-        for number, row in zip(self._lines, self._rows, strict=True):
-            if len(row) != len(self.names):
-                what = f"line {number} has {len(row)} values for {len(self.names)} columns"
-                raise self.bad(what, "give every line one value per column")
-
-    def of(self, names: Sequence[str]) -> Array:
-        """Columns of finite numbers side by side, shape (n, len(names)).
-
-        Raises:
-            BadInput: A column is missing, or a value is not a finite number; with its line.
-        """
-        columns = [(self._index(name), name) for name in names]
-        return np.array(
-            [
-                [self._number(row[index], name, line) for index, name in columns]
-                for row, line in zip(self._rows, self._lines, strict=True)
-            ]
-        )
-
-    def texts(self, name: str) -> list[str]:
-        """A column as text, without surrounding blanks.
-
-        Raises:
-            BadInput: It is missing.
-        """
-        index = self._index(name)
-        return [row[index].strip() for row in self._rows]
-
-    def line(self, row: int) -> int:
-        """The line, counted from 1, of a row, counted from 0."""
-        return self._lines[row]
-
-    def bad(self, what: str, next_step: str) -> BadInput:
-        """The error about this file."""
-        return BadInput(what, where=str(self._path), next_step=next_step)
-
-    def _index(self, name: str) -> int:
-        if name not in self.names:
-            raise self.bad(f"the column {name!r} is missing", "see docs/data-formats.md")
-        return self.names.index(name)
-
-    def _number(self, text: str, name: str, line: int) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
-        if not np.isfinite(value):
-            what = f"line {line}, {name}: {text!r} is not a finite number"
-            raise self.bad(what, "leave out lines that were not measured")
-        return value

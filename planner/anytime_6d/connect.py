@@ -11,8 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.anytime_6d.moves import put_between, put_rotated
-from planner.anytime_6d.problem import RotatingProblem, move_allowed
+from planner.anytime_6d.problem import RotatingProblem, move_allowed, put_between, put_rotated
 from planner.kernels.jit import kernel
 
 Array = NDArray[np.float64]

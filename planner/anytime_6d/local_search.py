@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.anytime_6d.moves import move_length, put_between, put_rotated
 from planner.anytime_6d.problem import (
     CAPACITY,
     CLEARANCE,
@@ -20,8 +19,11 @@ from planner.anytime_6d.problem import (
     RotatingProblem,
     gained,
     move_allowed,
+    move_length,
     move_lows,
     move_sum,
+    put_between,
+    put_rotated,
 )
 from planner.kernels.jit import kernel
 

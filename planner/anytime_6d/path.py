@@ -21,8 +21,7 @@ from planner.anytime_6d import connect as connecting
 from planner.anytime_6d import local_search as polishing
 from planner.anytime_6d.connect import connect
 from planner.anytime_6d.local_search import Line, copied, line_length, measure, new_line, polish
-from planner.anytime_6d.moves import move_length
-from planner.anytime_6d.problem import RotatingProblem, build_objective, set_weights
+from planner.anytime_6d.problem import RotatingProblem, build_objective, move_length, set_weights
 from planner.collision.world import build_robot, build_world
 from planner.costs import KinematicCost
 from planner.edge_checks import REASONS

@@ -22,7 +22,7 @@ from planner.check import check_path
 from planner.costs import KinematicCost
 from planner.edge_checks import ExactChecks
 from planner.path import PosePath
-from planner.rrt.edges import exact_checks
+from planner.rrt.rrt import exact_checks
 from planner.rrt.search import PaperPlanner, SearchResult
 from planner.rrt.variants import TEXT, AlgorithmVariant
 from planner.settings import CLEARANCE_RESERVE, CostName, PlannerSettings, SamplerName

@@ -15,16 +15,6 @@ from planner.costs import KinematicCost
 from planner.edge_checks import FREE, OBSTACLE, REASONS, ExactChecks
 from planner.kernels.jit import kernel
 from planner.path import Progress
-from planner.rrt.edges import (
-    CostField,
-    EdgeLimits,
-    edge_cost,
-    exact_checks,
-    kinematic_field,
-    length_field,
-    limits_of,
-    problem,
-)
 from planner.rrt.rrt import (
     CHECKS,
     ITERATIONS,
@@ -33,11 +23,19 @@ from planner.rrt.rrt import (
     NOT_REACHED,
     REACHED,
     REFUSALS,
+    CostField,
+    EdgeLimits,
     Rules,
     Search,
     Task,
+    edge_cost,
+    exact_checks,
     extend_tree,
+    kinematic_field,
+    length_field,
+    limits_of,
     new_search,
+    problem,
     try_straight,
 )
 from planner.rrt.sampling import new_tallies

@@ -24,7 +24,8 @@ from model.scene import load_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 from tests.cli.plans import CONFIGS, RIG, write_short_plan
-from tracking.measurement import PoseMeasurement, clearance_at
+from tracking.clearance import clearance_at
+from tracking.measurement import PoseMeasurement
 
 SCENE = load_scene(CONFIGS / "environment_1.yaml")
 THE_RIG = load_rig(RIG)

@@ -25,7 +25,8 @@ from model.errors import BadInput, Fault
 from model.pose import Pose
 from model.rig import load_rig
 from tests.cli.plans import RIG, free_scene
-from tracking.measurement import MeasuredClearance, PoseMeasurement, clearance_of
+from tracking.clearance import MeasuredClearance, clearance_of
+from tracking.measurement import PoseMeasurement
 from tracking.track import FrameRate
 
 RATE = 10.0

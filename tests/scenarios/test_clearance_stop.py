@@ -28,7 +28,8 @@ from simulation.camera.camera import SyntheticCamera
 from tests.cli.plans import GOAL_MM, RIG, START_MM, straight_plan
 from tests.cli.program import call
 from tests.scenarios.stage import at, staged
-from tracking.measurement import PoseMeasurement, clearance_of
+from tracking.clearance import clearance_of
+from tracking.measurement import PoseMeasurement
 
 #: True offset of the platform towards the block, [m].
 OFF = np.array([-0.005, 0.0, 0.0])

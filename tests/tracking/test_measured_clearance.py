@@ -18,10 +18,11 @@ from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene, load_scene
 from simulation.camera.camera import SyntheticCamera
 from tracking.camera_model import distort_pixels, project_undistorted, undistort_pixels
+from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.fusion import fuse_poses
-from tracking.measurement import MeasuredClearance, PoseMeasurement, clearance_of
+from tracking.measurement import PoseMeasurement
 from tracking.pnp import TagView, moved, solve_pnp
 from tracking.shared_errors import (
     SharedErrors,

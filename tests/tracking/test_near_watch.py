@@ -14,7 +14,7 @@ from executor.cameras.multi_camera import NEAR_IMAGES, ClearanceMonitor
 from executor.recording.clearance import ClearanceRow, clearance_table
 from executor.recording.verdict import distances
 from model.clearance import Nearest
-from tracking.measurement import MeasuredClearance
+from tracking.clearance import MeasuredClearance
 
 #: Clearance required by the scene, [mm].
 LIMIT_MM = 20.0

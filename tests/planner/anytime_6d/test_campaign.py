@@ -9,8 +9,7 @@ from model.files.scene_file import RotationLimitsDocument
 from model.pose import Array, Pose, interpolate
 from model.rig import Rig
 from model.scene import Scene, scene_from_document
-from planner.anytime_6d.moves import put_between
-from planner.anytime_6d.problem import RotatingProblem, move_allowed
+from planner.anytime_6d.problem import RotatingProblem, move_allowed, put_between
 from tests.effort import cases
 from tests.planner.anytime_6d.rotating_scenes import (
     GACHON,

@@ -10,14 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from model.pose import Pose, RotationLimits, interpolate, largest_rotations
 from model.rig import Rig
-from planner.anytime_6d.moves import (
+from planner.anytime_6d.problem import (
+    ROTATION,
     matrix_of,
+    move_allowed,
     move_length,
     put_between,
     rotations_kept,
     turn_between,
 )
-from planner.anytime_6d.problem import ROTATION, move_allowed
 from tests.planner.anytime_6d.rotating_scenes import (
     GACHON,
     HALL,

@@ -22,8 +22,7 @@ from planner.anytime_6d.local_search import (
     new_line,
     replace,
 )
-from planner.anytime_6d.moves import move_length, pose_clearance
-from planner.anytime_6d.problem import move_lows, move_sum, pose_cost
+from planner.anytime_6d.problem import move_length, move_lows, move_sum, pose_clearance, pose_cost
 from planner.check import verify
 from planner.costs import KinematicCost
 from planner.planning import make_plan

@@ -10,7 +10,7 @@ import pytest
 
 from model.errors import BadInput
 from planner.costs import KinematicCost
-from planner.rrt.edges import edge_cost, kinematic_field, length_field
+from planner.rrt.rrt import edge_cost, kinematic_field, length_field
 from planner.rrt.search import PaperPlanner
 from planner.rrt.variants import AlgorithmVariant
 from planner.settings import CLEARANCE_RESERVE, PlannerSettings

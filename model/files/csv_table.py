@@ -1,0 +1,87 @@
+"""CSV files with named columns of numbers, written by hand or by other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from model.errors import BadInput
+from model.files.reading import CsvFile
+from model.pose import Array
+
+
+class CsvTable:
+    """Named columns of text and numbers.
+
+    Attributes:
+        names: Of the columns, in order.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Reads a file with a header line and at least one line of values.
+
+        Raises:
+            BadInput: It cannot be read, names a column twice, or a line has more or fewer values
+                than there are columns.
+        """
+        self._path = path
+        file = CsvFile(path)
+        self.names = tuple(name.strip() for name in file.rows[0]) if file.rows else ()
+        self._rows, self._lines = file.rows[1:], file.lines[1:]
+        if not self._rows:
+            raise self.bad("the file holds no values", "write a header line, then lines of values")
+        twice = {name for name in self.names if self.names.count(name) > 1}
+        if twice:
+            raise self.bad(f"the column {min(twice)!r} appears twice", "name each column once")
+        for number, row in zip(self._lines, self._rows, strict=True):
+            if len(row) != len(self.names):
+                what = f"line {number} has {len(row)} values for {len(self.names)} columns"
+                raise self.bad(what, "give every line one value per column")
+
+    def of(self, names: Sequence[str]) -> Array:
+        """Columns of finite numbers side by side, shape (n, len(names)).
+
+        Raises:
+            BadInput: A column is missing, or a value is not a finite number; with its line.
+        """
+        columns = [(self._index(name), name) for name in names]
+        return np.array(
+            [
+                [self._number(row[index], name, line) for index, name in columns]
+                for row, line in zip(self._rows, self._lines, strict=True)
+            ]
+        )
+
+    def texts(self, name: str) -> list[str]:
+        """A column as text, without surrounding blanks.
+
+        Raises:
+            BadInput: It is missing.
+        """
+        index = self._index(name)
+        return [row[index].strip() for row in self._rows]
+
+    def line(self, row: int) -> int:
+        """The line, counted from 1, of a row, counted from 0."""
+        return self._lines[row]
+
+    def bad(self, what: str, next_step: str) -> BadInput:
+        """The error about this file."""
+        return BadInput(what, where=str(self._path), next_step=next_step)
+
+    def _index(self, name: str) -> int:
+        if name not in self.names:
+            raise self.bad(f"the column {name!r} is missing", "see docs/data-formats.md")
+        return self.names.index(name)
+
+    def _number(self, text: str, name: str, line: int) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not np.isfinite(value):
+            what = f"line {line}, {name}: {text!r} is not a finite number"
+            raise self.bad(what, "leave out lines that were not measured")
+        return value
