@@ -30,10 +30,13 @@ ARGUMENTS = [
     "--disable-sync",
 ]
 #: WebGL without a graphics card; it takes most of a core while the scene moves.
-WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-watchdog")
 VIEWS = ("live", "operate", "jog", "teach", "events", "service")
 AUDITS = (Path(__file__).parent / "audits.js").read_text(encoding="utf-8")
 SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1400, 900)}
+
+PATIENCE_S = 30.0  # on a busy computer; what comes is waited for no longer than it takes
+expect.set_options(timeout=1000.0 * PATIENCE_S)
 
 
 @dataclass
@@ -59,8 +62,8 @@ class Fake:
         return [m for m in self.ask()["received"] if kind in (m["kind"], m.get("command"))]
 
     def wait(self, page: Page, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """What it has once that holds; fails after 5 s of the page's time."""
-        for _ in range(100):
+        """What it has once that holds; fails after `PATIENCE_S` of the page's time."""
+        for _ in range(round(PATIENCE_S / 0.05)):
             found = self.ask()
             if holds(found):
                 return found
@@ -106,6 +109,22 @@ class Visit:
             self.page.locator("#teach-name").fill(name)
             self.page.locator("#teach").click()
             expect(self.page.locator("#poses li").last.locator("input")).to_have_value(name)
+
+    def pick(self, x: float | None = None, y: float | None = None) -> None:
+        """Clicks in the scene, in its middle or at a point of the page, until a goal is picked.
+
+        A click before the first frame is drawn picks nothing.
+        """
+        box = self.page.locator("#scene-canvas").bounding_box()
+        assert box
+        x = box["x"] + box["width"] / 2.0 if x is None else x
+        y = box["y"] + box["height"] / 2.0 if y is None else y
+        for _ in range(10):
+            self.page.mouse.click(x, y)
+            self.page.wait_for_timeout(100)
+            if " mm" in self.page.locator("#pick-text").inner_text():
+                return
+        raise AssertionError("nothing is picked in the scene")
 
     def load(self, name: str = "plans/circle.json") -> None:
         self.view("operate")

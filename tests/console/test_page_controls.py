@@ -289,7 +289,7 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
         expect(page.locator("#notice")).to_have_text("teach: done")
         expect(page.locator("#poses li")).to_have_count(taught)  # the next name follows from these
     page.locator("#pick").click()
-    page.locator("#scene-canvas").click()
+    desk.pick()
     page.locator("#pick-keep").click()
     expect(page.locator("#poses li")).to_have_count(3)
     page.get_by_role("button", name="Move pose 2 up").click()
