@@ -46,8 +46,9 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: --no-build-isolation -c constraints.txt -e ".[dev]" && \
 	"$(BIN)/python" -m pip check --disable-pip-version-check && \
 	echo "Compiling the planner, the tags' edge finder and the simulated platform (once; a minute or two) ..." && \
+	{ "$(BIN)/python" -c '$(COMPILE_REST)' & rest=$$!; } && \
 	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml -o "$(VENV)/first-plan.json" --force --json >/dev/null && \
-	"$(BIN)/python" -c '$(COMPILE_REST)' && \
+	wait $$rest && \
 	echo "$$place, $$pins" > "$(STAMP)"
 
 demo: install  ## Plan, prove, run and report the paper's first environment on simulated drives
