@@ -254,6 +254,9 @@ def _preload_results() -> None:
     import cv2  # noqa: F401
     import scipy.spatial  # noqa: F401
 
+    import executor.report.page
+    import executor.report.run_data  # noqa: F401
+
 
 def _move_and_measure(job: _Job, moved: _MotionData) -> None:
     """Moves and takes images; a failure after the start of motion becomes part of the outcome."""
