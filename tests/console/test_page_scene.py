@@ -100,8 +100,20 @@ def test_without_webgl_the_console_says_so_and_works(browser: Browser, fake: Fak
 # Picking a goal, comparing plans.
 
 
-def near(desk: Visit, x: float, y: float, role: str) -> int:
-    """Pixels in about the colour of a role within 8 px of a point of the page."""
+#: Where a goal is picked, as shares of the scene's width and height.
+PICKED = (0.48, 0.38)
+
+
+def picked_at(desk: Visit) -> tuple[float, float]:
+    """That point of the page; the scene moves when the text above it gets longer."""
+    box = desk.page.locator("#scene-canvas").bounding_box()
+    assert box
+    return box["x"] + PICKED[0] * box["width"], box["y"] + PICKED[1] * box["height"]
+
+
+def near_picked(desk: Visit, role: str) -> int:
+    """Pixels in about the colour of a role within 8 px of that point."""
+    x, y = picked_at(desk)
     return painted(desk.page, role, {"x": x - 8, "y": y - 8, "width": 17, "height": 17})
 
 
@@ -118,7 +130,7 @@ def begin_to_pick(found: Visit) -> dict[str, Any]:
 @pytest.mark.parametrize("turned", [0, 4])
 def test_a_goal_is_picked_where_the_pointer_is(desk: Visit, turned: int) -> None:
     """The goal is drawn, by the projection of the scene, under the pointer that picked it."""
-    box = begin_to_pick(desk)
+    begin_to_pick(desk)
     expect(desk.page.locator("#pick")).to_be_visible()  # the list stays: the scene is beside it
     desk.page.locator("#scene-canvas").focus()
     for _ in range(turned):
@@ -126,11 +138,10 @@ def test_a_goal_is_picked_where_the_pointer_is(desk: Visit, turned: int) -> None
         desk.page.keyboard.press("ArrowUp")
     for height in (300, 500):
         desk.page.locator("#pick-height").fill(str(height))
-        x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.38 * box["height"]
-        desk.page.mouse.click(x, y)
+        desk.page.mouse.click(*picked_at(desk))
         expect(desk.page.locator("#pick-text")).to_contain_text(f", {height} mm")
         # The ring about the goal.
-        desk.fake.wait(desk.page, lambda _, x=x, y=y: near(desk, x, y, "ink") > 20)
+        desk.fake.wait(desk.page, lambda _: near_picked(desk, "ink") > 20)
     desk.page.locator("#pick-keep").click()
     expect(desk.page.locator("#pick-bar")).to_be_hidden()
     (pose,) = desk.fake.wait(desk.page, lambda f: bool(f["poses"]))["poses"]
