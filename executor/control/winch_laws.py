@@ -11,7 +11,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from executor.safety.fault_messages import Alarm, StopReaction, over_tension
+from executor.safety.fault_messages import Alarm, not_taut, over_tension, went_slack
 from executor.trajectory.time_scaling import PEAK, smooth_step
 from model.kinematics import cable_lengths
 from model.pose import Array
@@ -213,20 +213,14 @@ class PretensionLaw:
             wanting, np.minimum(self._wound + pace * self._step, self._reach), self._wound
         )
         still_slack = (
-            self._still_slack(int(cable), float(pull[cable])) for cable in np.flatnonzero(short)
+            not_taut(int(cable) + 1, float(pull[cable]), self._reach, self._target)
+            for cable in np.flatnonzero(short)
         )
         return self._targets(self._wound), (*self._room.used_up(tensions), *still_slack)
 
     def _targets(self, wound: Array) -> Targets:
         counts = self._begin - self._per_metre * wound
         return tuple(int(c) for c in np.rint(counts))
-
-    def _still_slack(self, cable: int, tension: float) -> Alarm:
-        text = (
-            f"cable {cable + 1} carries {tension:.1f} N after {self._reach * 1000:g} mm were wound"
-            f" in; the target is {self._target:.1f} N. It may be off its drum or pulley, or broken"
-        )
-        return Alarm(StopReaction.PATH_STOP, "not_taut", text, cable + 1)
 
 
 class OneCableLaw:
@@ -316,11 +310,7 @@ class OneCableLaw:
             slack = self._was_taut[cable] and tension < self._least and cable != self._cable
             self._slack[cable] = self._slack[cable] + 1 if slack else 0
             if self._slack[cable] >= SLACK_CYCLES:
-                text = (
-                    f"cable {cable + 1} went slack ({tension:.1f} N, less than {self._least:.1f})"
-                    f" while only cable {self._cable + 1} was moved"
-                )
-                found.append(Alarm(StopReaction.PATH_STOP, "went_slack", text, cable + 1))
+                found.append(went_slack(cable + 1, tension, self._least, self._cable + 1))
         return found
 
 

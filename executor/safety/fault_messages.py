@@ -87,6 +87,24 @@ def over_tension(cable: int, tension: float, limit: float) -> Alarm:
     return Alarm(StopReaction.PATH_STOP, "over_tension", text, cable)
 
 
+def not_taut(cable: int, tension: float, wound: float, target: float) -> Alarm:
+    """A cable is not taut, [N], after a length was wound in, [m]."""
+    text = (
+        f"cable {cable} carries {tension:.1f} N after {wound * 1000:g} mm were wound"
+        f" in; the target is {target:.1f} N. It may be off its drum or pulley, or broken"
+    )
+    return Alarm(StopReaction.PATH_STOP, "not_taut", text, cable)
+
+
+def went_slack(cable: int, tension: float, limit: float, moved: int) -> Alarm:
+    """A cable went slack, [N], while only another one was moved."""
+    text = (
+        f"cable {cable} went slack ({tension:.1f} N, less than {limit:.1f})"
+        f" while only cable {moved} was moved"
+    )
+    return Alarm(StopReaction.PATH_STOP, "went_slack", text, cable)
+
+
 def late(cycles: float, *, too_late: bool) -> Alarm:
     """A cycle began late; too late if drives may have stopped on their own meanwhile."""
     reaction = StopReaction.QUICK_STOP if too_late else StopReaction.PATH_STOP
