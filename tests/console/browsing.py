@@ -110,17 +110,13 @@ class Visit:
             self.page.locator("#teach").click()
             expect(self.page.locator("#poses li").last.locator("input")).to_have_value(name)
 
-    def pick(self, x: float | None = None, y: float | None = None) -> None:
-        """Clicks in the scene, in its middle or at a point of the page, until a goal is picked.
+    def pick(self) -> None:
+        """Clicks in the middle of the scene until a goal is picked.
 
         A click before the first frame is drawn picks nothing.
         """
-        box = self.page.locator("#scene-canvas").bounding_box()
-        assert box
-        x = box["x"] + box["width"] / 2.0 if x is None else x
-        y = box["y"] + box["height"] / 2.0 if y is None else y
         for _ in range(10):
-            self.page.mouse.click(x, y)
+            self.page.locator("#scene-canvas").click()
             self.page.wait_for_timeout(100)
             if " mm" in self.page.locator("#pick-text").inner_text():
                 return

@@ -151,8 +151,8 @@ def test_a_goal_is_picked_where_the_pointer_is(desk: Visit, turned: int) -> None
 
 
 def test_turning_the_view_picks_nothing_and_cancel_keeps_nothing(desk: Visit) -> None:
-    box = begin_to_pick(desk)
-    x, y = box["x"] + 0.48 * box["width"], box["y"] + 0.38 * box["height"]
+    begin_to_pick(desk)
+    x, y = picked_at(desk)
     desk.page.mouse.move(x, y)
     desk.page.mouse.down()
     desk.page.mouse.move(x + 60, y, steps=4)
