@@ -19,16 +19,8 @@ if TYPE_CHECKING:
         locate_tags,
     )
     from calibration.targets.boards import Chessboard
-    from cdpr.verbs import (
-        check,
-        load_calibration,
-        open_camera,
-        plan,
-        report,
-        stop,
-        track,
-        workspace_map,
-    )
+    from cdpr.measurement import load_calibration, open_camera, track
+    from cdpr.operation import check, plan, report, stop, workspace_map
     from executor.homing import home
     from executor.jogging import jog
     from executor.run_result import RunResult, load_run
@@ -101,7 +93,8 @@ if not TYPE_CHECKING:
             "calibration.geometry.pose_selection": "measurement_poses",
             "calibration.procedures": "calibrate_camera calibrate_rig locate_camera locate_tags",
             "calibration.targets.boards": "Chessboard",
-            "cdpr.verbs": "check load_calibration open_camera plan report stop track workspace_map",
+            "cdpr.measurement": "load_calibration open_camera track",
+            "cdpr.operation": "check plan report stop workspace_map",
             "executor.homing": "home",
             "executor.jogging": "jog",
             "executor.run_result": "RunResult load_run",

@@ -12,9 +12,14 @@ import typer
 from cdpr.cli.output import out, show_json, show_line
 from model.errors import AlreadyExists, BadInput
 from model.files.documents import write_atomic
-from model.files.examples import copy_examples, find_examples, ready_folder, select_examples
+from model.files.examples import (
+    copy_examples,
+    find_examples,
+    ready_folder,
+    rig_text,
+    select_examples,
+)
 from model.files.new_rig import OPTIONS, RigQuestion, collect_answers, read_coordinates
-from model.files.rig_template import rig_text
 
 
 def examples(

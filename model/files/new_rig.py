@@ -1,6 +1,6 @@
 """A new rig file: the questions for its values, with units and defaults.
 
-`collect_answers` asks the questions in order through a callback; `model.files.rig_template` makes
+`collect_answers` asks the questions in order through a callback; `model.files.examples` makes
 the file from the answers.
 """
 

@@ -1,0 +1,92 @@
+"""Functions behind `cdpr track`, and cameras and calibration results for scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from calibration.result_files import load_result
+from calibration.results import ResultDocument
+from drivers.cameras.files import ImageFolder
+from drivers.cameras.live import LiveCamera, VideoFile
+from executor.cameras.sources import parse_camera_sources, require_camera_source
+from executor.track import TrackResult, track_sources
+from model.plan import Plan
+from model.progress import SILENT, Listener
+from model.rig import Rig
+from model.scene import Scene
+
+
+def open_camera(
+    rig: Rig, source: str | int | Path, camera: str | None = None
+) -> ImageFolder | VideoFile | LiveCamera:
+    """The images of one of the rig's cameras, as an iterable; a live one is a context manager.
+
+    Args:
+        rig: The robot with its cameras.
+        source: A folder of images, a video file, or the index or address of a live camera.
+        camera: Name of the rig's camera that took them (default: the first).
+
+    Raises:
+        BadInput: The source cannot be used, or the rig has no such camera.
+        HardwareMissing: The live camera does not open.
+    """
+    taken_by, path = rig.camera(camera), Path(str(source))
+    if path.is_dir():
+        return ImageFolder(path, taken_by)
+    if path.is_file():
+        return VideoFile(path, taken_by)
+    require_camera_source(str(source))
+    return LiveCamera(str(source), taken_by)
+
+
+def track(
+    rig: Rig,
+    source: str | int | Path | Mapping[str, str | int],
+    *,
+    camera: str | None = None,
+    scene: Scene | None = None,
+    plan: Plan | None = None,
+    pictures: int | None = None,
+    overlay: str | Path | None = None,
+    listener: Listener = SILENT,
+) -> TrackResult:
+    """Measures the platform's pose image by image, with one camera or several fused.
+
+    Args:
+        rig: The robot, with its tags and cameras.
+        source: A folder of images, a video file, the index or address of a live camera, or
+            ``synthetic``; for several cameras, a mapping by name.
+        camera: Name of the rig's camera for a single source (default: the first).
+        scene: Obstacles to which the clearance is measured (default: the plan's).
+        plan: Path of the platform in synthetic images.
+        pictures: Largest number of images per camera.
+        overlay: New folder or video for the images with the measurements drawn in.
+        listener: Receives the progress, and the files that are not used.
+
+    Raises:
+        NoPlatformSeen: No image gave a pose.
+        BadInput: A source cannot be used, or an image has another size.
+    """
+    if isinstance(source, Mapping):
+        sources = [f"{name}={one}" for name, one in source.items()]
+    else:
+        sources = [str(source)]
+    return track_sources(
+        rig,
+        parse_camera_sources(rig, sources, camera),
+        scene=scene,
+        plan=plan,
+        pictures=pictures,
+        overlay=None if overlay is None else Path(overlay),
+        listener=listener,
+    )
+
+
+def load_calibration(path: str | Path) -> ResultDocument:
+    """Reads a result file of a calibration, for `Rig.with_calibration`.
+
+    Raises:
+        BadInput: It cannot be read, is not a calibration result, or was edited.
+    """
+    return load_result(Path(path))
