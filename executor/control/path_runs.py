@@ -118,6 +118,9 @@ class PathMotion:
         self.setpoints.close()
 
 
+# A motion from arming to the end, in this process.
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
     """Result of a motion.

@@ -254,6 +254,8 @@ class ReadDrives:
     """Request for the drives' status after the motion; answered by a `CycleStatus`."""
 
 
+# The process: opens the drives, arms them, runs the loop.
+
 _TERMINAL_SIGNALS = (
     signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU
 )  # fmt: skip

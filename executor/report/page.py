@@ -185,6 +185,8 @@ def _alternative(run: RunData) -> str:
     )
 
 
+# The page.
+
 _HINT = (
     "Charts: point or tap for values; drag, pinch or turn the wheel with Ctrl to zoom in time;"
     " double-click to see all again."

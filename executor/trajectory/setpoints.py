@@ -1,6 +1,7 @@
 """From a plan to the set-point table: a whole run as int32 drive positions, checked.
 
-Nothing is armed without it. Each leg between stops begins and ends at rest.
+Nothing is armed without it. Each leg between stops begins and ends at rest, so that no corner is
+rounded at a stop.
 """
 
 from __future__ import annotations
@@ -345,6 +346,9 @@ def _speed_violations(rig: Rig, table: Trajectory) -> list[str]:
                 f" its winch allows {winch.max_speed * 1000:.1f} mm/s"
             )
     return found
+
+
+# From a plan to the checked table: round the corners, time the path, check all.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

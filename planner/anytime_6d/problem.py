@@ -26,6 +26,7 @@ from planner.settings import Weights
 from planner.wrench.capacity import LoadArrays, load_at, margin_at, structure_columns
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 Quaternion = tuple[float, float, float, float]
 
 
@@ -328,7 +329,7 @@ def gained(objective: Objective, clearance: float, margin: float) -> float:
     return gain
 
 
-Integers = NDArray[np.int64]
+# The problem, and the limits of a move.
 
 ROTATION: Final = 5
 """A move beyond the rotation limits; the other reasons are those of `planner.edge_checks`."""

@@ -105,6 +105,8 @@ def _starts(counts: list[int]) -> Integers:
     return np.concatenate([[0], np.cumsum(np.array(counts, dtype=np.int64))]).astype(np.int64)
 
 
+# Self clearance of a rig: precomputed proofs where possible, the rest checked by edge.
+
 _MOST_PIECES = 4096
 _DEEPEST = 64
 _FINEST = 1e-9

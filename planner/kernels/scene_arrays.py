@@ -263,6 +263,9 @@ def _features(shape: Shape, points: Array, pose: Pose) -> tuple[Array, Array]:
             return np.zeros((0, 3)), np.zeros((0, 2, 3))
 
 
+# Where a cable leaves its pulley, and a bound on the travel of that point.
+
+
 @kernel
 def exit_point(world: World, cable: int, anchor: Vector) -> Vector:
     """The exit point of a cable to an anchor, world frame, [m]; NaN where there is none."""

@@ -36,6 +36,9 @@ from planner.wrench.capacity import LoadArrays
 from planner.wrench.translation import Holding
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# Costs and limits of edges.
 
 _SAMPLING = 0.010
 
@@ -145,7 +148,7 @@ def problem(limits: EdgeLimits, start: Array, end: Array) -> int:
     return edge_problem(limits.world, limits.robot, limits.load, limits.holding, start, end)
 
 
-Integers = NDArray[np.int64]
+# The tree.
 
 ITERATIONS, LAST, CHECKS, REACHED, REFUSALS = range(5)
 NOT_REACHED = -1

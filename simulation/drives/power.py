@@ -18,6 +18,8 @@ from simulation.drives.behaviour import DriveBehaviour
 from simulation.drives.object_dictionary import DriveObjects
 from simulation.drives.pdo import Deadlines
 
+# Motion of the motor: following set-points, ramping down, holding. Pure.
+
 
 @dataclass(slots=True)
 class Motor:
@@ -127,6 +129,8 @@ def counts_in(unit: int, counts_per_turn: float) -> float | None:
         return None
     return numerator * 10.0**exponent / seconds
 
+
+# The drive function.
 
 SLIP_SHARE = 0.005
 """Slip speed of a motor loaded with twice its torque limit, as a fraction of its top speed; also

@@ -190,6 +190,9 @@ def _set_skew(stiffness: Array, x: float, y: float, z: float) -> None:
             stiffness[3 + j, i] = stiffness[i, 3 + j]
 
 
+# Newton's method.
+
+
 @compiled
 def hang_still(
     hanging: Hanging,

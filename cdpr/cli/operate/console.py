@@ -135,6 +135,9 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
     run_server(shown, host, port, show_address)
 
 
+# `cdpr demo`: all steps from plan to report on the paper's rig, simulated.
+
+
 def demo(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="folder to create", metavar="DIR")
