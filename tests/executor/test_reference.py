@@ -132,9 +132,10 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     interlock.confirm_held(range(8))
     assert interlock.kept_reference() == found, "no motion and no reset brings it back"
     absolute = MotionInterlock(rig_with("absolute"))
-    absolute.file.write(reference_of(rig))
+    left = reference_of(rig)
+    absolute.file.write(left)
     absolute.found_restarted((4,))
-    assert absolute.kept_reference() == reference_of(rig)
+    assert absolute.kept_reference() == left
 
 
 @pytest.mark.parametrize("ended", [State.STOPPED, State.LATCHED])
