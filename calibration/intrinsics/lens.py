@@ -11,6 +11,7 @@ prism); Kannala & Brandt, IEEE TPAMI 28(8), 2006 (fisheye).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -110,9 +111,12 @@ FOLDS = 4
 """Number of folds of the cross-validation."""
 GAIN = 0.03
 """Relative improvement of the held-out error that another model needs over ``five``."""
+NO_WORSE = 0.02
+"""Relative excess over the lowest held-out error up to which fewer parameters are preferred."""
 RADIAL = 0.02
 """Share of radial errors from which other models are tried; see `radial_share`."""
 _RINGS = 12
+_CLIP = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,10 +296,11 @@ def error_of(fit: LensFit, seen: DetectedBoard) -> float:
 def choose_lens(views: Mapping[str, DetectedBoard], size: tuple[int, int]) -> LensFit:
     """The fit of the lens model selected by cross-validation.
 
-    Five coefficients, unless their errors show a radial pattern (`RADIAL`) and another model has a
-    held-out RMS error lower by `GAIN`, in most images: the mean log ratio of their errors exceeds
-    two of its standard errors. Of several such models, the one with the fewest parameters whose
-    error is within `GAIN` of the best.
+    Five coefficients, unless their errors show a radial pattern (`RADIAL`) and another model has
+    held-out errors lower by `GAIN` and by two standard errors, in the geometric mean over the
+    images, so that a few bad images, equally bad for every model, do not hide the others. Of
+    several such models, the one with the fewest parameters whose error is within `NO_WORSE` of the
+    best.
 
     Raises:
         cv2.error: OpenCV finds no solution.
@@ -307,19 +312,21 @@ def choose_lens(views: Mapping[str, DetectedBoard], size: tuple[int, int]) -> Le
     pattern = radial_share(shown, np.concatenate(rest), first.matrix)
     if first.finite and (pattern < RADIAL or len(views) < 2 * FOLDS):
         return first
-    errors = {name: _as_array(held_out_errors(lens, views, size)) for name, lens in LENSES.items()}
-    rms = {name: float(np.sqrt(np.mean(each))) for name, each in errors.items()}
+    errors = {
+        name: _log_errors(held_out_errors(lens, views, size)) for name, lens in LENSES.items()
+    }
+    mean = {name: float(np.mean(each)) for name, each in errors.items()}
     better = [
         name for name in LENSES if name != "five" and _is_better(errors[name], errors["five"])
     ]
-    least = min((rms[name] for name in better), default=0.0)
-    near = [LENSES[name] for name in better if rms[name] <= least * (1.0 + GAIN)]
+    least = min((mean[name] for name in better), default=0.0)
+    near = [LENSES[name] for name in better if mean[name] <= least + np.log1p(NO_WORSE)]
     lens = min(near, key=lambda one: len(one.names), default=plain)
     return first if lens is plain else fit_lens(lens, views, size)
 
 
-def _as_array(errors: Mapping[str, float]) -> Array:
-    return np.array(list(errors.values()))
+def _log_errors(squared: Mapping[str, float]) -> Array:
+    return np.log(np.maximum(list(squared.values()), 1e-24)) / 2.0
 
 
 def _is_better(mine: Array, plain: Array) -> bool:
@@ -327,17 +334,18 @@ def _is_better(mine: Array, plain: Array) -> bool:
         return False
     if not np.isfinite(plain).all():
         return True
-    gains = np.log(np.maximum(plain, 1e-12) / np.maximum(mine, 1e-12))
-    margin = 2.0 * float(np.std(gains, ddof=1)) / np.sqrt(len(gains))
-    by_share = float(np.mean(mine)) < float(np.mean(plain)) * (1.0 - GAIN) ** 2
-    return by_share and float(np.mean(gains)) > margin
+    gains = plain - mine
+    margin = 2.0 * float(np.std(gains, ddof=1)) / math.sqrt(len(gains))
+    least = -math.log1p(-GAIN)
+    return float(np.mean(gains)) > max(margin, least)
 
 
 def radial_share(corners: Array, errors: Array, matrix: Array) -> float:
     """Share of squared errors that is a function of the distance from the principal point.
 
     It is estimated from the mean radial error in twelve rings of equal numbers of corners, less the
-    part expected by chance.
+    part expected by chance. Errors above `_CLIP` medians are shortened to that: a few bad images
+    must not hide the pattern of the others.
 
     Args:
         corners: Shape (n, 2), [px].
@@ -345,6 +353,9 @@ def radial_share(corners: Array, errors: Array, matrix: Array) -> float:
         matrix: Camera matrix, shape (3, 3), [px].
     """
     away = corners - matrix[:2, 2]
+    sizes = np.linalg.norm(errors, axis=1)
+    most = _CLIP * float(np.median(sizes))
+    errors = errors * np.minimum(1.0, most / np.maximum(sizes, 1e-300))[:, None]
     distance = np.linalg.norm(away, axis=1)
     radial = np.sum(errors * away, axis=1) / np.maximum(distance, 1e-9)
     rings: Sequence[Array] = np.array_split(radial[np.argsort(distance)], _RINGS)

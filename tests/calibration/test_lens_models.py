@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views
 from calibration.intrinsics.exchange import FORMATS, imported_camera, write_rig_with_camera
-from calibration.intrinsics.lens import LENSES, fit_lens, held_out_errors, radial_share
+from calibration.intrinsics.lens import LENSES, RADIAL, fit_lens, held_out_errors, radial_share
 from calibration.intrinsics.quality import (
     _slopes,
     _without_rotation,
@@ -136,6 +136,19 @@ def test_the_radial_share_is_nothing_for_noise_and_all_for_a_pure_pattern() -> N
     away = corners - m[:2, 2]
     pattern = away * (np.linalg.norm(away, axis=1, keepdims=True) / 300.0 - 0.5)
     assert radial_share(corners, pattern, m) > 0.9
+
+
+def test_a_few_bad_pictures_do_not_hide_a_radial_pattern() -> None:
+    """As real sets have: a shaken board, equally bad for every model."""
+    rng = np.random.default_rng(1)
+    corners = rng.uniform(0.0, 600.0, (2000, 2))
+    m = matrix_of(300.0)
+    away = corners - m[:2, 2]
+    errors = 0.3 * away * (np.linalg.norm(away, axis=1, keepdims=True) / 300.0 - 0.5) / 150.0
+    errors += rng.normal(0.0, 0.08, errors.shape)
+    shaken = np.arange(2000) < 200
+    errors[shaken] += rng.normal(0.0, 15.0, (200, 2))
+    assert radial_share(corners, errors, m) > 2.0 * RADIAL
 
 
 def apart_without_rotation(found: CameraCalibration, true: str) -> float:
