@@ -248,6 +248,21 @@ async def attacked(attack: Attack, count: int, watched: Watched, holder: Holder)
     """The whole attack; memory must not grow after the first eighth."""
     looking = asyncio.create_task(watched.sample(5.0))
     holding = asyncio.create_task(holder.watch())
+    attacking = asyncio.create_task(_attack_in_two_parts(attack, count, watched, holder))
+    await asyncio.wait({attacking, looking, holding}, return_when=asyncio.FIRST_COMPLETED)
+    if holding.done():
+        holder.wrong.append(f"the page in control was lost: {holding.exception()}")
+    if looking.done():
+        holder.wrong.append(f"the server ended: {looking.exception()}")
+    elif attacking.done():
+        attacking.result()
+    for task in (attacking, looking, holding):
+        task.cancel()
+
+
+async def _attack_in_two_parts(
+    attack: Attack, count: int, watched: Watched, holder: Holder
+) -> None:
     while not holder.moments:
         await asyncio.sleep(0.1)
     for part in (count // 8, count - count // 8):
@@ -258,10 +273,6 @@ async def attacked(attack: Attack, count: int, watched: Watched, holder: Holder)
         watched.samples.append(watched._sample())
         if part == count // 8:
             watched.samples = watched.samples[-1:]
-    if holding.done():
-        holder.wrong.append(f"the page in control was lost: {holding.exception()}")
-    looking.cancel()
-    holding.cancel()
 
 
 def enabled(me: Operator) -> list[str]:
@@ -294,9 +305,10 @@ def main() -> int:
         seconds = time.monotonic() - began
         wrong += holder.wrong
         wrong += [] if process.poll() is None else ["the server ended"]
-        with operator(address) as me:
-            me.command("stop")
-            me.until(lambda state: state["busy"] is None)
+        if process.poll() is None:
+            with operator(address) as me:
+                me.command("stop")
+                me.until(lambda state: state["busy"] is None)
     total = sum(attack.sent.values())
     print(f"{total} in {seconds:.0f} s: {dict(sorted(attack.sent.items()))}")
     print(f"the drives were at rest in all of {holder.moments} states with a session enabled")

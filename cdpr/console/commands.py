@@ -141,7 +141,7 @@ class Held(_Incoming):
     sense: Sense | None = None
     step_mm: float | None
     speed_mm_s: Annotated[float, Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
-    seq: int
+    seq: Number
 
     @model_validator(mode="after")
     def _possible(self) -> Held:
@@ -205,6 +205,7 @@ class _Page:
     motion: int = 0
     press: int = 0
     over: int = 0
+    seq: int = 0
 
 
 class PageControl:
@@ -285,7 +286,7 @@ class PageControl:
         """Name of the page that has control."""
         return None if self.holder is None else self._pages[self.holder].name
 
-    def hold(self, page: int, hold: int, motion: int) -> int | None:
+    def hold(self, page: int, hold: int, seq: int, motion: int) -> int | None:
         """The press number for a held control of a page; None if refused or over.
 
         A press reported while the page has no control is over: after gaining control, the operator
@@ -294,12 +295,14 @@ class PageControl:
         Args:
             page: Number of the page.
             hold: The page's number of the press, rising from 1.
+            seq: Number of the report, rising with each; a repeated report counts for nothing.
             motion: Number of the jog session; a press ends with the session in which it began,
                 and at once without a session (0).
         """
         state = self._pages[page]
-        if hold <= state.over or hold < state.hold:
+        if seq <= state.seq or hold <= state.over or hold < state.hold:
             return None
+        state.seq = seq
         if self.holder != page or motion == 0 or (hold == state.hold and motion != state.motion):
             state.over = hold
             return None

@@ -398,7 +398,7 @@ class Console:
         with self._control_lock:
             if message.cable is not None and not self.control.is_service:
                 motion = 0
-            press = self.control.hold(page, message.hold, motion)
+            press = self.control.hold(page, message.hold, message.seq, motion)
         if press is None:
             return
         status = self.watch.last.status or {}

@@ -62,11 +62,17 @@ class SimulatedPage:
     silent: int = 0
     is_over: bool = False
     over: list[str] = field(default_factory=list)
+    seq: int = 0
 
-    def message(self, hold: int | None = None) -> str:
-        """The message that it sends as long as its control is pressed."""
-        message = {"kind": "held", "hold": self.hold if hold is None else hold, "seq": 1}
-        return json.dumps(message | self.motion | {"step_mm": self.step, "speed_mm_s": self.speed})
+    def report(self) -> str:
+        """The next message that it sends as long as its control is pressed."""
+        self.seq += 1
+        return self.message()
+
+    def message(self) -> str:
+        """The last of these messages."""
+        message = {"kind": "held", "hold": self.hold, "seq": self.seq} | self.motion
+        return json.dumps(message | {"step_mm": self.step, "speed_mm_s": self.speed})
 
 
 @dataclass
@@ -264,7 +270,7 @@ class Sequences:
                 cable, sense = page.motion["cable"], page.motion["sense"]
                 assert isinstance(cable, int)
                 self._check.pressed_cables[cable, sense == "pay_out"] = self._now
-        self._send(page, page.message())
+        self._send(page, page.report())
 
     def _send(self, page: SimulatedPage, text: str) -> None:
         message = parse_message(text)
@@ -357,9 +363,10 @@ class Sequences:
         over = [text for other in self._pages for text in other.over[-5:]]
         for text in self._random.sample(over, min(3, len(over))):
             message = json.loads(text)
-            # A higher number would be a new press, so the number is limited to finished ones.
+            # Higher numbers would be a new press or report, so they are limited to finished ones.
             message["hold"] = min(message["hold"], page.highest - page.pressed)
-            if message["hold"] > 0:
+            message["seq"] = min(message["seq"], page.seq)
+            if message["hold"] > 0 and message["seq"] > 0:
                 self._send(page, json.dumps(message))
 
     def _mode(self, page: SimulatedPage) -> None:

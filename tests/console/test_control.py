@@ -25,6 +25,7 @@ class ControlMachine(RuleBasedStateMachine):
         self.named: dict[int, int] = {}
         self.refused: dict[int, int] = {}  # the highest number of a page's presses that were
         self.newest = 0
+        self.reports = 0
 
     @rule(jump=st.integers(-50, 200))
     def clock(self, jump: int) -> None:
@@ -71,7 +72,10 @@ class ControlMachine(RuleBasedStateMachine):
     def hold(self, number: int, ahead: int) -> None:
         if page := self._page(number):
             hold = self._hold_of(page, ahead)
-            press = self.control.hold(page, hold, self.motion)
+            press = self.control.hold(page, hold, self._next_report(), self.motion)
+            if press is not None:
+                again = self.control.hold(page, hold, self.reports, self.motion)
+                assert again is None, "a repeated report counts for nothing"
             if press is None:
                 self.refused[page] = max(hold, self.refused.get(page, 0))
                 return
@@ -90,7 +94,7 @@ class ControlMachine(RuleBasedStateMachine):
         if page := self._page(number):
             hold = self._hold_of(page, ahead)
             self._end(self.control.let_go(page, hold))
-            assert self.control.hold(page, hold, 1) is None
+            assert self.control.hold(page, hold, self._next_report(), 1) is None
 
     @invariant()
     def one_holder(self) -> None:
@@ -98,6 +102,10 @@ class ControlMachine(RuleBasedStateMachine):
 
     def _page(self, number: int) -> int | None:
         return sorted(self.pages)[number % len(self.pages)] if self.pages else None
+
+    def _next_report(self) -> int:
+        self.reports += 1
+        return self.reports
 
     def _hold_of(self, page: int, ahead: int) -> int:
         """A number near the last one that this page named."""
@@ -121,8 +129,18 @@ def test_a_press_that_was_let_go_before_it_arrived_is_over(hold: int) -> None:
     page = control.join("a")
     control.take(page, moving=False)
     control.let_go(page, hold)
-    assert control.hold(page, hold, 1) is None
-    assert control.hold(page, hold + 1, 1) is not None
+    assert control.hold(page, hold, 1, 1) is None
+    assert control.hold(page, hold + 1, 2, 1) is not None
+
+
+@given(st.lists(st.integers(1, 9), min_size=1))
+def test_a_report_that_is_repeated_or_overtaken_counts_for_nothing(numbers: list[int]) -> None:
+    control = PageControl(lambda: 1)
+    page = control.join("a")
+    control.take(page, moving=False)
+    counted = [seq for seq in numbers if control.hold(page, 1, seq, 1) is not None]
+    assert counted == sorted(set(counted))
+    assert max(numbers) in counted
 
 
 @given(st.integers(1, 1000), st.integers(0, 1000))
@@ -130,11 +148,11 @@ def test_a_press_that_began_without_control_is_over(hold: int, earlier: int) -> 
     """Nor does one before it count: words of old presses may be sent again."""
     control = PageControl(lambda: 1)
     page = control.join("a")
-    assert control.hold(page, hold, 1) is None
+    assert control.hold(page, hold, 1, 1) is None
     control.take(page, moving=False)
-    assert control.hold(page, hold, 1) is None
-    assert control.hold(page, max(hold - earlier, 1), 1) is None
-    assert control.hold(page, hold + 1, 1) is not None
+    assert control.hold(page, hold, 2, 1) is None
+    assert control.hold(page, max(hold - earlier, 1), 3, 1) is None
+    assert control.hold(page, hold + 1, 4, 1) is not None
 
 
 def test_only_who_has_control_operates_and_service_mode_is_asked_for() -> None:
@@ -171,6 +189,6 @@ def test_two_consoles_at_once_never_number_a_press_alike() -> None:
         control.take(page, moving=False)
     seen: list[int | None] = []
     for hold in range(1, 20):
-        seen += [c.hold(p, hold, 1) for c, p in zip(consoles, pages, strict=True)]
+        seen += [c.hold(p, hold, hold, 1) for c, p in zip(consoles, pages, strict=True)]
     assert len(set(seen)) == len(seen)
     assert None not in seen

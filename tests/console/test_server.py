@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import socket
@@ -154,6 +155,9 @@ def command(page: ClientConnection, name: str, **values: Any) -> dict[str, Any]:
     return answer_to(page, json.dumps({"kind": "command", "id": 7, "command": name, **values}))
 
 
+REPORTS = itertools.count(1)
+
+
 def held(hold: int) -> str:
     return json.dumps(
         {
@@ -163,7 +167,7 @@ def held(hold: int) -> str:
             "frame": "world",
             "step_mm": None,
             "speed_mm_s": 5.0,
-            "seq": 1,
+            "seq": next(REPORTS),
         }
     )
 
@@ -339,9 +343,9 @@ def test_a_held_control_is_passed_on_for_who_has_control_only(served: Served) ->
     with served.something_moves(), served.page() as first, served.page() as second:
         command(first, "take_control")
         second.send(held(1))
-        first.send(held(3))
-        first.send(held(3))
-        first.send(held(2))
+        once, again = held(3), held(3)
+        for report in (once, again, again, held(2)):
+            first.send(report)
         assert command(first, "stop")  # answers come in order
         holds = [values["press"] for name, values in served.said if name == "held"]
         assert len(holds) == 2
@@ -355,7 +359,7 @@ def test_a_held_control_is_passed_on_for_who_has_control_only(served: Served) ->
 
 def held_cable(hold: int, **changes: object) -> str:
     word = {"kind": "held", "hold": hold, "cable": 3, "sense": "wind_in", "step_mm": None}
-    return json.dumps(word | {"speed_mm_s": 5.0, "seq": 1} | changes)
+    return json.dumps(word | {"speed_mm_s": 5.0, "seq": next(REPORTS)} | changes)
 
 
 def test_a_cable_is_moved_by_a_page_in_service_mode_only(served: Served) -> None:

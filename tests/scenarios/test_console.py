@@ -39,7 +39,7 @@ class Operator:
     """An operator without a browser."""
 
     def __init__(self, page: ClientConnection) -> None:
-        self._page, self._press, self._words = page, 0, 0
+        self._page, self._press, self._reports = page, 0, 0
         self.state: dict[str, Any] = {}
 
     def until(self, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
@@ -94,17 +94,19 @@ class Operator:
     def held(self, direction: list[float]) -> None:
         """Sends one report of a press."""
         word = {"kind": "held", "hold": self._press, "direction": direction, "frame": "world"}
-        word |= {"step_mm": None, "speed_mm_s": 20.0, "seq": 1}
+        self._reports += 1
+        word |= {"step_mm": None, "speed_mm_s": 20.0, "seq": self._reports}
         self._page.send(json.dumps(word))
 
     def winds_in(self, cable: int, state: dict[str, Any]) -> float:
         """Keeps holding, with new presses if one ends; returns the length paid out, [mm]."""
         jog = state["cable"]
-        self._words += 1
-        if self._words % 40 == 1:
+        self._reports += 1
+        if self._reports % 40 == 1:
             self.press()
         word = {"kind": "held", "hold": self._press, "cable": cable, "sense": "wind_in"}
-        self._page.send(json.dumps(word | {"step_mm": None, "speed_mm_s": 2.0, "seq": 1}))
+        word |= {"step_mm": None, "speed_mm_s": 2.0, "seq": self._reports}
+        self._page.send(json.dumps(word))
         return float(jog["press_mm"]) if jog["cable"] == cable else 0.0
 
     def let_go(self) -> None:
