@@ -10,13 +10,14 @@ from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
+import numpy as np
 import typer
 
 import calibration  # loads names lazily: `cdpr stop` must not wait for scientific libraries
 from cdpr.cli.output import Terminal
 from model.errors import BadInput
 from model.files.documents import millimetres
-from model.pose import Pose
+from model.pose import Array, Pose, matrix_from_quaternion
 from model.rig import Rig, load_rig
 
 RigArgument = Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")]
@@ -25,11 +26,29 @@ PlanFileOption = Annotated[Path, typer.Option("-o", "--output", help="plan file 
 ReplacePlanOption = Annotated[bool, typer.Option("--force", help="replace an existing plan file")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
 Triple = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 
 
 def level_pose(position_mm: Triple | None) -> Pose | None:
     """The level pose at an option's position x y z, ``world_from_platform``."""
     return None if position_mm is None else Pose.level(millimetres(list(position_mm)))
+
+
+def rotation_of(wxyz: Quaternion | None) -> Array | None:
+    """The rotation matrix of an option's quaternion w x y z, of any length.
+
+    Raises:
+        BadInput: It has no direction.
+    """
+    if wxyz is None:
+        return None
+    norm = float(np.linalg.norm(wxyz))
+    if not 1e-6 < norm < np.inf:
+        raise BadInput(
+            "the rotation is not a quaternion w x y z of non-zero length",
+            next_step="use 1 0 0 0 for a level platform",
+        )
+    return matrix_from_quaternion(np.array(wxyz) / norm)
 
 
 def finite(value: float | None) -> float | None:

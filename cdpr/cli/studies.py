@@ -7,17 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.table import Table
 
-from cdpr.cli.options import RigArgument, Triple
+from cdpr.cli.options import Quaternion, RigArgument, Triple, rotation_of
 from cdpr.cli.output import Terminal, out, show_facts, show_json
-from model.errors import BadInput
 from model.files.documents import millimetres
 from model.files.examples import PAPER_RIG, ready_folder
 from model.files.output import make_folder
-from model.pose import Array, matrix_from_quaternion
 from model.rig import load_rig
 from model.scene import load_scene
 from planner.campaign.evaluation import about, run_campaign, write_campaign
@@ -66,7 +63,7 @@ def workspace(
         typer.Option(help="upper corner of the region x y z (default: the workspace's)"),
     ] = None,
     rotation_wxyz: Annotated[
-        tuple[float, float, float, float] | None,
+        Quaternion | None,
         typer.Option(help="platform orientation (default: the scene's start, else home)"),
     ] = None,
     length_mm: Annotated[
@@ -95,7 +92,7 @@ def workspace(
     the_rig = load_rig(rig)
     the_scene = None if scene is None else load_scene(scene)
     length = None if length_mm is None else length_mm / 1000.0
-    question = Question.about(the_rig, the_scene, _rotation(rotation_wxyz), length)
+    question = Question.about(the_rig, the_scene, rotation_of(rotation_wxyz), length)
     grids = workspace_grids(
         the_rig,
         [parsed_slice(text) for text in slices or []],
@@ -114,15 +111,6 @@ def workspace(
     else:
         facts = [*summary_facts(summary), ("next", f"open {output / 'index.html'}")]
         show_facts(f"maps of {the_rig.name} in {output}", facts)
-
-
-def _rotation(rotation_wxyz: tuple[float, float, float, float] | None) -> Array | None:
-    if rotation_wxyz is None:
-        return None
-    norm = float(np.linalg.norm(rotation_wxyz))
-    if not 1e-6 < norm < np.inf:
-        raise BadInput("the rotation is not a quaternion w x y z of non-zero length")
-    return matrix_from_quaternion(np.array(rotation_wxyz) / norm)
 
 
 # `cdpr bench`: long measurements of the planner.

@@ -85,10 +85,12 @@ class CompareCommand(_Command):
 
 
 class PlanCommand(_Command):
-    """Plan a path for a scene, or through the taught poses."""
+    """Plan a path for a scene, or through the taught poses, or to one from the present pose."""
 
     command: Literal["plan"]
     scene: Text | None = None
+    from_here: bool = False
+    pose: Text | None = None
     objective: Literal["shortest", "kinematic", "clearance"] = "shortest"
 
 

@@ -175,14 +175,14 @@ class ConsoleServer:
         return JSONResponse(await run_in_threadpool(_plans_and_scenes))
 
     async def _preview(self, _request: Request) -> Response:
-        if self._console.preview is None:
+        if self._console.plan.preview is None:
             raise HTTPException(404, "no plan is loaded")
-        return JSONResponse(self._console.preview)
+        return JSONResponse(self._console.plan.preview)
 
     async def _compared(self, _request: Request) -> Response:
-        if self._console.compared is None:
+        if self._console.plan.compared is None:
             raise HTTPException(404, "no plan is compared")
-        return JSONResponse(self._console.compared)
+        return JSONResponse(self._console.plan.compared)
 
     async def _picture(self, request: Request) -> Response:
         """The newest image of a measuring camera."""

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from cdpr.console.commands import (
     TakeCommand,
 )
 from cdpr.console.state import (
+    LoadedPlan,
     StartedVerb,
     StoredState,
     cable_state,
@@ -37,16 +39,14 @@ from cdpr.console.state import (
     local_file,
     measured_state,
     outcome_state,
-    preview,
+    read_stored,
+    simulated_start,
     stored_state,
 )
 from cdpr.console.teach import TaughtPoses, scene_text
 from cdpr.console.view import RobotNow, RobotView, nearest_data, pose_data
 from cdpr.console.watch import CameraPictures, RunWatch
-from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
-from executor.interlock.fault_latch import FaultLatch
-from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.jogging import FASTEST
 from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
@@ -109,11 +109,13 @@ class Console:
         self.view = RobotView(files.rig, self.scene)
         self.pictures = CameraPictures()
         self.poses = TaughtPoses(MADE / "poses.json")
-        self.preview: dict[str, Any] | None = None
-        self.compared: dict[str, Any] | None = None
+        self.plan = LoadedPlan(self.rig)
         self._control_lock, self._one_at_a_time = threading.Lock(), threading.Lock()
         self._line = ""
-        self._robot: RobotNow | None = self.view.at_home() if is_simulated(self.rig) else None
+        self._robot: RobotNow | None = None
+        if is_simulated(self.rig):
+            self._robot = self.view.simulated_at(self.rig.home)
+        self._planned: Path | None = None
         self._at_rest: Future[StatusResult] | None = None
         self._asks = ThreadPoolExecutor(1, "cdpr-drives")
         self._was_busy = True  # so that the drives are read at the start
@@ -124,6 +126,7 @@ class Console:
         """The state that all pages show; to be called about 20 times a second."""
         report = self.watch.update()
         self._line = self.verbs.update()
+        self._load_planned()
         if report.status is not None:
             seen = self.view.take(report.status)
             self._robot = seen or self._robot
@@ -133,10 +136,24 @@ class Console:
         return self._state(report.status, time.monotonic() - report.at)
 
     def close(self) -> None:
-        """Closes all connections; motions continue."""
+        """Ends a session of jogs begun here, and closes all connections; a run continues."""
+        if self.verbs.verb == "jog":
+            self.watch.send("end")
         self._asks.shutdown()
         self.pictures.close()
         self.watch.close()
+
+    def _load_planned(self) -> None:
+        """Loads the plan that was made here, once it is there; its check takes a moment."""
+        if self._planned is None or self.verbs.verb is not None:
+            return
+        path, self._planned = self._planned, None
+        if self.verbs.outcome is not None and self.verbs.outcome.exit_code == 0:
+            self._asks.submit(self._load_at_rest, path)
+
+    def _load_at_rest(self, path: Path) -> None:
+        with self._one_at_a_time, suppress(CdprError):  # replaced or removed meanwhile
+            self.plan.load(path)
 
     def _ask_at_rest(self, busy: bool) -> None:
         """Reads the drives once after each motion; they may be silent or absent.
@@ -156,7 +173,7 @@ class Console:
             return read_status(self.rig)
 
     def _state(self, status: dict[str, Any] | None, age: float) -> dict[str, Any]:
-        robot, rig, verb = self._robot, self.view.rig, self.verbs.verb
+        robot, rig, verb, plan = self._robot, self.view.rig, self.verbs.verb, self.plan
         near = None if robot is None else robot.nearest
         return {
             "kind": "state",
@@ -174,8 +191,9 @@ class Console:
             "clearance_mm": near and nearest_data(near, self.view.required_clearance),
             "measured": measured_state(status, age),
             "next_stop": None if status is None else status["next_stop"],
-            "preview": None if self.preview is None else self.preview["name"],
-            "compared": None if self.compared is None else self.compared["name"],
+            "preview": plan.preview and plan.preview["name"],
+            "plan_start_off_mm": plan.off_mm(None if robot is None else robot.pose),
+            "compared": plan.compared and plan.compared["name"],
             "jog": jog_state(status),
             "cable": cable_state(status),
             "poses": self.poses.as_dicts(),
@@ -187,19 +205,7 @@ class Console:
         if now - self._stored_at < STORED_EVERY:
             return
         self._stored_at = now
-        if is_simulated(self.rig):
-            self._stored = StoredState(None, True, None)
-            return
-        fault, is_moving = None, self.watch.last.status is not None
-        try:
-            fault = FaultLatch(BusSettings.of(self.rig)).read()
-            reference = reference_status(MotionInterlock(self.rig))
-            why = reference.why_not
-        except CdprError as error:
-            why = error.what
-        self._stored = StoredState(
-            None if fault is None or is_moving else fault.cause, not why, why
-        )
+        self._stored = read_stored(self.rig, is_moving=self.watch.last.status is not None)
 
     # Commands.
 
@@ -221,22 +227,15 @@ class Console:
         except CdprError as error:
             return str(error)
 
-    def load_plan(self, path: Path) -> None:
-        """Loads a plan for preview.
+    def begin_with(self, path: Path) -> None:
+        """Loads a plan; a platform with drives simulated by each run begins at its start.
 
         Raises:
             BadInput: It cannot be read, or is for another rig.
         """
-        self.preview = None
-        self.preview = preview(path, self.rig)
-
-    def compare_plan(self, path: Path | None) -> None:
-        """Shows another plan beside the loaded one; None ends the comparison.
-
-        Raises:
-            BadInput: It cannot be read, or is for another rig.
-        """
-        self.compared = None if path is None else preview(path, self.rig)
+        self.plan.load(path)
+        if is_simulated(self.rig) and self.plan.start is not None:
+            self._robot = self.view.simulated_at(self.plan.start)
 
     def _command(self, page: int, message: Message) -> str:
         if isinstance(message, TakeCommand):
@@ -258,9 +257,9 @@ class Console:
             case SpeedCommand():
                 return self.watch.send("speed", percent=message.percent)
             case FileCommand():
-                self.load_plan(local_file(message.file))
+                self.plan.load(local_file(message.file))
             case CompareCommand():
-                self.compare_plan(None if message.file is None else local_file(message.file))
+                self.plan.compare(None if message.file is None else local_file(message.file))
             case PlanCommand():
                 self._plan(message)
             case NameCommand():
@@ -295,35 +294,41 @@ class Console:
 
     def _home(self) -> str:
         how = ["--camera", self.files.cameras[0]] if self.files.cameras else ["--at-home"]
-        return self._start("home", [str(self.files.rig_file), *how])
+        return self._start_verb("home", [str(self.files.rig_file), *how])
 
     def _reset(self) -> str:
-        return self._start("reset", [str(self.files.rig_file)], real_time=False)
+        return self._start_verb("reset", [str(self.files.rig_file)], real_time=False)
 
     def _release(self) -> str:
-        return self._start("release", [str(self.files.rig_file)])
+        return self._start_verb("release", [str(self.files.rig_file)])
 
     def _run(self) -> str:
-        if self.preview is None or not self.preview["passed"]:
+        if self.plan.preview is None or not self.plan.preview["passed"]:
             return "load a plan that passes its check first"
+        here = None if self._robot is None or is_simulated(self.rig) else self._robot.pose
+        if here is not None and self.plan.begins_elsewhere(here):
+            off = self.plan.off_mm(here)
+            return f"the platform is {off} mm from the plan's start: plan from its present pose"
         cameras = [text for source in self.files.cameras for text in ("--camera", source)]
         if not (cameras or is_simulated(self.rig)):
             cameras = ["--no-camera"]
         rig = ["--rig", str(self.files.rig_file)]
-        return self._start("run", [self.preview["name"], *rig, *cameras])
+        return self._start_verb("run", [self.plan.preview["name"], *rig, *cameras])
 
     def _jog_begin(self) -> str:
         scene = self.files.scene_file
         around = ["--no-scene"] if scene is None else ["--scene", str(scene)]
         speed = ["--speed-mm-s", f"{1e3 * FASTEST:g}"]
-        return self._start("jog", [str(self.files.rig_file), "--hold-to-run", *speed, *around])
+        at = simulated_start(self.rig, None if self._robot is None else self._robot.pose)
+        rig = str(self.files.rig_file)
+        return self._start_verb("jog", [rig, "--hold-to-run", *speed, *around, *at])
 
     def _cable_begin(self) -> str:
         if not self.control.is_service:
             return "enter service mode first"
         speed = ["--speed-mm-s", f"{1e3 * FASTEST:g}"]
         rig = str(self.files.rig_file)
-        return self._start("jog", [rig, "--hold-to-run", "--one-cable", *speed])
+        return self._start_verb("jog", [rig, "--hold-to-run", "--one-cable", *speed])
 
     def _service(self, *, on: bool) -> str:
         """Enters or leaves service mode, the only mode that jogs single cables."""
@@ -337,7 +342,7 @@ class Console:
         self._end_press(press)
         return self.watch.send("end") if jogs_cables and not on else ""
 
-    def _start(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
+    def _start_verb(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
         if why_not := self.watch.why_busy():
             return why_not
         relaxed = ["--without-real-time"] if real_time and self.files.without_real_time else []
@@ -346,19 +351,21 @@ class Console:
         return ""
 
     def _plan(self, message: PlanCommand) -> None:
-        scene = self._taught_scene() if message.scene is None else local_file(message.scene)
+        scene = self._taught_scene(message) if message.scene is None else local_file(message.scene)
         output = MADE / f"{scene.stem}.plan.json"
         cost = [] if message.objective == "shortest" else ["--cost", message.objective]
         if load_scene(scene).rotation_limits is not None:
             cost.append("--free-rotation")
-        self.preview = None
+        self.plan.forget()
         rig = str(self.files.rig_file)
         options = ["-o", str(output), "--force", *cost, *self.files.calibration_options]
         self.verbs.start("plan", [rig, str(scene), *options])
+        self._planned = output
 
-    def _taught_scene(self) -> Path:
+    def _taught_scene(self, message: PlanCommand) -> Path:
         around = empty_scene(self.rig) if self.scene is None else self.scene
-        document = self.poses.scene(around, "taught")
+        begin = self._pose_now() if message.from_here or message.pose is not None else None
+        document = self.poses.scene(around, "taught", begin=begin, only=message.pose)
         path = MADE / "taught.yaml"
         MADE.mkdir(exist_ok=True)
         write_atomic(path, scene_text(document))

@@ -16,6 +16,10 @@ from typing import Any
 import numpy as np
 
 from cdpr.console.view import measured_data, scene_figure
+from drivers.can_bus import BusSettings
+from executor.drives import is_simulated
+from executor.interlock.fault_latch import FaultLatch
+from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.jogging import FASTEST
 from executor.recording.record_files import RUNS
 from executor.report.page import plan_labels
@@ -23,7 +27,7 @@ from executor.runner import prepare_plan
 from executor.trajectory.setpoints import PreparedRun
 from model.clearance import ClearanceModel
 from model.errors import BadInput, CdprError, Refused
-from model.kinematics import cables_at
+from model.kinematics import cable_lengths, cables_at
 from model.pages.scene import Moment, Stroke, scene_data
 from model.plan import Plan, load_plan, require_same_rig
 from model.pose import Pose
@@ -31,6 +35,8 @@ from model.rig import Rig
 
 #: Length of a verb's output that is shown, [characters].
 SHOWN = 4000
+#: Exit code of a verb that the operator stopped.
+STOPPED = 130
 _REPORT = re.compile(r"(\S+/report\.html)")
 _HELP = re.compile(r"docs/faults/(\w+)\.md")
 
@@ -122,10 +128,15 @@ def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
     return VerbOutcome(
         verb=verb,
         exit_code=code,
-        text=text.strip()[-SHOWN:],
+        text=_without_commands(text).strip()[-SHOWN:],
         report=Path(report[-1]) if report else None,
         fault=fault[-1] if fault else None,
     )
+
+
+def _without_commands(text: str) -> str:
+    """Output without the commands that a terminal would need next: the page has buttons."""
+    return re.sub(r"(?m)^\s*next:?\s+cdpr .*\n?", "", text)
 
 
 def local_file(name: str) -> Path:
@@ -165,6 +176,27 @@ def stored_state(stored: StoredState) -> dict[str, Any]:
     return {"latched": stored.latched, "reference": reference}
 
 
+def read_stored(rig: Rig, *, is_moving: bool) -> StoredState:
+    """Reads the fault latch and the homing reference of a bus from their files."""
+    if is_simulated(rig):
+        return StoredState(None, True, None)
+    fault = None
+    try:
+        fault = FaultLatch(BusSettings.of(rig)).read()
+        why = reference_status(MotionInterlock(rig)).why_not
+    except CdprError as error:
+        why = error.what
+    return StoredState(None if fault is None or is_moving else fault.cause, not why, why)
+
+
+def simulated_start(rig: Rig, pose: Pose | None) -> list[str]:
+    """Options of `cdpr jog` that begin at a pose, where it simulates the drives itself."""
+    if pose is None or not is_simulated(rig):
+        return []
+    position = [f"{v:.4f}" for v in 1e3 * pose.position]
+    return ["--at-mm", *position, "--at-wxyz", *(f"{v:.9f}" for v in pose.quaternion)]
+
+
 def outcome_state(ended: VerbOutcome | None) -> dict[str, Any] | None:
     """The last verb's result, with addresses of its report and help page."""
     if ended is None:
@@ -172,6 +204,7 @@ def outcome_state(ended: VerbOutcome | None) -> dict[str, Any] | None:
     return {
         "verb": ended.verb,
         "ok": ended.exit_code == 0,
+        "stopped": ended.exit_code == STOPPED,
         "text": ended.text,
         "report": None if ended.report is None else _address_of(ended.report),
         "fault_page": None if ended.fault is None else f"/help/{ended.fault}",
@@ -246,14 +279,58 @@ def measured_state(status: dict[str, Any] | None, age: float) -> dict[str, Any] 
 POSES = 200
 
 
-def preview(path: Path, rig: Rig) -> dict[str, Any]:
-    """Preview data of a plan; the verdict says why a plan does not pass.
+class LoadedPlan:
+    """The plan that a run would follow, and another to compare it with."""
 
-    Raises:
-        BadInput: It cannot be read, or is for another rig.
-    """
-    plan = load_plan(path)
-    require_same_rig(plan, rig, path)
+    def __init__(self, rig: Rig) -> None:
+        """Before any plan."""
+        self._rig = rig
+        self.preview: dict[str, Any] | None = None
+        self.compared: dict[str, Any] | None = None
+        self.start: Pose | None = None
+
+    def load(self, path: Path) -> None:
+        """Loads a plan for preview.
+
+        Raises:
+            BadInput: It cannot be read, or is for another rig.
+        """
+        self.forget()
+        plan = self._read(path)
+        self.preview, self.start = preview(path, plan, self._rig), plan.waypoints[0]
+
+    def forget(self) -> None:
+        """No plan is loaded; another takes its place."""
+        self.preview = self.start = None
+
+    def compare(self, path: Path | None) -> None:
+        """Shows another plan beside the loaded one; None ends the comparison.
+
+        Raises:
+            BadInput: It cannot be read, or is for another rig.
+        """
+        self.compared = None if path is None else preview(path, self._read(path), self._rig)
+
+    def _read(self, path: Path) -> Plan:
+        plan = load_plan(path)
+        require_same_rig(plan, self._rig, path)
+        return plan
+
+    def off_mm(self, pose: Pose | None) -> float | None:
+        """Distance of a pose from the plan's start, [mm]; None if one is unknown."""
+        start = self.start
+        return None if start is None or pose is None else round(1e3 * pose.distance_to(start), 1)
+
+    def begins_elsewhere(self, pose: Pose) -> bool:
+        """Whether a cable has another length at a pose than at the plan's start."""
+        if self.start is None:
+            return False
+        off = cable_lengths(self._rig, pose) - cable_lengths(self._rig, self.start)
+        return bool(np.max(np.abs(off)) > self._rig.motion.start_tolerance)
+
+
+def preview(path: Path, plan: Plan, rig: Rig) -> dict[str, Any]:
+    """Preview data of a plan and its file; the verdict says why a plan does not pass."""
     try:
         prepared = prepare_plan(plan, rig)
     except CdprError as error:

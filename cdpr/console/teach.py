@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +23,8 @@ from model.scene import Scene
 MOST = 200
 #: Orientations within this angle count as equal, [deg]: drives do not hold them more accurately.
 ALIKE_DEG = 0.1
+#: A platform within this distance of the first pose is there already, [m].
+NEAR = 0.5e-3
 AGAIN = "restore the file, or move it away to start without poses"
 
 
@@ -118,22 +121,38 @@ class TaughtPoses:
         index = self._index(pose)
         self._keep([*self._poses[:index], *self._poses[index + 1 :]])
 
-    def scene(self, around: Scene, name: str) -> SceneDocument:
+    def scene(
+        self, around: Scene, name: str, *, begin: Pose | None = None, only: str | None = None
+    ) -> SceneDocument:
         """A scene from the first pose through all others to the last, with given surroundings.
 
         If all orientations are within `ALIKE_DEG`, every pose gets the first one's orientation;
         otherwise the scene has rotation limits, and is to be planned with free rotation.
 
+        Args:
+            around: Obstacles and load.
+            name: Of the scene.
+            begin: The path's first pose, before the taught ones; None for the first of them.
+            only: The one taught pose to go to; None for all.
+
         Raises:
-            BadInput: There are fewer than two poses.
+            BadInput: There is no such pose, or the path has fewer than two poses.
         """
-        if len(self._poses) < 2:
-            raise _refusal(f"a path needs two poses, not {len(self._poses)}", "teach another one")
-        first = self._poses[0].pose()
-        apart = max(np.degrees(first.angle_to(one.pose())) for one in self._poses)
-        limits = None if apart <= ALIKE_DEG else self._rotation_limits()
-        alike = {"rotation_wxyz": self._poses[0].rotation_wxyz} if limits is None else {}
-        start, *stops, goal = (pose.model_copy(update=alike) for pose in self._poses)
+        poses = self._poses if only is None else [self._poses[self._index(only)]]
+        if begin is not None:
+            if poses and _is_at(begin, poses[0].pose()):
+                poses = poses[1:]
+            poses = [_named(PoseDocument.of(begin), "start"), *poses]
+        if len(poses) < 2:
+            if begin is not None and self._poses:
+                raise _refusal("the platform is there already", "choose another pose")
+            needed = "one pose" if begin is not None else "two poses"
+            raise _refusal(f"a path needs {needed}, not {len(self._poses)}", "teach another one")
+        first = poses[0].pose()
+        apart = max(np.degrees(first.angle_to(one.pose())) for one in poses)
+        limits = None if apart <= ALIKE_DEG else _rotation_limits(poses)
+        alike = {"rotation_wxyz": poses[0].rotation_wxyz} if limits is None else {}
+        start, *stops, goal = (pose.model_copy(update=alike) for pose in poses)
         return around.document.model_copy(
             update={
                 "name": name,
@@ -143,13 +162,6 @@ class TaughtPoses:
                 "rotation_limits": limits,
             }
         )
-
-    def _rotation_limits(self) -> RotationLimitsDocument:
-        """Limits that contain all poses and the shortest rotations between them, plus 1°."""
-        quaternions = [one.pose().quaternion for one in self._poses]
-        largest = np.degrees([largest_rotations(a, b) for a, b in pairwise(quaternions)])
-        tilt, turn = (largest.max(axis=0) + 1.0).tolist()
-        return RotationLimitsDocument(tilt_deg=min(90.0, tilt), turn_deg=min(180.0, turn))
 
     def _keep(self, poses: list[TaughtPose]) -> None:
         """Saves the poses, then adopts them."""
@@ -168,6 +180,18 @@ class TaughtPoses:
     def _require_free(self, name: str) -> None:
         if any(pose.name == name for pose in self._poses):
             raise _refusal(f"there is a pose '{name}' already", "choose another name")
+
+
+def _rotation_limits(poses: Sequence[TaughtPose]) -> RotationLimitsDocument:
+    """Limits that contain all poses and the shortest rotations between them, plus 1°."""
+    quaternions = [one.pose().quaternion for one in poses]
+    largest = np.degrees([largest_rotations(a, b) for a, b in pairwise(quaternions)])
+    tilt, turn = (largest.max(axis=0) + 1.0).tolist()
+    return RotationLimitsDocument(tilt_deg=min(90.0, tilt), turn_deg=min(180.0, turn))
+
+
+def _is_at(pose: Pose, other: Pose) -> bool:
+    return pose.distance_to(other) <= NEAR and np.degrees(pose.angle_to(other)) <= ALIKE_DEG
 
 
 def scene_text(document: SceneDocument) -> str:

@@ -172,10 +172,11 @@ class RobotView:
         tensions = [drive.tension for drive in status.drives]
         return RobotNow(status.pose, tensions, self._near(status.pose))
 
-    def at_home(self) -> RobotNow:
-        """The robot at its home pose, where simulated drives start."""
-        tensions = working_tensions(self.rig, self.rig.home, self.scene.load).tensions
-        return RobotNow(self.rig.home, tensions.tolist(), self._near(self.rig.home))
+    def simulated_at(self, pose: Pose) -> RobotNow:
+        """The robot at a pose where simulated drives start."""
+        self._pose, self._looked = pose, float("-inf")
+        tensions = working_tensions(self.rig, pose, self.scene.load).tensions
+        return RobotNow(pose, tensions.tolist(), self._near(pose))
 
     @property
     def required_clearance(self) -> float:

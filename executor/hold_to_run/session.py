@@ -55,6 +55,7 @@ def jog_session(
     scene: Scene | None,
     *,
     speed: float = FASTEST,
+    simulated_start: Pose | None = None,
     realtime: bool = True,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
@@ -74,6 +75,8 @@ def jog_session(
         rig: The robot and its bus.
         scene: Obstacles and load; its stops are ignored. None states that there are no obstacles.
         speed: Largest jog speed, [m/s].
+        simulated_start: Pose of the platform if the drives are simulated in this process; None for
+            its home pose.
         realtime: As for `executor.runner.run`, like all up to the supervisor.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
         listener: Receives events.
@@ -92,7 +95,10 @@ def jog_session(
     interlock.require_free()
     ready = interlock.referenced_rig()
     around = (empty_scene(slow) if scene is None else scene).changed(stops=())
-    start = ready.home if is_simulated(ready) else measured_pose(ready, around)
+    if is_simulated(ready):
+        start = simulated_start or ready.home
+    else:
+        start = measured_pose(ready, around)
     require_confirmed(confirm, JogProposal(ready, around, start))
     session = _Session(
         ready,

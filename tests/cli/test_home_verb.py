@@ -68,6 +68,24 @@ def test_a_no_moves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.json"))
 
 
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        (("--at-mm", 0, 0, 445), "--hold-to-run"),
+        (("--hold-to-run", "--no-scene", "--at-wxyz", 1, 0, 0, 0), "without a position"),
+        (("--hold-to-run", "--no-scene", "--at-mm", 0, 0, 445, "--at-wxyz", 0, 0, 0, 0), "length"),
+        (
+            ("--hold-to-run", "--no-scene", "--at-mm", 0, 0, 445, "--interface", "udp_multicast"),
+            "is measured, not stated",
+        ),
+    ],
+)
+def test_a_pose_is_stated_for_drives_that_a_session_simulates_only(
+    options: tuple[object, ...], part: str
+) -> None:
+    one_message(call("jog", RIG, *options), 2, part)
+
+
 def test_every_question_is_preceded_by_what_will_happen(tmp_path: Path) -> None:
     """With --json too: what will happen is on standard error, before the question."""
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41990", "--json")

@@ -275,6 +275,7 @@ class Fake:
             "measured": self._measured(near),
             "next_stop": self._next_stop(),
             "preview": self.plan,
+            "plan_start_off_mm": None if self.plan is None else 0.0,
             "compared": self.compared,
             "jog": {**jog, "speed_mm_s": 20.0},
             "cable": self._cable(),

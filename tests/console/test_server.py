@@ -12,6 +12,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,15 @@ from websockets.sync.client import ClientConnection, connect
 from cdpr.console.commands import Held, LetGo, parse_message
 from cdpr.console.server import MOST_PAGES, MOST_WAITING, ConsoleServer
 from cdpr.console.session import Console, ConsoleFiles
+from cdpr.console.state import VerbOutcome, _without_commands
 from cdpr.console.watch import RunWatch
 from executor.remote.command_socket import advertised
 from executor.remote.command_socket import serving as commands
 from executor.supervision import LocalRequests
+from model.plan import load_plan
+from model.pose import Pose
 from model.rig import load_rig
+from model.scene import load_scene
 from tests.cli.plans import RIG, write_short_plan
 from tests.console import fake_server
 
@@ -172,11 +177,56 @@ def held(hold: int) -> str:
     )
 
 
+def test_a_plan_that_was_made_here_is_loaded(served: Served) -> None:
+    """The page promises it: no one has to look for the file."""
+    planned = VerbOutcome("plan", 0, "", None, None)
+    with served.page() as page:
+        command(page, "take_control")
+        for name in ("one", "two"):
+            served.console.poses.teach(name, Pose.level([0.0, 0.02, 0.42 + 0.01 * len(name)]))
+        served.console.verbs.outcome = planned
+        Path("console/taught.plan.json").write_bytes(Path("short.json").read_bytes())
+        assert command(page, "plan")["ok"]
+        while state(page)["preview"] != "console/taught.plan.json":
+            pass
+        served.console.verbs.outcome = replace(planned, exit_code=3)
+        assert command(page, "plan", pose="two")["ok"]
+        while state(page)["preview"] is not None:
+            pass
+        assert [state(page)["preview"] for _ in range(5)] == [None] * 5, "it was not made"
+    scene = load_scene(Path("console/taught.yaml"))
+    assert scene.start.distance_to(served.console.rig.home) < 1e-9
+    for name in ("one", "two"):
+        served.console.poses.forget(name)
+
+
+def test_simulated_drives_continue_where_the_platform_was_seen(served: Served) -> None:
+    served.console.begin_with(Path("short.json"))
+    start = load_plan(Path("short.json")).waypoints[0]
+    with served.page() as page:
+        command(page, "take_control")
+        seen = state(page)
+        assert seen["plan_start_off_mm"] == 0.0
+        assert seen["platform"]["position_mm"] == pytest.approx(1e3 * start.position, abs=0.01)
+        assert command(page, "jog_begin")["ok"]
+    ((_, arguments),) = served.started
+    at = arguments.index("--at-mm")
+    assert [float(v) for v in arguments[at + 1 : at + 4]] == pytest.approx(1e3 * start.position)
+    assert arguments[at + 4] == "--at-wxyz"
+
+
+def test_the_output_of_a_verb_names_no_commands_for_a_terminal() -> None:
+    said = "plan p.json\n  length  3 mm\n"
+    todo = "  next    cdpr check p.json, then cdpr run\nnext: cdpr home\n"
+    assert _without_commands(said + todo) == said
+    assert _without_commands("next: find the cause\n") == "next: find the cause\n"
+
+
 def test_stop_waits_for_no_other_command_of_any_page(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slow = threading.Event()
-    monkeypatch.setattr(served.console, "load_plan", lambda _: slow.wait(60) and None)
+    monkeypatch.setattr(served.console.plan, "load", lambda _: slow.wait(60) and None)
     with ExitStack() as stack:
         stack.callback(slow.set)
         pages = [stack.enter_context(served.page()) for _ in range(MOST_PAGES)]

@@ -108,6 +108,25 @@ def test_rotated_poses_keep_their_orientation(tmp_path: Path) -> None:
     assert limits.excess(scene.start, scene.goal) is None
 
 
+def test_a_path_begins_where_the_platform_is(tmp_path: Path) -> None:
+    taught = TaughtPoses(tmp_path / "poses.json")
+    for k in range(2):
+        taught.teach(f"p{k}", pose(k))
+    around = empty_scene(load_rig(RIG))
+    through = scene_from_document(taught.scene(around, "taught", begin=pose(2)))
+    assert [stop.name for stop in through.stops] == ["p0"]
+    assert through.start.distance_to(pose(2)) < 1e-9
+    assert through.goal.distance_to(pose(1)) < 1e-9
+    only = scene_from_document(taught.scene(around, "taught", begin=pose(2), only="p0"))
+    assert not only.stops
+    assert only.goal.distance_to(pose(0)) < 1e-9
+    there = scene_from_document(taught.scene(around, "taught", begin=pose(0)))
+    assert not there.stops, "a pose where it is already is no stop"
+    for only_one, refusal in (("p1", "there already"), ("p9", "no pose 'p9'")):
+        with pytest.raises(BadInput, match=refusal):
+            taught.scene(around, "taught", begin=pose(1), only=only_one)
+
+
 def test_one_pose_is_no_path(tmp_path: Path) -> None:
     taught = TaughtPoses(tmp_path / "poses.json")
     taught.teach("alone", pose(1))

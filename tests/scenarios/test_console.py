@@ -209,7 +209,9 @@ def taught_and_run(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
 
         planned = me.does("plan")
         assert planned["ok"], planned["text"]
-        assert me.command("load_plan", file="console/taught.plan.json")["ok"]
+        loaded = me.until(lambda state: state["preview"])
+        assert loaded["preview"] == "console/taught.plan.json"
+        assert loaded["plan_start_off_mm"] < 0.2
         assert me.command("run")["ok"]
         me.until(lambda state: state["motion"] and state["motion"]["state"] == "moving")
         assert me.command("hold")["ok"]
@@ -223,7 +225,13 @@ def taught_and_run(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
             assert json.load(answer) == {"ok": True, "what": ""}
         ended = me.until(lambda state: state["outcome"] and state["busy"] is None)["outcome"]
         assert not ended["ok"]
+        assert ended["stopped"]
         assert "STOPPED" in ended["text"]
+        assert me.state["plan_start_off_mm"] > 1.0
+        assert "plan from its present pose" in me.command("run")["what"]
+        assert me.command("plan", scene=None, pose="beside")["ok"]
+        me.until(lambda state: state["plan_start_off_mm"] is not None)
+        assert me.state["plan_start_off_mm"] < 0.2, "the path begins where the platform stopped"
         assert ended["report"].startswith("/runs/")
         assert process.poll() is None
     assert list((folder / "runs").glob("*/report.html"))
@@ -257,6 +265,22 @@ def console_killed(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         assert '"code": "held"' in events
         targets = [row.split(",")[3:11] for row in rows[-10:]]
         assert all(target == targets[0] for target in targets)
+
+
+def test_jogging_ends_with_the_console(on_a_day: Callable[[Day], None]) -> None:
+    on_a_day(console_ended)
+
+
+def console_ended(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
+    with console(slow_rig, bus) as (process, address), operator(address) as me:
+        assert me.command("jog_begin")["ok"]
+        me.until(lambda state: state["jog"]["ready"])
+        process.send_signal(signal.SIGINT)
+        process.wait()
+        while find_any():
+            pass
+    events = (folder / "runs" / "jog-session" / "events.jsonl").read_text()
+    assert "stop" not in events
 
 
 def find_any() -> bool:

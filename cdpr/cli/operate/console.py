@@ -71,8 +71,8 @@ def console(
     """Serve the operator's page: live view, jog, teach, preview, run, hold, stop.
 
     Open the printed address in a browser. Runs are separate processes, and continue when the
-    console ends. STOP on the page is a software stop: it does not replace the emergency-stop
-    button.
+    console ends; jogging ends with it. STOP on the page is a software stop: it does not replace the
+    emergency-stop button.
 
     [dim]Examples:[/dim]
 
@@ -126,11 +126,11 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
         ) from None
     shown = Console(files)
     if plan is not None:
-        shown.load_plan(plan)
+        shown.begin_with(plan)
 
     def show_address(address: str) -> None:
         show_line(f"console of {files.rig.name}: {address}")
-        show_line("Ctrl-C ends the console; a run continues")
+        show_line("Ctrl-C ends the console and jogging; a run continues")
 
     run_server(shown, host, port, show_address)
 

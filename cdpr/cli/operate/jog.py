@@ -27,11 +27,14 @@ from cdpr.cli.options import (
     DEFAULT_BUS,
     BusOptions,
     FastOption,
+    Quaternion,
     RigArgument,
     SummaryJsonOption,
+    Triple,
     WithoutRealTimeOption,
     YesOption,
     require_unused,
+    rotation_of,
     with_option_groups,
 )
 from cdpr.cli.output import Terminal, err, out, show_json, show_line
@@ -45,6 +48,7 @@ from executor.proposals import Proposal
 from executor.state_machine import CycleRecord, State
 from model.errors import BadInput
 from model.files.documents import millimetres
+from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, load_scene
 
@@ -110,6 +114,42 @@ class HeldOptions:
             help="with --hold-to-run: wind one cable in or pay it out, homed or not",
         ),
     ] = False
+    at_mm: Annotated[
+        Triple | None,
+        typer.Option(
+            "--at-mm",
+            help="with --hold-to-run or --keys, interface 'virtual': initial position x y z of the"
+            " simulated platform (default: home)",
+        ),
+    ] = None
+    at_wxyz: Annotated[
+        Quaternion | None,
+        typer.Option("--at-wxyz", help="with --at-mm: its orientation (default: as at home)"),
+    ] = None
+
+    def simulated_start(self, rig: Rig) -> Pose | None:
+        """Where the simulated platform begins, if stated.
+
+        Raises:
+            BadInput: The drives are not simulated by the jog, or only the orientation is stated.
+        """
+        if self.at_mm is None:
+            if self.at_wxyz is not None:
+                raise BadInput(
+                    "an orientation without a position",
+                    where="--at-wxyz",
+                    next_step="add --at-mm X Y Z",
+                )
+            return None
+        if not is_simulated(rig):
+            raise BadInput(
+                "the pose of a platform with drives on a bus is measured, not stated",
+                where="--at-mm",
+                next_step="leave it out, or use --interface virtual",
+            )
+        rotation = rotation_of(self.at_wxyz)
+        position = millimetres(list(self.at_mm))
+        return Pose(position, rig.home.rotation if rotation is None else rotation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,6 +230,9 @@ def jog(
         )
         _one_cable(the_rig, cable, mm, limit_n, speed, drives)
         return
+    if not (held.hold_to_run or held.keys):
+        unused = {"--at-mm": held.at_mm, "--at-wxyz": held.at_wxyz}
+        require_unused("cdpr jog", unused, "only with --hold-to-run or --keys")
     if held.one_cable:
         _held_cables(the_rig, path, held, limit_n, speed, drives)
         return
@@ -244,13 +287,14 @@ def _held(
             rig,
             _scene(path.scene, path.no_scene, path.clearance_mm),
             speed=speed,
+            simulated_start=held.simulated_start(rig),
             need_real_time_rights=not drives.without_real_time,
             listener=Terminal(quiet=False),
             confirm=drives.confirm(rig),
             supervisor=SignalSupervisor(),
             on_cycle=None if keys is None else keys.take_cycle,
         )
-    out.print("jogging ended; the drives hold")
+    _say_ended(rig)
 
 
 def _held_cables(
@@ -279,7 +323,11 @@ def _held_cables(
         confirm=drives.confirm(rig),
         supervisor=SignalSupervisor(),
     )
-    out.print("jogging ended; the drives hold")
+    _say_ended(rig)
+
+
+def _say_ended(rig: Rig) -> None:
+    out.print("jogging ended" + ("" if is_simulated(rig) else "; the drives hold"))
 
 
 class JogKeys:
