@@ -51,6 +51,29 @@ def rotation_of(wxyz: Quaternion | None) -> Array | None:
     return matrix_from_quaternion(np.array(wxyz) / norm)
 
 
+def simulated_start(
+    rig: Rig, position_mm: Triple | None, wxyz: Quaternion | None, *, is_simulated: bool
+) -> Pose | None:
+    """The pose of options ``--at-mm`` and ``--at-wxyz``, for drives that the verb simulates.
+
+    Raises:
+        BadInput: The drives are on a bus, or only the orientation is stated.
+    """
+    if position_mm is None:
+        if wxyz is not None:
+            raise BadInput("an orientation without a position", next_step="add --at-mm X Y Z")
+        return None
+    if not is_simulated:
+        raise BadInput(
+            "the pose of a platform with drives on a bus is measured, not stated",
+            where="--at-mm",
+            next_step="leave it out, or use --interface virtual",
+        )
+    rotation = rotation_of(wxyz)
+    position = millimetres(list(position_mm))
+    return Pose(position, rig.home.rotation if rotation is None else rotation)
+
+
 def finite(value: float | None) -> float | None:
     """Option callback that refuses `inf` and `nan`, which pass min and max.
 

@@ -34,7 +34,7 @@ from cdpr.cli.options import (
     WithoutRealTimeOption,
     YesOption,
     require_unused,
-    rotation_of,
+    simulated_start,
     with_option_groups,
 )
 from cdpr.cli.output import Terminal, err, out, show_json, show_line
@@ -48,7 +48,6 @@ from executor.proposals import Proposal
 from executor.state_machine import CycleRecord, State
 from model.errors import BadInput
 from model.files.documents import millimetres
-from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, load_scene
 
@@ -126,30 +125,6 @@ class HeldOptions:
         Quaternion | None,
         typer.Option("--at-wxyz", help="with --at-mm: its orientation (default: as at home)"),
     ] = None
-
-    def simulated_start(self, rig: Rig) -> Pose | None:
-        """Where the simulated platform begins, if stated.
-
-        Raises:
-            BadInput: The drives are not simulated by the jog, or only the orientation is stated.
-        """
-        if self.at_mm is None:
-            if self.at_wxyz is not None:
-                raise BadInput(
-                    "an orientation without a position",
-                    where="--at-wxyz",
-                    next_step="add --at-mm X Y Z",
-                )
-            return None
-        if not is_simulated(rig):
-            raise BadInput(
-                "the pose of a platform with drives on a bus is measured, not stated",
-                where="--at-mm",
-                next_step="leave it out, or use --interface virtual",
-            )
-        rotation = rotation_of(self.at_wxyz)
-        position = millimetres(list(self.at_mm))
-        return Pose(position, rig.home.rotation if rotation is None else rotation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,7 +262,9 @@ def _held(
             rig,
             _scene(path.scene, path.no_scene, path.clearance_mm),
             speed=speed,
-            simulated_start=held.simulated_start(rig),
+            simulated_start=simulated_start(
+                rig, held.at_mm, held.at_wxyz, is_simulated=is_simulated(rig)
+            ),
             need_real_time_rights=not drives.without_real_time,
             listener=Terminal(quiet=False),
             confirm=drives.confirm(rig),
