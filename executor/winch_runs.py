@@ -146,14 +146,12 @@ def with_board(
     if result.state is State.STOPPED:
         raise StoppedByOperator("stopped; the drives hold", next_step="start again when ready")
     if result.state is not State.FINISHED:
-        raise Fault(
-            result.cause,
-            where="winches",
-            why="the motion was stopped, all drives together; `cdpr status RIG` shows which hold",
-            next_step="find the cause; simulated drives start fresh"
-            if is_simulated(rig)
-            else "find the cause and check the platform, then run `cdpr reset RIG`",
-        )
+        why = "the motion was stopped, all drives together"
+        next_step = "find the cause, then begin again: the simulated drives ended with the motion"
+        if not is_simulated(rig):
+            why += "; `cdpr status RIG` shows which hold"
+            next_step = "find the cause and check the platform, then run `cdpr reset RIG`"
+        raise Fault(result.cause, where="winches", why=why, next_step=next_step)
     return result
 
 
