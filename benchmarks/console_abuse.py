@@ -306,9 +306,13 @@ def main() -> int:
         wrong += holder.wrong
         wrong += [] if process.poll() is None else ["the server ended"]
         if process.poll() is None:
-            with operator(address) as me:
-                me.command("stop")
-                me.until(lambda state: state["busy"] is None)
+            try:
+                with operator(address) as me:
+                    me.command("stop")
+                    me.until(lambda state: state["busy"] is None)
+            except (TimeoutError, OSError) as error:
+                wrong.append(f"the server does not answer: {error}")
+                process.kill()
     total = sum(attack.sent.values())
     print(f"{total} in {seconds:.0f} s: {dict(sorted(attack.sent.items()))}")
     print(f"the drives were at rest in all of {holder.moments} states with a session enabled")

@@ -95,10 +95,8 @@ def jog_session(
     interlock.require_free()
     ready = interlock.referenced_rig()
     around = (empty_scene(slow) if scene is None else scene).changed(stops=())
-    if is_simulated(ready):
-        start = simulated_start or ready.home
-    else:
-        start = measured_pose(ready, around)
+    known = (simulated_start or ready.home) if is_simulated(ready) else None
+    start = known or measured_pose(ready, around)
     require_confirmed(confirm, JogProposal(ready, around, start))
     session = _Session(
         ready,
