@@ -364,7 +364,8 @@ def run_server(console: Console, host: str, port: int, on_ready: Callable[[str],
     with _listening(host, port) as listener:
         server = ConsoleServer(console, host=host)
         on_ready(f"http://{host}:{listener.getsockname()[1]}/?token={server.token}")
-        config = uvicorn.Config(server.app(), log_level="warning", ws_max_size=4096)
+        # A warning for each bad request would fill a pipe that nobody reads, and block the server.
+        config = uvicorn.Config(server.app(), log_level="error", ws_max_size=4096)
         uvicorn.Server(config).run(sockets=[listener])
 
 

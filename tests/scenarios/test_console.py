@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -328,6 +329,19 @@ def one_cable(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         assert moved == {cable - 1}, name
         last = [row.split(",")[3:11] for row in rows[-10:]]
         assert all(target == last[0] for target in last)
+
+
+def test_bad_requests_never_block_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody reads its standard error here, as where it is started by another program."""
+    monkeypatch.chdir(tmp_path)
+    with console(CONFIGS / "gachon_8_6.yaml", ()) as (_, address):
+        host, port = address.removeprefix("http://").split("/")[0].split(":")
+        for _ in range(2500):
+            with socket.create_connection((host, int(port)), timeout=30) as connection:
+                connection.sendall(b"\x00garbage\r\n\r\n")
+                assert b"400" in connection.recv(100)
+        with operator(address) as me:
+            assert me.command("stop")["what"] == "nothing moves"
 
 
 def test_a_stop_without_a_run_reports_it(on_a_day: Callable[[Day], None]) -> None:
