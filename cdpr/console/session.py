@@ -103,9 +103,9 @@ class Console:
             None if files.scene_file is None else load_scene(files.scene_file)
         )
         self.control, self.verbs = PageControl(_milliseconds), StartedVerb()
-        self.watch = RunWatch(
-            f"{files.rig.document.bus.interface} {files.rig.document.bus.channel}".strip()
-        )
+        # Drives simulated by each run share no bus: other robots' runs have the same bus name.
+        only = self.rig.name if is_simulated(self.rig) else None
+        self.watch = RunWatch(bus_name(self.rig), only)
         self.view = RobotView(files.rig, self.scene)
         self.pictures = CameraPictures()
         self.poses = TaughtPoses(MADE / "poses.json")

@@ -45,9 +45,9 @@ class RunReport:
 class RunWatch:
     """Follows the runs on one bus; thread-safe."""
 
-    def __init__(self, bus: str) -> None:
-        """Starts unconnected; ``bus`` as in a run's status."""
-        self._bus = bus
+    def __init__(self, bus: str, rig: str | None = None) -> None:
+        """Starts unconnected; ``bus`` and ``rig`` as in a run's status, None for any rig."""
+        self._bus, self._rig = bus, rig
         self._lock = threading.Lock()
         self._links = ExitStack()
         self._run: RunLink | None = None
@@ -132,7 +132,7 @@ class RunWatch:
         for run in links.enter_context(find_runs()):
             link = RunLink(run)
             answer = link.ask(make_line("status"), PATIENCE)
-            if answer.status is not None and answer.status["bus"] == self._bus:
+            if answer.status is not None and self._is_here(answer.status):
                 self._run = link
                 self._count += 1
                 return []
@@ -140,6 +140,9 @@ class RunWatch:
                 silent.append(run.process)
         self._disconnect()
         return silent
+
+    def _is_here(self, status: dict[str, Any]) -> bool:
+        return status["bus"] == self._bus and self._rig in (None, status["rig"])
 
     def _disconnect(self) -> None:
         self._run = None

@@ -113,13 +113,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class MovesOn:
-    """A minimal `RunStatus` with only the bus of a run."""
+    """A minimal `RunStatus` with only the bus of a run, and its rig."""
 
-    def __init__(self, bus: str) -> None:
-        self._bus = bus
+    def __init__(self, bus: str, rig: str) -> None:
+        self._bus, self._rig = bus, rig
 
     def as_dict(self) -> dict[str, Any]:
-        return {"bus": self._bus}
+        return {"bus": self._bus, "rig": self._rig}
 
 
 @pytest.fixture(autouse=True)
@@ -259,16 +259,17 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
         assert [asked("reset"), asked("service_begin")] == [silent] * 2
         state = console.update()
         assert state["motion"] is None
-        here: Any = MovesOn(state["bus"])
+        here: Any = MovesOn(state["bus"], state["rig"])
         with commands(listeners, LocalRequests(), here):
             moves = "the robot moves; wait, or stop it"
             assert [asked("reset"), asked("service_begin")] == [moves] * 2
     assert served.started == []
     console.watch.close()
-    elsewhere: Any = MovesOn("can can7")
-    with advertised() as listeners, commands(listeners, LocalRequests(), elsewhere):
-        assert [asked("service_begin"), asked("service_end"), asked("reset")] == [""] * 3
-    assert [verb for verb, _ in served.started] == ["reset"]
+    others: list[Any] = [MovesOn("can can7", state["rig"]), MovesOn(state["bus"], "another")]
+    for elsewhere in others:  # drives simulated by another robot's run are on no common bus
+        with advertised() as listeners, commands(listeners, LocalRequests(), elsewhere):
+            assert [asked("service_begin"), asked("service_end"), asked("reset")] == [""] * 3
+    assert [verb for verb, _ in served.started] == ["reset"] * 2
     console.close()
 
 
