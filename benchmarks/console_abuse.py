@@ -37,6 +37,8 @@ from tests.scenarios.test_console import Operator, console, drives, operator  # 
 
 #: Messages that are sent before their answers are read; sockets and connections at a time.
 BATCH, SOCKETS, CONNECTIONS = 40, 6, 4
+#: Longer than a million messages take, [s].
+ENDS_WITHIN_S = 4 * 3600.0
 COMMANDS = (
     *("hold", "resume", "home", "reset", "release", "run", "jog_begin", "jog_end"),
     *("take_control", "load_plan", "compare", "plan", "speed", "teach", "teach_at", "rename"),
@@ -296,8 +298,8 @@ def main() -> int:
     wrong = []
     with ExitStack() as stack:
         stack.enter_context(alone())
-        bus = stack.enter_context(drives(RIG, 7))
-        process, address = stack.enter_context(console(RIG, bus))
+        bus = stack.enter_context(drives(RIG, 7, within=ENDS_WITHIN_S))
+        process, address = stack.enter_context(console(RIG, bus, within=ENDS_WITHIN_S))
         with operator(address) as me:
             attack = Attack(address, enabled(me), 1)
         watched, holder, began = Watched(process.pid), Holder(address), time.monotonic()
@@ -310,7 +312,7 @@ def main() -> int:
                 with operator(address) as me:
                     me.command("stop")
                     me.until(lambda state: state["busy"] is None)
-            except (TimeoutError, OSError) as error:
+            except (TimeoutError, OSError, InvalidHandshake) as error:
                 wrong.append(f"the server does not answer: {error}")
                 process.kill()
     total = sum(attack.sent.values())
