@@ -3,7 +3,7 @@
     python benchmarks/console_sequences.py [--count 100000] [--seed 1] [--cables]
 
 `tests/console/sequences.py` defines the events and the checks of each cycle. Prints what was done
-and what was wrong; exit code 1 if anything was. 100 000 sequences take hours.
+and what was wrong; exit code 1 if anything was. 100 000 sequences take half an hour.
 """
 
 from __future__ import annotations
