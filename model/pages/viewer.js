@@ -302,7 +302,8 @@ function sceneViewer(canvas, data, shown = () => true) {
       word.textContent = text;
       sign.wide = ruler.measureText(text).width;
     }
-    const found = free(mark ? x + 9 : x - sign.wide / 2, mark ? y - 7 : y + 4, sign.wide);
+    const { wide } = sign;
+    const found = mark ? free(x + 9, y - 7, wide) ?? free(x - 9 - wide, y - 7, wide) : free(x - wide / 2, y + 4, wide);
     sign.className = mark;
     sign.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
     word.hidden = !found; // its mark stays

@@ -32,7 +32,7 @@ CONTROLS = """() => [...document.querySelectorAll("#panels button, #panels input
   .map((e) => {
     const { x, y, width, height } = e.getBoundingClientRect();
     const front = document.elementFromPoint(x + width / 2, y + height / 2);
-    const own = front === e || e.contains(front) || Boolean(front && front.closest("label, .files"));
+    const own = front === e || e.contains(front) || Boolean(front?.closest("label, .files"));
     return { name: e.id || e.textContent.trim(), box: [x, y, width, height], front: own };
   })"""
 

@@ -129,7 +129,7 @@ export class Scene {
     const fresh = isFresh(measured) ? { ...measured, age_s: 0 } : null;
     const shown = JSON.stringify([platform, tensions?.map((tension) => Math.round(2 * tension)), clearance, fresh, this.#pick]);
     if (shown !== this.#shown) {
-      const measure = ellipsoid(fresh, this.#view.size()), more = drawn([closestPair(clearance), measure, this.#goal()]);
+      const measure = ellipsoid(fresh, this.#view.size()), more = drawn([this.#goal(), closestPair(clearance), measure]);
       write(at("scene-legend"), measure && !this.#hidden.has("measured") ? measure.legend : "");
       this.#view.show(platform && { p: platform.position_mm, r: platform.rotation, exits: platform.exits_mm, tensions, ...more });
     }
