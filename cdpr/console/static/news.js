@@ -22,7 +22,7 @@ export function busyText({ busy, motion, jog, cable }) {
   if (!busy) return "";
   const verb = VERBS[busy.verb] ?? busy.verb;
   if (jog.ready || cable.ready) return `${verb} is enabled`;
-  if (!isActive(motion)) return `${verb}: ${busy.text || "…"}`;
+  if (busy.verb !== "run" || !isActive(motion)) return `${verb}: ${busy.text || "…"}`;
   const state = (STATES[motion.state] ?? motion.state).toLowerCase();
   return `${verb}: ${state}${motion.feed_percent === 0 && busy.text ? `, ${busy.text}` : ""}`;
 }
