@@ -197,6 +197,7 @@ def test_a_limit_is_shown_as_the_one_ahead_and_only_during_a_press(desk: Visit) 
     desk.ready_to_jog()
     jog = {"ready": True, "why_not": None, "moving": True, "speed_mm_s": 20.0}
     limit = "stops in 12.0 mm: obstacle clearance too small, pillar: 2.353 mm (limit 10 mm)"
+    limit += " with the platform at [-42.1, 0.0, 445.0] mm"
     desk.fake.ask(state={"jog": {**jog, "limit": limit}})
     shown = desk.page.locator("#jog-limit")
     expect(shown).to_have_text(
@@ -206,7 +207,9 @@ def test_a_limit_is_shown_as_the_one_ahead_and_only_during_a_press(desk: Visit) 
     desk.fake.ask(state={"jog": {**jog, "moving": False, "limit": limit}})
     expect(shown).to_be_hidden()
     desk.hold()
-    expect(shown).to_be_visible()
+    expect(shown).to_have_text(
+        "Limit reached. Farther on: obstacle clearance too small, pillar: 2.353 mm (limit 10 mm)"
+    )
     desk.page.mouse.up()
     expect(shown).to_be_hidden()
 

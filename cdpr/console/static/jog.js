@@ -87,10 +87,10 @@ export function bindJog(connection, situation, command) {
   };
 }
 
-/** The server's limit of a jog in words: its numbers are those at the limit ahead, not the present ones. */
-function ahead(limit) {
-  const [, room, what] = /^stops in ([\d.]+ mm): (.*)$/s.exec(limit ?? "") ?? [];
-  return what ? `Limit ahead: comes to rest within ${room}. Farther on: ${what}` : limit ?? "";
+/** The server's limit of a jog in words: its values are predicted beyond the limit, not the present ones. */
+function ahead({ limit, moving }) {
+  const [, room, what] = /^stops in ([\d.]+ mm): (.*?)( with the platform at .*)?$/s.exec(limit ?? "") ?? [];
+  return what ? `${moving ? `Limit ahead: comes to rest within ${room}.` : "Limit reached."} Farther on: ${what}` : limit ?? "";
 }
 
 /** What a pad says: moving only if the position changes. */
@@ -105,7 +105,7 @@ function showPad(panel, jog, text, isHeld) {
   write(at(`${panel}-state`), text);
   if (jog.speed_mm_s) mark(at(`${panel}-speed`), "max", String(jog.speed_mm_s)); // the limit of the session
   showSpeed(panel);
-  const limit = jog.moving || isHeld ? ahead(jog.limit) : "";
+  const limit = jog.moving || isHeld ? ahead(jog) : "";
   write(at(`${panel}-limit`), limit);
   at(`${panel}-limit`).hidden = !limit;
 }

@@ -24,7 +24,8 @@ export function busyText({ busy, motion, jog, cable }) {
   if (jog.ready || cable.ready) return `${verb} is enabled`;
   if (busy.verb !== "run" || !isActive(motion)) return `${verb}: ${busy.text || "…"}`;
   const state = (STATES[motion.state] ?? motion.state).toLowerCase();
-  return `${verb}: ${state}${motion.feed_percent === 0 && busy.text ? `, ${busy.text}` : ""}`;
+  const rests = ["moving", "holding"].includes(motion.state) && motion.feed_percent === 0; // such as at a stop
+  return `${verb}: ${state}${rests && busy.text ? `, ${busy.text}` : ""}`;
 }
 
 function titleOf({ verb, ok, stopped }, preview) {
