@@ -85,13 +85,20 @@ class CompareCommand(_Command):
 
 
 class PlanCommand(_Command):
-    """Plan a path for a scene, or through the taught poses, or to one from the present pose."""
+    """Plan a path for a scene, or through the taught poses.
+
+    Attributes:
+        scene: File of the scene; None for the taught poses.
+        objective: What the path minimizes.
+        from_here: The path begins at the present pose, then goes through the taught poses in order.
+        pose: Only to this taught pose, from the present one.
+    """
 
     command: Literal["plan"]
     scene: Text | None = None
+    objective: Literal["shortest", "kinematic", "clearance"] = "shortest"
     from_here: bool = False
     pose: Text | None = None
-    objective: Literal["shortest", "kinematic", "clearance"] = "shortest"
 
 
 class NameCommand(_Command):

@@ -273,39 +273,51 @@ function sceneViewer(canvas, data, shown = () => true) {
   canvas.after(texts);
   const ruler = document.createElement("canvas").getContext("2d");
   ruler.font = "600 12px system-ui, sans-serif";
-  const taken = []; // where texts stand already: [left, right, base]
-  let count = 0;
+  const taken = []; // where marks and texts are already: [left, right, base]
 
+  /** All texts, the most important first: of two that overlap, the later one moves by some lines or is left out. */
   function writeTexts() {
-    taken.length = count = 0;
-    for (const list of [data.labels, now?.labels ?? [], names])
-      for (const { layer, text, at, mark } of list) if (shown(layer)) write(text, point.fromArray(at), mark);
-    if (shown("numbers") && robot.visible)
-      cables.forEach(({ segment: [s] }, i) => write(String(i + 1), point.fromArray(s).lerp({ x: s[3], y: s[4], z: s[5] }, 0.25)));
-    for (let k = count; k < texts.childElementCount; k++) texts.children[k].hidden = true;
+    const words = [];
+    const add = (layer, text, at, mark = "") => shown(layer) && words.push({ text, mark, ...pixelOf(at) });
+    for (const list of [data.labels, now?.labels ?? []]) for (const { layer, text, at, mark } of list) add(layer, text, point.fromArray(at), mark);
+    if (robot.visible) cables.forEach(({ segment: [s] }, i) => add("numbers", String(i + 1), point.fromArray(s).lerp({ x: s[3], y: s[4], z: s[5] }, 0.25)));
+    for (const { layer, text, at } of names) add(layer, text, point.fromArray(at));
+    taken.length = 0;
+    for (const { mark, x, y } of words) if (mark) taken.push([x - 4, x + 4, y + 5]);
+    words.forEach(write);
+    for (let k = words.length; k < texts.childElementCount; k++) texts.children[k].hidden = true;
   }
 
-  function write(text, at, mark = "") {
+  function pixelOf(at) {
     at.project(camera);
-    const x = ((1 + at.x) * pane.width) / 2, y = ((1 - at.y) * pane.height) / 2;
-    const sign = texts.children[count++] ?? texts.appendChild(document.createElement("span"));
+    return { x: ((1 + at.x) * pane.width) / 2, y: ((1 - at.y) * pane.height) / 2, isIn: Math.abs(at.x) <= 1 && Math.abs(at.y) <= 1 };
+  }
+
+  function write({ text, mark, x, y, isIn }, k) {
+    const sign = texts.children[k] ?? texts.appendChild(document.createElement("span"));
     const word = sign.firstChild ?? sign.appendChild(document.createElement("b"));
+    sign.hidden = !isIn;
+    if (!isIn) return;
     if (word.textContent !== text) {
       word.textContent = text;
       sign.wide = ruler.measureText(text).width;
     }
-    if (mark) taken.push([x - 4, x + 4, y + 5]);
-    const [left, base] = free(mark ? x + 9 : x - sign.wide / 2, mark ? y - 7 : y + 4, sign.wide);
-    sign.hidden = Math.abs(at.x) > 1 || Math.abs(at.y) > 1;
+    const { wide } = sign;
+    const found = mark ? free(x + 9, y - 7, wide) ?? free(x - 9 - wide, y - 7, wide) : free(x - wide / 2, y + 4, wide);
     sign.className = mark;
     sign.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
+    word.hidden = !found; // its mark stays
+    if (!found) return;
+    const [left, base] = found;
     word.style.transform = `translate(${(left - x).toFixed(1)}px, ${(base - 11 - y).toFixed(1)}px)`;
   }
 
-  function free(wanted, base, wide) { // within the picture, and beside what is written there already: some lines up or down
+  /** A free position in the picture, up to some lines higher or lower; null without one. */
+  function free(wanted, base, wide) {
     const left = Math.max(3, Math.min(wanted, pane.width - wide - 3));
     const isFree = (at) => at > LINE && at < pane.height - 3 && taken.every(([l, r, b]) => left + wide + 4 < l || left > r + 4 || Math.abs(at - b) >= LINE);
-    const at = [0, -1, 1, -2, 2, -3, 3].map((lines) => base + lines * LINE).find(isFree) ?? base;
+    const at = [0, -1, 1, -2, 2, -3, 3].map((lines) => base + lines * LINE).find(isFree);
+    if (at === undefined) return null;
     taken.push([left, left + wide, at]);
     return [left, at];
   }

@@ -156,11 +156,22 @@ class Fake:
         self.events: list[dict[str, Any]] = []
         self.pictures: list[float] = []
         self.slow_ms = 0
+        self.planning: str | None = None  # the plan being made
+        self.planning_ticks = 0  # until it is made
+        self.files = {
+            "scenes": ["configs/environment_1.yaml", "configs/hall_pillar.yaml"],
+            "plans": ["plans/circle.json", "plans/colliding.json"],
+        }
         self._seq = itertools.count(1)
 
     def tick(self) -> None:
         """One period of the motion."""
         self.ticks += 1
+        if self.planning is not None:
+            self.planning_ticks -= 1
+            if self.planning_ticks <= 0:
+                self.plan, self.planning = self.planning, None
+                self._finish("plan", True, "planned and checked: 921 mm in 24.0 s")
         if self.moving:
             wished = (
                 0.0
@@ -195,19 +206,26 @@ class Fake:
             "stop" if stopped else "end",
             "stopped by the operator" if stopped else "the end of the path",
         )
-        text = (
-            "Stopped along the path by the operator."
+        facts = "bus            udp_multicast 239.74.163.2, 8 drives\nplan           circle.json\n"
+        text = facts + (
+            "STOPPED Stopped along the path by the operator."
             if stopped
-            else "Passed.\nLeast clearance 12.4 mm."
+            else "PASSED The run reached the goal.\n  Least clearance 12.4 mm."
         )
+        self._finish("run", not stopped, text, stopped=stopped, report="/report")
+        self.moving, self.rate = None, 0.0
+
+    def _finish(
+        self, verb: str, ok: bool, text: str, *, stopped: bool = False, report: str | None = None
+    ) -> None:
         self.outcome = {
-            "verb": "run",
-            "ok": not stopped,
+            "verb": verb,
+            "ok": ok,
+            "stopped": stopped,
             "text": text,
-            "report": "/report",
+            "report": report,
             "fault_page": None,
         }
-        self.moving, self.rate = None, 0.0
 
     def event(self, code: str, text: str) -> None:
         at = round(time.monotonic() - self.began, 2)
@@ -227,7 +245,9 @@ class Fake:
         if self.held and near < 60.0:
             jog["limit"] = f"stops in {near - 10.0:.0f} mm: clearance to obstacle_1"
         busy = None
-        if self.moving or self.jog_ready or self.cable_ready:
+        if self.planning is not None:
+            busy = {"verb": "plan", "text": "searching"}
+        elif self.moving or self.jog_ready or self.cable_ready:
             verb = "run" if self.moving else "jog"
             busy = {
                 "verb": verb,
@@ -431,8 +451,12 @@ class Fake:
             self.latched = None
         elif command in ("home", "release"):
             self.homed = command == "home"
-        elif command in ("load_plan", "plan"):
-            self.plan = message.get("file") or message.get("scene") or "taught poses"
+        elif command == "load_plan":
+            self.plan = message["file"]
+        elif command == "plan":
+            self.plan = self.outcome = None
+            self.planning = message["scene"] or "console/taught.plan.json"
+            self.planning_ticks = 8
         elif command == "compare":
             self.compared = message["file"]
         elif command == "teach_at":
@@ -480,12 +504,7 @@ def application(fake: Fake) -> Starlette:
         return JSONResponse({**scene_of(RIG, None), **drawn})
 
     async def files(request: Request) -> Response:
-        return JSONResponse(
-            {
-                "scenes": ["configs/environment_1.yaml", "configs/hall_pillar.yaml"],
-                "plans": ["plans/circle.json", "plans/colliding.json"],
-            }
-        )
+        return JSONResponse(fake.files)
 
     async def preview_of(request: Request) -> Response:
         return JSONResponse(preview(fake.plan)) if fake.plan else PlainTextResponse("no plan", 404)
@@ -521,7 +540,7 @@ def application(fake: Fake) -> Starlette:
                 for left in list(fake.sockets):
                     await left.close()
         position = np.round(fake.position * 1e3, 3).tolist()
-        names = ("received", "stops", "ticks", "plan", "poses", "latched", "pictures")
+        names = ("received", "stops", "ticks", "plan", "poses", "latched", "pictures", "files")
         return JSONResponse(
             {name: getattr(fake, name) for name in names} | {"position_mm": position}
         )

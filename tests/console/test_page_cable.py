@@ -120,7 +120,14 @@ def test_a_stick_winds_in_and_pays_out_and_ends_when_it_changes_direction(
 
 def test_tension_and_travel_are_shown(desk: Visit) -> None:
     desk.ready_to_jog_cables()
-    cable = {**AT_REST, "ready": True, "cable": 3, "press_mm": -0.25, "limit_n": 62.0}
+    cable = {
+        **AT_REST,
+        "ready": True,
+        "moving": True,
+        "cable": 3,
+        "press_mm": -0.25,
+        "limit_n": 62.0,
+    }
     travel = [0.0, 0.0, 1.25, 0.0, 0.0, 0.0, 0.0, 0.0]
     limit = "cable 3 carries 55.1 N, near the limit of 62 N"
     desk.fake.ask(

@@ -41,11 +41,13 @@ def moving(state: str, **wished: Any) -> dict[str, Any]:
 
 
 RUN = {"verb": "run", "text": ""}
-PLANS = {"load_plan", "compare", "plan", "plan_poses"}
+PLANS = {"load_plan", "compare", "compare_end", "plan", "plan_poses", "go_to"}
+PLANS |= {"plan_files", "scene_files"}
 REST = {"home", "release", "run", "jog_begin", "service_begin"} | PLANS
-ALWAYS = {"stop", "jog_setting", "cable_setting"}
+ALWAYS = {"stop", "jog_setting", "cable_setting", "plan_setting"}
 SERVICE = {"yours": True, "held_by": "A", "mode": "service"}
 TAUGHT = {"teach", "teach_at", "edit_pose", "give_control"}
+SELECTED = {"plan_file": "a.json", "scene_file": "b.yaml", "from_here": False}
 #: Name, situation, and the buttons that are possible in it; all others are not.
 TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
     ("at rest", {}, ALWAYS | TAUGHT | REST),
@@ -138,9 +140,33 @@ TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
         ALWAYS | TAUGHT | {"service_begin", "jog_end"},
     ),
     ("jogging begins", {"busy": {"verb": "jog", "text": ""}}, ALWAYS | TAUGHT | {"jog_end"}),
-    ("position not known", {"platform": None}, (ALWAYS | TAUGHT | REST) - {"teach", "teach_at"}),
+    (
+        "position not known",
+        {"platform": None},
+        (ALWAYS | TAUGHT | REST) - {"teach", "teach_at", "go_to"},
+    ),
+    (
+        "position not known, path from the present pose",
+        {"platform": None, "form": {**SELECTED, "from_here": True}},
+        (ALWAYS | TAUGHT | REST) - {"teach", "teach_at", "go_to", "plan_poses"},
+    ),
     ("one pose", {"poses": [{}]}, (ALWAYS | TAUGHT | REST) - {"plan_poses"}),
-    ("no pose", {"poses": []}, (ALWAYS | TAUGHT | REST) - {"plan_poses", "edit_pose"}),
+    (
+        "one pose, path from the present pose",
+        {"poses": [{}], "form": {**SELECTED, "from_here": True}},
+        ALWAYS | TAUGHT | REST,
+    ),
+    ("no pose", {"poses": []}, (ALWAYS | TAUGHT | REST) - {"plan_poses", "go_to", "edit_pose"}),
+    (
+        "no plan file selected",
+        {"form": {**SELECTED, "plan_file": None}},
+        (ALWAYS | TAUGHT | REST) - {"load_plan", "compare"},
+    ),
+    (
+        "no scene file selected",
+        {"form": {**SELECTED, "scene_file": None}},
+        (ALWAYS | TAUGHT | REST) - {"plan"},
+    ),
 ]
 
 
@@ -156,9 +182,13 @@ def test_the_table_of_buttons(desk: Visit) -> None:
         state = (
             None
             if "state" in changes
-            else state_of(**{k: v for k, v in changes.items() if k not in ("stale", "plan")})
+            else state_of(
+                **{k: v for k, v in changes.items() if k not in ("stale", "plan", "form")}
+            )
         )
-        reasons = desk.page.evaluate(ask, {"state": state, "stale": stale, "preview": plan})
+        situation = {"state": state, "stale": stale, "preview": plan}
+        situation["form"] = changes.get("form", SELECTED)
+        reasons = desk.page.evaluate(ask, situation)
         assert {button for button, reason in reasons.items() if reason is None} == possible, name
         assert all(reason for button, reason in reasons.items() if button not in possible), name
     tried = {button for _, _, possible in TABLE for button in possible}
@@ -283,6 +313,7 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     page.locator("summary", has_text="Make a plan").click()
     page.locator("input[name=scene-file]").first.check(force=True)
     page.locator("#make-plan").click()
+    expect(page.locator("#outcome-show")).to_be_visible()
     desk.view("teach")
     for taught in range(1, 3):
         page.locator("#teach").click()
@@ -297,7 +328,13 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     page.get_by_role("textbox", name="Name of pose 1").fill("grip")
     page.get_by_role("textbox", name="Name of pose 1").press("Enter")
     page.locator("#plan-poses").click()
+    expect(page.locator("#outcome-show")).to_be_visible()
+    page.get_by_role("button", name="Plan a path to grip").click()
+    expect(page.locator("#outcome-show")).to_be_hidden()
+    expect(page.locator("#outcome-show")).to_be_visible()
     page.get_by_role("button", name="Remove pose 1").click()
+    page.locator(".confirm").click()
+    expect(page.locator("#poses li")).to_have_count(2)
     desk.view("jog")
     page.locator("#jog-begin").click()
     expect(page.locator("#jog-state")).to_contain_text("Ready")

@@ -192,11 +192,48 @@ def test_a_gamepad_jogs_with_a_shoulder_button_and_from_the_centre(desk: Visit, 
     assert desk.fake.let_pass(desk.page)["received"][-1]["kind"] == "let_go"
 
 
-def test_a_limit_near_the_platform_is_shown(desk: Visit) -> None:
+def test_a_limit_is_shown_as_the_one_ahead_and_only_during_a_press(desk: Visit) -> None:
+    """Its numbers are those predicted at the limit; at rest they would pass for present ones."""
     desk.ready_to_jog()
     jog = {"ready": True, "why_not": None, "moving": True, "speed_mm_s": 20.0}
-    desk.fake.ask(state={"jog": {**jog, "limit": "stops in 12 mm: clearance to pillar"}})
-    expect(desk.page.locator("#jog-limit")).to_have_text("stops in 12 mm: clearance to pillar")
+    limit = "stops in 12.0 mm: obstacle clearance too small, pillar: 2.353 mm (limit 10 mm)"
+    limit += " with the platform at [-42.1, 0.0, 445.0] mm"
+    desk.fake.ask(state={"jog": {**jog, "limit": limit}})
+    shown = desk.page.locator("#jog-limit")
+    expect(shown).to_have_text(
+        "Limit ahead: comes to rest within 12.0 mm. Farther on:"
+        " obstacle clearance too small, pillar: 2.353 mm (limit 10 mm)"
+    )
+    desk.fake.ask(state={"jog": {**jog, "moving": False, "limit": limit}})
+    expect(shown).to_be_hidden()
+    desk.hold()
+    expect(shown).to_have_text(
+        "Limit reached. Farther on: obstacle clearance too small, pillar: 2.353 mm (limit 10 mm)"
+    )
+    desk.page.mouse.up()
+    expect(shown).to_be_hidden()
+
+
+def test_what_rests_is_not_said_to_move(desk: Visit) -> None:
+    """Such as at the limit, or after the step, while the button is still held."""
+    desk.ready_to_jog()
+    jog = {"ready": True, "why_not": None, "speed_mm_s": 20.0, "limit": None}
+    desk.fake.ask(state={"jog": {**jog, "moving": False}})
+    desk.hold()
+    expect(desk.page.locator("#jog-state")).to_have_text("At rest: release, then press again")
+    expect(desk.page.locator("#motion-text")).to_have_text("Ready to jog")
+    desk.fake.ask(state={"jog": {**jog, "moving": True}})
+    expect(desk.page.locator("#jog-state")).to_have_text("Moving")
+    expect(desk.page.locator("#motion-text")).to_have_text("Jogging")
+    desk.page.mouse.up()
+
+
+@pytest.mark.parametrize("panel", ["jog", "service"])
+def test_the_distance_of_a_press_is_called_its_limit(desk: Visit, panel: str) -> None:
+    desk.view(panel)
+    expect(desk.page.locator(f"#panel-{panel}")).to_contain_text(
+        "At most per press: hold until it has moved"
+    )
 
 
 def test_the_pad_stays_where_it_is_whatever_is_shown(browser: Browser, fake: Fake) -> None:
@@ -218,8 +255,8 @@ def test_the_pad_stays_where_it_is_whatever_is_shown(browser: Browser, fake: Fak
             expect(found.page.locator("#jog-said")).to_contain_text("Ended: the window lost")
             lamps = {"reference": {"counts": False, "why_not": "cable 3 was switched on again"}}
             found.fake.ask(state={**changes, **more, **lamps})
-            expect(found.page.locator("#jog-limit")).to_have_text(limit)
-            expect(found.page.locator("#outcome")).to_be_visible()
+            expect(found.page.locator("#jog-limit")).to_contain_text("comes to rest within 17.1 mm")
+            expect(found.page.locator("#latched")).to_be_visible()
             assert found.page.locator("#jog-pad").bounding_box() == before, size
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from itertools import combinations
 from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.console.browsing import NO_WEBGL, Fake, Visit, painted, visit
+from tests.console.fake_server import on_circle
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 WEBGL = True
@@ -188,6 +190,69 @@ def test_picking_ends_with_control(desk: Visit) -> None:
     begin_to_pick(desk)
     desk.fake.ask(state={"control": {"yours": False, "held_by": "page 7"}})
     expect(desk.page.locator("#pick-bar")).to_be_hidden()
+
+
+# Texts in the scene.
+
+
+def texts(desk: Visit) -> dict[str, dict[str, float]]:
+    """The texts that are shown, with their boxes."""
+    words = desk.page.evaluate(
+        """() => [...document.querySelectorAll(".texts b")].filter((e) => e.checkVisibility())
+             .map((e) => [e.textContent, e.getBoundingClientRect().toJSON()])"""
+    )
+    assert len({word for word, _ in words}) == len(words), "no text appears twice"
+    return dict(words)
+
+
+def pose_of(name: str, *position: float) -> dict[str, Any]:
+    return {"name": name, "position_mm": list(position), "quaternion": [1, 0, 0, 0]}
+
+
+def test_taught_poses_are_named_in_the_scene_with_and_without_a_plan(desk: Visit) -> None:
+    start = on_circle(0.0) * 1e3
+    poses = [pose_of("grip", *start), pose_of("above", -100.0, 150.0, 500.0)]
+    desk.fake.ask(set={"poses": poses})
+    desk.fake.wait(desk.page, lambda _: {"grip", "above"} <= set(texts(desk)))
+    desk.take_control()
+    desk.load()  # it starts at "grip"
+    desk.fake.let_pass(desk.page)
+    assert {"grip", "above"} <= set(texts(desk))
+    assert "start" not in texts(desk)
+    without_layer(desk, "Taught poses")
+    desk.fake.wait(desk.page, lambda _: "start" in texts(desk))
+    assert not {"grip", "above"} & set(texts(desk))
+
+
+def test_a_picked_goal_is_named_so(desk: Visit) -> None:
+    begin_to_pick(desk)
+    desk.pick()
+    desk.fake.wait(desk.page, lambda _: "picked" in texts(desk))
+    assert "goal" not in texts(desk)
+
+
+def test_the_axes_of_the_world_are_shown(desk: Visit) -> None:
+    desk.fake.wait(desk.page, lambda _: {"x", "y", "z"} <= set(texts(desk)))
+    found = texts(desk)
+    assert found["z"]["y"] < min(found["x"]["y"], found["y"]["y"]), "z is up"
+    without_layer(desk, "Axes")
+    desk.fake.wait(desk.page, lambda _: not {"x", "y", "z"} & set(texts(desk)))
+
+
+def test_texts_that_would_overlap_are_left_out_the_less_important_first(desk: Visit) -> None:
+    """Taught names stay; numbers of cables and names of obstacles give way."""
+    crowd = [pose_of(f"pose number {k}", -150.0, 4.0 * k, 450.0) for k in range(5)]
+    desk.fake.ask(set={"poses": crowd})
+    desk.fake.wait(desk.page, lambda _: "pose number 2" in texts(desk))
+    found = texts(desk)
+    assert {pose["name"] for pose in crowd} <= set(found)
+    assert "obstacle_1" not in found
+    for one, other in combinations(found.values(), 2):
+        assert (
+            one["right"] <= other["left"]
+            or other["right"] <= one["left"]
+            or abs(one["top"] - other["top"]) >= 13.0
+        )
 
 
 def test_two_plans_stand_side_by_side_and_both_paths_are_drawn(desk: Visit) -> None:

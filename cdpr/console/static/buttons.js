@@ -1,8 +1,9 @@
 /* When each button is enabled, and the reason when not: one table, applied to the page.
 
-`situation` is `{ state, stale }`: the server's last state, and why it is stale (text) or null. */
+`situation` is `{ state, stale, preview, form }`: the server's last state, why it is stale (text) or null, the loaded
+plan, and what is selected on the page: `{ plan_file, scene_file, from_here }`. */
 
-import { mark } from "./elements.js";
+import { mark, write } from "./elements.js";
 
 const MOVING = ["enabling", "approaching", "moving", "holding", "stopping", "securing"];
 const ACTIVE = ["preparing", ...MOVING];
@@ -40,8 +41,13 @@ const REQUIREMENTS = {
   not_service: ({ state: { control } }) => (control.mode === "service" ? "This page is in service mode" : null),
   idle_but_cables: (situation) => (situation.state.cable.ready ? null : REQUIREMENTS.idle(situation)),
   located: ({ state }) => (state.platform ? null : "The platform’s position is unknown"),
+  plan_file: ({ form }) => (form.plan_file ? null : "Select a plan file first"),
+  scene_file: ({ form }) => (form.scene_file ? null : "Select a scene file first"),
   poses: ({ state }) => (state.poses.length ? null : "No pose has been taught"),
-  two_poses: ({ state }) => (state.poses.length > 1 ? null : "Teach two poses first"),
+  path_poses: (situation) => {
+    if (situation.form.from_here) return REQUIREMENTS.poses(situation) ?? REQUIREMENTS.located(situation);
+    return situation.state.poses.length > 1 ? null : "Teach two poses first";
+  },
 };
 
 const OPERATOR = ["fresh", "writable", "control"];
@@ -57,10 +63,15 @@ export const BUTTONS = {
   home: [...OPERATOR, "idle", "unlatched"],
   reset: [...OPERATOR, "idle", "latched"],
   release: [...OPERATOR, "idle"],
-  load_plan: [...OPERATOR, "idle"],
-  compare: [...OPERATOR, "idle", "planned"],
-  plan: [...OPERATOR, "idle"],
-  plan_poses: [...OPERATOR, "two_poses", "idle"],
+  plan_files: [...OPERATOR, "idle"],
+  load_plan: [...OPERATOR, "idle", "plan_file"],
+  compare: [...OPERATOR, "idle", "planned", "plan_file"],
+  compare_end: [...OPERATOR, "idle"],
+  scene_files: [...OPERATOR, "idle"],
+  plan: [...OPERATOR, "idle", "scene_file"],
+  plan_setting: ["fresh", "writable"],
+  plan_poses: [...OPERATOR, "path_poses", "idle"],
+  go_to: [...OPERATOR, "poses", "located", "idle"],
   run: [...OPERATOR, "idle", "unlatched", "homed", "planned", "proved"],
   jog_begin: [...OPERATOR, "idle", "unlatched", "homed"],
   jog_end: [...OPERATOR, "jogging"],
@@ -85,6 +96,19 @@ export function whyNot(button, situation) {
   return null;
 }
 
+/** Shows at the top of each panel why its controls are inactive, and offers to take control where that is the reason. */
+function showReasons(root, situation) {
+  for (const line of root.querySelectorAll(".why")) {
+    const { stale, state } = situation, jogs = state && (state.jog.ready || state.busy?.verb === "jog");
+    const button = { jog: jogs ? "jog" : "jog_begin", teach: "teach", service: "give_control" }[line.dataset.panel];
+    const reason = whyNot(button, situation), isFree = !stale && state && !state.read_only && !state.control.yours;
+    const text = isFree && !state.control.held_by ? "Control is free: take it to use these controls." : reason ? `${reason}.` : "You have control.";
+    write(line.querySelector("span"), text);
+    line.classList.toggle("quiet", !reason);
+    line.querySelector("button").hidden = !isFree;
+  }
+}
+
 /** Updates every element with `data-button`; disabled buttons stay focusable, so that the reason can be read. */
 export function applyButtons(root, situation) {
   const reasons = Object.fromEntries(Object.keys(BUTTONS).map((name) => [name, whyNot(name, situation)]));
@@ -96,6 +120,7 @@ export function applyButtons(root, situation) {
     mark(element, "aria-description", reason);
     mark(element, "title", reason ?? element.dataset.title ?? null);
   }
+  showReasons(root, situation);
 }
 
 /** A press of a disabled button only shows the reason, by `say(text)`. */

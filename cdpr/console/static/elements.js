@@ -32,7 +32,8 @@ export function mark(element, name, value) {
 
 /** A number with its unit, or a dash if unknown. */
 export function known(value, digits, unit = "") {
-  const number = value === null || value === undefined ? "–" : value.toFixed(digits).replace("-", "\u2212");
+  const rounded = value?.toFixed(digits) ?? "–";
+  const number = Number(rounded) === 0 ? rounded.replace("-", "") : rounded.replace("-", "\u2212"); // no negative zero
   return unit && number !== "–" ? `${number}\u00a0${unit}` : number;
 }
 

@@ -81,28 +81,42 @@ export function bindJog(connection, situation, command) {
   return {
     end: (why) => hold.end(why),
     show: (state) => {
-      showPlatform(state);
-      showCable(state);
+      showPlatform(state, hold.source !== null);
+      showCable(state, hold.source !== null);
     },
   };
 }
 
-function showPad(panel, jog, text) {
+/** The server's limit of a jog in words: its values are predicted beyond the limit, not the present ones. */
+function ahead({ limit, moving }) {
+  const [, room, what] = /^stops in ([\d.]+ mm): (.*?)( with the platform at .*)?$/s.exec(limit ?? "") ?? [];
+  return what ? `${moving ? `Limit ahead: comes to rest within ${room}.` : "Limit reached."} Farther on: ${what}` : limit ?? "";
+}
+
+/** What a pad says: moving only if the position changes. */
+function stateText(jog, isHeld, moving, ready) {
+  if (!jog.ready) return null;
+  if (jog.moving) return moving;
+  return isHeld ? "At rest: release, then press again" : ready;
+}
+
+function showPad(panel, jog, text, isHeld) {
   at(`${panel}-pad`).classList.toggle("ready", jog.ready);
   write(at(`${panel}-state`), text);
   if (jog.speed_mm_s) mark(at(`${panel}-speed`), "max", String(jog.speed_mm_s)); // the limit of the session
   showSpeed(panel);
-  write(at(`${panel}-limit`), jog.limit ?? "");
-  at(`${panel}-limit`).hidden = !jog.limit;
+  const limit = jog.moving || isHeld ? ahead(jog) : "";
+  write(at(`${panel}-limit`), limit);
+  at(`${panel}-limit`).hidden = !limit;
 }
 
-function showPlatform({ jog, platform, clearance_mm: clearance }) {
+function showPlatform({ jog, platform, clearance_mm: clearance }, isHeld) {
   const here = ["x", "y", "z"].map((axis, k) => `${axis}\u00a0${known(platform?.position_mm[k], 1)}`).join("  ");
   write(at("jog-here"), `${here}\u00a0mm · clearance ${known(clearance?.now, 0, "mm")}`);
-  showPad("jog", jog, jog.ready ? (jog.moving ? "Moving" : "Ready: hold a button to move") : jog.why_not || "The drives are not enabled for jogging");
+  showPad("jog", jog, stateText(jog, isHeld, "Moving", "Ready: hold a button to move") ?? (jog.why_not || "The drives are not enabled for jogging"), isHeld);
 }
 
-function showCable({ cable: jog, tensions_n: tensions, tension_limits_n: [low, high] }) {
+function showCable({ cable: jog, tensions_n: tensions, tension_limits_n: [low, high] }, isHeld) {
   const list = at("cables"), count = tensions?.length ?? 0;
   if (count && list.querySelectorAll("input").length !== count) makeCables(list, count);
   const number = Number(chosen("cable")), tension = tensions?.[number - 1] ?? null, limit = jog.limit_n ?? high, full = 1.1 * limit;
@@ -116,7 +130,7 @@ function showCable({ cable: jog, tensions_n: tensions, tension_limits_n: [low, h
   const sense = (mm) => (Math.abs(mm) < 0.0005 ? "not moved" : `${known(Math.abs(mm), 3, "mm")} ${mm > 0 ? "paid out" : "wound in"}`);
   const own = jog.cable === number ? `This press: ${sense(jog.press_mm)} · since` : "Since";
   write(at("cable-travel"), jog.ready && number ? `${own} the session began ${sense(jog.session_mm[number - 1])}` : "");
-  showPad("cable", jog, jog.ready ? (jog.moving ? `Cable ${jog.cable} is held` : "Ready: hold a button to move the cable") : jog.why_not || "The drives are not enabled");
+  showPad("cable", jog, stateText(jog, isHeld, `Cable ${jog.cable} moves`, "Ready: hold a button to move the cable") ?? (jog.why_not || "The drives are not enabled"), isHeld);
 }
 
 /** Cable numbers as in the scene; the first is selected. */

@@ -9,18 +9,22 @@ const LAMPS = {
     readOnly ? ["Read-only", "quiet"] : control.mode === "service" ? ["Service mode", "stop"] : control.yours ? ["You have control", "pass"] : [control.held_by ? `Control: ${control.held_by}` : "Control is free", "quiet"],
   drives: ({ motion, jog, cable }) => {
     const drives = motion?.drives ?? [], on = drives.filter((d) => d.state === "operation enabled").length;
-    const ready = jog.ready || cable.ready;
-    if (!drives.length) return [ready ? "Drives on" : "No drive data", ready ? "stop" : "quiet"];
-    return [`${on} of ${drives.length} drives on`, drives.some((d) => d.state.includes("fault")) ? "fail" : on ? "stop" : "quiet"];
+    const ready = jog.ready || cable.ready, holding = drives.filter((d) => d.state === "quick stop active").length;
+    if (!drives.length) return [ready ? "Drives on" : "No drive data", ready ? "pass" : "quiet"];
+    // After a quick stop drives hold by themselves, with torque.
+    const text = !on && holding ? `${holding} of ${drives.length} drives hold` : `${on} of ${drives.length} drives on`;
+    return [text, drives.some((d) => d.state.includes("fault")) ? "fail" : on === drives.length ? "pass" : on ? "stop" : "quiet"];
   },
   homed: ({ reference }) => [reference.counts ? "Homed" : "Not homed", reference.counts ? "pass" : "stop"],
   latch: ({ latched }) => (latched === null ? ["No fault", "pass"] : ["Fault latched", "fail"]),
 };
 
-const STATES = {
+export const STATES = {
   preparing: "Preparing", enabling: "Enabling drives", approaching: "Approaching the start", moving: "Moving", holding: "Held",
   stopping: "Stopping", securing: "Securing", finished: "Finished", stopped: "Stopped", latched: "Stopped by a fault", releasing: "Releasing",
 };
+
+const BEFORE = { run: "Preparing the run", home: "Preparing to home", plan: "Planning", jog: "Preparing to jog", reset: "Resetting", release: "Releasing" };
 
 /** The present motion, in a few words. */
 export function motionText({ motion, busy, jog, cable, latched }) {
@@ -30,7 +34,7 @@ export function motionText({ motion, busy, jog, cable, latched }) {
     const share = motion.path_length_mm ? ` · ${Math.round((100 * motion.path_mm) / motion.path_length_mm)} %` : "";
     return (STATES[motion.state] ?? motion.state) + (isActive(motion) ? share : "");
   }
-  if (busy) return `Busy: ${busy.verb}`;
+  if (busy) return BEFORE[busy.verb] ?? busy.verb;
   return latched === null ? "At rest" : "Fault latched";
 }
 

@@ -4,10 +4,11 @@ import { applyButtons, guardButtons, isActive } from "./buttons.js";
 import { Connection } from "./connection.js";
 import { Curves } from "./curves.js";
 import { cancelDialog, checkDialog } from "./dialog.js";
-import { at, known, mark, write } from "./elements.js";
+import { at, chosen, known, mark, write } from "./elements.js";
 import { Events } from "./events.js";
 import { bindJog } from "./jog.js";
 import { Live } from "./live.js";
+import { News } from "./news.js";
 import { Operate } from "./operate.js";
 import { Pick } from "./pick.js";
 import { Pictures } from "./pictures.js";
@@ -18,17 +19,19 @@ import { Teach } from "./teach.js";
 const NOTICE_MS = { done: 4000, failed: 10000 };
 const connection = new Connection();
 const scene = new Scene();
-const situation = () => ({ state: connection.state, stale: connection.freshness().why, preview: operate.plan });
+const form = () => ({ plan_file: chosen("plan-file"), scene_file: chosen("scene-file"), from_here: at("plan-from-here").checked });
+const situation = () => ({ state: connection.state, stale: connection.freshness().why, preview: operate.plan, form: form() });
 let noticed = 0;
 
-/** Shows a line above STOP for a while: the server's answer, or why a command was not executed. */
+/** Shows a text below the panels for a while: the server's answer, or why a command was not executed. */
 function say(text, failed = false) {
   write(at("notice"), text);
-  at("notice").classList.toggle("failed", failed);
-  at("notice").hidden = !text;
+  at("notice-box").classList.toggle("failed", failed);
+  at("notice-box").hidden = !text;
   clearTimeout(noticed);
-  noticed = setTimeout(() => (at("notice").hidden = true), failed ? NOTICE_MS.failed : NOTICE_MS.done);
+  noticed = setTimeout(() => (at("notice-box").hidden = true), failed ? NOTICE_MS.failed : NOTICE_MS.done);
 }
+at("notice-seen").addEventListener("click", () => (at("notice-box").hidden = true));
 
 async function command(name, fields) {
   const answer = await connection.command(name, fields);
@@ -46,7 +49,7 @@ const stopBar = bindStop(connection, () => {
   const { state, stale } = situation();
   return !stale && !state.jog.ready && !state.cable.ready && !isActive(state.motion);
 });
-const live = new Live(), curves = new Curves(), events = new Events(), pictures = new Pictures(), teach = new Teach(page), pick = new Pick(page), operate = new Operate(page);
+const live = new Live(), curves = new Curves(), events = new Events(), pictures = new Pictures(), teach = new Teach(page), pick = new Pick(page), operate = new Operate(page), news = new News(page);
 const jog = bindJog(connection, situation, command);
 
 // Views: beside the live view on a wide screen, one of six on a narrow one.
@@ -95,6 +98,7 @@ function showAge() {
   at("lamp-data").className = why ? "fail" : "pass";
   // Stale controls cannot be used, not even by keyboard; an open question is withdrawn.
   if (why) checkDialog();
+  at("notice-box").inert = why !== null;
   if (at("dialog").hidden) at("main").inert = at("tabs").inert = why !== null;
   applyButtons(document.body, situation());
 }
@@ -114,6 +118,7 @@ connection.addEventListener("state", () => {
     events.show(state);
     pictures.show(state);
     operate.show(state);
+    news.show(state);
     teach.show(state);
     pick.show();
     jog.show(state);

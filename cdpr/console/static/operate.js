@@ -1,24 +1,11 @@
-/* The operator's panel: control, fault latch, motion, drives, and plans. */
+/* The operator's panel: control, motion, drives, and plans. */
 
 import { isActive, whyNot } from "./buttons.js";
 import { address } from "./connection.js";
 import { PlanCurves } from "./curves.js";
 import { ask } from "./dialog.js";
-import { at, chosen, duration, known, link, make, mark, write } from "./elements.js";
+import { at, chosen, duration, known, make, mark, write } from "./elements.js";
 import { motionText } from "./live.js";
-
-const VERBS = { run: "Run", home: "Homing", reset: "Reset", release: "Release", plan: "Planning", jog: "Jogging" };
-
-function isInView(element) {
-  const { top, bottom } = element.getBoundingClientRect();
-  return bottom > top && top >= 0 && bottom <= at("stop-bar").getBoundingClientRect().top;
-}
-
-/** The line of a verb's output with the result: the last that is neither indented nor a report. */
-function headline(text) {
-  const lines = text.trim().split("\n");
-  return lines.findLast((line) => /^\S/.test(line) && !line.startsWith("report:")) ?? lines.at(-1);
-}
 
 export class Operate {
   plan = null; // the loaded plan, from /api/preview
@@ -27,14 +14,14 @@ export class Operate {
   #other = null; // that plan, from /api/compared
   #preview = null; // id of the plan loaded or being loaded
   #curves = new PlanCurves();
-  #outcome = "";
+  #files = {}; // names listed so far, by group
   #busy = null;
   #sliding = false; // the operator moves the slider: the run's status must not
 
   /** `page` has `command(name, fields)`, `situation()`, `say(text, failed)` and `scene`. */
   constructor(page) {
     this.#page = page;
-    at("take-control").addEventListener("click", () => this.#takeControl());
+    for (const button of document.querySelectorAll(".take")) button.addEventListener("click", () => this.#takeControl());
     for (const [id, command] of [["give-control", "give_control"], ["hold", "hold"], ["resume", "resume"]])
       at(id).addEventListener("click", () => page.command(command));
     at("speed").addEventListener("input", () => {
@@ -52,37 +39,32 @@ export class Operate {
     at("reset").addEventListener("click", () => this.#reset());
     at("release").addEventListener("click", () => this.#release());
     at("run").addEventListener("click", () => this.#run());
-    at("load-plan").addEventListener("click", () => this.#withFile("plan-file", (file) => page.command("load_plan", { file })));
-    at("compare-plan").addEventListener("click", () => this.#withFile("plan-file", (file) => page.command("compare", { file })));
+    at("load-plan").addEventListener("click", () => page.command("load_plan", { file: chosen("plan-file") }));
+    at("compare-plan").addEventListener("click", () => page.command("compare", { file: chosen("plan-file") }));
     at("compare-end").addEventListener("click", () => page.command("compare", { file: null }));
-    at("make-plan").addEventListener("click", () => this.#withFile("scene-file", (scene) => page.command("plan", { scene, objective: chosen("objective") })));
+    at("make-plan").addEventListener("click", () => page.command("plan", { scene: chosen("scene-file"), objective: chosen("objective") }));
     at("plan-time").addEventListener("input", () => this.#look());
-    at("outcome-seen").addEventListener("click", () => (at("outcome").hidden = true));
     at("scene-live").addEventListener("click", () => this.#leave());
     this.readFiles();
   }
 
-  /** Lists the files that can be loaded, and keeps the selection. */
+  /** Lists the files that can be loaded. A new file is selected, and so is a single one; otherwise the selection stays. */
   async readFiles() {
     const response = await fetch(address("/api/files")).catch(() => null);
     if (!response?.ok) return;
     const { scenes, plans } = await response.json();
-    for (const [group, button, names] of [["scene-file", "plan", scenes], ["plan-file", "load_plan", plans]]) {
-      const before = chosen(group);
+    for (const [group, button, names] of [["scene-file", "scene_files", scenes], ["plan-file", "plan_files", plans]]) {
+      const known = this.#files[group], added = known ? names.filter((name) => !known.includes(name)) : [];
+      const selected = names.length === 1 ? names[0] : added.at(-1) ?? chosen(group);
+      this.#files[group] = names;
       // Not a <select>: its open list would take the space bar, and cover STOP on a phone.
-      const rows = names.map((name) => make("label", {}, make("input", { type: "radio", name: group, value: name, "data-button": button, checked: name === before }), make("span", {}, name)));
+      const rows = names.map((name) => make("label", {}, make("input", { type: "radio", name: group, value: name, "data-button": button, checked: name === selected }), make("span", {}, name)));
       at(`${group}s`).replaceChildren(...(rows.length ? rows : [make("p", { class: "quiet" }, "No file found in the console’s working folder.")]));
     }
   }
 
-  #withFile(group, use) {
-    const file = chosen(group);
-    if (file) use(file);
-    else this.#page.say("Choose a file first.");
-  }
-
   show(state) {
-    const { control, latched, motion, outcome, busy, preview, compared } = state;
+    const { control, motion, busy, preview, compared } = state;
     write(at("control-text"), state.read_only ? "This console is read-only: you see everything, and STOP works." : control.yours ? "You have control." : control.held_by ? `${control.held_by} has control. You see everything, and STOP works.` : "Control is free. Take it to command the robot.");
     at("take-control").hidden = control.yours;
     at("give-control").hidden = !control.yours;
@@ -90,51 +72,30 @@ export class Operate {
     write(at("service-text"), isService ? "In service mode." : "For commissioning, with the robot in sight.");
     at("service-begin").hidden = isService;
     at("service-end").hidden = !isService;
-    at("latched").hidden = latched === null;
-    write(at("latched-cause"), latched ?? "");
     this.#motion(state);
     if (preview !== this.#preview) this.#read(preview);
     if (compared !== this.#compared) this.#readCompared(compared);
     if (isActive(motion)) this.#leave();
     at("plan-look").hidden = !(this.plan?.moments.length > 1) || isActive(motion);
-    write(at("busy"), busy ? `${VERBS[busy.verb] ?? busy.verb}: ${busy.text || "…"}` : "");
-    at("busy").hidden = !busy;
     if (this.#busy && !busy) this.readFiles();
     this.#busy = busy?.verb ?? null;
-    this.#showOutcome(outcome);
     write(at("homed-text"), state.reference.counts ? "The drives are homed." : `Not homed: ${state.reference.why_not || "reason unknown"}.`);
   }
 
   #motion(state) {
     const { motion } = state, along = motion?.path_length_mm ? motion.path_mm / motion.path_length_mm : null;
     write(at("motion-state"), motionText(state));
-    at("progress").hidden = along === null;
+    at("progress").classList.toggle("absent", along === null); // its space stays
     if (along !== null) {
       at("progress").value = along;
       write(at("progress-text"), `${known(motion.path_mm, 0)} of ${known(motion.path_length_mm, 0, "mm")} · ${duration(motion.elapsed_s)} · feed ${known(motion.feed_percent, 0)} %`);
-    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : state.jog.moving || state.cable.moving ? "" : "Nothing is moving.");
+    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : state.busy ? "" : "Nothing is moving.");
     write(at("motion-cause"), motion?.cause ?? "");
     const asked = motion?.wished.speed_percent;
     if (asked !== undefined && !this.#sliding) {
       at("speed").value = asked;
       write(at("speed-shown"), `${Math.round(asked)} %`);
     }
-  }
-
-  #showOutcome(outcome) {
-    const text = JSON.stringify(outcome);
-    if (text === this.#outcome) return;
-    const isNews = this.#outcome !== "";
-    this.#outcome = text;
-    at("outcome").hidden = outcome === null;
-    if (outcome === null) return;
-    at("outcome").className = `verdict ${outcome.ok ? "pass" : "fail"}`;
-    write(at("outcome-title"), `${VERBS[outcome.verb] ?? outcome.verb}: ${outcome.ok ? "done" : "not completed"}`);
-    write(at("outcome-text"), outcome.text);
-    at("outcome-text").scrollTop = at("outcome-text").scrollHeight; // the result is at the end
-    const links = [[outcome.report, "Report"], [outcome.fault_page, "What this fault means"]].map(([where, text]) => where && link(address(where), text));
-    at("outcome-links").replaceChildren(...links.filter(Boolean));
-    if (isNews && !outcome.ok && !isInView(at("outcome"))) this.#page.say(`${at("outcome-title").textContent}: ${headline(outcome.text)}`, true);
   }
 
   // The plan.
@@ -185,7 +146,7 @@ export class Operate {
 
   #showPlan() {
     const { plan } = this;
-    at("plan").hidden = plan === null;
+    at("plan").hidden = at("plan-box").hidden = plan === null;
     this.#page.scene.load(plan);
     this.#curves.show(plan, this.#page.situation().state.tension_limits_n);
     if (!plan) return;
@@ -267,10 +228,12 @@ export class Operate {
   }
 
   async #run() {
-    const { plan } = this;
+    const { plan } = this, { plan_start_off_mm: off, simulated } = this.#page.situation().state;
     const rows = [["Plan", plan.name], ["Check", plan.verdict], ["Duration", duration(plan.duration_s)], ["Length", known(plan.length_mm, 0, "mm")]];
     const facts = make("dl", { class: "facts" }, ...rows.flatMap(([name, text]) => [make("dt", {}, name), make("dd", {}, text)]));
-    const lines = [facts, "The drives are enabled and the platform moves. Keep clear of the platform and of its cables."];
+    // Drives on a bus have to be at the start; simulated ones are put there.
+    const elsewhere = simulated && off > 1 ? [`The simulated platform is put at the plan’s start, ${known(off, 0, "mm")} from where it is shown.`] : [];
+    const lines = [facts, ...elsewhere, "The drives are enabled and the platform moves. Keep clear of the platform and of its cables."];
     if (await this.#confirmed("run", { title: "Run this plan?", lines, confirm: "Run: the platform moves" })) {
       this.#page.command("run");
       at("motion").scrollIntoView({ block: "nearest" });

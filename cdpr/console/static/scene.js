@@ -6,9 +6,9 @@ import { isFresh } from "./live.js";
 
 const LAYERS = {
   obstacles: "Obstacles", robot: "Platform", numbers: "Cable numbers", frame: "Frame", floor: "Floor", workspace: "Workspace",
-  path: "Planned path", raw: "Raw path", tree: "Search tree", trail: "Driven path", other: "Compared path", nearest: "Closest pair", measured: "Measured position",
+  axes: "Axes", poses: "Taught poses", path: "Planned path", raw: "Raw path", tree: "Search tree", trail: "Driven path", other: "Compared path", nearest: "Closest pair", measured: "Measured position",
 };
-const COLOURS = { obstacles: "obstacle", robot: "platform", numbers: "ink", frame: "frame", floor: "line", workspace: "muted", path: "ink", raw: "raw", tree: "tree", trail: "encoder", other: "raw", nearest: "limit", measured: "tag" };
+const COLOURS = { obstacles: "obstacle", robot: "platform", numbers: "ink", frame: "frame", floor: "line", workspace: "muted", axes: "ink", poses: "ink", path: "ink", raw: "raw", tree: "tree", trail: "encoder", other: "raw", nearest: "limit", measured: "tag" };
 const HIDDEN_AT_FIRST = ["tree", "raw"];
 const TRAIL_STEP_MM = 2, TRAIL_MOST = 600;
 
@@ -20,6 +20,37 @@ function gridAt(height, [low, high]) {
     const [x, y] = [0, 1].map((axis) => low[axis] + ((high[axis] - low[axis]) * k) / GRID_LINES);
     return [[x, low[1], height, x, high[1], height], [low[0], y, height, high[0], y, height]];
   }).flat();
+}
+
+const AXIS_SHARE = 0.14;
+/** The axes of the world as short arrows with letters, at a corner of the floor. */
+function worldAxes({ strokes, surfaces }) {
+  const floor = strokes.find((one) => one.layer === "floor")?.segments.flatMap((one) => [one.slice(0, 3), one.slice(3)]);
+  const points = floor ?? surfaces.flatMap((one) => one.vertices);
+  if (!points.length) return { strokes: [], labels: [] };
+  const [low, high] = [Math.min, Math.max].map((most) => [0, 1, 2].map((axis) => most(...points.map((point) => point[axis]))));
+  const length = AXIS_SHARE * Math.max(...high.map((v, k) => v - low[k]));
+  const along = (from, axis, share) => from.map((v, k) => (k === axis ? v + share * length : v));
+  const segments = [0, 1, 2].flatMap((axis) => {
+    const tip = along(low, axis, 1), side = axis === 0 ? 1 : 0;
+    return [[...low, ...tip], ...[-0.1, 0.1].map((share) => [...tip, ...along(along(low, axis, 0.75), side, share)])];
+  });
+  return {
+    strokes: [{ layer: "axes", role: "ink", segments, width: 2, opacity: 1, dash: [], ahead: true }],
+    labels: ["x", "y", "z"].map((text, axis) => ({ layer: "axes", text, at: along(low, axis, 1.25), mark: "" })),
+  };
+}
+
+const SAME_MM = 1;
+const isSamePoint = (one, other) => Math.hypot(...one.at.map((v, k) => v - other.at[k])) < SAME_MM;
+
+/** Labels of a plan and of taught poses, one a point: a taught pose's name instead of “start” or “goal” there. */
+function namedPoints(planned, poses) {
+  const taught = poses.map(({ name, position_mm: at }) => ({ layer: "poses", text: name, at, mark: "dot" }));
+  const own = planned.filter((label, k) => planned.findIndex((one) => isSamePoint(one, label)) === k);
+  const merged = own.map((label) => ({ ...label, text: [...new Set(planned.filter((one) => isSamePoint(one, label)).map((one) => one.text))].join(", ") }));
+  for (const pose of taught) pose.mark = planned.find((one) => isSamePoint(one, pose))?.mark || "dot";
+  return [...merged.filter((label) => !taught.some((pose) => isSamePoint(pose, label))), ...taught];
 }
 
 /** Strokes and labels of several parts, each `{strokes, labels}` or null. */
@@ -63,6 +94,7 @@ export class Scene {
   #plan = null;
   #other = null; // the plan that is compared
   #pick = null; // {height, point}: where a goal is being picked
+  #poses = []; // as taught
   #trail = [];
   #shown = "";
   #moment = null; // of the plan, while it is looked through
@@ -78,20 +110,26 @@ export class Scene {
     at("scene-out").addEventListener("click", () => this.#view.zoom(0.8));
     at("scene-in").addEventListener("click", () => this.#view.zoom(1.25));
     at("scene-reset").addEventListener("click", () => this.#view.reset());
+    this.#draw();
     this.#layers();
     if (this.#plan) this.load(this.#plan);
     if (this.#other) this.compare(this.#other);
   }
 
   /** The platform where it is now; a plan that is looked through is left for it as soon as something moves. */
-  show({ platform, tensions_n: tensions, tension_limits_n: limits, clearance_mm: clearance, measured, motion, jog }) {
+  show({ platform, tensions_n: tensions, tension_limits_n: limits, clearance_mm: clearance, measured, motion, jog, poses }) {
     if (!this.#view) return;
+    if (JSON.stringify(poses) !== JSON.stringify(this.#poses)) {
+      this.#poses = poses;
+      this.#draw();
+      this.#layers();
+    }
     if ((motion || jog.moving) && platform?.source === "drives") this.#drive(platform.position_mm);
     if (this.#moment) return;
     const fresh = isFresh(measured) ? { ...measured, age_s: 0 } : null;
     const shown = JSON.stringify([platform, tensions?.map((tension) => Math.round(2 * tension)), clearance, fresh, this.#pick]);
     if (shown !== this.#shown) {
-      const measure = ellipsoid(fresh, this.#view.size()), more = drawn([closestPair(clearance), measure, this.#goal()]);
+      const measure = ellipsoid(fresh, this.#view.size()), more = drawn([this.#goal(), closestPair(clearance), measure]);
       write(at("scene-legend"), measure && !this.#hidden.has("measured") ? measure.legend : "");
       this.#view.show(platform && { p: platform.position_mm, r: platform.rotation, exits: platform.exits_mm, tensions, ...more });
     }
@@ -142,7 +180,7 @@ export class Scene {
     const { point } = this.#pick, below = [point[0], point[1], 0];
     return {
       strokes: [{ layer: "pick", role: "encoder", segments: [[...point, ...below]], width: 2, dash: [4, 4] }],
-      labels: [{ layer: "pick", text: "goal", at: point, mark: "ring" }],
+      labels: [{ layer: "pick", text: "picked", at: point, mark: "ring" }],
     };
   }
 
@@ -171,6 +209,9 @@ export class Scene {
       const more = this.#plan?.[kind] ?? [], replaced = new Set(more.map((one) => one.layer));
       parts[kind] = [...this.#base[kind].filter((one) => !replaced.has(one.layer)), ...more];
     }
+    const axes = worldAxes(parts);
+    parts.strokes.push(...axes.strokes);
+    parts.labels = [...namedPoints(parts.labels, this.#hidden.has("poses") ? [] : this.#poses), ...axes.labels];
     if (this.#other) {
       const path = this.#other.strokes.filter((one) => one.layer === "path");
       parts.strokes.push(...path.map((one) => ({ ...one, layer: "other", role: "raw", width: 3, ahead: true })));
@@ -188,14 +229,15 @@ export class Scene {
   }
 
   #layers() {
-    const { surfaces, strokes } = this.#parts();
-    const drawn = new Set([...surfaces, ...strokes].map((one) => one.layer)).add("robot").add("numbers").add("nearest").add("measured");
+    const { surfaces, strokes, labels } = this.#parts();
+    const drawn = new Set([...surfaces, ...strokes, ...labels].map((one) => one.layer)).add("robot").add("numbers").add("nearest").add("measured");
+    if (this.#poses.length) drawn.add("poses");
     const boxes = Object.keys(LAYERS).filter((layer) => drawn.has(layer)).map((layer) => {
       const box = make("input", { type: "checkbox", checked: !this.#hidden.has(layer) });
       box.addEventListener("change", () => {
         if (box.checked) this.#hidden.delete(layer);
         else this.#hidden.add(layer);
-        this.#view.redraw();
+        this.#draw(); // a hidden name gives way to “start” or “goal”
       });
       return make("label", {}, box, make("span", { class: `swatch role-${COLOURS[layer]}` }), LAYERS[layer]);
     });

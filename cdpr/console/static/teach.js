@@ -1,12 +1,14 @@
 /* Taught poses: store the present pose, name, order and remove poses, plan a path through them. */
 
+import { whyNot } from "./buttons.js";
+import { ask } from "./dialog.js";
 import { at, chosen, freeName, known, make, mark, write } from "./elements.js";
 
 export class Teach {
   #page;
   #shown = "";
 
-  /** `page` has `command(name, fields)`. */
+  /** `page` has `command(name, fields)`, `situation()` and `say(text)`. */
   constructor(page) {
     this.#page = page;
     at("teach-form").addEventListener("submit", (event) => {
@@ -18,10 +20,25 @@ export class Teach {
       const { ok } = await page.command("teach", { name });
       if (ok) at("teach-name").value = "";
     });
-    at("plan-poses").addEventListener("click", () => page.command("plan", { scene: null, objective: chosen("poses-objective") }));
+    at("plan-poses").addEventListener("click", () => this.#plan({ from_here: at("plan-from-here").checked }));
+    at("teach-jog-end").addEventListener("click", () => page.command("jog_end"));
   }
 
-  show({ poses, platform }) {
+  #plan(fields) {
+    this.#page.command("plan", { scene: null, objective: chosen("poses-objective"), ...fields });
+  }
+
+  async #forget(name) {
+    const { say, situation } = this.#page;
+    const lines = ["It cannot be restored with its orientation; teach it again if it is needed later."];
+    const possible = () => whyNot("edit_pose", situation());
+    if (await ask({ title: `Remove “${name}”?`, lines, confirm: "Remove", possible, say })) this.#page.command("forget", { pose: name });
+  }
+
+  show({ poses, platform, control, jog, busy }) {
+    at("teach-jog-end").hidden = !jog.ready && busy?.verb !== "jog";
+    const why = control.yours ? whyNot("plan_poses", this.#page.situation()) : null;
+    write(at("plan-poses-why"), why ? `${why}.` : "");
     write(at("teach-here"), platform ? `Now at ${platform.position_mm.map((v) => known(v, 1)).join(", ")} mm` : "The position is unknown.");
     const text = JSON.stringify(poses);
     if (text === this.#shown) return;
@@ -60,6 +77,8 @@ export class Teach {
     });
     const button = (text, title, key, press) =>
       make("button", { type: "button", "data-button": "edit_pose", "data-title": title, "data-name": title, "data-key": key, "aria-label": title, onclick: press }, text);
+    const goTo = button("Go to", `Plan a path to ${name}`, "go", () => this.#plan({ pose: name }));
+    goTo.dataset.button = "go_to";
     const move = (by) => () => {
       const to = [...at("poses").children].indexOf(row) + by;
       command("move", { pose: name, to });
@@ -67,10 +86,12 @@ export class Teach {
     const row = make("li", { "data-pose": name },
       make("span", { class: "number", "data-key": "number" }),
       make("div", { class: "pose" }, field, make("span", { class: "figure quiet", "data-key": "position" })),
-      make("div", { class: "row" },
-        button("↑", `Move ${name} up`, "up", move(-1)),
-        button("↓", `Move ${name} down`, "down", move(1)),
-        button("✕", `Remove ${name}`, "forget", () => command("forget", { pose: name }))));
+      make("div", { class: "side" },
+        make("div", { class: "row" },
+          button("↑", `Move ${name} up`, "up", move(-1)),
+          button("↓", `Move ${name} down`, "down", move(1)),
+          button("✕", `Remove ${name}`, "forget", () => this.#forget(name))),
+        goTo));
     return row;
   }
 }

@@ -1,0 +1,153 @@
+"""Files, taught poses and the plans made of them on the console's page, in a real browser."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.console.browsing import Visit
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+POSE = {"name": "one", "position_mm": [100.0, 50.0, 400.0], "quaternion": [1, 0, 0, 0]}
+
+
+def selected(found: Visit, group: str) -> Any:
+    return found.page.evaluate(
+        f"() => document.querySelector('input[name={group}]:checked')?.value ?? null"
+    )
+
+
+def read_files(found: Visit, **files: list[str]) -> None:
+    """The page reads the lists of files again, as after every verb."""
+    found.fake.ask(set={"files": {"scenes": [], "plans": [], **files}})
+    found.fake.ask(state={"busy": {"verb": "plan", "text": ""}})
+    expect(found.page.locator("#busy")).to_be_visible()
+    with found.page.expect_response("**/api/files*"):
+        found.fake.ask(state={"busy": None})
+    found.fake.let_pass(found.page, 2)
+
+
+# Files.
+
+
+def test_a_single_file_and_a_new_file_are_selected(desk: Visit) -> None:
+    desk.take_control()
+    scenes = desk.fake.ask()["files"]["scenes"]
+    assert (selected(desk, "plan-file"), selected(desk, "scene-file")) == (None, None)
+    read_files(desk, plans=["a.json"], scenes=scenes)
+    assert (selected(desk, "plan-file"), selected(desk, "scene-file")) == ("a.json", None)
+    read_files(desk, plans=["a.json", "b.json"], scenes=scenes)
+    assert (selected(desk, "plan-file"), selected(desk, "scene-file")) == ("b.json", None)
+    desk.page.locator("input[name=plan-file][value='a.json']").check(force=True)
+    read_files(desk, plans=["a.json", "b.json"], scenes=scenes)
+    assert selected(desk, "plan-file") == "a.json", "the operator's choice stays"
+
+
+@pytest.mark.parametrize(
+    ("button", "reason"),
+    [
+        ("load-plan", "Select a plan file first"),
+        ("compare-plan", "Select a plan file first"),
+        ("make-plan", "Select a scene file first"),
+    ],
+)
+def test_without_a_selected_file_its_buttons_are_inactive_and_say_why(
+    desk: Visit, button: str, reason: str
+) -> None:
+    desk.fake.ask(set={"plan": "plans/circle.json"})
+    desk.take_control()
+    desk.page.locator("summary", has_text="Make a plan").click()
+    inactive = desk.page.locator(f"#{button}")
+    expect(inactive).to_have_attribute("aria-disabled", "true")
+    expect(inactive).to_have_attribute("title", reason)
+    group = "scene-file" if button == "make-plan" else "plan-file"
+    desk.page.locator(f"input[name={group}]").first.check(force=True)
+    expect(inactive).not_to_have_attribute("aria-disabled", "true")
+
+
+# Paths.
+
+
+def planned(found: Visit) -> dict[str, Any]:
+    """The last plan command, once it is executed."""
+    answer = found.fake.wait(
+        found.page, lambda f: any(m.get("command") == "plan" for m in f["received"])
+    )
+    return [m for m in answer["received"] if m.get("command") == "plan"][-1]  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("from_here", [True, False])
+def test_a_path_begins_at_the_present_pose_if_so_ticked(desk: Visit, from_here: bool) -> None:
+    desk.fake.ask(set={"poses": [POSE, {**POSE, "name": "two"}]})
+    desk.take_control()
+    desk.view("teach")
+    box = desk.page.get_by_role("checkbox", name="Begin at the present pose")
+    expect(box).to_be_checked()
+    box.set_checked(from_here)
+    desk.page.locator("#plan-poses").click()
+    message = planned(desk)
+    assert (message["scene"], message["from_here"]) == (None, from_here)
+    assert "pose" not in message
+
+
+def test_one_pose_is_enough_for_a_path_from_the_present_one(desk: Visit) -> None:
+    desk.fake.ask(set={"poses": [POSE]})
+    desk.take_control()
+    desk.view("teach")
+    plan = desk.page.locator("#plan-poses")
+    expect(plan).not_to_have_attribute("aria-disabled", "true")
+    desk.page.locator("#plan-from-here").uncheck()
+    expect(plan).to_have_attribute("title", "Teach two poses first")
+
+
+def test_a_path_to_one_pose_is_planned_and_the_page_leads_to_it(desk: Visit) -> None:
+    desk.fake.ask(set={"poses": [POSE, {**POSE, "name": "two"}]})
+    desk.take_control()
+    desk.view("teach")
+    desk.page.get_by_role("button", name="Plan a path to two").click()
+    message = planned(desk)
+    assert (message["scene"], message["pose"]) == (None, "two")
+    expect(desk.page.locator("#outcome-title")).to_have_text(
+        "Path planned: it is loaded under Operate"
+    )
+    expect(desk.page.locator("#panel-teach")).to_be_visible()  # no view changes by itself
+    desk.page.get_by_role("button", name="Show it").click()
+    expect(desk.page.locator("#panel-operate")).to_be_visible()
+    expect(desk.page.locator("#plan-name")).to_be_in_viewport()
+
+
+def test_a_plan_that_failed_leads_nowhere(desk: Visit) -> None:
+    outcome = {"verb": "plan", "ok": False, "text": "error: no path found", "report": None}
+    desk.fake.ask(set={"outcome": {**outcome, "fault_page": None, "stopped": False}})
+    expect(desk.page.locator("#outcome-title")).to_have_text("Planning: not completed")
+    expect(desk.page.locator("#outcome-show")).to_be_hidden()
+
+
+def test_jogging_can_be_ended_where_it_prevents_planning(desk: Visit) -> None:
+    desk.fake.ask(set={"poses": [POSE]})
+    desk.ready_to_jog()
+    desk.view("teach")
+    expect(desk.page.locator("#plan-poses")).to_have_attribute("aria-disabled", "true")
+    expect(desk.page.locator("#plan-poses-why")).to_have_text("Jogging is enabled: end it first.")
+    end = desk.page.locator("#teach-jog-end")
+    end.click()
+    expect(end).to_be_hidden()
+    expect(desk.page.locator("#plan-poses-why")).to_have_text("")
+    expect(desk.page.locator("#plan-poses")).not_to_have_attribute("aria-disabled", "true")
+
+
+def test_a_pose_is_removed_only_after_a_question(desk: Visit) -> None:
+    desk.fake.ask(set={"poses": [POSE]})
+    desk.take_control()
+    desk.view("teach")
+    remove = desk.page.get_by_role("button", name="Remove one")
+    remove.click()
+    expect(desk.page.locator("#dialog")).to_contain_text("Remove “one”?")
+    desk.page.get_by_role("button", name="Cancel").click()
+    assert desk.fake.received("forget") == []
+    remove.click()
+    desk.page.locator(".confirm").click()
+    desk.fake.wait(desk.page, lambda f: f["poses"] == [])
