@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tests.cli.plans import RIG  # noqa: E402
-from tests.scenarios.test_console import Operator, console, drives, operator  # noqa: E402
+from tests.scenarios.test_console import Busy, Operator, console, drives, operator  # noqa: E402
 
 #: Messages that are sent before their answers are read; sockets and connections at a time.
 BATCH, SOCKETS, CONNECTIONS = 40, 6, 4
@@ -205,13 +205,16 @@ class Watched:
 
 
 class Holder:
-    """A page that has control and holds nothing; nothing may move meanwhile."""
+    """A page that has control and holds nothing; nothing may move meanwhile.
+
+    A fault is latched where the computer is too busy for a cycle; it is reset.
+    """
 
     def __init__(self, address: str) -> None:
         """Starts unconnected."""
         self.host, _, self.token = address.removeprefix("http://").partition("/?token=")
         self.wrong: list[str] = []
-        self.states = self.moments = 0
+        self.states = self.moments = self.latched = 0
         self._targets: dict[int, list[int]] = {}
 
     async def watch(self) -> None:
@@ -227,12 +230,13 @@ class Holder:
 
     async def _check(self, page: ClientConnection, state: dict[str, Any]) -> None:
         self.states += 1
-        if (state["busy"] or {"verb": "jog"})["verb"] != "jog":
+        if (state["busy"] or {"verb": "jog"})["verb"] not in ("jog", "reset"):
             self.wrong.append(f"`cdpr {state['busy']['verb']}` was started")
         motion = state["motion"]
         if motion is None:
             if state["busy"] is None and self.states % 40 == 0:
-                await self._say(page, "jog_begin")
+                self.latched += state["latched"] is not None
+                await self._say(page, "reset" if state["latched"] else "jog_begin")
             return
         if motion["state"] != "moving":
             return
@@ -312,12 +316,15 @@ def main() -> int:
                 with operator(address) as me:
                     me.command("stop")
                     me.until(lambda state: state["busy"] is None)
+            except Busy:  # latched
+                holder.latched += 1
             except (TimeoutError, OSError, InvalidHandshake) as error:
                 wrong.append(f"the server does not answer: {error}")
                 process.kill()
     total = sum(attack.sent.values())
     print(f"{total} in {seconds:.0f} s: {dict(sorted(attack.sent.items()))}")
     print(f"the drives were at rest in all of {holder.moments} states with a session enabled")
+    print(f"latched {holder.latched} times, as the computer was too busy for a cycle")
     print(f"answered: {dict(sorted(attack.answers.items()))}")
     first, last = watched.samples[0], watched.samples[-1]
     for name, a, b in zip(("memory [MB]", "threads", "descriptors"), first, last, strict=True):
