@@ -33,7 +33,7 @@ ENDS: dict[str, Callable[[Visit], Any]] = {
     "pointer cancelled": end_by_event(
         BUTTON, "PointerEvent('pointercancel', { pointerId: 1, bubbles: true })"
     ),
-    "capture lost": lambda found: found.page.evaluate(f"() => {BUTTON}.releasePointerCapture(1)"),
+    "capture lost": lambda found: found.page.evaluate(f"() => {BUTTON}?.releasePointerCapture(1)"),
     "window blurred": end_by_event("window", "Event('blur')"),
     "page hidden": hidden,
     "page left": end_by_event("window", "Event('pagehide')"),

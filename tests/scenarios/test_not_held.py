@@ -43,19 +43,23 @@ def fails_once_left(drive: SimulatedDrive) -> None:
 def test_a_drive_that_releases_after_a_run_is_latched_and_reported_with_exit_code_1(
     slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
-    channel = f"239.74.163.41:{20000 + (os.getpid() * 31) % 20000}"
-    bus = ("--interface", "udp_multicast", "--channel", channel)
-    rest = ("--no-camera", "--yes", "--without-real-time")
-    with drives_on(channel, slow_run) as rehearsal:
-        fails_once_left(rehearsal.drives[SIXTH])
-        answer = call("run", short_plan, "--rig", slow_rig, "-o", tmp_path / "run", *bus, *rest)
-        states = [drive.state for drive in rehearsal.drives]
+    for attempt in range(3):  # a busy computer may begin a cycle late, which stops the run earlier
+        folder = tmp_path / f"run-{attempt}"
+        channel = f"239.74.163.41:{20000 + (os.getpid() * 31 + attempt) % 20000}"
+        bus = ("--interface", "udp_multicast", "--channel", channel)
+        rest = ("--no-camera", "--yes", "--without-real-time")
+        with drives_on(channel, slow_run) as rehearsal:
+            fails_once_left(rehearsal.drives[SIXTH])
+            answer = call("run", short_plan, "--rig", slow_rig, "-o", folder, *bus, *rest)
+            states = [drive.state for drive in rehearsal.drives]
+        if "cycles late" not in answer.out:
+            break
     assert answer.code == 1, answer
     assert "\nFAILED " in answer.out
     message = "cable 6 (drive 6) went from quick stop active to fault"
     assert message in answer.out
     assert states.count(DriveState.QUICK_STOP_ACTIVE) == 7, "the others hold"
-    summary = RunFolder.open(tmp_path / "run").summary()
+    summary = RunFolder.open(folder).summary()
     assert (summary["verdict"], summary["final_state"]) == ("FAILED", "latched")
     (event,) = (each for each in summary["events"] if each["code"] == "not_held")
     assert message in event["text"]
