@@ -15,6 +15,8 @@ export NO_MKDOCS_2_WARNING := 1
 
 # A sourced ROS or Conda shell puts its own packages in front of ours.
 unexport PYTHONPATH PYTHONHOME
+# Without byte code on disk every process compiles all of it again, and the tests start many.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo docs-run wheel test test-root test-quiet test-lowest test-python check-arm64 mutation fuzz hil hil-runs hil-table hil-makers hil-epos4 hil-nanotec-c5e hil-akd hil-subset lint docs schema clean distclean

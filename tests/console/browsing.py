@@ -196,8 +196,8 @@ def painted(page: Page, role: str, clip: FloatRect | None = None) -> int:
 
 
 def chromium() -> str:
-    """The path of the system's Chromium; skips without one."""
-    for name in ("chromium", "chromium-browser", "google-chrome"):
+    """The path of the system's Chromium, best without a window's parts; skips without one."""
+    for name in ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome"):
         if found := shutil.which(name):
             return found
     pytest.skip("NOT TESTED: the console's page needs a browser, and no Chromium is on PATH")
