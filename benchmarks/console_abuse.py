@@ -310,8 +310,9 @@ def main() -> int:
         asyncio.run(attacked(attack, options.messages, watched, holder))
         seconds = time.monotonic() - began
         wrong += holder.wrong
-        wrong += [] if process.poll() is None else ["the server ended"]
-        if process.poll() is None:
+        if process.poll() is not None:
+            wrong.append("the server ended")
+        else:
             try:
                 with operator(address) as me:
                     me.command("stop")

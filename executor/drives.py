@@ -73,6 +73,20 @@ def require_own_time(rig: Rig, realtime: bool) -> None:
         )
 
 
+def require_simulated_start(rig: Rig, start: Pose | None) -> None:
+    """Requires drives simulated in this process where a pose of the platform is stated.
+
+    Raises:
+        BadInput: The drives are on a bus.
+    """
+    if start is not None and not is_simulated(rig):
+        raise BadInput(
+            "only a platform simulated in this process can be placed",
+            where="--simulated-start-mm",
+            next_step="leave it out, or use the interface 'virtual'",
+        )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Drives:
     """An open bus, and its drives if simulated in this process."""

@@ -24,6 +24,7 @@ from executor.drives import (
     is_simulated,
     open_drives,
     require_own_time,
+    require_simulated_start,
 )
 from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
 from executor.interlock.interlock import MotionInterlock
@@ -40,7 +41,7 @@ from executor.run_result import RunResult
 from executor.state_machine import LoopEvent, State
 from executor.supervision import LocalRequests, Supervisor
 from executor.trajectory.setpoints import PreparedRun, prepare
-from model.errors import BadInput, CdprError
+from model.errors import CdprError
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -129,12 +130,7 @@ def run(
     require_own_time(rig, realtime)
     if plan.scene.obstacles:
         require_stated_errors(rig, list(chosen))
-    if start is not None and not is_simulated(rig):
-        raise BadInput(
-            "only a platform simulated in this process can be placed",
-            where="--simulated-start-mm",
-            next_step="leave it out, or use the interface 'virtual'",
-        )
+    require_simulated_start(rig, start)
     output = dated_folder() if folder is None else Path(folder)
     RunFolder.require_free(output)
     interlock = MotionInterlock(rig)

@@ -51,25 +51,19 @@ def rotation_of(wxyz: Quaternion | None) -> Array | None:
     return matrix_from_quaternion(np.array(wxyz) / norm)
 
 
-def simulated_start(
-    rig: Rig, position_mm: Triple | None, wxyz: Quaternion | None, *, is_simulated: bool
-) -> Pose | None:
-    """The pose of options ``--at-mm`` and ``--at-wxyz``, for drives that the verb simulates.
+def simulated_start(rig: Rig, position_mm: Triple | None, wxyz: Quaternion | None) -> Pose | None:
+    """The pose of options ``--simulated-start-mm`` and ``--simulated-start-wxyz``.
 
     Raises:
-        BadInput: The drives are on a bus, or only the orientation is stated.
+        BadInput: Only the orientation is stated, or it is none.
     """
-    if position_mm is None:
-        if wxyz is not None:
-            raise BadInput("an orientation without a position", next_step="add --at-mm X Y Z")
-        return None
-    if not is_simulated:
-        raise BadInput(
-            "the pose of a platform with drives on a bus is measured, not stated",
-            where="--at-mm",
-            next_step="leave it out, or use --interface virtual",
-        )
     rotation = rotation_of(wxyz)
+    if position_mm is None:
+        if rotation is not None:
+            raise BadInput(
+                "an orientation without a position", next_step="add --simulated-start-mm X Y Z"
+            )
+        return None
     position = millimetres(list(position_mm))
     return Pose(position, rig.home.rotation if rotation is None else rotation)
 

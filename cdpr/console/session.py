@@ -40,7 +40,7 @@ from cdpr.console.state import (
     measured_state,
     outcome_state,
     read_stored,
-    simulated_start,
+    start_options,
     stored_state,
 )
 from cdpr.console.teach import TaughtPoses, scene_text
@@ -319,7 +319,7 @@ class Console:
         scene = self.files.scene_file
         around = ["--no-scene"] if scene is None else ["--scene", str(scene)]
         speed = ["--speed-mm-s", f"{1e3 * FASTEST:g}"]
-        at = simulated_start(self.rig, None if self._robot is None else self._robot.pose)
+        at = start_options(self.rig, None if self._robot is None else self._robot.pose)
         rig = str(self.files.rig_file)
         return self._start_verb("jog", [rig, "--hold-to-run", *speed, *around, *at])
 

@@ -189,12 +189,13 @@ def read_stored(rig: Rig, *, is_moving: bool) -> StoredState:
     return StoredState(None if fault is None or is_moving else fault.cause, not why, why)
 
 
-def simulated_start(rig: Rig, pose: Pose | None) -> list[str]:
+def start_options(rig: Rig, pose: Pose | None) -> list[str]:
     """Options of `cdpr jog` that begin at a pose, where it simulates the drives itself."""
     if pose is None or not is_simulated(rig):
         return []
     position = [f"{v:.4f}" for v in 1e3 * pose.position]
-    return ["--at-mm", *position, "--at-wxyz", *(f"{v:.9f}" for v in pose.quaternion)]
+    rotation = [f"{v:.9f}" for v in pose.quaternion]
+    return ["--simulated-start-mm", *position, "--simulated-start-wxyz", *rotation]
 
 
 def outcome_state(ended: VerbOutcome | None) -> dict[str, Any] | None:

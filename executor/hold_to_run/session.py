@@ -20,6 +20,7 @@ from executor.drives import (
     drives_of,
     is_simulated,
     require_own_time,
+    require_simulated_start,
     unreferenced_drives_of,
 )
 from executor.hold_to_run.cables import CableMotion, CableTravel
@@ -55,7 +56,7 @@ def jog_session(
     scene: Scene | None,
     *,
     speed: float = FASTEST,
-    simulated_start: Pose | None = None,
+    start: Pose | None = None,
     realtime: bool = True,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
@@ -75,8 +76,7 @@ def jog_session(
         rig: The robot and its bus.
         scene: Obstacles and load; its stops are ignored. None states that there are no obstacles.
         speed: Largest jog speed, [m/s].
-        simulated_start: Pose of the platform if the drives are simulated in this process; None for
-            its home pose.
+        start: Pose of the simulated platform, ``world_from_platform``; None for its home pose.
         realtime: As for `executor.runner.run`, like all up to the supervisor.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
         listener: Receives events.
@@ -91,11 +91,12 @@ def jog_session(
     """
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
+    require_simulated_start(slow, start)
     interlock = MotionInterlock(slow)
     interlock.require_free()
     ready = interlock.referenced_rig()
     around = (empty_scene(slow) if scene is None else scene).changed(stops=())
-    known = (simulated_start or ready.home) if is_simulated(ready) else None
+    known = (start or ready.home) if is_simulated(ready) else None
     start = known or measured_pose(ready, around)
     require_confirmed(confirm, JogProposal(ready, around, start))
     session = _Session(

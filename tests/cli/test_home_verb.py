@@ -68,16 +68,17 @@ def test_a_no_moves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.json"))
 
 
+HELD = ("--hold-to-run", "--no-scene")
+AT, AT_WXYZ = ("--simulated-start-mm", 0, 0, 445), ("--simulated-start-wxyz",)
+
+
 @pytest.mark.parametrize(
     ("options", "part"),
     [
-        (("--at-mm", 0, 0, 445), "--hold-to-run"),
-        (("--hold-to-run", "--no-scene", "--at-wxyz", 1, 0, 0, 0), "without a position"),
-        (("--hold-to-run", "--no-scene", "--at-mm", 0, 0, 445, "--at-wxyz", 0, 0, 0, 0), "length"),
-        (
-            ("--hold-to-run", "--no-scene", "--at-mm", 0, 0, 445, "--interface", "udp_multicast"),
-            "is measured, not stated",
-        ),
+        (AT, "--hold-to-run"),
+        ((*HELD, *AT_WXYZ, 1, 0, 0, 0), "without a position"),
+        ((*HELD, *AT, *AT_WXYZ, 0, 0, 0, 0), "length"),
+        ((*HELD, *AT, "--interface", "udp_multicast"), "simulated in this process can be placed"),
     ],
 )
 def test_a_pose_is_stated_for_drives_that_a_session_simulates_only(

@@ -210,9 +210,9 @@ def test_simulated_drives_continue_where_the_platform_was_seen(served: Served) -
         assert seen["platform"]["position_mm"] == pytest.approx(1e3 * start.position, abs=0.01)
         assert command(page, "jog_begin")["ok"]
     ((_, arguments),) = served.started
-    at = arguments.index("--at-mm")
+    at = arguments.index("--simulated-start-mm")
     assert [float(v) for v in arguments[at + 1 : at + 4]] == pytest.approx(1e3 * start.position)
-    assert arguments[at + 4] == "--at-wxyz"
+    assert arguments[at + 4] == "--simulated-start-wxyz"
 
 
 def test_the_output_of_a_verb_names_no_commands_for_a_terminal() -> None:

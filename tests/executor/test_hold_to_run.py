@@ -115,7 +115,7 @@ def test_it_goes_straight_while_held_and_stops_when_released() -> None:
 def test_simulated_drives_begin_at_a_stated_pose() -> None:
     start = Pose(rig().home.position + np.array([0.02, -0.03, 0.01]), rig().home.rotation)
     script = Script([], 0.3)
-    jog_session(rig(), scene(), simulated_start=start, realtime=False, on_cycle=script)
+    jog_session(rig(), scene(), start=start, realtime=False, on_cycle=script)
     assert positions(script.records)[-1] == pytest.approx(start.position, abs=1e-4)
 
 

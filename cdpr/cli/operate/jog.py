@@ -113,17 +113,16 @@ class HeldOptions:
             help="with --hold-to-run: wind one cable in or pay it out, homed or not",
         ),
     ] = False
-    at_mm: Annotated[
+    simulated_start_mm: Annotated[
         Triple | None,
         typer.Option(
-            "--at-mm",
-            help="with --hold-to-run or --keys, interface 'virtual': initial position x y z of the"
-            " simulated platform (default: home)",
+            help="with --hold-to-run or --keys: initial position of the simulated platform x y z"
+            " (default: home)",
         ),
     ] = None
-    at_wxyz: Annotated[
+    simulated_start_wxyz: Annotated[
         Quaternion | None,
-        typer.Option("--at-wxyz", help="with --at-mm: its orientation (default: as at home)"),
+        typer.Option(help="its orientation (default: as at home)"),
     ] = None
 
 
@@ -206,7 +205,10 @@ def jog(
         _one_cable(the_rig, cable, mm, limit_n, speed, drives)
         return
     if not (held.hold_to_run or held.keys):
-        unused = {"--at-mm": held.at_mm, "--at-wxyz": held.at_wxyz}
+        unused = {
+            "--simulated-start-mm": held.simulated_start_mm,
+            "--simulated-start-wxyz": held.simulated_start_wxyz,
+        }
         require_unused("cdpr jog", unused, "only with --hold-to-run or --keys")
     if held.one_cable:
         _held_cables(the_rig, path, held, limit_n, speed, drives)
@@ -262,9 +264,7 @@ def _held(
             rig,
             _scene(path.scene, path.no_scene, path.clearance_mm),
             speed=speed,
-            simulated_start=simulated_start(
-                rig, held.at_mm, held.at_wxyz, is_simulated=is_simulated(rig)
-            ),
+            start=simulated_start(rig, held.simulated_start_mm, held.simulated_start_wxyz),
             need_real_time_rights=not drives.without_real_time,
             listener=Terminal(quiet=False),
             confirm=drives.confirm(rig),

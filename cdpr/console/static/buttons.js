@@ -97,11 +97,11 @@ export function whyNot(button, situation) {
 }
 
 /** Shows at the top of each panel why its controls are inactive, and offers to take control where that is the reason. */
-function showReasons(root, situation) {
+function showReasons(root, { stale, state }, reasons) {
   for (const line of root.querySelectorAll(".why")) {
-    const { stale, state } = situation, jogs = state && (state.jog.ready || state.busy?.verb === "jog");
+    const jogs = state && (state.jog.ready || state.busy?.verb === "jog");
     const button = { jog: jogs ? "jog" : "jog_begin", teach: "teach", service: "give_control" }[line.dataset.panel];
-    const reason = whyNot(button, situation), isFree = !stale && state && !state.read_only && !state.control.yours;
+    const reason = reasons[button], isFree = !stale && state && !state.read_only && !state.control.yours;
     const text = isFree && !state.control.held_by ? "Control is free: take it to use these controls." : reason ? `${reason}.` : "You have control.";
     write(line.querySelector("span"), text);
     line.classList.toggle("quiet", !reason);
@@ -120,7 +120,7 @@ export function applyButtons(root, situation) {
     mark(element, "aria-description", reason);
     mark(element, "title", reason ?? element.dataset.title ?? null);
   }
-  showReasons(root, situation);
+  showReasons(root, situation, reasons);
 }
 
 /** A press of a disabled button only shows the reason, by `say(text)`. */

@@ -81,9 +81,9 @@ export class News {
 
   #showOutcome(outcome, preview) {
     const text = outcome ? JSON.stringify(outcome) : "";
-    if (text !== this.#outcome) at("news-more").open = false;
-    if (!outcome) memory.write((this.#dismissed = null));
     const isNew = text !== this.#outcome;
+    if (isNew) at("news-more").open = false;
+    if (!outcome) memory.write((this.#dismissed = null));
     this.#outcome = text;
     if (!outcome) return;
     const title = titleOf(outcome, preview), head = headline(outcome.text);
