@@ -7,7 +7,8 @@ import os
 import signal
 import threading
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
 
@@ -27,8 +28,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
+from tests.held_up import LIMIT_S, REPEATS, HoldUp  # noqa: E402
+
 ROOT = Path(__file__).parents[1]
 GRACE_S = 2.0  # for a thread that was told to end and is just returning
+HELD_UP = pytest.StashKey[HoldUp]()
 
 settings.register_profile("ci", derandomize=True, deadline=None, max_examples=40, print_blob=True)
 settings.register_profile("explore", deadline=None, max_examples=1000, print_blob=True)
@@ -69,6 +73,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     order drawn once and for all: so those that wait in real time lie between those that compute.
     """
     items.sort(key=lambda item: zlib.crc32(str(item.path.relative_to(ROOT)).encode()))
+    for item in items:
+        if _in_real_time(item):
+            again = partial(_was_held_up, item)
+            item.add_marker(pytest.mark.flaky(reruns=REPEATS, condition=again))
     if os.geteuid() != 0:
         for item in items:
             if item.get_closest_marker("root"):
@@ -78,6 +86,30 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if needing:
         config.hook.pytest_deselected(items=needing)
         items[:] = [item for item in items if item not in needing]
+
+
+def _in_real_time(item: pytest.Item) -> bool:
+    return any(item.get_closest_marker(name) for name in ("real_time", "browser"))
+
+
+def _was_held_up(item: pytest.Item) -> bool:
+    return item.stash[HELD_UP].worst_s > LIMIT_S
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A test in real time is repeated where this computer held it up, its fixtures included."""
+    if _in_real_time(item):
+        item.stash[HELD_UP] = HoldUp()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Generator[None]:
+    try:
+        yield
+    finally:
+        if _in_real_time(item):
+            item.stash[HELD_UP].end()
 
 
 @pytest.fixture(autouse=True)

@@ -23,6 +23,7 @@ def commands(heading: str) -> list[list[str]]:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_the_steps_of_the_first_page_lead_to_a_run_that_passed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -52,15 +52,6 @@ def plan_back(folder: Path) -> Path:
     return path
 
 
-class HeldUp(Exception):
-    """This computer was busy for a while, for which the program rightly stopped."""
-
-
-def is_held_up(said: str) -> bool:
-    """A cycle came late, or the simulated drives, which are on this computer too, answered late."""
-    return "cycles late" in said or "did not answer for" in " ".join(said.split())
-
-
 @dataclass
 class Day:
     """One day with a rig: each step leaves drives and bus in the right state.
@@ -79,8 +70,6 @@ class Day:
     def does(self, code: int, *arguments: str | Path) -> Answer:
         """A command with its exit code; no drive reports anything because of it."""
         answer = call(*arguments)
-        if answer.code != code and is_held_up(answer.said):
-            raise HeldUp(answer.said)
         assert answer.code == code, (arguments, answer)
         self.is_quiet(str(arguments[0]))
         return answer
@@ -97,9 +86,7 @@ class Day:
             if events.is_file() and f'"{code}"' in events.read_text():
                 return
             signal.sigtimedwait([], 0.01)
-        out, err = process.communicate()
-        assert is_held_up(out + err), (code, out, err)
-        raise HeldUp(out + err)
+        raise AssertionError(f"the run ended before {code!r}: {process.communicate()}")
 
     def doctor(self) -> None:
         """Nothing is missing; a virtual machine may have one processor only."""
@@ -127,8 +114,6 @@ class Day:
             if stops:
                 process.send_signal(signal.SIGINT)
             out, err = process.communicate()
-        if process.returncode == 1 and is_held_up(out + err):
-            raise HeldUp(out + err)
         assert process.returncode == (130 if stops else 0), (out, err)
         assert self.states() == {HOLDING}
         self.is_quiet(name)
@@ -154,8 +139,6 @@ def a_day(day: Day, prepared: PreparedRun, plan: Path, back: Path) -> Iterator[s
     rehearsal.on_cycle = lambda: _fails_when_moving(rehearsal)
     jog = ("jog", day.rig, "--by-mm", "0", "0", "8", "--no-scene", *_YES)
     jogged = call(*jog)
-    if failing.state is not DriveState.FAULT and is_held_up(jogged.said):
-        raise HeldUp(jogged.said)
     assert jogged.code == 1, jogged
     assert failing.state is DriveState.FAULT, jogged
     assert "drive 3" in jogged.said, jogged

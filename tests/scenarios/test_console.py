@@ -24,7 +24,7 @@ from executor.remote.command_socket import find_runs
 from tests.cli.plans import CONFIGS
 from tests.scenarios.test_processes import program
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 #: Largest number of states to wait for.
 PATIENCE = 3000

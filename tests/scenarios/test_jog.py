@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from executor.trajectory.setpoints import PreparedRun
 from model.rig import load_rig
 from tests.cli.plans import RIG
 from tests.cli.program import call, one_message
-from tests.scenarios.makers import HeldUp, is_held_up
 from tests.scenarios.test_real_time import drives_on
 
 BY = ("--by-mm", "6", "0", "8")
@@ -125,27 +123,17 @@ def test_a_jog_into_an_obstacle_is_denied(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_on_a_bus_it_begins_where_the_drives_are_and_is_not_home(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
-    for attempt in range(3):
-        folder = tmp_path / str(attempt)
-        folder.mkdir()
-        channel = f"239.74.163.24:{20000 + (os.getpid() * 13 + attempt) % 20000}"
-        with suppress(HeldUp):
-            return jogs_twice(channel, slow_run, slow_rig, folder)
-    raise AssertionError("this computer was too busy three times in a row")
-
-
-def jogs_twice(channel: str, slow_run: PreparedRun, slow_rig: Path, folder: Path) -> None:
+    channel = f"239.74.163.24:{20000 + (os.getpid() * 13) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel, "--yes", "--without-real-time")
     with drives_on(channel, slow_run) as rehearsal:
         for number in (1, 2):
             before = rehearsal.pose.position
-            run = folder / f"jog-{number}"
+            run = tmp_path / f"jog-{number}"
             answer = call("jog", slow_rig, "--by-mm", "5", "0", "0", "--no-scene", *bus, "-o", run)
-            if answer.code == 1 and is_held_up(answer.said):
-                raise HeldUp
             assert answer.code == 0, answer
             moved = rehearsal.pose.position - before
             assert moved == pytest.approx([0.005, 0.0, 0.0], abs=5e-5)

@@ -248,6 +248,7 @@ def test_what_a_program_wrote_while_it_ran_is_what_it_writes_at_the_end(
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 @pytest.mark.parametrize(("number", "path_mm", "whole"), [(31, 1.0, True), (32, 15.0, False)])
 def test_cycles_up_to_the_last_second_outlive_a_kill_of_the_program_or_of_all_of_it(
     slow_run: PreparedRun,
@@ -279,6 +280,7 @@ def test_cycles_up_to_the_last_second_outlive_a_kill_of_the_program_or_of_all_of
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_a_folder_that_is_removed_while_drives_move_ends_in_a_latched_fault(
     slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:

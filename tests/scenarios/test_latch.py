@@ -209,6 +209,7 @@ def test_reset_of_drives_that_do_not_answer_leaves_it_engaged(tmp_path: Path) ->
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
@@ -231,6 +232,7 @@ def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
@@ -253,6 +255,7 @@ def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_after_a_crash_nothing_moves_until_reset_and_then_only_from_where_it_is(
     slow_run: PreparedRun, slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:

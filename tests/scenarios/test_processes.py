@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 PROGRAM = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from cdpr.cli import main; main()"
 ENDS_WITHIN_S = 90.0
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 
 @contextmanager

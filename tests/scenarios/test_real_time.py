@@ -24,7 +24,7 @@ from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.ground_truth import PowerLoss
 from tests.scenarios.test_processes import finished, program, send, waited_for
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 AWAY_S = 20.0
 SIXTH = 5

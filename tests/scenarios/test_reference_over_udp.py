@@ -23,6 +23,7 @@ from tests.scenarios.test_real_time import drives_on
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on(
     slow_run: PreparedRun,
     slow_rig: Path,
@@ -94,6 +95,7 @@ def test_a_run_needs_a_reference_that_was_made_since_the_drives_were_switched_on
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_a_run_whose_end_cannot_be_kept_leaves_its_whole_record(
     slow_run: PreparedRun,
     slow_rig: Path,

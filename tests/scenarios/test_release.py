@@ -45,6 +45,7 @@ def hold(drives: tuple[SimulatedDrive, ...]) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 @pytest.mark.parametrize("braked", [True, False])
 def test_no_drive_has_torque_afterwards_and_nothing_has_moved(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path, braked: bool
@@ -80,6 +81,7 @@ def test_no_drive_has_torque_afterwards_and_nothing_has_moved(
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_drives_that_count_from_anywhere_stay_where_they_are(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
@@ -122,6 +124,7 @@ def _on(channel: str, file: Path) -> Rig:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_a_drive_that_does_not_go_along_leaves_a_latched_fault(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
@@ -140,6 +143,7 @@ def test_a_drive_that_does_not_go_along_leaves_a_latched_fault(
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_ctrl_c_during_release_stops_all_and_says_what_is_left(
     slow_run: PreparedRun, slow_rig: Path
 ) -> None:

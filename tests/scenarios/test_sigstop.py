@@ -18,7 +18,7 @@ from tests.scenarios.faults.suspension import Suspension, seen_by
 from tests.scenarios.test_processes import program, waited_for
 from tests.scenarios.test_real_time import drives_on, real_time_process
 
-pytestmark = [pytest.mark.slow, pytest.mark.quiet]
+pytestmark = [pytest.mark.slow, pytest.mark.real_time, pytest.mark.quiet]
 
 
 @pytest.mark.parametrize("milliseconds", [8, 21, 28, 45])

@@ -29,6 +29,7 @@ def kept(drive: SimulatedDrive) -> dict[Any, Any]:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_it_shows_the_state_of_the_rig_and_leaves_everything_as_it_was(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
@@ -66,6 +67,7 @@ def test_it_shows_the_state_of_the_rig_and_leaves_everything_as_it_was(
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_what_is_on_file_is_reported_although_no_drive_answers(
     slow_rig: Path, tmp_path: Path
 ) -> None:
@@ -80,6 +82,7 @@ def test_what_is_on_file_is_reported_although_no_drive_answers(
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_drives_in_configuration_are_not_read(slow_run: PreparedRun, slow_rig: Path) -> None:
     channel = f"239.74.163.27:{20000 + (os.getpid() * 23) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)

@@ -49,6 +49,7 @@ def test_in_simulated_time(prepared: PreparedRun, tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 @pytest.mark.parametrize("name", BETWEEN_PROCESSES)
 def test_between_processes_in_real_time(
     calm_run: PreparedRun,

@@ -58,6 +58,7 @@ def positions(bench: Bench) -> list[float]:
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_f2_a_suspended_master_that_continues_enables_nothing(
     calm_run: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
 ) -> None:
@@ -258,6 +259,7 @@ def test_f23_a_step_of_the_clock_changes_nothing(
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_f25_a_master_that_is_requested_to_end_stops_along_the_path(
     calm_run: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
 ) -> None:

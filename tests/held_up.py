@@ -1,0 +1,37 @@
+"""Whether this computer was busy with something else while a test ran in real time.
+
+Such a test depends on programs that are woken on time. Where they were not, a run rightly stops,
+and its failure says nothing about the code: it is done again. On a computer that kept time a
+failure counts at once.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+
+PERIOD_S = 0.01
+LIMIT_S = 0.02
+"""A quiet computer wakes a thread within a few milliseconds, also beside one that computes."""
+REPEATS = 4
+
+
+class HoldUp:
+    """Asks to be woken every 10 ms, in a thread, and keeps by how much it was late at worst."""
+
+    def __init__(self) -> None:
+        self.worst_s = 0.0
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="hold-up", daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        asked = time.monotonic()
+        while not self._over.wait(PERIOD_S):
+            woken = time.monotonic()
+            self.worst_s = max(self.worst_s, woken - asked - PERIOD_S)
+            asked = woken
