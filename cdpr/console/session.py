@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,7 +55,7 @@ from model.errors import CdprError, Refused
 from model.files.documents import millimetres, write_atomic
 from model.pose import Pose
 from model.rig import Rig
-from model.scene import Scene, empty_scene, load_scene
+from model.scene import empty_scene, load_scene
 
 #: Shortest period of reading the fault latch and the reference, [s].
 STORED_EVERY = 0.5
@@ -99,9 +98,8 @@ class Console:
             BadInput: The scene, or the file of taught poses, cannot be read.
         """
         self.files, self.rig = files, files.rig
-        self.scene: Scene | None = (
-            None if files.scene_file is None else load_scene(files.scene_file)
-        )
+        file = files.scene_file
+        self.scene = None if file is None else load_scene(file)
         self.control, self.verbs = PageControl(_milliseconds), StartedVerb()
         # Drives simulated by each run share no bus: other robots' runs have the same bus name.
         only = self.rig.name if is_simulated(self.rig) else None
@@ -152,8 +150,11 @@ class Console:
             self._asks.submit(self._load_at_rest, path)
 
     def _load_at_rest(self, path: Path) -> None:
-        with self._one_at_a_time, suppress(CdprError):  # replaced or removed meanwhile
-            self.plan.load(path)
+        try:
+            with self._one_at_a_time:
+                self.plan.load(path)
+        except CdprError as error:  # replaced or removed meanwhile
+            self.verbs.fail(error)
 
     def _ask_at_rest(self, busy: bool) -> None:
         """Reads the drives once after each motion; they may be silent or absent.
@@ -173,7 +174,8 @@ class Console:
             return read_status(self.rig)
 
     def _state(self, status: dict[str, Any] | None, age: float) -> dict[str, Any]:
-        robot, rig, verb, plan = self._robot, self.view.rig, self.verbs.verb, self.plan
+        robot, rig, verb = self._robot, self.view.rig, self.verbs.verb
+        loaded, compared = self.plan.preview, self.plan.compared
         near = None if robot is None else robot.nearest
         return {
             "kind": "state",
@@ -191,9 +193,9 @@ class Console:
             "clearance_mm": near and nearest_data(near, self.view.required_clearance),
             "measured": measured_state(status, age),
             "next_stop": None if status is None else status["next_stop"],
-            "preview": plan.preview and plan.preview["name"],
-            "plan_start_off_mm": plan.off_mm(None if robot is None else robot.pose),
-            "compared": plan.compared and plan.compared["name"],
+            "preview": loaded and loaded["name"],
+            "plan_start_off_mm": self.plan.off_mm(None if robot is None else robot.pose),
+            "compared": compared and compared["name"],
             "jog": jog_state(status),
             "cable": cable_state(status),
             "poses": self.poses.as_dicts(),

@@ -89,6 +89,12 @@ class StartedVerb:
                 )
             self._start(verb, arguments)
 
+    def fail(self, error: CdprError) -> None:
+        """Notes that the last verb's result cannot be used, unless another one was started."""
+        with self._lock:
+            if self.outcome is not None:
+                self.outcome = replace(self.outcome, exit_code=error.exit_code, text=str(error))
+
     def update(self) -> str:
         """The last line of the verb's output; records its end."""
         with self._lock:
@@ -228,8 +234,11 @@ def jog_state(status: dict[str, Any] | None) -> dict[str, Any]:
     if status is not None and "cable_jog" in status:
         why_not = "single cables are being jogged: end that first"
     jog = None if status is None else status.get("jog")
-    limit = jog and jog["limit"] and f"stops in {jog['room_mm']:.1f} mm: {jog['limit']}"
-    return {**_session_state(status, jog, why_not), "limit": limit}
+    ahead = {"limit": None, "room_mm": None}
+    if jog and jog["limit"]:
+        short = jog["limit"].partition(" with the platform at ")[0]
+        ahead = {"limit": short, "room_mm": jog["room_mm"]}
+    return {**_session_state(status, jog, why_not), **ahead}
 
 
 def cable_state(status: dict[str, Any] | None) -> dict[str, Any]:

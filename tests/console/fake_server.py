@@ -241,9 +241,10 @@ class Fake:
             "why_not": None,
             "moving": self.jog_ready and self.held is not None,
             "limit": None,
+            "room_mm": None,
         }
         if self.held and near < 60.0:
-            jog["limit"] = f"stops in {near - 10.0:.0f} mm: clearance to obstacle_1"
+            jog.update(limit="clearance to obstacle_1", room_mm=near - 10.0)
         busy = None
         if self.planning is not None:
             busy = {"verb": "plan", "text": "searching"}

@@ -196,15 +196,15 @@ def test_a_limit_is_shown_as_the_one_ahead_and_only_during_a_press(desk: Visit) 
     """Its numbers are those predicted at the limit; at rest they would pass for present ones."""
     desk.ready_to_jog()
     jog = {"ready": True, "why_not": None, "moving": True, "speed_mm_s": 20.0}
-    limit = "stops in 12.0 mm: obstacle clearance too small, pillar: 2.353 mm (limit 10 mm)"
-    limit += " with the platform at [-42.1, 0.0, 445.0] mm"
-    desk.fake.ask(state={"jog": {**jog, "limit": limit}})
+    jog["limit"] = "obstacle clearance too small, pillar: 2.353 mm (limit 10 mm)"
+    jog["room_mm"] = 12.0
+    desk.fake.ask(state={"jog": jog})
     shown = desk.page.locator("#jog-limit")
     expect(shown).to_have_text(
         "Limit ahead: comes to rest within 12.0 mm. Farther on:"
         " obstacle clearance too small, pillar: 2.353 mm (limit 10 mm)"
     )
-    desk.fake.ask(state={"jog": {**jog, "moving": False, "limit": limit}})
+    desk.fake.ask(state={"jog": {**jog, "moving": False}})
     expect(shown).to_be_hidden()
     desk.hold()
     expect(shown).to_have_text(
@@ -244,9 +244,12 @@ def test_the_pad_stays_where_it_is_whatever_is_shown(browser: Browser, fake: Fak
             before = found.page.locator("#jog-pad").bounding_box()
             found.ready_to_jog()
             jog = {"ready": True, "why_not": None, "moving": True, "speed_mm_s": 20.0}
-            limit = "stops in 17.1 mm: obstacle clearance too small, platform – obstacle_1"
+            limit = "obstacle clearance too small, platform – obstacle_1"
             outcome = {"verb": "jog", "ok": False, "text": "a\n" * 20, "report": None}
-            changes = {"jog": {**jog, "limit": limit}, "latched": "slack: cable 3 " * 4}
+            changes = {
+                "jog": {**jog, "limit": limit, "room_mm": 17.1},
+                "latched": "slack: cable 3 " * 4,
+            }
             busy = {"verb": "jog", "text": "a long line about the command in progress " * 3}
             more = {"outcome": {**outcome, "fault_page": "/help/slack"}, "busy": busy}
             found.hold()

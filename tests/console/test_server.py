@@ -194,6 +194,12 @@ def test_a_plan_that_was_made_here_is_loaded(served: Served) -> None:
         while state(page)["preview"] is not None:
             pass
         assert [state(page)["preview"] for _ in range(5)] == [None] * 5, "it was not made"
+        Path("console/taught.plan.json").write_text("{}")
+        served.console.verbs.outcome = planned
+        assert command(page, "plan", pose="two")["ok"]
+        while state(page)["outcome"]["ok"]:
+            pass
+        assert "taught.plan.json" in state(page)["outcome"]["text"], "it cannot be read"
     scene = load_scene(Path("console/taught.yaml"))
     assert scene.start.distance_to(served.console.rig.home) < 1e-9
     for name in ("one", "two"):

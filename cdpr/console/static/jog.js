@@ -87,10 +87,10 @@ export function bindJog(connection, situation, command) {
   };
 }
 
-/** The server's limit of a jog in words: its values are predicted beyond the limit, not the present ones. */
-function ahead({ limit, moving }) {
-  const [, room, what] = /^stops in ([\d.]+ mm): (.*?)( with the platform at .*)?$/s.exec(limit ?? "") ?? [];
-  return what ? `${moving ? `Limit ahead: comes to rest within ${room}.` : "Limit reached."} Farther on: ${what}` : limit ?? "";
+/** The limit of a jog in words: its values are predicted beyond it, not the present ones. */
+function ahead({ limit, room_mm: room, moving }) {
+  if (!limit || room === undefined) return limit ?? ""; // single cables: a limit that is reached
+  return `${moving ? `Limit ahead: comes to rest within ${room.toFixed(1)} mm.` : "Limit reached."} Farther on: ${limit}`;
 }
 
 /** What a pad says: moving only if the position changes. */
