@@ -15,15 +15,9 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import uvicorn
-from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
-from starlette.exceptions import HTTPException
-from starlette.middleware import Middleware
-from starlette.middleware.base import BaseHTTPMiddleware
-from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
-from starlette.routing import Route, WebSocketRoute
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from fastapi import FastAPI, HTTPException, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 
 from cdpr.console.commands import Held, LetGo, Message, NotAMessage, parse_message
 from cdpr.console.session import MADE, Console
@@ -79,28 +73,28 @@ class ConsoleServer:
         self._stops = ThreadPoolExecutor(STOPS_AT_ONCE, "cdpr-stop")
         self._stopping: set[asyncio.Task[None]] = set()
 
-    def app(self) -> Starlette:
+    def app(self) -> FastAPI:
         """The application for any ASGI server."""
-        return Starlette(
-            routes=[
-                Route("/", self._page),
-                Route("/static/{name:path}", _static),
-                Route("/scene", self._scene),
-                Route("/api/files", self._files),
-                Route("/api/preview", self._preview),
-                Route("/api/compared", self._compared),
-                Route("/camera/{name}", self._picture),
-                Route("/runs/{name:path}", _run_file),
-                Route("/help/{code}", _help),
-                Route("/stop", self._stop, methods=["POST"]),
-                WebSocketRoute("/ws", self._socket),
-            ],
-            middleware=[Middleware(BaseHTTPMiddleware, dispatch=self._guarded)],
-            lifespan=self._living,
-        )
+        app = FastAPI(lifespan=self._living, openapi_url=None)
+        app.middleware("http")(self._guarded)
+        for path, resource in (
+            ("/", self._page),
+            ("/static/{name:path}", _static),
+            ("/scene", self._scene),
+            ("/api/files", self._files),
+            ("/api/preview", self._preview),
+            ("/api/compared", self._compared),
+            ("/camera/{name}", self._picture),
+            ("/runs/{name:path}", _run_file),
+            ("/help/{code}", _help),
+        ):
+            app.get(path, response_model=None)(resource)
+        app.post("/stop")(self._stop)
+        app.websocket("/ws")(self._socket)
+        return app
 
     @asynccontextmanager
-    async def _living(self, _app: Starlette) -> AsyncIterator[None]:
+    async def _living(self, _app: FastAPI) -> AsyncIterator[None]:
         updates = asyncio.create_task(self._update_states())
         try:
             yield
@@ -164,35 +158,34 @@ class ConsoleServer:
 
     # Resources.
 
-    async def _page(self, _request: Request) -> Response:
+    async def _page(self) -> Response:
         return HTMLResponse(_resource("index.html"))
 
-    async def _scene(self, _request: Request) -> Response:
+    async def _scene(self) -> Response:
         data = await run_in_threadpool(scene_of, self._console.rig, self._console.scene)
         return JSONResponse(data)
 
-    async def _files(self, _request: Request) -> Response:
+    async def _files(self) -> Response:
         return JSONResponse(await run_in_threadpool(_plans_and_scenes))
 
-    async def _preview(self, _request: Request) -> Response:
+    async def _preview(self) -> Response:
         if self._console.plan.preview is None:
             raise HTTPException(404, "no plan is loaded")
         return JSONResponse(self._console.plan.preview)
 
-    async def _compared(self, _request: Request) -> Response:
+    async def _compared(self) -> Response:
         if self._console.plan.compared is None:
             raise HTTPException(404, "no plan is compared")
         return JSONResponse(self._console.plan.compared)
 
-    async def _picture(self, request: Request) -> Response:
+    async def _picture(self, name: str) -> Response:
         """The newest image of a measuring camera."""
-        name = request.path_params["name"]
         made = await run_in_threadpool(self._console.pictures.jpeg, name)
         if made is None:
             return Response(status_code=204)  # the page retries
         return Response(made, media_type="image/jpeg")
 
-    async def _stop(self, _request: Request) -> Response:
+    async def _stop(self) -> Response:
         """STOP without a socket; needs no token."""
         why_not = await self._run_stop(self._console.stop)
         return JSONResponse({"ok": not why_not, "what": why_not})
@@ -301,9 +294,8 @@ def _resource(name: str) -> str:
     return files("cdpr.console").joinpath("static", name).read_text(encoding="utf-8")
 
 
-async def _static(request: Request) -> Response:
+async def _static(name: str) -> Response:
     """Files of the page, and those shared with reports."""
-    name = request.path_params["name"]
     is_shared = name in ("base.css", "viewer.js") or name.startswith("vendor/")
     root = files("model.pages") if is_shared else files("cdpr.console").joinpath("static")
     kind = _KINDS.get(Path(name).suffix)
@@ -315,17 +307,16 @@ async def _static(request: Request) -> Response:
         raise HTTPException(404) from None
 
 
-async def _run_file(request: Request) -> Response:
+async def _run_file(name: str) -> Response:
     """A file below the folder of runs."""
-    path, root = (RUNS / request.path_params["name"]).resolve(), RUNS.resolve()
+    path, root = (RUNS / name).resolve(), RUNS.resolve()
     if not (path.is_relative_to(root) and path.is_file()):
         raise HTTPException(404)
     return FileResponse(path)
 
 
-async def _help(request: Request) -> Response:
+async def _help(code: str) -> Response:
     """The help page of an event or fault."""
-    code = request.path_params["code"]
     if code not in fault_codes():
         raise HTTPException(404)
     return Response(page_text(code), media_type=_KINDS[".md"])

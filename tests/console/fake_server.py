@@ -26,11 +26,8 @@ from typing import Any
 import cv2
 import numpy as np
 import uvicorn
-from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
-from starlette.routing import Route, WebSocketRoute
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from fastapi import FastAPI, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.responses import FileResponse, JSONResponse, PlainTextResponse
 
 from cdpr.console.view import scene_of
 from model.pages.scene import (
@@ -484,47 +481,57 @@ class Fake:
         return True, f"{command.replace('_', ' ')}: done"
 
 
-def application(fake: Fake) -> Starlette:
+def application(fake: Fake) -> FastAPI:
     """The routes of the console, and `/fake`."""
+    app = FastAPI(lifespan=lambda _: moving(fake), openapi_url=None)
 
-    async def index(request: Request) -> Response:
+    @app.get("/")
+    async def index() -> Response:
         text = (STATIC / "index.html").read_text(encoding="utf-8")
         text = text.replace('name="token" content=""', f'name="token" content="{TOKEN}"')
         return Response(text, media_type="text/html", headers={"Content-Security-Policy": POLICY})
 
-    async def static(request: Request) -> Response:
-        name = request.path_params["name"]
+    @app.get("/static/{name:path}")
+    async def static(name: str) -> Response:
         is_shared = name in ("base.css", "viewer.js") or name.startswith("vendor/")
         root = ROOT / "model" / "pages" if is_shared else STATIC
         path = (root / name).resolve()
         inside = path.is_relative_to(root) and path.is_file()
         return FileResponse(path) if inside else PlainTextResponse("no such file", 404)
 
-    async def scene(request: Request) -> Response:
+    @app.get("/scene")
+    async def scene() -> Response:
         drawn = {k: v for k, v in scene_data(figure()).items() if k != "moments"}
         return JSONResponse({**scene_of(RIG, None), **drawn})
 
-    async def files(request: Request) -> Response:
+    @app.get("/api/files")
+    async def files() -> Response:
         return JSONResponse(fake.files)
 
-    async def preview_of(request: Request) -> Response:
+    @app.get("/api/preview")
+    async def preview_of() -> Response:
         return JSONResponse(preview(fake.plan)) if fake.plan else PlainTextResponse("no plan", 404)
 
-    async def picture(request: Request) -> Response:
+    @app.get("/camera/{name}")
+    async def picture() -> Response:
         fake.pictures.append(time.monotonic())
         await asyncio.sleep(0.001 * fake.slow_ms)
         _, file = cv2.imencode(".jpg", np.full((480, 640), 90, np.uint8))
         return Response(file.tobytes(), media_type="image/jpeg")
 
-    async def compared_of(request: Request) -> Response:
+    @app.get("/api/compared")
+    async def compared_of() -> Response:
         if fake.compared is None:
             return PlainTextResponse("no plan", 404)
         return JSONResponse(preview(fake.compared))
 
-    async def stop(request: Request) -> Response:
+    @app.post("/stop")
+    async def stop() -> Response:
         ok, what = fake.stop()
         return JSONResponse({"ok": ok, "what": what})
 
+    @app.get("/fake")
+    @app.post("/fake")
     async def hooks(request: Request) -> Response:
         if request.method == "POST":
             asked = await request.json()
@@ -546,19 +553,11 @@ def application(fake: Fake) -> Starlette:
             {name: getattr(fake, name) for name in names} | {"position_mm": position}
         )
 
-    routes = [
-        Route("/", index),
-        Route("/static/{name:path}", static),
-        Route("/scene", scene),
-        Route("/api/files", files),
-        Route("/api/preview", preview_of),
-        Route("/api/compared", compared_of),
-        Route("/camera/{name}", picture),
-        Route("/stop", stop, methods=["POST"]),
-        Route("/fake", hooks, methods=["GET", "POST"]),
-        WebSocketRoute("/ws", lambda page: speak(fake, page)),
-    ]
-    return Starlette(routes=routes, lifespan=lambda app: moving(fake))
+    @app.websocket("/ws")
+    async def page(page: WebSocket) -> None:
+        await speak(fake, page)
+
+    return app
 
 
 async def speak(fake: Fake, page: WebSocket) -> None:
