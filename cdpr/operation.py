@@ -50,7 +50,7 @@ def plan(
         weights: Instead of a cost: weights of a weighted sum, by objective.
         budget: Time for search and improvement, [s] (default: 0.05; 0.5 with `free_rotation`).
             The result depends on the computer's speed.
-        rounds: Instead of a budget: number of rounds, for all segments between stops or for each.
+        rounds: Instead of a budget: number of rounds, for all legs together or for each.
             The same rounds and seed give the same path.
         seed: Random seed.
         longest: Upper limit of the path length, [m].

@@ -258,7 +258,7 @@ def _referenced(
     source: tuple[Camera, str] | None,
     pictures: int,
 ) -> HomingReference:
-    """The reference at the present pose of the platform.
+    """The reference at the current pose of the platform.
 
     Args:
         rig: The robot.

@@ -118,7 +118,7 @@ class RunResult:
 
     @property
     def clearance_interval(self) -> tuple[float, float]:
-        """3σ bounds of the true clearance where the smallest was measured, [m]; else NaN."""
+        """95 % interval of the true clearance where the smallest was measured, [m]; else NaN."""
         known = self.summary.get("clearance_mm")
         if known is None:
             return float("nan"), float("nan")
@@ -138,7 +138,7 @@ class RunResult:
     def _repr_html_(self) -> str:
         """For notebooks."""
         low, high = (bound * 1e3 for bound in self.clearance_interval)
-        least = f"{self.smallest_clearance * 1e3:.2f} mm (3σ bounds {low:.2f}–{high:.2f} mm)"
+        least = f"{self.smallest_clearance * 1e3:.2f} mm (95 % interval {low:.2f}–{high:.2f} mm)"
         rows = [
             ("verdict", self.verdict),
             ("why", self.sentence),

@@ -281,7 +281,7 @@ def reset(
     """Clears a latched fault after its cause is removed: resets drives in fault; moves nothing.
 
     Drives that hold keep holding. A drive in fault is not reset while others hold the platform.
-    Afterwards a run must start at the platform's present pose.
+    Afterwards a run must start at the platform's current pose.
 
     Args:
         rig: The robot and its bus.

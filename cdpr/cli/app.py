@@ -92,7 +92,11 @@ PANELS: dict[str, tuple[Verb, ...]] = {
     ),
     "Set up": (
         *_verbs("doctor:doctor", "sim:sim"),
-        Verb("calibrate", verbs=CALIBRATE, about="Calibrate and compare."),
+        Verb(
+            "calibrate",
+            verbs=CALIBRATE,
+            about="Calibrate cameras, tags and the rig; print targets; compare, convert results.",
+        ),
     ),
     "Measure": _verbs("track:track"),
     "Analyse": (

@@ -86,7 +86,7 @@ def _show_checks(checks: Iterable[MachineCheck]) -> None:
 def _show_table(found: Examined, rig: Rig) -> None:
     """Objects that need a change first, then the others, then the total."""
     table = Table("", "object", "needed", "found", "meaning", "change")
-    marks = {"ok": "[green]ok[/]", "remark": "[yellow]note[/]", "wrong": "[red]wrong[/]"}
+    marks = {"ok": "[green]ok[/]", "remark": "[yellow]remark[/]", "wrong": "[red]wrong[/]"}
     for verdict in ("wrong", "remark", "ok"):
         for row in found.rows:
             if row.verdict == verdict:

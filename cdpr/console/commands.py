@@ -90,7 +90,7 @@ class PlanCommand(_Command):
     Attributes:
         scene: File of the scene; None for the taught poses.
         objective: What the path minimizes.
-        from_here: The path begins at the present pose, then goes through the taught poses in order.
+        from_here: The path begins at the current pose, then goes through the taught poses in order.
         pose: Only to this taught pose, from the present one.
     """
 
@@ -102,7 +102,7 @@ class PlanCommand(_Command):
 
 
 class NameCommand(_Command):
-    """Teach the present pose."""
+    """Teach the current pose."""
 
     command: Literal["teach"]
     name: Text

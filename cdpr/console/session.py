@@ -310,7 +310,7 @@ class Console:
         here = None if self._robot is None or is_simulated(self.rig) else self._robot.pose
         if here is not None and self.plan.begins_elsewhere(here):
             off = self.plan.off_mm(here)
-            return f"the platform is {off} mm from the plan's start: plan from its present pose"
+            return f"the platform is {off} mm from the plan's start: plan from its current pose"
         cameras = [text for source in self.files.cameras for text in ("--camera", source)]
         if not (cameras or is_simulated(self.rig)):
             cameras = ["--no-camera"]

@@ -257,7 +257,7 @@ def distances(
     A distance fails only if it is too small by more than its uncertainty.
     """
     checks = []
-    for source, source_name in (("tag", _camera_phrase(cameras)), ("encoder", "the drives")):
+    for source, source_name in (("tag", _camera_phrase(cameras)), ("encoder", "the encoders")):
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():
             checks.append(_against_required(rows, required, source_name))

@@ -138,7 +138,7 @@ class ProfileDocument(Document):
     )
     sync_timeout_periods: Annotated[float, Field(ge=1.1, le=10.0)] = Field(
         default=3.0,
-        description="periods of 1006h without SYNC after which a drive stops by itself; with"
+        description="periods of 1006h without SYNC after which a drive stops on its own; with"
         " monitoring heartbeat, the age of SYNC from which no drive is enabled",
     )
     heartbeat_loss: Literal["quick stop", "fault"] = Field(

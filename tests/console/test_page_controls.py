@@ -146,13 +146,13 @@ TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
         (ALWAYS | TAUGHT | REST) - {"teach", "teach_at", "go_to"},
     ),
     (
-        "position not known, path from the present pose",
+        "position not known, path from the current pose",
         {"platform": None, "form": {**SELECTED, "from_here": True}},
         (ALWAYS | TAUGHT | REST) - {"teach", "teach_at", "go_to", "plan_poses"},
     ),
     ("one pose", {"poses": [{}]}, (ALWAYS | TAUGHT | REST) - {"plan_poses"}),
     (
-        "one pose, path from the present pose",
+        "one pose, path from the current pose",
         {"poses": [{}], "form": {**SELECTED, "from_here": True}},
         ALWAYS | TAUGHT | REST,
     ),

@@ -84,7 +84,7 @@ def test_a_path_begins_at_the_present_pose_if_so_ticked(desk: Visit, from_here: 
     desk.fake.ask(set={"poses": [POSE, {**POSE, "name": "two"}]})
     desk.take_control()
     desk.view("teach")
-    box = desk.page.get_by_role("checkbox", name="Begin at the present pose")
+    box = desk.page.get_by_role("checkbox", name="Begin at the current pose")
     expect(box).to_be_checked()
     box.set_checked(from_here)
     desk.page.locator("#plan-poses").click()

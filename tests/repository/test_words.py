@@ -27,7 +27,7 @@ WENT = {
     "told": "reported, commanded, given",
     "telling": "reporting, showing",
     "tell apart": "distinguish",
-    "surely": "the interval's name, such as 3σ bounds",
+    "surely": "the interval's name, such as a 95 % interval",
     "anew": "again, re-",
     "mend": "fix, correct, repair",
     "mended": "fixed, corrected",

@@ -229,7 +229,7 @@ def taught_and_run(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         assert ended["stopped"]
         assert "STOPPED" in ended["text"]
         assert me.state["plan_start_off_mm"] > 1.0
-        assert "plan from its present pose" in me.command("run")["what"]
+        assert "plan from its current pose" in me.command("run")["what"]
         assert me.command("plan", scene=None, pose="beside")["ok"]
         me.until(lambda state: state["plan_start_off_mm"] is not None)
         assert me.state["plan_start_off_mm"] < 0.2, "the path begins where the platform stopped"

@@ -1,4 +1,4 @@
-"""Jogging: a short, slow, straight run from the present pose, denied by default."""
+"""Jogging: a short, slow, straight run from the current pose, denied by default."""
 
 from __future__ import annotations
 

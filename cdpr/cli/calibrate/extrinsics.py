@@ -77,7 +77,7 @@ def extrinsics(
     wanted_mm: WantedOption = 1.0,
     result: ResultOptions = DEFAULT_RESULT,
 ) -> None:
-    """Find a camera's pose, from surveyed tags on the frame or from the rig's motion.
+    """Find a camera's pose: from surveyed tags, the rig's motion, or another camera.
 
     The camera must not move between images. Exit code 3 where the result is not good enough.
 

@@ -1,4 +1,4 @@
-"""`cdpr jog`: short, slow, straight motions from the present pose."""
+"""`cdpr jog`: short, slow, straight motions from the current pose."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def jog(
     bus: BusOptions = DEFAULT_BUS,
     drives: DriveOptions = DEFAULT_DRIVES,
 ) -> None:
-    """Move the platform slowly and straight by a few millimetres from its present pose.
+    """Move the platform slowly and straight by a few millimetres from its current pose.
 
     A jog is a run: planned, verified and gated like any other, and it can be stopped, held and
     monitored. With the interface 'virtual' the simulated platform starts at home. With --cable a

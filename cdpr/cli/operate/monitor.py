@@ -80,9 +80,10 @@ def monitor(
 ) -> None:
     """Show a run live: state, pose, clearance, tensions, drives, lateness, progress and events.
 
-    In a terminal it takes keys: space stops the run, h holds it, r resumes it, + and - change its
-    speed by ten per cent of the planned one. Ctrl-C or q ends the monitor, not the run. Exit code:
-    0 if the motion finished, 130 if it was stopped, 1 otherwise.
+    In a terminal it takes keys: space stops every run of this user, as `cdpr stop` does; h holds
+    this one, r resumes it, + and - change its speed by ten per cent of the planned one. Ctrl-C or
+    q ends the monitor, not the run. Exit code: 0 if the motion finished, 130 if it was stopped, 1
+    otherwise.
 
     [dim]Examples:[/dim]
 

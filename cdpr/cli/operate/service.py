@@ -1,4 +1,4 @@
-"""`cdpr status`, `reset`, `release`: show a rig's state, release its fault latch or drives."""
+"""`cdpr status`, `reset`, `release`: show a rig's state, clear its latch, release its drives."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def status(
         raise result.missing
 
 
-# `cdpr reset`: the only command that releases a latched fault.
+# `cdpr reset`: the only command that clears a latched fault.
 
 
 @with_option_groups
@@ -54,10 +54,10 @@ def reset(
     yes: NoQuestionOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Release a latched fault once its cause is removed: reset drives in fault, move nothing.
+    """Clear a latched fault once its cause is removed: reset drives in fault, move nothing.
 
     Drives that hold keep holding. A drive in fault is not reset while others hold the platform.
-    The next run must start at the platform's present pose.
+    The next run must start at the platform's current pose.
 
     [dim]Example:[/dim]
 
@@ -77,8 +77,8 @@ def reset(
         names = ", ".join(the_rig.drive_names[node] for node in result.restarted)
         show_line(f"power-cycled since their last configuration: {names}")
     show_line(f"reference: {result.reference}")
-    latch_now = "the fault latch is released" if result.was_latched else "no fault was latched"
-    out.print(f"{latch_now}; the next run must start from the platform's present pose")
+    latch_now = "the fault latch is cleared" if result.was_latched else "no fault was latched"
+    out.print(f"{latch_now}; the next run must start from the platform's current pose")
 
 
 # `cdpr release`: close all brakes, then remove the torque of all drives.

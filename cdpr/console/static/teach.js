@@ -1,4 +1,4 @@
-/* Taught poses: store the present pose, name, order and remove poses, plan a path through them. */
+/* Taught poses: store the current pose, name, order and remove poses, plan a path through them. */
 
 import { whyNot } from "./buttons.js";
 import { ask } from "./dialog.js";
