@@ -1,8 +1,11 @@
-"""Messages from a page, one JSON object each, and which page has control."""
+"""Messages from a page, one JSON object each, those that wait, and which page has control."""
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -21,6 +24,8 @@ from executor.supervision import FASTEST, SLOWEST
 
 #: Longest message, [bytes].
 LONGEST = 4096
+#: Largest number of queued commands per page; STOP is never queued.
+MOST_WAITING = 8
 
 Text = Annotated[str, Field(max_length=400)]
 Millimetres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
@@ -202,6 +207,54 @@ def parse_message(text: str) -> Message | Held | LetGo:
     except ValidationError as error:
         problems = error.errors(include_url=False, include_context=False, include_input=False)
         raise NotAMessage("; ".join(str(problem["msg"]) for problem in problems[:3])) from None
+
+
+class Inbox:
+    """Messages of a page that are not yet executed: bounded, however many it sends."""
+
+    def __init__(self) -> None:
+        """Starts empty."""
+        self.commands: asyncio.Queue[Message] = asyncio.Queue(MOST_WAITING)
+        self.refused: asyncio.Queue[tuple[int, str]] = asyncio.Queue(MOST_WAITING)
+        self._held: tuple[int, Held, float] | None = None
+        self._release: int | None = None
+        self._has_held, self._has_release = asyncio.Event(), asyncio.Event()
+
+    def refuse(self, command: int, why: str) -> None:
+        """Queues the answer to a refused message; drops it if the page does not read answers."""
+        with suppress(asyncio.QueueFull):
+            self.refused.put_nowait((command, why))
+
+    def hold(self, press: int | None, message: Held) -> None:
+        """Keeps the newest report of a press, with the time of its arrival."""
+        if press is not None:
+            self._held = press, message, time.monotonic()
+            self._has_held.set()
+
+    def let_go(self, press: int | None) -> None:
+        """Keeps the newest press that is over, and drops its reports."""
+        if press is None:
+            return
+        if self._held is not None and self._held[0] <= press:
+            self._held = None
+        self._release = max(press, self._release or 0)
+        self._has_release.set()
+
+    async def next_held(self) -> tuple[int, Held, float]:
+        """Waits for a report of a press; returns both with the time of its arrival."""
+        while self._held is None:
+            self._has_held.clear()
+            await self._has_held.wait()
+        held, self._held = self._held, None
+        return held
+
+    async def next_release(self) -> int:
+        """Waits for a press that is over."""
+        while self._release is None:
+            self._has_release.clear()
+            await self._has_release.wait()
+        release, self._release = self._release, None
+        return release
 
 
 # Which page has control, and the numbers of its jog presses. Pure.

@@ -19,7 +19,7 @@ from fastapi import FastAPI, HTTPException, Request, Response, WebSocket, WebSoc
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 
-from cdpr.console.commands import Held, LetGo, Message, NotAMessage, parse_message
+from cdpr.console.commands import Held, Inbox, LetGo, Message, NotAMessage, parse_message
 from cdpr.console.session import MADE, Console
 from cdpr.console.view import scene_of
 from executor.recording.record_files import RUNS
@@ -32,9 +32,8 @@ RATE = 20.0
 PATIENCE = 2.0
 #: Largest number of open pages; STOP by `POST /stop` works without one.
 MOST_PAGES = 64
-#: Largest number of queued commands per page; STOP is never queued.
-MOST_WAITING = 8
 STOPS_AT_ONCE = 4
+PRESSES_AT_ONCE = 4
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:;"
     " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -71,6 +70,7 @@ class ConsoleServer:
         self._news = asyncio.Condition()
         self._seq = 0
         self._stops = ThreadPoolExecutor(STOPS_AT_ONCE, "cdpr-stop")
+        self._presses = ThreadPoolExecutor(PRESSES_AT_ONCE, "cdpr-press")
         self._stopping: set[asyncio.Task[None]] = set()
 
     def app(self) -> FastAPI:
@@ -103,6 +103,7 @@ class ConsoleServer:
             with suppress(asyncio.CancelledError):
                 await updates
             self._stops.shutdown()
+            self._presses.shutdown()
             await run_in_threadpool(self._console.close)
 
     async def _update_states(self) -> None:
@@ -211,16 +212,26 @@ class ConsoleServer:
             self._pages -= 1
 
     async def _serve_page(self, page: WebSocket) -> None:
+        """Serves a page until it disconnects; reading its socket waits for nothing else.
+
+        Else reports of a held control could queue, and go on moving the robot after its release.
+        """
         await page.accept()
         number = self._console.control.join("?" if page.client is None else page.client.host)
-        commands: asyncio.Queue[Message] = asyncio.Queue(MOST_WAITING)
+        inbox = Inbox()
         tasks = [
-            asyncio.create_task(self._send_states(page, number)),
-            asyncio.create_task(self._execute_commands(page, number, commands)),
+            asyncio.create_task(work)
+            for work in (
+                self._send_states(page, number),
+                self._execute_commands(page, number, inbox),
+                self._forward_held(inbox),
+                self._forward_releases(inbox),
+                _send_refusals(page, inbox),
+            )
         ]
         try:
             while True:
-                await self._handle(page, number, await page.receive_text(), commands)
+                self._take(page, number, await page.receive_text(), inbox)
         except (WebSocketDisconnect, RuntimeError, KeyError):  # KeyError: binary
             pass
         finally:
@@ -249,43 +260,56 @@ class ConsoleServer:
                     await page.close(1013)
                 return
 
-    async def _handle(
-        self, page: WebSocket, number: int, text: str, commands: asyncio.Queue[Message]
-    ) -> None:
-        """Executes STOP and jog controls at once; queues other commands."""
+    def _take(self, page: WebSocket, number: int, text: str, inbox: Inbox) -> None:
+        """Begins STOP at once; passes everything else to the page's tasks."""
         try:
             message = parse_message(text)
         except NotAMessage as error:
-            await page.send_json({"kind": "answer", "to": 0, "ok": False, "what": str(error)})
+            inbox.refuse(0, str(error))
             return
         if isinstance(message, Held):
-            await run_in_threadpool(self._console.held, number, message)
+            inbox.hold(self._console.held(number, message), message)
         elif isinstance(message, LetGo):
-            await run_in_threadpool(self._console.let_go, number, message)
+            inbox.let_go(self._console.let_go(number, message))
         elif message.command == "stop":
             stopping = asyncio.create_task(self._stop_and_answer(page, number, message))
             self._stopping.add(stopping)  # completes even if the page disconnects
             stopping.add_done_callback(self._stopping.discard)
-        elif commands.full():
-            await _answer(page, message, "earlier commands of this page are not finished yet")
+        elif inbox.commands.full():
+            inbox.refuse(message.id, "earlier commands of this page are not finished yet")
         else:
-            commands.put_nowait(message)
+            inbox.commands.put_nowait(message)
 
     async def _stop_and_answer(self, page: WebSocket, number: int, message: Message) -> None:
         why_not = await self._run_stop(self._console.command, number, message)
-        await _answer(page, message, why_not)
+        await _answer(page, message.id, why_not)
 
-    async def _execute_commands(
-        self, page: WebSocket, number: int, commands: asyncio.Queue[Message]
-    ) -> None:
+    async def _execute_commands(self, page: WebSocket, number: int, inbox: Inbox) -> None:
         while True:
-            message = await commands.get()
+            message = await inbox.commands.get()
             why_not = await run_in_threadpool(self._console.command, number, message)
-            await _answer(page, message, why_not)
+            await _answer(page, message.id, why_not)
+
+    async def _forward_held(self, inbox: Inbox) -> None:
+        """Forwards the newest report of a held control; one that waited too long is dropped."""
+        while True:
+            await self._run_press(self._console.forward_held, *await inbox.next_held())
+
+    async def _forward_releases(self, inbox: Inbox) -> None:
+        while True:
+            await self._run_press(self._console.end_press, await inbox.next_release())
+
+    async def _run_press(self, forward: Callable[..., None], *arguments: Any) -> None:
+        await asyncio.get_running_loop().run_in_executor(self._presses, forward, *arguments)
 
 
-async def _answer(page: WebSocket, message: Message, why_not: str) -> None:
-    answer = {"kind": "answer", "to": message.id, "ok": not why_not, "what": why_not}
+async def _send_refusals(page: WebSocket, inbox: Inbox) -> None:
+    while True:
+        await _answer(page, *await inbox.refused.get())
+
+
+async def _answer(page: WebSocket, command: int, why_not: str) -> None:
+    answer = {"kind": "answer", "to": command, "ok": not why_not, "what": why_not}
     with suppress(RuntimeError, WebSocketDisconnect):  # the page is closed
         await page.send_json(answer)
 

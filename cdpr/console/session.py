@@ -100,7 +100,7 @@ class Console:
         self.files, self.rig = files, files.rig
         file = files.scene_file
         self.scene = None if file is None else load_scene(file)
-        self.control, self.verbs = PageControl(_milliseconds), StartedVerb()
+        self.control, self.verbs = PageControl(lambda: time.time_ns() // 1_000_000), StartedVerb()
         # Drives simulated by each run share no bus: other robots' runs have the same bus name.
         only = self.rig.name if is_simulated(self.rig) else None
         self.watch = RunWatch(bus_name(self.rig), only)
@@ -247,7 +247,7 @@ class Console:
         if message.command == "give_control":
             with self._control_lock:
                 press = self.control.give(page)
-            self._end_press(press)
+            self.end_press(press)
             return ""
         with self._one_at_a_time:
             if self.control.holder != page:
@@ -341,7 +341,7 @@ class Console:
         page = self.control.holder
         with self._control_lock:
             press = None if page is None else self.control.set_service(page, on)
-        self._end_press(press)
+        self.end_press(press)
         return self.watch.send("end") if jogs_cables and not on else ""
 
     def _start_verb(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
@@ -401,15 +401,16 @@ class Console:
 
     # Jogging.
 
-    def held(self, page: int, message: Held) -> None:
-        """Forwards a held jog control, if the page may move what it controls."""
+    def held(self, page: int, message: Held) -> int | None:
+        """The press of a held control; None if the page may not move what it controls."""
         motion = 0 if self.files.read_only else self.watch.number
         with self._control_lock:
             if message.cable is not None and not self.control.is_service:
                 motion = 0
-            press = self.control.hold(page, message.hold, message.seq, motion)
-        if press is None:
-            return
+            return self.control.hold(page, message.hold, message.seq, motion)
+
+    def forward_held(self, press: int, message: Held, received: float) -> None:
+        """Passes a report of a press on, with its age; received at a monotonic time, [s]."""
         status = self.watch.last.status or {}
         jog = status.get("jog") or status.get("cable_jog")
         fastest = 1e3 * self.view.rig.motion.speed if jog is None else float(jog["speed_mm_s"])
@@ -419,21 +420,22 @@ class Console:
             length = math.hypot(*message.direction)
             direction = [v / length for v in message.direction]
             what = {"direction": direction, "frame": message.frame}
-        self.watch.send("held", press=press, step_mm=message.step_mm, percent=percent, **what)
+        what |= {"press": press, "step_mm": message.step_mm, "percent": percent}
+        self.watch.send("held", received, **what)
 
-    def let_go(self, page: int, message: LetGo) -> None:
-        """Ends the press of a page's jog control."""
+    def let_go(self, page: int, message: LetGo) -> int | None:
+        """Ends the press of a page's jog control, and returns it for `end_press`, if any."""
         with self._control_lock:
-            press = self.control.let_go(page, message.hold)
-        self._end_press(press)
+            return self.control.let_go(page, message.hold)
 
     def leave(self, page: int) -> None:
         """Removes a page, and ends its press."""
         with self._control_lock:
             press = self.control.leave(page)
-        self._end_press(press)
+        self.end_press(press)
 
-    def _end_press(self, press: int | None) -> None:
+    def end_press(self, press: int | None) -> None:
+        """Tells the run that a press is over."""
         if press is not None:
             self.watch.send("let_go", press=press)
 
@@ -444,7 +446,3 @@ def _tensions(status: dict[str, Any] | None, robot: RobotNow | None) -> list[flo
     if drives:
         return [drive["tension_n"] for drive in drives]
     return None if robot is None else [round(t, 2) for t in robot.tensions]
-
-
-def _milliseconds() -> int:
-    return time.time_ns() // 1_000_000

@@ -5,6 +5,7 @@ It reconnects to the next run. Detections are outlined in the images.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from contextlib import ExitStack, suppress
@@ -23,6 +24,8 @@ SEARCH_PERIOD = 0.2
 PATIENCE = 0.1
 #: Time-out of a command, [s].
 ANSWERED_WITHIN = 0.5
+#: Largest age of the report of a held control that is sent, [s].
+FRESH = 0.1
 #: Commands sent to a silent run too: executed late, they move nothing.
 _ALWAYS = frozenset({"let_go", "hold", "end"})
 _SILENT = "the run does not answer"
@@ -93,10 +96,16 @@ class RunWatch:
                 return f"process {numbers} moves a robot and does not answer; wait, or stop it"
             return ""
 
-    def send(self, command: str, **values: Any) -> str:
+    def send(self, command: str, received: float | None = None, **values: Any) -> str:
         """Sends the run a command; returns why it was refused, or an empty text.
 
         A silent run gets only commands of `_ALWAYS`, as it might execute others much later.
+
+        Args:
+            command: See `executor.remote.protocol`.
+            received: Time of a report's arrival on the monotonic clock, [s]: one that is too old,
+                because others were sent first, is not sent.
+            values: Of the command.
         """
         with self._lock:
             if self._run is None:
@@ -107,6 +116,11 @@ class RunWatch:
                     return "nothing moves"
                 if self._run.owed and command not in _ALWAYS:
                     return _SILENT
+            if received is not None:
+                age = time.monotonic() - received
+                if age > FRESH:
+                    return "the report is too old"
+                values["age_ms"] = math.ceil(1e3 * age)
             answer = self._run.ask(make_line(command, **values), ANSWERED_WITHIN)
             if answer.what:
                 return answer.what

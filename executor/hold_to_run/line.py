@@ -117,7 +117,7 @@ class JogLine:
 # Transfer of checked pieces to the real-time process.
 
 
-_HEAD = struct.Struct("<QQ?71s")
+_HEAD = struct.Struct("<QQ?d71s")
 #: Pieces in transit at most.
 SLOTS = 64
 #: Largest step, [rows].
@@ -132,6 +132,7 @@ class Piece:
         press: Its number.
         first: Index of the first row on the line.
         from_rest: Whether the rows include the ramps; others are at the jog speed.
+        peak: Their largest speed, as a share of the jog speed; up to 1.
         rows: Set-points, int32, shape (n, m), [counts].
         hash: Their fingerprint when checked.
     """
@@ -139,6 +140,7 @@ class Piece:
     press: int
     first: int
     from_rest: bool
+    peak: float
     rows: Setpoints
     hash: str
 
@@ -165,15 +167,16 @@ class PieceRing:
         Raises:
             ValueError: It is too long.
         """
-        head = _HEAD.pack(piece.press, piece.first, piece.from_rest, piece.hash.encode())
-        self._ring.put(head + np.ascontiguousarray(piece.rows).tobytes())
+        values = (piece.press, piece.first, piece.from_rest, piece.peak, piece.hash.encode())
+        self._ring.put(_HEAD.pack(*values) + np.ascontiguousarray(piece.rows).tobytes())
 
     def take(self) -> Iterator[Piece]:
         """Pieces that arrived since the last call, in order."""
         for content in self._ring.take():
-            press, first, from_rest, digest = _HEAD.unpack_from(content)
-            rows = np.frombuffer(content, dtype=np.int32, offset=_HEAD.size)
-            yield Piece(press, first, from_rest, rows.reshape(-1, self._cables), digest.decode())
+            press, first, from_rest, peak, digest = _HEAD.unpack_from(content)
+            counts = np.frombuffer(content, dtype=np.int32, offset=_HEAD.size)
+            rows = counts.reshape(-1, self._cables)
+            yield Piece(press, first, from_rest, peak, rows, digest.decode())
 
 
 # Look-ahead check of the line, in the supervisor.
@@ -257,5 +260,8 @@ class JogProver:
         self._is_whole = press.step is not None
         if not self._narrows:
             self._size = MOST_ROWS
-        rows = checked.table.setpoints
-        self._send(Piece(press.number, first, self._is_whole, rows, checked.hash))
+        rows, peak = checked.table.setpoints, 1.0
+        if self._is_whole:
+            fastest = float(np.max(np.diff(checked.table.travelled))) / self._cycle
+            peak = min(fastest / self._rig.motion.speed, 1.0)
+        self._send(Piece(press.number, first, self._is_whole, peak, rows, checked.hash))

@@ -66,19 +66,19 @@ class JogLoop(Loop):
         self._held_now, self._pieces = held, pieces
         self._feed = Feed(1, here.cycle, here.rig.motion, rate=0.0)
         self._rows: Setpoints = here.setpoints
-        self._press, self._from_rest = 0, True
+        self._press, self._from_rest, self._peak = 0, True, 1.0
 
     def _follow(self) -> None:
         """One cycle on the line, or at rest."""
         held = self._held_now(self._clock.now)
         for piece in self._pieces():
             if piece.press == held.press:
-                self._take(piece)
+                self._take(piece, held.share)
         moving = self.machine.state is State.MOVING
         if not (moving and held.press and held.press == self._press):
             self._feed.stop()
-        elif not self._from_rest:
-            self._feed.go_to(held.share if self._has_room() else 0.0)
+        else:
+            self._feed.go_to(self._rate(held.share))
         if not self._feed.at_rest:
             self._send(Purpose.MOVE, targets_at(self._rows, self._feed.advance()))
         elif not moving or held.ends:
@@ -86,10 +86,16 @@ class JogLoop(Loop):
         else:
             self._send(Purpose.HOLD, self._sender.resting_targets)
 
+    def _rate(self, share: float) -> float:
+        """Rows per cycle for a share of the jog speed; 0 near the end of the checked rows."""
+        if self._from_rest:  # it has its own ramps, and short steps do not reach the jog speed
+            return min(share / self._peak, 1.0)
+        return share if self._has_room() else 0.0
+
     def _has_room(self) -> bool:
         return self._feed.index + self._feed.rows_to_rest + MARGIN < len(self._rows) - 1
 
-    def _take(self, piece: Piece) -> None:
+    def _take(self, piece: Piece, share: float) -> None:
         """Begins a line at the platform's rest position, or extends the present one.
 
         Raises:
@@ -104,7 +110,7 @@ class JogLoop(Loop):
             )
         if piece.first == 0:
             if self._feed.at_rest and _meet(piece.rows[0], self._sender.resting_targets):
-                self._begin(piece)
+                self._begin(piece, share)
             else:
                 text = f"press {piece.press}: its line does not begin where the platform rests"
                 self._report("jog_not_begun", text)
@@ -117,9 +123,10 @@ class JogLoop(Loop):
             self._feed.extend(len(self._rows))
             self._sender.allow(self._rows)
 
-    def _begin(self, piece: Piece) -> None:
+    def _begin(self, piece: Piece, share: float) -> None:
         self._press, self._from_rest, self._rows = piece.press, piece.from_rest, piece.rows
-        rate = 1.0 if piece.from_rest else 0.0
+        self._peak = piece.peak
+        rate = self._rate(share) if piece.from_rest else 0.0
         motion = self._checked.rig.motion
         self._feed = Feed(len(self._rows), self._checked.cycle, motion, rate=rate)
         self._sender.allow(self._rows)

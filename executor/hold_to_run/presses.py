@@ -130,7 +130,14 @@ class PressBoard:
         self._write()
 
     def hold(
-        self, number: int, direction: Array, *, in_platform: bool, step: float | None, percent: int
+        self,
+        number: int,
+        direction: Array,
+        *,
+        in_platform: bool,
+        step: float | None,
+        percent: int,
+        age: float = 0.0,
     ) -> bool:
         """Reports a held control that moves the platform; returns False if that press is over.
 
@@ -140,6 +147,7 @@ class PressBoard:
             in_platform: See `PlatformPress`.
             step: See `Press`, [m].
             percent: Of the jog speed, from 1 to 100.
+            age: Of the report, [s].
 
         Raises:
             ValueError: The session moves one cable at a time.
@@ -149,11 +157,19 @@ class PressBoard:
         return self._hold(
             number,
             percent,
+            age,
             lambda free_since: PlatformPress(number, step, free_since, direction, in_platform),
         )
 
     def hold_cable(
-        self, number: int, cable: int, *, pays_out: bool, step: float | None, percent: int
+        self,
+        number: int,
+        cable: int,
+        *,
+        pays_out: bool,
+        step: float | None,
+        percent: int,
+        age: float = 0.0,
     ) -> bool:
         """Reports a held control that moves one winch; returns False if that press is over.
 
@@ -163,6 +179,7 @@ class PressBoard:
             pays_out: See `CablePress`.
             step: See `Press`, [m].
             percent: Of the jog speed, from 1 to 100.
+            age: Of the report, [s].
 
         Raises:
             ValueError: There is no such cable, or the session moves the platform.
@@ -174,22 +191,25 @@ class PressBoard:
         return self._hold(
             number,
             percent,
+            age,
             lambda free_since: CablePress(number, step, free_since, cable, pays_out),
         )
 
-    def _hold(self, number: int, percent: int, begin: Callable[[float], Press]) -> bool:
+    def _hold(self, number: int, percent: int, age: float, begin: Callable[[float], Press]) -> bool:
         """Continues a press, or begins a new one; returns False if it is over."""
         with self._lock:
             now = self._now()
+            heard = now - age
             known = self._press is not None and self._press.number == number
-            if not self._rule.held(number, self._heard if known else now, now):
+            if not self._rule.held(number, self._heard if known else heard, now):
                 if known:
                     self._let_go()
                 return False
             if not known:
                 self._end_press(now)
                 self._press = begin(self._free_since)
-            self._heard, self._percent, self.last_heard = now, percent, now
+            self._heard = max(heard, self._heard) if known else heard
+            self._percent, self.last_heard = percent, now
             self._write()
             return True
 

@@ -51,11 +51,8 @@ def ask(run: RunConnection, line: bytes) -> Answer:
 
 
 def _ask_all(runs: Sequence[RunConnection], line: bytes) -> list[Answer]:
-    sent = [_send_line(run, line) for run in runs]
-    return [
-        _receive(run) if taken else Answer(run.process, None, ended=True)
-        for run, taken in zip(runs, sent, strict=True)
-    ]
+    unsent = [_send_line(run, line) for run in runs]
+    return [_receive(run) if why is None else why for run, why in zip(runs, unsent, strict=True)]
 
 
 class RunLink:
@@ -72,8 +69,8 @@ class RunLink:
 
     def ask(self, line: bytes, patience: float) -> Answer:
         """Sends a line of `make_line`; waits up to ``patience`` [s] for its answer."""
-        if not _send_line(self._run, line):
-            return Answer(self._run.process, None, ended=True)
+        if unsent := _send_line(self._run, line):
+            return unsent
         self.owed += 1
         return self.hear(patience)
 
@@ -96,13 +93,18 @@ class RunLink:
         return _parsed(self._run.process, newest)
 
 
-def _send_line(run: RunConnection, line: bytes) -> bool:
+def _send_line(run: RunConnection, line: bytes) -> Answer | None:
+    """Sends a line; returns what an answer would be if it cannot be sent, else None."""
+    if not run.is_connected:
+        return Answer(run.process, None)
     run.link.settimeout(ANSWER_TIMEOUT)
     try:
         run.link.sendall(line)
-    except OSError:  # the run has ended
-        return False
-    return True
+    except TimeoutError:
+        return Answer(run.process, None)
+    except OSError:
+        return Answer(run.process, None, ended=True)
+    return None
 
 
 def _receive(run: RunConnection) -> Answer:

@@ -147,11 +147,13 @@ class RunConnection:
 
     Attributes:
         process: Its process ID.
-        link: Connected socket; the owner closes it.
+        link: The socket; the owner closes it.
+        is_connected: False for a run that accepts no connections, as it is suspended or hangs.
     """
 
     process: int
     link: socket.socket
+    is_connected: bool = True
 
 
 @contextlib.contextmanager
@@ -165,7 +167,7 @@ def find_runs() -> Iterator[list[RunConnection]]:
         with _open_folders(_reachable_folders()) as folders:
             for folder in folders:
                 names = os.listdir(folder.descriptor)
-                for name in sorted(n for n in names if n.endswith(_ENDING)):
+                for name in sorted(n for n in names if _is_of_a_run(n)):
                     run = _connect(folder.descriptor, name, folder.owner)
                     if run is None:
                         continue
@@ -174,18 +176,25 @@ def find_runs() -> Iterator[list[RunConnection]]:
         yield [runs[number] for number in sorted(runs)]
 
 
+def _is_of_a_run(name: str) -> bool:
+    return name.endswith(_ENDING) and name.removesuffix(_ENDING).isdecimal()
+
+
 def _connect(folder: int, name: str, owner: int) -> RunConnection | None:
     """Connects to the folder owner's run at a socket; removes a socket without a listener."""
     with contextlib.suppress(FileNotFoundError):
         if not stat.S_ISSOCK(os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode):
             return None
     link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    link.setblocking(False)  # else it waits for a suspended run with many waiting clients
     try:
         link.connect(_path_in(folder, name))
     except ConnectionRefusedError:
         link.close()
         _remove(folder, name)
         return None
+    except BlockingIOError:
+        return RunConnection(int(name.removesuffix(_ENDING)), link, is_connected=False)
     except OSError:  # gone
         link.close()
         return None

@@ -3,7 +3,8 @@
 A request has a ``command``: ``status``, ``stop``, ``hold``, ``resume``, or ``speed`` with
 ``percent`` (1 to 100). A jog session also takes ``held`` with ``press`` (a number, rising),
 ``step_mm`` (one of `STEPS_MM`, or null to move while it is held), ``percent`` of the jog speed,
-and the motion: of the platform by ``direction`` (x, y, z; normalized by the receiver) in a
+``age_ms`` (since the operator's report, for a program that passes it on; 0 if left out), and the
+motion: of the platform by ``direction`` (x, y, z; normalized by the receiver) in a
 ``frame`` (``world`` or ``platform``), or of one cable by ``cable`` (its number, from 1) and
 ``sense`` (``wind_in`` or ``pay_out``); ``let_go`` with ``press``; and ``end``. The answer has
 ``ok``; if true, ``status`` (see `executor.remote.status`), otherwise ``what``, a sentence.
@@ -62,6 +63,7 @@ class HeldCommand(_Request):
     sense: Sense | None = None
     step_mm: float | None = None
     percent: Annotated[int, Field(ge=SLOWEST, le=FASTEST)] = FASTEST
+    age_ms: Annotated[int, Field(ge=0, le=10_000)] = 0
 
     @model_validator(mode="after")
     def _one_motion(self) -> HeldCommand:
@@ -118,13 +120,27 @@ class Presses(Protocol):
     """Takes reports of jog controls; see `executor.hold_to_run.presses.PressBoard`."""
 
     def hold(
-        self, number: int, direction: Array, *, in_platform: bool, step: float | None, percent: int
+        self,
+        number: int,
+        direction: Array,
+        *,
+        in_platform: bool,
+        step: float | None,
+        percent: int,
+        age: float,
     ) -> bool:
         """Reports a held control that moves the platform; returns False if that press is over."""
         ...
 
     def hold_cable(
-        self, number: int, cable: int, *, pays_out: bool, step: float | None, percent: int
+        self,
+        number: int,
+        cable: int,
+        *,
+        pays_out: bool,
+        step: float | None,
+        percent: int,
+        age: float,
     ) -> bool:
         """Reports a held control that moves one cable; returns False if that press is over."""
         ...
@@ -232,10 +248,15 @@ def _jog(command: JogCommand, presses: Presses | None) -> None:
 
 def _hold(command: HeldCommand, presses: Presses) -> bool:
     step = None if command.step_mm is None else command.step_mm / 1000.0
+    age = command.age_ms / 1000.0
     if command.cable is not None:
-        pays_out = command.sense == "pay_out"
         return presses.hold_cable(
-            command.press, command.cable, pays_out=pays_out, step=step, percent=command.percent
+            command.press,
+            command.cable,
+            pays_out=command.sense == "pay_out",
+            step=step,
+            percent=command.percent,
+            age=age,
         )
     direction = np.array(command.direction, dtype=np.float64)
     return presses.hold(
@@ -244,4 +265,5 @@ def _hold(command: HeldCommand, presses: Presses) -> bool:
         in_platform=command.frame == "platform",
         step=step,
         percent=command.percent,
+        age=age,
     )

@@ -276,7 +276,9 @@ class Sequences:
         message = parse_message(text)
         assert isinstance(message, Held)
         page.highest = max(page.highest, message.hold)
-        self.console.held(page.number, message)
+        press = self.console.held(page.number, message)
+        if press is not None:
+            self.console.forward_held(press, message, watch.time.monotonic())
 
     def _command(self, page: SimulatedPage, command: str, **values: object) -> str:
         text = json.dumps({"kind": "command", "id": 1, "command": command, **values})
@@ -331,7 +333,7 @@ class Sequences:
         message = parse_message(json.dumps({"kind": "let_go", "hold": page.hold}))
         assert isinstance(message, LetGo)
         page.highest = max(page.highest, message.hold)
-        self.console.let_go(page.number, message)
+        self.console.end_press(self.console.let_go(page.number, message))
 
     def _release(self, page: SimulatedPage) -> None:
         if self.console.control.holder == page.number:

@@ -23,8 +23,8 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from cdpr.console.commands import Held, LetGo, parse_message
-from cdpr.console.server import MOST_PAGES, MOST_WAITING, ConsoleServer
+from cdpr.console.commands import MOST_WAITING, Held, LetGo, parse_message
+from cdpr.console.server import MOST_PAGES, ConsoleServer
 from cdpr.console.session import Console, ConsoleFiles
 from cdpr.console.state import VerbOutcome, _without_commands
 from cdpr.console.watch import RunWatch
@@ -61,7 +61,8 @@ class Served:
             patch.setattr(RunWatch, "number", property(lambda _: 1))
             yield
 
-    def _say(self, command: str, **values: Any) -> str:
+    def _say(self, command: str, received: float | None = None, **values: Any) -> str:
+        assert (received is None) == (command != "held")
         self.said.append((command, values))
         return ""
 
@@ -158,6 +159,17 @@ def answer_to(page: ClientConnection, text: str) -> dict[str, Any]:
 
 def command(page: ClientConnection, name: str, **values: Any) -> dict[str, Any]:
     return answer_to(page, json.dumps({"kind": "command", "id": 7, "command": name, **values}))
+
+
+def said(served: Served, page: ClientConnection, names: list[str]) -> bool:
+    """Waits for what is told to the run, and makes sure that nothing else follows soon."""
+    while len(served.said) < len(names):
+        state(page)
+    for _ in range(2):
+        state(page)
+    found = [name for name, _ in served.said]
+    assert found == names
+    return True
 
 
 REPORTS = itertools.count(1)
@@ -400,18 +412,46 @@ def test_a_held_control_is_passed_on_for_who_has_control_only(served: Served) ->
     with served.something_moves(), served.page() as first, served.page() as second:
         command(first, "take_control")
         second.send(held(1))
-        once, again = held(3), held(3)
-        for report in (once, again, again, held(2)):
+        command(second, "stop")
+        again = held(3)
+        for number, report in enumerate((again, held(3)), 1):
             first.send(report)
-        assert command(first, "stop")  # answers come in order
-        holds = [values["press"] for name, values in served.said if name == "held"]
-        assert len(holds) == 2
-        assert len(set(holds)) == 1
+            assert said(served, first, ["held"] * number)
+        first.send(again)
+        first.send(held(2))
         first.send(json.dumps({"kind": "let_go", "hold": 3}))
         first.send(held(3))
-        command(first, "stop")
-        assert [name for name, _ in served.said].count("held") == 2, "what was let go is over"
-        assert served.said[-1] == ("let_go", {"press": holds[0]})
+        assert said(served, first, ["held", "held", "let_go"]), "what was let go is over"
+        one, other = (values["press"] for name, values in served.said if name == "held")
+        assert one == other
+        assert served.said[-1] == ("let_go", {"press": one})
+
+
+def test_release_and_stop_wait_for_no_report_of_a_press(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run may take long to answer: else reports would queue, and prolong what was let go."""
+    answers, heard = threading.Event(), served._say
+
+    def say(command: str, received: float | None = None, **values: Any) -> str:
+        heard(command, received, **values)
+        return "" if command != "held" or answers.wait(60) else "silent"
+
+    monkeypatch.setattr(served.console.watch, "send", say)
+    with ExitStack() as stack:
+        stack.callback(answers.set)
+        stack.enter_context(served.something_moves())
+        page = stack.enter_context(served.page())
+        command(page, "take_control")
+        for _ in range(100):
+            page.send(held(1))
+        page.send(json.dumps({"kind": "let_go", "hold": 1}))
+        assert command(page, "stop")["what"] == "nothing moves"
+        assert said(served, page, ["held", "let_go"])
+        answers.set()
+        page.send(held(2))
+        assert said(served, page, ["held", "let_go", "held"])
+        assert served.said[0][1]["press"] < served.said[2][1]["press"]
 
 
 def held_cable(hold: int, **changes: object) -> str:
@@ -432,21 +472,19 @@ def test_a_cable_is_moved_by_a_page_in_service_mode_only(served: Served) -> None
         assert {"--hold-to-run", "--one-cable", "--yes"} <= set(arguments)
         with served.something_moves():
             page.send(held_cable(1))
-            command(page, "stop")
-            ((name, values),) = served.said
-            assert name == "held"
+            assert said(served, page, ["held"])
+            ((_, values),) = served.said
             assert (values["cable"], values["sense"], values["step_mm"]) == (3, "wind_in", None)
             assert "direction" not in values
             assert command(page, "service_end")["ok"]
             assert served.said[-1] == ("let_go", {"press": values["press"]})
             page.send(held_cable(1))
             page.send(held_cable(2))
-            command(page, "stop")
-            assert [name for name, _ in served.said] == ["held", "let_go"]
             command(page, "service_begin")
             page.send(held_cable(2))
-            command(page, "stop")
-            assert [name for name, _ in served.said].count("held") == 1, "it was over at once"
+            page.send(held_cable(3))
+            assert said(served, page, ["held", "let_go", "let_go", "held"])
+            assert served.said[-1][1]["press"] > values["press"] + 1, "the second was over at once"
 
 
 def test_service_mode_ends_with_control(served: Served) -> None:
@@ -492,7 +530,7 @@ def test_what_a_page_held_ends_when_the_page_is_gone(served: Served) -> None:
     with served.something_moves(), served.page() as first:
         command(first, "take_control")
         first.send(held(1))
-        command(first, "stop")
+        assert said(served, first, ["held"])
     with served.page() as second:
         while state(second)["control"]["held_by"] is not None:
             pass
@@ -506,11 +544,8 @@ def test_a_press_without_a_session_is_over_before_there_is_one(served: Served) -
         assert command(first, "stop")
         with served.something_moves():
             first.send(held(1))
-            assert command(first, "stop")
-            assert served.said == []
             first.send(held(2))
-            assert command(first, "stop")
-            assert [name for name, _ in served.said] == ["held"]
+            assert said(served, first, ["held"])
 
 
 @pytest.mark.parametrize(

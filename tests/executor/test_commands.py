@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import tempfile
 import threading
@@ -16,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from executor.remote.client import ask_all, final_status, no_answer, select_run
+from executor.remote.client import ask_all, final_status, no_answer, select_run, stop_runs
 from executor.remote.command_socket import (
     LONGEST_REQUEST,
     MOST_CLIENTS,
@@ -227,6 +228,27 @@ def test_a_run_that_could_not_be_stopped_from_elsewhere_any_more_is_stopped(monk
     assert board.read().stop
 
 
+def test_a_run_that_accepts_no_connection_is_silent_and_blocks_nobody(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As of a suspended run, at which a console has looked many times."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    with advertised(), ExitStack() as waiting:
+        for _ in range(300):
+            (run,) = waiting.enter_context(find_runs())
+            if not run.is_connected:
+                break
+        assert run.process == os.getpid()
+        result = stop_runs()
+        assert result.stopped == ()
+        assert [(a.process, a.status, a.ended) for a in result.silent] == [
+            (os.getpid(), None, False)
+        ]
+        assert "did not answer" in str(no_answer("stop", result.silent))
+
+
 def test_which_run_is_meant_must_be_clear():
     ours, theirs = socket.socketpair()
     with ours, theirs:
@@ -269,9 +291,16 @@ class _Presses:
         self.calls: list[tuple[Any, ...]] = []
 
     def hold(
-        self, number: int, direction: Any, *, in_platform: bool, step: float | None, percent: int
+        self,
+        number: int,
+        direction: Any,
+        *,
+        in_platform: bool,
+        step: float | None,
+        percent: int,
+        age: float,
     ) -> bool:
-        self.calls.append((number, direction.tolist(), in_platform, step, percent))
+        self.calls.append((number, direction.tolist(), in_platform, step, percent, age))
         return number < 9
 
     def let_go(self, number: int) -> None:
@@ -291,13 +320,13 @@ def _said(presses: _Presses | None, **question: Any) -> dict[str, Any]:
 def test_a_session_of_jogs_takes_what_is_reported_of_presses() -> None:
     presses = _Presses()
     held = {"command": "held", "press": 3, "direction": [0, 0.6, 0.8], "frame": "platform"}
-    assert _said(presses, **held, step_mm=0.1, percent=25)["ok"]
+    assert _said(presses, **held, step_mm=0.1, percent=25, age_ms=40)["ok"]
     assert _said(presses, command="held", press=4, direction=[1, 1, 0])["ok"]
     assert _said(presses, command="let_go", press=4)["ok"]
     assert _said(presses, command="end")["ok"]
     first, second, *others = presses.calls
-    assert first == (3, [0.0, pytest.approx(0.6), pytest.approx(0.8)], True, 0.0001, 25)
-    assert second == (4, pytest.approx([0.5**0.5, 0.5**0.5, 0.0]), False, None, 100)
+    assert first == (3, [0.0, pytest.approx(0.6), pytest.approx(0.8)], True, 0.0001, 25, 0.04)
+    assert second == (4, pytest.approx([0.5**0.5, 0.5**0.5, 0.0]), False, None, 100, 0.0)
     assert others == [("let go", 4), ("end",)]
     assert "over" in _said(presses, command="held", press=9, direction=[1, 0, 0])["what"]
 
@@ -314,6 +343,8 @@ def test_a_session_of_jogs_takes_what_is_reported_of_presses() -> None:
         {"step_mm": 5.0},
         {"percent": 0},
         {"percent": 101},
+        {"age_ms": -1},
+        {"age_ms": 0.5},
         {"more": 1},
     ],
 )
@@ -364,10 +395,12 @@ def _held(**values: Any) -> tuple[dict[str, Any], list[Any]]:
 def test_a_held_control_moves_the_platform_or_one_cable():
     answer, said = _held(press=1, direction=[0, 0, 2 / 3], frame="platform", step_mm=1.0)
     assert answer["ok"]
-    assert said == [(1, [0, 0, 1], {"in_platform": True, "step": 0.001, "percent": 100})]
+    assert said == [
+        (1, [0, 0, 1], {"in_platform": True, "step": 0.001, "percent": 100, "age": 0.0})
+    ]
     answer, said = _held(press=2, cable=3, sense="pay_out", percent=7)
     assert answer["ok"]
-    assert said == [(2, 3, {"pays_out": True, "step": None, "percent": 7})]
+    assert said == [(2, 3, {"pays_out": True, "step": None, "percent": 7, "age": 0.0})]
     assert _held(press=2, cable=3, sense="wind_in")[1][0][2]["pays_out"] is False
 
 

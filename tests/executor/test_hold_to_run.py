@@ -128,6 +128,18 @@ def test_a_step_ends_where_it_should(length: float) -> None:
     assert np.abs(path[:2]).max() < 5e-5
 
 
+@pytest.mark.parametrize("percent", [5, 25])
+def test_a_step_keeps_to_the_selected_speed(percent: int) -> None:
+    z = np.array([0.0, 0.0, 1.0])
+    script = Script([(0.5, 3.5, hold(1, z, step=0.001, percent=percent))], 4.0)
+    path = positions(script.run(scene()))
+    cycle, fastest = rig().document.bus.cycle_ms / 1000.0, 0.020 * percent / 100.0
+    over = 10  # cycles, so that whole counts do not matter
+    speeds = np.linalg.norm(path[over:] - path[:-over], axis=1) / (over * cycle)
+    assert 0.9 * fastest < speeds.max() <= 1.1 * fastest + 1e-4
+    assert path[-1, 2] - path[0, 2] == pytest.approx(0.001, abs=3e-5)
+
+
 def test_a_step_that_is_released_ends_early() -> None:
     z = np.array([0.0, 0.0, 1.0])
     records = Script([(0.5, 0.7, hold(1, z, step=0.010))], 3.0).run(scene())
@@ -267,12 +279,13 @@ def test_pieces_arrive_as_they_were_sent(press: int, first: int, whole: bool, co
     memory = SharedMemory.create(PieceRing.size(8))
     sender, receiver = PieceRing(memory, 8), PieceRing(memory, 8)
     rows = np.arange(8 * count, dtype=np.int32).reshape(count, 8)
-    sender.put(Piece(press, first, whole, rows, "sha256:" + "a" * 64))
+    sender.put(Piece(press, first, whole, 0.25, rows, "sha256:" + "a" * 64))
     (got,) = receiver.take()
-    assert (got.press, got.first, got.from_rest, got.hash) == (
+    assert (got.press, got.first, got.from_rest, got.peak, got.hash) == (
         press,
         first,
         whole,
+        0.25,
         "sha256:" + "a" * 64,
     )
     assert np.array_equal(got.rows, rows)

@@ -76,6 +76,26 @@ def test_a_press_that_comes_after_its_time_is_over_for_every_reader(
     assert PressReader(board.memory).read(time.now - 2.0 * TIMEOUT).press == 0
 
 
+def test_a_report_that_was_passed_on_late_counts_from_when_it_was_made(
+    board: PressBoard, time: Time
+) -> None:
+    def old(number: int, age: float) -> bool:
+        return board.hold(number, UP, in_platform=False, step=None, percent=100, age=age)
+
+    reader = PressReader(board.memory)
+    assert not old(1, TIMEOUT + 0.001), "it is over before it begins"
+    assert old(2, 0.1)
+    assert reader.read(time.now).press == 2
+    time.now += TIMEOUT - 0.1 - 0.001
+    assert reader.read(time.now).press == 2
+    hold(board, 2)
+    assert old(2, 0.1), "an older report takes nothing from a newer one"
+    time.now += TIMEOUT - 0.001
+    assert reader.read(time.now).press == 2
+    time.now += 0.002
+    assert reader.read(time.now).press == 0
+
+
 def test_letting_go_of_an_earlier_press_leaves_the_newest_held(board: PressBoard) -> None:
     hold(board, 1)
     hold(board, 2)
