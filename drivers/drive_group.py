@@ -72,6 +72,7 @@ class Capabilities:
             without a set-point, [ms]; None without such a watchdog.
         sync_timeout: Cycles without SYNC after which a drive stops itself; None without SYNC.
         master_timeout: Longest time until a drive reacts to the loss of this master, [s].
+        released_within: Longest time until all drives are without torque, brakes closed, [s].
         unmonitored_within: Longest time until answering drives confirm that they no longer monitor
             this master, [s].
         simulated: All drives identify themselves as simulated; known once configured.
@@ -86,6 +87,7 @@ class Capabilities:
     sync_timeout: float | None
     master_timeout: float
     unmonitored_within: float = 0.0
+    released_within: float = 3.0
     simulated: bool = False
 
 

@@ -40,6 +40,11 @@ BEFORE = (
         *(0x6502, 0, 0x80, 0x80, "supported drive modes"),
         "cyclic synchronous position (CSP), bit 7; Technosoft iPOS and Pilz PRBT do not have it",
     ),
+    Expectation(
+        *(0x607E, 0, 0x80, 0, "polarity"),
+        "bit 7 inverts positions but not torques; `direction` of the winch inverts both",
+        optional=True,
+    ),
 )
 
 
@@ -121,8 +126,14 @@ def require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
     """Requires that an object exists, so that all missing ones are reported before any write.
 
     Raises:
-        Refused: The drive lacks a required object.
+        Refused: The drive lacks a required object, or its value is a share of nothing.
     """
+    if setting.per_mille_of is not None:
+        index, sub = setting.per_mille_of
+        rated = Expectation(index, sub, 0xFFFFFFFF, 0, "rated value", "")
+        if not any(network.client(node).read(index, sub, rated.name)):
+            why = f"{setting} is a share of it: the drive would have no torque"
+            raise wrong_value(node, str(rated), "0", "the motor's data", why)
     if setting.optional or setting.transient:
         return
     try:

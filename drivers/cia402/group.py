@@ -28,12 +28,15 @@ from drivers.cia402.sdo_jobs import (
 )
 from drivers.cia402.state_machine import (
     FAULTED,
+    FOLLOWS,
     HOLDS,
     ControlWord,
     DriveState,
     Goal,
+    ignores_target,
     late_drives,
     next_words,
+    state_of,
 )
 from drivers.cyclic_group import CyclicBus, CyclicGroup
 from drivers.drive_group import (
@@ -51,10 +54,12 @@ from drivers.plausibility import require_within_limits, winding_signs
 from model.errors import HardwareMissing, Refused
 from model.rig import Rig
 
-RESET_CYCLES = 10
-"""Cycles within which a drive must leave the state FAULT after a reset."""
+RESET_WITHIN = 1.0
+"""Time within which a drive must leave the state FAULT after a reset, [s]."""
 
-FIRST_READING_ATTEMPTS = 10
+FIRST_READING_WITHIN = 2.0
+"""Time in which every drive must answer SYNC: NMT START is not confirmed, [s]."""
+
 FIRST_READINGS = 2
 """Consistent readings per drive before its position is accepted: one frame may be wrong."""
 
@@ -118,6 +123,7 @@ class Cia402Group(CyclicGroup):
             master_timeout=max(
                 heartbeat_timeout(self._cycle_s), self._profile.sync_timeout_periods * self._cycle_s
             ),
+            released_within=2.0 * self._profile.enable_timeout_ms / 1000.0 + 1.0,
             unmonitored_within=time_to_end(self._heartbeats, self._cycle_s, self._answer_time),
             simulated=self._simulated,
         )
@@ -166,7 +172,8 @@ class Cia402Group(CyclicGroup):
         """Sends SYNC until every drive has reported a position; see `DriveGroup.read_positions`."""
         self._watch.forget_positions()
         agreed = 0
-        for _ in range(FIRST_READING_ATTEMPTS):
+        attempt = FIRST_READING_TIMEOUT if pace is None else self._cycle_s
+        for _ in range(round(FIRST_READING_WITHIN / attempt)):
             time_left = FIRST_READING_TIMEOUT if pace is None else pace()
             self.send_cycle(self._watch.positions)
             status = self.receive(time_left)
@@ -350,18 +357,33 @@ class Cia402Group(CyclicGroup):
         states = self._watch.states
         self._cycles_to_goal += 1
         if self._goal is Goal.RESET_FAULT:
-            if self._cycles_to_goal > RESET_CYCLES or DriveState.FAULT not in states:
+            late = self._cycles_to_goal * self._cycle_s > RESET_WITHIN
+            if late or DriveState.FAULT not in states:
                 self._goal = Goal.IDLE
         elif self._state is GroupState.ENABLING:
-            if all(state is DriveState.OPERATION_ENABLED for state in states):
+            idle = self._ignoring()
+            if all(state is DriveState.OPERATION_ENABLED for state in states) and not idle:
                 self._check_modes()
             elif self._cycles_to_goal > self._patience:
-                self._latch(self._late((DriveState.OPERATION_ENABLED,)))
+                self._latch(self._late((DriveState.OPERATION_ENABLED,)) or idle)
         elif self._goal is Goal.RELEASE:
             if all(state in _WITHOUT_TORQUE for state in states):
                 self._goal, self._state = Goal.IDLE, GroupState.RELEASED
-            elif self._cycles_to_goal > self._patience:
+            elif self._cycles_to_goal > 2 * self._patience:  # it enables the drives first
                 self._latch(self._late(_WITHOUT_TORQUE))
+
+    def _ignoring(self) -> list[tuple[int, str]]:
+        """Enabled drives that still ignore their target, such as while a brake opens."""
+        if not self._profile.follows_bit:
+            return []
+        seconds = self._patience * self._cycle_s
+        return [
+            (node, ignores_target(name, seconds))
+            for (node, name), word in zip(
+                self._rig.drive_names.items(), self._watch.status_words, strict=True
+            )
+            if state_of(word) is DriveState.OPERATION_ENABLED and not word & FOLLOWS
+        ]
 
     def _check_modes(self) -> None:
         """Enters ENABLED once every drive shows CSP; most profiles check it when configuring."""

@@ -192,29 +192,35 @@ def _within(setting: Setting, profile: ProfileDocument) -> Setting:
 def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ...]:
     """Heartbeats that the drive monitors: the master's, then its peers', up to its entries.
 
-    All entries are cleared if a loss would remove the torque.
+    All entries are cleared first, since a drive refuses a node that another entry has, and stay so
+    if a loss would remove the torque.
 
     Args:
         rig: The robot.
         drive: Index of the winch in the rig file.
         entries: Number of producers that the drive can monitor (1016h:00).
     """
-    if not profile_of(rig).watches_heartbeats:
-        name, why = "consumer heartbeat time", "a lost heartbeat would remove the torque"
-        return tuple(
-            Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why) for sub in range(1, entries + 1)
-        )
+    name = "consumer heartbeat time"
+    watches = profile_of(rig).watches_heartbeats
+    used = min(entries, rig.cable_count) if watches else 0
+    why = "no other node is monitored" if watches else "a lost heartbeat would remove the torque"
+    cleared = tuple(
+        Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why, transient=sub <= used)
+        for sub in range(1, entries + 1)
+    )
+    if not watches:
+        return cleared
     cycle = rig.cycle
     time_ms = math.ceil(1000 * heartbeat_timeout(cycle))
     peers_ms = max(time_ms, math.ceil(HEARTBEATS_WAITED * _produced_ms(cycle, profile_of(rig))))
     peers = [w.node_id for i, w in enumerate(rig.winches) if i != drive]
-    return tuple(
+    return cleared + tuple(
         Setting(
             HEARTBEAT_CONSUMERS,
             sub,
             "<I",
             node << 16 | (time_ms if node == MASTER_NODE else peers_ms),
-            "consumer heartbeat time",
+            name,
             "stop when the master is lost" if node == MASTER_NODE else "stop when a peer is lost",
         )
         for sub, node in enumerate([MASTER_NODE, *peers][:entries], start=1)

@@ -88,6 +88,9 @@ def state_of(status_word: int) -> DriveState:
 VOLTAGE_ENABLED, REMOTE = 1 << 4, 1 << 9
 """Bits of the status word. Source: CiA 402-2, object 6041h."""
 
+FOLLOWS = 1 << 12
+"""The target position is used. Source: CiA 402-2, cyclic synchronous position mode."""
+
 _NO_VOLTAGE = (
     "its bit 4 (voltage enabled) is 0: mains power is off, or safe torque off (STO) is active"
 )
@@ -119,6 +122,14 @@ def late_drives(
         for (node, name), word in zip(names.items(), status_words, strict=True)
         if state_of(word) not in wanted
     ]
+
+
+def ignores_target(name: str, seconds: float) -> str:
+    """Text on an enabled drive that does not follow its target after a time [s]."""
+    return (
+        f"{name} is enabled but ignores its target (bit 12 of 6041h) {seconds:g} s after it was"
+        " commanded (enable_timeout_ms and follows_bit of its profile)"
+    )
 
 
 def _reason_for(status_word: int) -> str:

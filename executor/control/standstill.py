@@ -21,10 +21,10 @@ from model.errors import CdprError, Fault, StoppedByOperator
 from model.pose import Pose
 from model.rig import Rig
 
-#: All drives must be without torque, or stopped, within this time, [s].
+#: All drives must have stopped within this time, [s].
 WITHIN_S = 3.0
-#: Cycles for a drive to leave its fault, and for the others to be confirmed holding.
-SETTLING_CYCLES = 30
+#: Time for a drive to leave its fault, and for the others to be confirmed holding, [s].
+SETTLING_S = 1.5
 
 
 class Standstill(ABC):
@@ -187,7 +187,8 @@ class Release(Standstill):
 
     def _work(self) -> CycleStatus:
         self._group.command(GroupCommand.RELEASE)
-        for _ in range(self._longest):
+        within = self._group.capabilities.released_within
+        for _ in range(round(within / self._rig.cycle)):
             if self._requests().stop:
                 raise StoppedByOperator(
                     "stopped while releasing the drives; those under torque hold, a"
@@ -199,7 +200,7 @@ class Release(Standstill):
                 return status
             if status.state is GroupState.FAULT:
                 raise _not_released("; ".join(text for _, text in status.faults))
-        raise _not_released(f"the drives still had torque after {WITHIN_S:g} s")
+        raise _not_released(f"the drives still had torque after {within:g} s")
 
     def _require_heard(self, silence: ReplyTimeout) -> None:
         silence.require_none(
@@ -228,7 +229,7 @@ class FaultReset(Standstill):
     def _work(self) -> CycleStatus:
         if self._group.state is GroupState.FAULT:
             self._group.command(GroupCommand.RESET_FAULT)
-        for _ in range(SETTLING_CYCLES):
+        for _ in range(round(SETTLING_S / self._rig.cycle)):
             status = self._cycle()
         if status.state is GroupState.FAULT:
             raise Fault(

@@ -40,8 +40,11 @@ class TensionHeadroom:
         self._cycles = 0
 
     def share(self, tensions: Sequence[float]) -> float:
-        """Share of the winches' speed allowed at these tensions [N]; call once per cycle."""
-        most = float(np.max(tensions))
+        """Share of the winches' speed allowed at these tensions [N]; call once per cycle.
+
+        A drive whose torque has the wrong sign reports them as negative.
+        """
+        most = float(np.max(np.abs(tensions)))
         # "not ... <=", so that NaN counts as too large.
         over = not most <= self._limit
         self._cycles = self._cycles + 1 if over else 0
@@ -55,7 +58,7 @@ class TensionHeadroom:
         return [
             over_tension(cable, tension, self._limit)
             for cable, tension in enumerate(tensions, start=1)
-            if not tension <= self._limit
+            if not abs(tension) <= self._limit
         ]
 
 

@@ -27,7 +27,7 @@ class Clock(Protocol):
 
     @property
     def now(self) -> float:
-        """Present time, on the same scale as `time`, [s]."""
+        """Present time, on the same scale as `time`, [s]; passes in a suspended computer too."""
 
     def next_cycle(self) -> float:
         """Waits until the next cycle begins; returns its lateness, in cycles."""
@@ -97,6 +97,9 @@ class RealClock:
         self._cycle_ns = round(cycle * 1e9)
         self._begin_ns: int | None = None
         self._woke_ns = 0
+        mono = time.monotonic_ns()
+        self._not_suspended_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - mono
+        self._suspended_ns = 0
 
     @property
     def time(self) -> float:
@@ -105,11 +108,19 @@ class RealClock:
 
     @property
     def now(self) -> float:
-        """On the system's monotonic clock, [s]."""
-        return time.monotonic_ns() / 1e9
+        """On the system's monotonic clock, which a suspended computer stops, and that time, [s]."""
+        return (time.monotonic_ns() + self._suspended()) / 1e9
+
+    def _suspended(self) -> int:
+        """For how long the computer was suspended since this clock was made, [ns]; never more.
+
+        Between the two readings this process may wait: the earlier one is never the later clock's.
+        """
+        boot = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        return max(0, boot - time.monotonic_ns() - self._not_suspended_ns)
 
     def next_cycle(self) -> float:
-        """Sleeps until the deadline."""
+        """Sleeps until the deadline; a suspended computer is late by that time."""
         self._on_cycle()
         self._woke_ns = time.monotonic_ns()
         if self._begin_ns is None:
@@ -119,7 +130,9 @@ class RealClock:
         if self._woke_ns < deadline:
             sleep_until(deadline)
             self._woke_ns = time.monotonic_ns()
-        late = (self._woke_ns - deadline) / self._cycle_ns
+        before, self._suspended_ns = self._suspended_ns, self._suspended()
+        slept = max(0, self._suspended_ns - before)
+        late = (self._woke_ns - deadline + slept) / self._cycle_ns
         self._begin_ns = deadline if late <= self.CAUGHT_UP else self._woke_ns
         return late
 

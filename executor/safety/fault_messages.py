@@ -84,6 +84,11 @@ def slack(cable: int, tension: float, limit: float) -> Alarm:
 def over_tension(cable: int, tension: float, limit: float) -> Alarm:
     """A cable has too much tension, [N]."""
     text = f"cable {cable} carries {tension:.1f} N, more than {limit:.1f} N"
+    if tension < 0.0:
+        text = (
+            f"the torque of cable {cable} pays it out with {-tension:.1f} N, more than"
+            f" {limit:.1f} N: check its sign (607Eh, `direction` of the winch)"
+        )
     return Alarm(StopReaction.PATH_STOP, "over_tension", text, cable)
 
 

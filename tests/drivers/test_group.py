@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -15,7 +16,11 @@ from drivers.cia402.object_dictionary import PDO_NO_RTR, Setting, settings_for
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import GroupCommand, GroupState
+from drivers.factory import make_drive_group
 from model.errors import Fault, HardwareMissing, Refused
+from model.files.rig_file import RigDocument
+from model.rig import rig_from_document
+from simulation.drives.cia402 import SimulatedDrive
 from tests.drivers.drive_bench import Bench
 
 HOLDING = DriveState.QUICK_STOP_ACTIVE
@@ -86,6 +91,73 @@ def test_set_up_is_read_back_and_reaches_the_drives(bench: Bench) -> None:
             else:
                 assert kept == value
         assert bench.drives[drive].objects[0x1401, 1] & 1 << 31  # unused process data are off
+
+
+def test_drives_that_were_listed_in_another_order_are_set_up_again(bench: Bench) -> None:
+    """As after a killed run: a drive refuses a node that another entry of 1016h has."""
+    bench.group.configure()
+    document = bench.rig.document.model_dump()
+    winches = document["winches"]
+    winches[1]["node_id"], winches[5]["node_id"] = 6, 2
+    other = rig_from_document(RigDocument.model_validate(document))
+    before = bench.drives[0].objects[0x1016, 2]
+    make_drive_group(other, bench.group._bus, bench.rehearsal.pump).configure()
+    assert bench.drives[0].objects[0x1016, 2] >> 16 == 6
+    assert before >> 16 == 2
+
+
+def test_a_drive_may_need_some_time_until_it_answers_sync(bench: Bench) -> None:
+    bench.group.configure()
+    late, cycles = bench.drives[4], itertools.count(1)
+    late.silent = True
+
+    def pace() -> float:
+        late.silent = next(cycles) < 150  # 1.5 s at 100 Hz
+        return 0.0
+
+    status = bench.group.read_positions(pace)
+    assert not status.missing.any()
+    assert next(cycles) > 150
+
+
+def without_following(drive: SimulatedDrive, hidden: list[bool]) -> None:
+    """Bit 12 of its status word stays 0 while the list says so, as while a brake opens."""
+    drive.objects.measured(
+        *(0x6041, 0), lambda: drive.status_word & ~0x1000 if hidden[0] else drive.status_word
+    )
+
+
+def test_set_points_wait_until_all_drives_say_that_they_follow(bench: Bench) -> None:
+    hidden = [True]
+    without_following(bench.drives[3], hidden)
+    profile = bench.group._profile.model_copy(update={"follows_bit": True})  # type: ignore[attr-defined]
+    bench.group._profile = profile  # type: ignore[attr-defined]
+    bench.group.configure()
+    bench.group.read_positions()
+    stood = bench.group.targets.tolist()
+    bench.group.command(GroupCommand.ENABLE)
+    for _ in range(50):
+        bench.cycle([target + 100 for target in stood])
+    assert {drive.state for drive in bench.drives} == {DriveState.OPERATION_ENABLED}
+    assert bench.group.state is GroupState.ENABLING
+    assert np.abs(bench.group.targets - stood).max() <= 1
+    hidden[0] = False
+    bench.until(GroupState.ENABLED)
+
+
+def test_a_drive_that_never_follows_is_named(bench: Bench) -> None:
+    without_following(bench.drives[3], [True])
+    profile = bench.group._profile.model_copy(update={"follows_bit": True})  # type: ignore[attr-defined]
+    bench.group._profile = profile  # type: ignore[attr-defined]
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    bench.until(GroupState.FAULT, limit=150)
+    assert bench.status is not None
+    ((node, text),) = bench.status.faults
+    assert node == 4
+    assert "ignores its target" in text
+    assert "follows_bit" in text
 
 
 def test_nothing_is_sent_before_configure(bench: Bench) -> None:

@@ -49,11 +49,14 @@ def test_set_points_are_six_bytes_and_replies_eight_at_each_sync(rig: Rig) -> No
 
 
 def test_master_is_watched_first_then_the_peers_as_far_as_there_is_room(rig: Rig) -> None:
-    all_entries = heartbeat_consumers(rig, 0, 8)
-    nodes = [setting.value >> 16 for setting in all_entries]
+    *cleared, _, _, _, _, _, _, _, _ = all_entries = heartbeat_consumers(rig, 0, 8)
+    assert [(s.sub, s.value) for s in cleared] == [(sub, 0) for sub in range(1, 9)]
+    nodes = [setting.value >> 16 for setting in all_entries[8:]]
     assert nodes == [127, 2, 3, 4, 5, 6, 7, 8]
-    assert {setting.value & 0xFFFF for setting in all_entries} == {100}
-    assert [s.value >> 16 for s in heartbeat_consumers(rig, 0, 1)] == [127]
+    assert {setting.value & 0xFFFF for setting in all_entries[8:]} == {100}
+    assert [s.value >> 16 for s in heartbeat_consumers(rig, 0, 1)] == [0, 127]
+    more = heartbeat_consumers(rig, 0, 10)
+    assert [(s.sub, s.transient) for s in more if s.value == 0][-2:] == [(9, False), (10, False)]
 
 
 @given(value=st.integers(1, 255), exponent=st.integers(-6, -3))

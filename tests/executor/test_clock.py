@@ -20,11 +20,21 @@ class _Time:
 
     def __init__(self) -> None:
         self.now = 5_000_000_000
+        self.suspended = 7_000_000_000  # before the test
+        self.between = 0  # passes between two readings
         self.overshoot = 0
         self.slept: list[int] = []
 
+    CLOCK_BOOTTIME = 7
+
     def monotonic_ns(self) -> int:
+        self.now += self.between
         return self.now
+
+    def clock_gettime_ns(self, clock: int) -> int:
+        assert clock == self.CLOCK_BOOTTIME
+        self.now += self.between
+        return self.now + self.suspended
 
     def sleep_until(self, deadline: int) -> None:
         assert deadline > self.now
@@ -59,6 +69,30 @@ def test_cycles_begin_on_time_whatever_the_work_takes(time):
         time.work(0.001 * cycle)
         assert real.next_cycle() == 0.0
         assert time.now == begin + cycle * CYCLE_NS
+
+
+def test_a_suspended_computer_is_late_by_that_time(time):
+    """The monotonic clock stands still meanwhile, but the drives have stopped."""
+    real = RealClock(CYCLE)
+    real.next_cycle()
+    time.work(0.002)
+    before = real.now
+    time.suspended += 60 * 10**9
+    assert real.now - before == pytest.approx(60.0)
+    assert real.next_cycle() == pytest.approx(6000.0)
+    assert real.next_cycle() == 0.0
+
+
+@given(waits=st.lists(st.integers(0, 10**9), min_size=1, max_size=20))
+def test_a_process_that_waits_between_two_readings_was_not_suspended(waits):
+    time = _Time()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scheduling, "time", time)
+        real = RealClock(CYCLE)
+        for time.between in waits:
+            earliest = time.now
+            now = round(1e9 * real.now)
+            assert earliest - 2 <= now <= time.now + 2
 
 
 def test_small_delays_are_reported_and_do_not_add_up(time):

@@ -80,7 +80,7 @@ def test_a_step_raises_no_tension_beyond_what_is_left_before_it_is_seen():
         assert (2.0 * 2.0 * step * stiffness <= limit - target + 1e-9).all()
 
 
-@pytest.mark.parametrize("wrong", [61.0, float("nan")])
+@pytest.mark.parametrize("wrong", [61.0, -61.0, float("nan")])
 def test_beyond_the_limit_no_winch_continues(wrong):
     rig = RIGS[0]
     for law in (
