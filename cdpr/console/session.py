@@ -435,7 +435,7 @@ class Console:
         self.end_press(press)
 
     def end_press(self, press: int | None) -> None:
-        """Tells the run that a press is over."""
+        """Reports to the run that a press is over."""
         if press is not None:
             self.watch.send("let_go", press=press)
 

@@ -28,15 +28,13 @@ from drivers.cia402.sdo_jobs import (
 )
 from drivers.cia402.state_machine import (
     FAULTED,
-    FOLLOWS,
     HOLDS,
     ControlWord,
     DriveState,
     Goal,
-    ignores_target,
+    ignoring_drives,
     late_drives,
     next_words,
-    state_of,
 )
 from drivers.cyclic_group import CyclicBus, CyclicGroup
 from drivers.drive_group import (
@@ -54,18 +52,14 @@ from drivers.plausibility import require_within_limits, winding_signs
 from model.errors import HardwareMissing, Refused
 from model.rig import Rig
 
+#: Time within which a drive must leave the state FAULT after a reset, [s].
 RESET_WITHIN = 1.0
-"""Time within which a drive must leave the state FAULT after a reset, [s]."""
-
+#: Time in which every drive must answer SYNC: NMT START is not confirmed, [s].
 FIRST_READING_WITHIN = 2.0
-"""Time in which every drive must answer SYNC: NMT START is not confirmed, [s]."""
-
+#: Consistent readings per drive before its position is accepted: one frame may be wrong.
 FIRST_READINGS = 2
-"""Consistent readings per drive before its position is accepted: one frame may be wrong."""
-
+#: Time-out per attempt, [s]; a drive just started may miss the first SYNC.
 FIRST_READING_TIMEOUT = 0.1
-"""Time-out per attempt, [s]; a drive just started may miss the first SYNC."""
-
 _WITHOUT_TORQUE = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON)
 
 
@@ -83,6 +77,7 @@ class Cia402Group(CyclicGroup):
         self._answer_time = self._profile.sdo_timeout_ms / 1000.0
         self._heartbeat_cycles = heartbeat_cycles(cycle)
         self._patience = max(3, round(self._profile.enable_timeout_ms / 1000.0 / cycle))
+        self._reset_cycles = round(RESET_WITHIN / cycle)
         self._again_after = max(1, round(ASKED_AGAIN_AFTER / cycle))
         self._max_tension = max_tension
         self._restarted: tuple[int, ...] = ()
@@ -357,11 +352,10 @@ class Cia402Group(CyclicGroup):
         states = self._watch.states
         self._cycles_to_goal += 1
         if self._goal is Goal.RESET_FAULT:
-            late = self._cycles_to_goal * self._cycle_s > RESET_WITHIN
-            if late or DriveState.FAULT not in states:
+            if self._cycles_to_goal > self._reset_cycles or DriveState.FAULT not in states:
                 self._goal = Goal.IDLE
         elif self._state is GroupState.ENABLING:
-            idle = self._ignoring()
+            idle = self._ignoring_targets() if self._profile.follows_bit else []
             if all(state is DriveState.OPERATION_ENABLED for state in states) and not idle:
                 self._check_modes()
             elif self._cycles_to_goal > self._patience:
@@ -371,19 +365,6 @@ class Cia402Group(CyclicGroup):
                 self._goal, self._state = Goal.IDLE, GroupState.RELEASED
             elif self._cycles_to_goal > 2 * self._patience:  # it enables the drives first
                 self._latch(self._late(_WITHOUT_TORQUE))
-
-    def _ignoring(self) -> list[tuple[int, str]]:
-        """Enabled drives that still ignore their target, such as while a brake opens."""
-        if not self._profile.follows_bit:
-            return []
-        seconds = self._patience * self._cycle_s
-        return [
-            (node, ignores_target(name, seconds))
-            for (node, name), word in zip(
-                self._rig.drive_names.items(), self._watch.status_words, strict=True
-            )
-            if state_of(word) is DriveState.OPERATION_ENABLED and not word & FOLLOWS
-        ]
 
     def _check_modes(self) -> None:
         """Enters ENABLED once every drive shows CSP; most profiles check it when configuring."""
@@ -401,6 +382,10 @@ class Cia402Group(CyclicGroup):
         elif self._modes.is_overdue:
             self._modes = None
             self._latch([(n, mode_text(self._rig.drive_names[n], m)) for n, m in wrong.items()])
+
+    def _ignoring_targets(self) -> list[tuple[int, str]]:
+        seconds = self._patience * self._cycle_s
+        return ignoring_drives(self._rig.drive_names, self._watch.status_words, seconds)
 
     def _late(self, wanted: tuple[DriveState, ...]) -> list[tuple[int, str]]:
         words, seconds = self._watch.status_words, self._patience * self._cycle_s

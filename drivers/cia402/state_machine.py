@@ -124,12 +124,22 @@ def late_drives(
     ]
 
 
-def ignores_target(name: str, seconds: float) -> str:
-    """Text on an enabled drive that does not follow its target after a time [s]."""
-    return (
-        f"{name} is enabled but ignores its target (bit 12 of 6041h) {seconds:g} s after it was"
-        " commanded (enable_timeout_ms and follows_bit of its profile)"
+def ignoring_drives(
+    names: Mapping[int, str], status_words: Sequence[int], seconds: float
+) -> list[tuple[int, str]]:
+    """Enabled drives that still ignore their target, by node, such as while a brake opens.
+
+    Arguments as for `late_drives`.
+    """
+    text = (
+        f"is enabled but ignores its target (bit 12 of 6041h) {seconds:g} s after it was commanded"
+        " (enable_timeout_ms and follows_bit of its profile)"
     )
+    return [
+        (node, f"{name} {text}")
+        for (node, name), word in zip(names.items(), status_words, strict=True)
+        if state_of(word) is DriveState.OPERATION_ENABLED and not word & FOLLOWS
+    ]
 
 
 def _reason_for(status_word: int) -> str:
