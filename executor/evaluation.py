@@ -116,12 +116,17 @@ def evaluate_cut_short(folder: RunFolder) -> EvaluatedRun:
     rig, plan, course = folder.rig(), folder.plan(), folder.course()
     cycles = folder.cycles_cut_short(rig.cable_count)
     poses = folder.poses() if folder.has(POSES) else no_poses()
-    clearance = _clearance(rig, plan.scene, cycles, CameraRecords())
     events = folder.events()
     if not course.final_state:
         course = _ended_by_events(course, cycles, events)
     lost = course.cycles - len(cycles)
     troubles = [f"Of {course.cycles} cycles the last {lost} are not on record"] if lost > 0 else []
+    if folder.has(CLEARANCE):
+        clearance = folder.clearance()
+    else:
+        clearance = _clearance(rig, plan.scene, cycles, CameraRecords())
+        if plan.scene.obstacles and np.isfinite(poses.position).any():
+            troubles.append("The clearance that the cameras measured is not on record")
     has_images = any((folder.path / PICTURES).glob("**/*.jpg"))  # the first image of each is kept
     if has_images and not folder.has(POSES):
         troubles.append("What the cameras measured is not on record")

@@ -252,7 +252,7 @@ def read_poses(path: Path) -> dict[str, Pose]:
         InvalidFile: With every invalid row.
     """
     file = CsvFile(path)
-    header = file.rows[0] if file.rows else []
+    header = [name.strip() for name in file.rows[0]] if file.rows else []
     if missing := [name for name in COLUMNS if name not in header]:
         raise InvalidFile(str(path), [Problem("", f"no column {', '.join(missing)}", 1, 1)])
     poses: dict[str, Pose] = {}
@@ -261,7 +261,8 @@ def read_poses(path: Path) -> dict[str, Pose]:
         texts = dict(zip(header, row, strict=False))
         picture = Path(texts.get("picture", "")).name
         values = [texts.get(name, "").strip() for name in COLUMNS[1:]]
-        if not any(values):  # an image without a pose
+        kept = "status" not in header or (picture and texts["status"].strip() == "ok")
+        if not kept or not any(values):  # a log's row without a pose, or without a kept image
             continue
         found = _pose(values)
         if isinstance(found, str):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -273,21 +274,21 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
     if "time_s" in table.names:
         _require_increasing(table)
     tensions = np.full((n, cables), np.nan)
-    if "tension_1_n" in table.names:
+    if _has(table, r"tension_\d+_n"):
         tensions = table.of([f"tension_{i}_n" for i in range(1, cables + 1)])
     positions, rotations = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
     deviations = np.zeros((n, 6))
-    if _POSITION[0] in table.names:
+    if _has(table, "[xyz]_mm"):
         positions = table.of(_POSITION) / 1e3
         if any(name in table.names for name in _ROTATION):
             rotations = _rotations(table)
-    if _DEVIATIONS[0] in table.names:
+    if _has(table, "std_.*"):
         stated = _DEVIATIONS if np.isfinite(rotations).all() else _DEVIATIONS[:3]
         deviations[:, : len(stated)] = table.of(stated) * _TO_SI[: len(stated)]
         if (deviations[:, : len(stated)] <= 0.0).any():
             raise table.bad("a standard deviation is not positive", "leave out what is unknown")
     swivels = _nothing()
-    if "swivel_1_deg" in table.names:
+    if _has(table, r"swivel_\d+_deg"):
         swivels = np.radians(table.of([f"swivel_{i}_deg" for i in range(1, cables + 1)]))
     return RigMeasurements(
         names=tuple(f"{path}, line {k + 2}" for k in range(n)),
@@ -299,6 +300,11 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
         swivels=read_only(swivels),
         verticals=read_only(_verticals(table)),
     )
+
+
+def _has(table: CsvTable, pattern: str) -> bool:
+    """Whether any column belongs to a group, all of which is then required; in any case."""
+    return any(re.fullmatch(pattern, name, re.IGNORECASE) for name in table.names)
 
 
 def _require_increasing(table: CsvTable) -> None:

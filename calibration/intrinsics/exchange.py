@@ -163,6 +163,8 @@ FORMATS: dict[FormatName, Callable[[CameraDocument], str]] = {
 def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None) -> CameraDocument:
     """A camera with the parameters of a file in one of `FORMATS`, detected by content.
 
+    Such files state no uncertainties: that of the lens, and of a pose found with it, is unknown.
+
     Args:
         path: The file.
         camera: Gives name, pose and rate.
@@ -171,7 +173,8 @@ def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None
     Raises:
         BadInput: The file cannot be read, has an unknown format, or values out of range.
     """
-    plain = camera.model_dump(mode="json") | _found(path, entry)
+    unknown = dict.fromkeys(("lens_covariance", "pose_by_lens", "pose_covariance"))
+    plain = camera.model_dump(mode="json") | unknown | _found(path, entry)
     try:
         return CameraDocument.model_validate(plain)
     except ValidationError as error:

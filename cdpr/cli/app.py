@@ -236,6 +236,7 @@ def main() -> None:
     # Imports create some 10^5 permanent objects; garbage collection over them took a tenth of
     # the time of a plan.
     gc.set_threshold(100_000, 50, 50)
+    _replace_closed_streams()
     _escape_unprintable()
     try:
         build_app()()
@@ -262,6 +263,13 @@ def main() -> None:
     finally:
         # The final collection took another fifth.
         gc.freeze()
+
+
+def _replace_closed_streams() -> None:
+    """Discards what is written to a stream that was closed before the start (``2>&-``)."""
+    if None in (sys.stdout, sys.stderr):
+        nothing = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115  # to the end
+        sys.stdout, sys.stderr = sys.stdout or nothing, sys.stderr or nothing
 
 
 def _escape_unprintable() -> None:

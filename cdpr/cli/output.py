@@ -24,13 +24,13 @@ class _Remarks:
 
     def write(self, text: str) -> int:
         """Writes; errors are ignored."""
-        with suppress(OSError):
+        with suppress(OSError, ValueError):
             sys.stderr.write(text)
         return len(text)
 
     def flush(self) -> None:
         """Flushes; errors are ignored."""
-        with suppress(OSError):
+        with suppress(OSError, ValueError):
             sys.stderr.flush()
 
     def __getattr__(self, name: str) -> Any:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -96,7 +98,8 @@ class OneCamerasPictures:
         size: Width and height, [px].
         names: Names of the images used, in order.
         unused: Reason by name of each file that is not used.
-        upright: Whether the EXIF orientation is applied.
+        upright: Whether the EXIF orientation is applied; not if it differs between images, which a
+            camera that points down states at random.
 
     Raises:
         BadInput: The folder is missing, has no images, or none that can be read or has the
@@ -116,7 +119,8 @@ class OneCamerasPictures:
         if not sizes:
             raise _no_picture(folder, len(files))
         self.upright = True
-        if set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
+        mixed = len({exif_orientation(read_bytes(path, PICTURE_LIMIT)) for path in sizes}) > 1
+        if mixed or set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
             as_stored = {path: _size(read_picture(path, upright=False)) for path in sizes}
             if set(as_stored.values()) == {wanted or next(iter(as_stored.values()))}:
                 sizes, self.upright = as_stored, False
@@ -176,6 +180,23 @@ def read_picture(path: Path, upright: bool = True) -> Image | None:
     except cv2.error:
         return None
     return None if picture is None else np.asarray(picture, dtype=np.uint8)
+
+
+def exif_orientation(data: bytes) -> int:
+    """The orientation in a JPEG file's EXIF data, 1 to 8; 1 if it states none."""
+    at = data.find(b"Exif\0\0", 0, 65536)
+    tiff = data[at + 6 : at + 65536]
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    if at < 0 or order is None:
+        return 1
+    with suppress(struct.error):
+        (first,) = struct.unpack_from(f"{order}I", tiff, 4)
+        (count,) = struct.unpack_from(f"{order}H", tiff, first)
+        for entry in range(count):
+            tag, _, _, value = struct.unpack_from(f"{order}HHIH", tiff, first + 2 + 12 * entry)
+            if tag == 0x0112:
+                return int(value)
+    return 1
 
 
 def _other_size(size: tuple[int, int], owner: str, wanted: tuple[int, int]) -> str:

@@ -236,7 +236,7 @@ class VideoFile:
         capture = _opened(str(self._path))
         rate = capture.get(cv2.CAP_PROP_FPS)
         rate = rate if np.isfinite(rate) and rate > 0 else self._camera.rate
-        number = 0
+        number, seconds = 0, -1.0 / rate
         try:
             while True:
                 good, picture = capture.read()
@@ -245,7 +245,10 @@ class VideoFile:
                 image = _grey(np.asarray(picture))
                 if number == 0:
                     refuse_wrong_size(image, self._camera, str(self._path))
-                yield Frame(number / rate, image, f"image {number}")
+                shown = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the rate may vary
+                is_later = np.isfinite(shown) and shown > seconds
+                seconds = shown if is_later else seconds + 1.0 / rate
+                yield Frame(seconds, image, f"image {number}")
                 number += 1
         finally:
             capture.release()

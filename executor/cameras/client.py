@@ -277,7 +277,7 @@ def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
         )
     rotation = matrix_from_rotation_vector(turns.mean(axis=0))
     pose = Pose(positions.mean(axis=0), rotation @ first.rotation)
-    covariance = np.mean([sample.covariance for sample in found], axis=0)
+    covariance = np.mean([sample.covariance + sample.shared for sample in found], axis=0)
     columns = structure_matrix(rig, pose)
     lengths = float(np.sqrt(np.max(np.einsum("im,ij,jm->m", columns, covariance, columns))))
     allowed = rig.motion.start_tolerance / 2.0
@@ -285,7 +285,8 @@ def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
         raise _refusal(
             f"the uncertainty of a cable's length is {lengths * 1000:.2f} mm, limit"
             f" {allowed * 1000:.2f} mm",
-            "few tags are visible, from far away or at a steep angle",
+            "few tags are visible, from far away or at a steep angle, or the camera's calibrations,"
+            " or `error_mm`, state an error that large",
         )
     worst = float(np.sqrt(np.max(np.linalg.eigvalsh(covariance[:3, :3]))))
     return RestPose(pose, worst, lengths, len(found))

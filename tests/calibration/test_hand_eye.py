@@ -161,6 +161,14 @@ def test_poses_are_read_by_picture_and_rows_without_one_left_out(tmp_path: Path)
     assert poses["a.png"].position.tolist() == pytest.approx([0.001, 0.002, 0.003])
 
 
+def test_a_log_of_a_run_is_read_as_far_as_it_has_poses_and_images(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    head = "frame, status, picture, x_mm, y_mm, z_mm, qw, qx, qy, qz\n"
+    rows = ("0,ok,a.png,1,2,3,1,0,0,0", "1,ok,,1,2,3,1,0,0,0", "2,no tag,b.png" + ",nan" * 7)
+    path.write_text(head + "\n".join(rows))
+    assert list(read_poses(path)) == ["a.png"]
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [

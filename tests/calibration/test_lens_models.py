@@ -283,6 +283,13 @@ def test_a_camera_comes_back_from_the_files_of_others(rig, tmp_path, form, name)
     file = tmp_path / "camera.yaml"
     file.write_text(FORMATS[form](own))
     plain = rig.document.cameras[0]
+    sure = plain.model_copy(
+        update={
+            "lens_covariance": np.eye(4 + len(plain.distortion)).tolist(),
+            "pose_by_lens": np.zeros((6, 4 + len(plain.distortion))).tolist(),
+        }
+    )
+    assert imported_camera(file, sure) == imported_camera(file, plain), "files state no errors"
     back = imported_camera(file, plain)
     assert back.lens == own.lens
     assert back.distortion == pytest.approx(own.distortion, abs=1e-15)

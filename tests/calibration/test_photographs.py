@@ -12,7 +12,7 @@ from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
 from calibration.intrinsics.quality import judge_camera
 from calibration.targets.boards import Charuco, Chessboard
 from drivers.cameras.files import OneCamerasPictures, read_picture
-from tests.calibration.exif import rotated_by_exif
+from tests.calibration.exif import jpeg, rotated_by_exif
 from tracking.detection.detector import TagDetector
 
 FOLDER = Path(__file__).parent / "photographs"
@@ -79,6 +79,21 @@ def test_rotated_and_coloured_photographs_show_the_same(tmp_path: Path) -> None:
     for name, image in OneCamerasPictures(tmp_path):
         assert image.shape == (480, 640), name
         assert np.abs(BOARD.find(image).corners - expected).max() < 0.3, name
+
+
+def test_orientations_that_change_between_images_are_those_of_a_camera_that_points_down(
+    tmp_path: Path,
+) -> None:
+    """Turned by 180° an image has the same size, but another principal point."""
+    grey = read_picture(chessboards()[0])
+    for name, orientation in (("a", 1), ("b", 3)):
+        (tmp_path / f"{name}.jpg").write_bytes(jpeg(grey, orientation))
+    one, other = (image for _, image in OneCamerasPictures(tmp_path))
+    assert np.array_equal(one, other)
+    (tmp_path / "a.jpg").write_bytes(jpeg(grey, 3))
+    one, other = (image for _, image in OneCamerasPictures(tmp_path))
+    assert np.abs(one.astype(int) - np.rot90(grey, 2)).mean() < 2.0, "all are turned alike"
+    assert np.array_equal(one, other)
 
 
 def test_corners_are_found_in_twelve_megapixels() -> None:

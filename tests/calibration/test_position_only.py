@@ -106,3 +106,9 @@ def test_a_file_of_positions_needs_no_rotation_and_half_of_one_is_refused(
     half.write_text("\n".join([lines[0] + ",qw", *(line + ",1" for line in lines[1:])]))
     with pytest.raises(BadInput, match="'qx' is missing"):
         read_rig_data(half, 8)
+    for column in ("x_mm", "std_x_mm"):
+        half.write_text(
+            "\n".join([lines[0].replace(f",{column}", f",{column.upper()}"), *lines[1:]])
+        )
+        with pytest.raises(BadInput, match=f"'{column}' is missing"):
+            read_rig_data(half, 8)

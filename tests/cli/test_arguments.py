@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import subprocess
@@ -14,7 +15,7 @@ import yaml
 
 from cdpr.cli.arguments import check_arguments
 from model.errors import BadInput
-from tests.cli.plans import CONFIGS, RIG
+from tests.cli.plans import CONFIGS, RIG, write_short_plan
 from tests.cli.program import call, nothing_written, one_message
 
 SCENE = CONFIGS / "environment_1.yaml"
@@ -153,6 +154,26 @@ def test_a_full_disk_behind_standard_output_is_reported() -> None:
     assert "could not write all its output" in done.stderr
     assert "defect" not in done.stderr
     assert "Exception ignored" not in done.stderr
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
+def test_streams_that_were_closed_before_the_start_end_no_run(tmp_path: Path, closed: str) -> None:
+    """As by some service managers."""
+    plan = write_short_plan(tmp_path / "plan.json")
+    words = ("run", plan, "--rig", RIG, "--fast", "--no-camera", "-o", tmp_path / "run")
+    program = "from cdpr.cli import main; main()"
+    done = subprocess.run(
+        ["sh", "-c", f'exec "$0" "$@" {closed}', sys.executable, "-c", program, *map(str, words)],
+        cwd=CONFIGS.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done
+    assert "Traceback" not in done.stderr
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["verdict"] == "PASSED"
+    assert (tmp_path / "run" / "report.html").is_file()
 
 
 def test_a_terminal_of_ascii_only_shows_what_it_can(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -226,6 +226,24 @@ def test_a_killed_run_without_a_cycle_file_has_a_report_too(
     assert "did not finish" in folder.report.read_text()
 
 
+@pytest.mark.parametrize("lost", [("summary.json",), ("summary.json", "clearance.csv")])
+def test_a_report_made_later_does_not_pass_what_the_cameras_failed(
+    tmp_path: Path, lost: tuple[str, ...]
+) -> None:
+    run = fake_run.make(every=5)
+    seen = run.clearance
+    near = replace(seen, distance=seen.distance - 0.05, at_most=seen.at_most - 0.05)
+    folder = fake_run.write(replace(run, clearance=near), tmp_path / "run", pictures=False)
+    course = RunCourse(run.context.started, "virtual", True, True, "finished")
+    folder.write_course(course)
+    folder.write_end_of_course(course)
+    assert folder.summary()["verdict"] == "FAILED"
+    for name in lost:
+        (folder.path / name).unlink()
+    assert call("report", folder.path).code == 0
+    assert RunFolder.open(folder.path).summary()["verdict"] == "FAILED"
+
+
 def test_a_run_that_is_active_has_no_report_yet(killed: RunFolder, tmp_path: Path) -> None:
     folder = cut(killed, tmp_path / "run")
     with folder.held():

@@ -114,6 +114,52 @@ def test_a_video_is_measured_picture_by_picture(
         assert result.observation.pose.distance_to(truth) < 2e-3
 
 
+class Capture:
+    """Images with the times of a container, whose rate varies."""
+
+    def __init__(self, times_ms: list[float], size: tuple[int, int]) -> None:
+        self._times, self._size, self._at = times_ms, size, -1
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        self._at += 1
+        good = self._at < len(self._times)
+        return good, np.zeros(self._size, np.uint8) if good else None
+
+    def get(self, what: int) -> float:
+        return self._times[self._at] if what == cv2.CAP_PROP_POS_MSEC else 10.0
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("stated", "expected"),
+    [
+        ([0.0, 33.0, 66.0, 166.0, 266.0], [0.0, 0.033, 0.066, 0.166, 0.266]),
+        ([0.0, 0.0, 0.0], [0.0, 0.1, 0.2]),
+        ([float("nan")] * 3, [0.0, 0.1, 0.2]),
+        ([0.0, 500.0, 100.0, 900.0], [0.0, 0.5, 0.6, 0.9]),
+    ],
+)
+def test_a_video_may_change_its_rate(
+    tmp_path: Path,
+    camera: Camera,
+    monkeypatch: pytest.MonkeyPatch,
+    stated: list[float],
+    expected: list[float],
+) -> None:
+    path = tmp_path / "run.avi"
+    writer = cv2.VideoWriter(
+        str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (camera.width, camera.height), False
+    )
+    writer.write(np.zeros((camera.height, camera.width), np.uint8))
+    writer.release()
+    video = VideoFile(path, camera)
+    capture = Capture(stated, (camera.height, camera.width))
+    monkeypatch.setattr("drivers.cameras.live._opened", lambda _path: capture)
+    assert [frame.time for frame in video] == pytest.approx(expected)
+
+
 def test_a_file_that_is_no_video_is_refused(tmp_path: Path, camera: Camera) -> None:
     path = tmp_path / "notes.avi"
     path.write_text("not a readable video")

@@ -185,7 +185,7 @@ def readout(
 
       cdpr calibrate readout rig.yaml moving.mp4 -o calibration
 
-      cdpr calibrate readout rig.yaml runs/first/pictures --rate-hz 10
+      cdpr calibrate readout rig.yaml moving/ --rate-hz 30
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)
     made = measure_readout(
