@@ -35,11 +35,13 @@ from model.scene import Scene
 # At its anchor a cable touches the platform, so the platform is compared with the part of each
 # cable farther than a stub from its anchor. The stub is a quarter of the platform's shortest side;
 # a clearance c then means that the cable leaves the platform at an angle of at least
-# arcsin(c / stub). For the same reason, two cables whose anchors (or outlets) are nearer to each
-# other than a stub are compared without a stub at that end.
+# arcsin(c / stub). For the same reason, two cables that share an anchor (or an outlet) are compared
+# without a stub at that end: they could never keep their clearance there.
 
 
 _STUB_SHARE = 0.25
+_SAME = 1e-6
+"""Ends nearer to each other are the same, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,16 +65,26 @@ class SelfModel:
     Attributes:
         pairs: The cables of each compared pair, counted from 0, shape (p, 2).
         stub: Length of cable at its anchor that may be near the platform, [m].
+        stubs: Length left out of both cables of each pair at the anchors and at the outlets, shape
+            (p, 2), [m]; 0 where these are apart.
     """
 
-    def __init__(self, rig: Rig) -> None:
-        """Finds the pairs of cables and the ends that they share."""
+    def __init__(self, rig: Rig, clearance: float) -> None:
+        """Finds the pairs of cables and the ends that they share.
+
+        Args:
+            rig: The robot.
+            clearance: Required between cables, [m].
+        """
         self.rig = rig
         self.stub = _STUB_SHARE * 2.0 * float(np.min(rig.half_size))
         pairs = np.array(list(combinations(range(rig.cable_count), 2)), dtype=np.int64)
         self.pairs: NDArray[np.int64] = pairs.reshape(-1, 2)
-        self._at_anchor = self._stubs_where_near(rig.anchors)
-        self._at_exit = self._stubs_where_near(rig.outlets)
+        ends = np.stack([rig.anchors, rig.outlets], axis=1)
+        apart = np.linalg.norm(ends[self.pairs[:, 0]] - ends[self.pairs[:, 1]], axis=-1)
+        self.stubs: Array = np.where(
+            apart <= 2.0 * rig.cable_radius + clearance + _SAME, self.stub, 0.0
+        )
 
     def cable_pairs(self, cables: Cables) -> Gaps:
         """Distances of the cable pairs in `pairs`; ``cables`` of one pose or a batch."""
@@ -102,15 +114,10 @@ class SelfModel:
         rotated = np.swapaxes(rotations, -1, -2)
         return Gaps(distances, on_cable @ rotated + origin, in_box @ rotated + origin)
 
-    def _stubs_where_near(self, ends: Array) -> Array:
-        """The length left out at one end of both cables of each pair, shape (p, 1), [m]."""
-        apart = np.linalg.norm(ends[self.pairs[:, 0]] - ends[self.pairs[:, 1]], axis=-1)
-        return np.where(apart < self.stub, self.stub, 0.0)[:, None]
-
     def _parts(self, cables: Cables, chosen: NDArray[np.int64]) -> tuple[Array, Array]:
         along = cables.directions[..., chosen, :]
-        start = cables.anchors[..., chosen, :] + self._at_anchor * along
-        end = cables.exits[..., chosen, :] - self._at_exit * along
+        start = cables.anchors[..., chosen, :] + self.stubs[:, :1] * along
+        end = cables.exits[..., chosen, :] - self.stubs[:, 1:] * along
         return start, end
 
 
@@ -241,7 +248,7 @@ class ClearanceModel:
         self.obstacle_names = tuple(obstacle.name for obstacle in scene.obstacles)
         self._body_names = (*(cable_name(i) for i in range(rig.cable_count)), PLATFORM)
         self._radii = np.append(np.full(rig.cable_count, rig.cable_radius), 0.0)
-        self._self = SelfModel(rig)
+        self._self = SelfModel(rig, scene.self_clearance)
         self._obstacles = [
             _ObstacleDistances(convex_bodies(o.shape, o.pose), rig) for o in scene.obstacles
         ]

@@ -75,6 +75,20 @@ def cables_to(rig: Rig, anchors_in_world: Array) -> Cables:
     return _on_pulleys(rig, anchors_in_world)
 
 
+def cables_exist(rig: Rig, anchors: Array) -> NDArray[np.bool_]:
+    """Whether all cables have a path, by pose; anchors shape (k, m, 3), [m]; shape (k,)."""
+    try:
+        cables_to(rig, anchors)
+    except NoCable:
+        if len(anchors) == 1:
+            return np.array([False])
+        half = len(anchors) // 2
+        return np.concatenate(
+            [cables_exist(rig, part) for part in (anchors[:half], anchors[half:])]
+        )
+    return np.ones(len(anchors), dtype=np.bool_)
+
+
 def _on_pulleys(rig: Rig, anchors_in_world: Array) -> Cables:
     radius, feed = rig.pulley_radius, rig.feed_directions
     offset = anchors_in_world - rig.outlets

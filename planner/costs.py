@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from model import kinematics
-from model.kinematics import cables_to, structure_matrix_of
+from model.kinematics import cables_exist, cables_to, structure_matrix_of
 from model.pose import Array, Pose, interpolate
 from model.rig import Rig
 from model.scene import Scene
@@ -87,7 +87,7 @@ class KinematicCost:
         self.lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
         key = [rig.plan_hash, rotation.tolist(), _version()]
         condition, inverse = stored("cost", key, (2, self.lattice.count), self._on_lattice)
-        self.extremes = [(float(v.min()), float(v.max())) for v in (condition, inverse)]
+        self.extremes = [_extremes(v) for v in (condition, inverse)]
         self.values = self._scaled(condition, inverse)
 
     def at(self, positions: Array) -> Array:
@@ -137,9 +137,15 @@ class KinematicCost:
         return self._scaled(*self._indices(np.array([p.position for p in poses]), rotations))
 
     def _on_lattice(self) -> Array:
-        """Both indices at the lattice's points, shape (2, lattice.count)."""
+        """Both indices at the lattice's points, shape (2, lattice.count).
+
+        Infinite where the platform is singular, or a cable has no path over its pulley.
+        """
         points = self.lattice.points(np.arange(self.lattice.count))
-        return np.stack(self._indices(points, self._rotation))
+        exist = cables_exist(self.rig, self.rig.anchors @ self._rotation.T + points[:, None, :])
+        found = np.full((2, self.lattice.count), np.inf)
+        found[:, exist] = self._indices(points[exist], self._rotation)
+        return found
 
     def _indices(self, positions: Array, rotations: Array) -> tuple[Array, Array]:
         """Condition number and inverse volume of the force set, shape (k,) each."""
@@ -147,15 +153,22 @@ class KinematicCost:
         anchors = rig.anchors @ np.swapaxes(rotations, -1, -2) + positions[:, None, :]
         matrices = structure_matrix_of(cables_to(rig, anchors), positions)
         condition = condition_number(matrices, rms_anchor_radius(rig.anchors))
-        return condition, 1.0 / force_volume(matrices, rig.max_tension - rig.min_tension)
+        with np.errstate(divide="ignore"):
+            return condition, 1.0 / force_volume(matrices, rig.max_tension - rig.min_tension)
 
     def _scaled(self, condition: Array, inverse: Array) -> Array:
         scaled = [
-            (v - low) / (high - low) if high > low else np.zeros_like(v)
+            np.where(np.isfinite(v), (v - low) / (high - low if high > low else 1.0), 1.0)
             for v, (low, high) in zip((condition, inverse), self.extremes, strict=True)
         ]
         total: Array = scaled[0] + scaled[1]
         return total
+
+
+def _extremes(values: Array) -> tuple[float, float]:
+    """The smallest and the largest finite value; 0 without any."""
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
 
 
 # Wrench feasibility: weight, payload and the box of disturbances, within the tension limits.

@@ -9,6 +9,7 @@ from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Leg, Scene, legs_of
+from planner.check import SPACING
 from planner.costs import capacity_margins
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
@@ -33,6 +34,7 @@ def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) 
             _require_same_orientation(leg)
         for name, pose in ((leg.begin, leg.scene.start), (leg.end, leg.scene.goal)):
             _require_in_workspace(rig, name, pose)
+            _require_off_pulley_axes(rig, name, pose)
             _require_clear(scene, model, name, pose)
             _require_holdable(rig, leg.scene, name, pose)
 
@@ -82,6 +84,24 @@ def _require_in_workspace(rig: Rig, name: str, pose: Pose) -> None:
         where=f"scene {name}",
         next_step=f"move the {name} into the workspace box of the rig file",
         values={"outside_mm": outside * 1e3},
+    )
+
+
+def _require_off_pulley_axes(rig: Rig, name: str, pose: Pose) -> None:
+    """As the check of a path requires: four pulley radii, and its distance between samples."""
+    offset = pose.apply(rig.anchors) - rig.outlets
+    along = np.sum(offset * rig.feed_directions, axis=-1, keepdims=True)
+    reach = np.linalg.norm(offset - along * rig.feed_directions, axis=-1)
+    cable, needed = int(np.argmin(reach)), 4.0 * rig.pulley_radius + SPACING
+    if rig.pulley_radius == 0.0 or reach[cable] >= needed:
+        return
+    raise BadInput(
+        f"at the {name} the anchor of cable {cable + 1} is {reach[cable] * 1e3:.1f} mm from the"
+        f" swivel axis of its pulley, less than the required {needed * 1e3:.1f} mm",
+        where=f"scene {name}",
+        why="nearer than four pulley radii the motion of the cable's exit cannot be bounded",
+        next_step=f"move the {name}, or the outlet in the rig file",
+        values={"cable": cable + 1, "distance_mm": float(reach[cable]) * 1e3},
     )
 
 

@@ -221,6 +221,7 @@ def make_plan(
     poses = [space.pose(point) for point in route.path]
     report = check_path(rig, scene, poses, path.stops)
     if not report.passed:
+        _require_winch_speeds(rig, report)
         raise Fault(
             "the planned path failed its own check: "
             + "; ".join(v.sentence() for v in report.violations),
@@ -433,3 +434,14 @@ def _quality(report: CheckReport, raw: Array, mean_cost: float) -> dict[str, Any
         "min_tension_n": report.min_tension,
         "max_tension_n": report.max_tension,
     }
+
+
+def _require_winch_speeds(rig: Rig, report: CheckReport) -> None:
+    """Refuses a rig whose winches are slower than the path needs, which no other path mends."""
+    if all(violation.unit == "mm/s" for violation in report.violations):
+        raise BadInput(
+            report.violations[0].sentence(),
+            where=f"rig {rig.name}",
+            why="the platform moves along every path at motion.speed_mm_s",
+            next_step="reduce motion.speed_mm_s, or correct winches[].max_speed_mm_s",
+        )

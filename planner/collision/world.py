@@ -152,11 +152,11 @@ def unproved_robot(rig: Rig, world: World, clearance: float) -> Robot:
             f"the self clearance must be 0 mm or more (it is {clearance * 1000.0:g} mm)",
             where="exact edge checks",
         )
-    model = SelfModel(rig)
+    model = SelfModel(rig, clearance)
     guard = ROUND_OFF * float(max(np.abs(rig.outlets).max(), np.abs(world.limits).max()))
     return Robot(
         pairs=np.array(model.pairs),
-        stubs=np.column_stack([_stubs(rig.anchors, model), _stubs(rig.outlets, model)]),
+        stubs=np.array(model.stubs),
         stub=float(model.stub),
         pair_needed=clearance + 2.0 * rig.cable_radius + guard,
         platform_needed=clearance + rig.cable_radius + guard,
@@ -173,13 +173,6 @@ def _open_cells(world: World, robot: Robot, left: list[int]) -> Masks:
         word, bit = number // WORD, np.uint64(1 << (number % WORD))
         mark_open_cells(world, robot, which, masks, word, bit)
     return masks
-
-
-def _stubs(ends: Array, model: SelfModel) -> Array:
-    """Lengths left out where two cables share an end, shape (q,); as in `model.clearance`."""
-    apart = np.linalg.norm(ends[model.pairs[:, 0]] - ends[model.pairs[:, 1]], axis=-1)
-    stubs: Array = np.where(apart < model.stub, model.stub, 0.0)
-    return stubs
 
 
 @kernel

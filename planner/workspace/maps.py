@@ -10,10 +10,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.clearance import SelfModel
-from model.kinematics import Cables, NoCable, cables_to, structure_matrix_of
+from model.kinematics import Cables, cables_exist, cables_to, structure_matrix_of
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
@@ -90,7 +89,7 @@ def values_at(question: Question, positions: Array) -> Values:
         Shape (k,) each, SI, by name; NaN where a cable has no exit point.
     """
     anchors = question.rig.anchors @ question.rotation.T + positions[:, None, :]
-    runs = _cables_run(question.rig, anchors)
+    runs = cables_exist(question.rig, anchors)
     values = {name: np.full(len(positions), np.nan) for name in question.quantities}
     numbers = np.flatnonzero(runs)
     for start in range(0, len(numbers), _POSES_AT_ONCE):
@@ -114,18 +113,6 @@ class _Robots:
     @property
     def matrices(self) -> Array:
         return structure_matrix_of(self.cables, self.positions)
-
-
-def _cables_run(rig: Rig, anchors: Array) -> NDArray[np.bool_]:
-    """Whether all cables have exit points; anchors shape (k, m, 3), [m]; shape (k,)."""
-    try:
-        cables_to(rig, anchors)
-    except NoCable:
-        if len(anchors) == 1:
-            return np.array([False])
-        half = len(anchors) // 2
-        return np.concatenate([_cables_run(rig, part) for part in (anchors[:half], anchors[half:])])
-    return np.ones(len(anchors), dtype=np.bool_)
 
 
 def _closure(robots: _Robots) -> Array:
@@ -163,7 +150,8 @@ def _volume(robots: _Robots) -> Array:
 
 def _own_clearance(robots: _Robots) -> Array:
     question = robots.question
-    model = SelfModel(question.rig)
+    scene = question.scene
+    model = SelfModel(question.rig, 0.0 if scene is None else scene.self_clearance)
     pairs = model.cable_pairs(robots.cables).distances.min(axis=-1, initial=np.inf)
     platform = model.to_platform(robots.cables, robots.positions, question.rotation).distances
     return np.asarray(np.minimum(pairs, platform.min(axis=-1)))

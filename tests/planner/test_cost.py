@@ -5,12 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from model.errors import BadInput
+from model.files.rig_file import RigDocument
 from model.kinematics import structure_matrix
 from model.pose import Pose
+from model.rig import Rig, rig_from_document
 from model.statics.wrench_sets import condition_number, force_volume, rms_anchor_radius
 from planner.costs import KinematicCost, LengthCost
 from planner.kernels import jit as stored
+from planner.planning import make_plan
 from planner.space import Lattice, corners_and_weights
+from tests.cli.plans import free_scene
+from tests.model.rig_builds import paper_rig_with_pulleys
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +122,61 @@ def test_trilinear_weights_reproduce_a_linear_function() -> None:
     corners, weights = corners_and_weights(lattice, points)
     values = lattice.points(corners.ravel()).reshape(50, 8, 3) @ slope
     assert np.sum(values * weights, axis=1) == pytest.approx(points @ slope)
+
+
+def changed(rig: Rig, **changes: object) -> Rig:
+    return rig_from_document(RigDocument.model_validate(rig.document.model_dump() | changes))
+
+
+def singular_in_the_middle(gachon: Rig) -> Rig:
+    """Mirrored about z = 500 mm, where the structure matrix loses a rank, and crossed in height."""
+    turns = {s: np.array([[1.0, -s, 0.0], [s, 1.0, 0.0], [0.0, 0.0, 1.0]]) for s in (1.0, -1.0)}
+    around = [(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]
+    return changed(
+        gachon,
+        outlets_mm=[[500.0 * x, 500.0 * y, 500.0 + 500.0 * s] for s in turns for x, y in around],
+        anchors_mm=[
+            (turn @ [65.0 * x, 65.0 * y, -65.0 * s] * [0.5**0.5, 0.5**0.5, 1.0]).tolist()
+            for s, turn in turns.items()
+            for x, y in around
+        ],
+    )
+
+
+def test_a_singular_pose_in_the_workspace_spoils_no_other(gachon) -> None:
+    """A whole plane of the lattice is singular; the cost is the worst there, and finite."""
+    rig = singular_in_the_middle(gachon)
+    cost = KinematicCost(rig, np.eye(3))
+    points = cost.lattice.points(np.arange(cost.lattice.count))
+    assert (np.abs(points[:, 2] - 0.5) < 1e-9).any()
+    assert np.isfinite(cost.values).all()
+    assert cost.values.min() >= 0.0
+    assert cost.values.max() <= 2.0
+
+
+@pytest.mark.slow
+def test_poses_without_a_cable_path_spoil_no_plan_elsewhere() -> None:
+    """The whole frame as workspace: near an outlet an anchor would be inside its pulley."""
+    rig = changed(
+        paper_rig_with_pulleys(13.0),
+        workspace={"lower_mm": [-500.0, -500.0, 0.0], "upper_mm": [500.0, 500.0, 900.0]},
+    )
+    cost = KinematicCost(rig, np.eye(3))
+    assert np.isfinite(cost.values).all()
+    scene = free_scene((0.0, 0.0, 400.0), (100.0, 50.0, 500.0))
+    assert make_plan(rig, scene).waypoints[-1].pose().distance_to(scene.goal) < 1e-9
+
+
+def test_winches_slower_than_the_platform_are_no_fault_of_the_program(gachon) -> None:
+    winches = [w | {"max_speed_mm_s": 5.0} for w in gachon.document.model_dump()["winches"]]
+    scene = free_scene((0.0, 0.0, 400.0), (100.0, 0.0, 400.0))
+    with pytest.raises(BadInput, match="faster than its winch can") as caught:
+        make_plan(changed(gachon, winches=winches), scene)
+    assert "motion.speed_mm_s" in caught.value.next_step
+
+
+def test_an_end_near_a_pulleys_axis_is_refused_before_the_search() -> None:
+    rig = paper_rig_with_pulleys(200.0)
+    with pytest.raises(BadInput, match="swivel axis") as caught:
+        make_plan(rig, free_scene((-100.0, 0.0, 400.0), (100.0, 0.0, 400.0)))
+    assert "four pulley radii" in str(caught.value)
