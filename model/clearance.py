@@ -36,7 +36,7 @@ from model.scene import Scene
 # cable farther than a stub from its anchor. The stub is a quarter of the platform's shortest side;
 # a clearance c then means that the cable leaves the platform at an angle of at least
 # arcsin(c / stub). For the same reason, two cables that share an anchor (or an outlet) are compared
-# without a stub at that end: they could never keep their clearance there.
+# without a stub at that end: they touch there.
 
 
 _STUB_SHARE = 0.25
@@ -69,22 +69,15 @@ class SelfModel:
             (p, 2), [m]; 0 where these are apart.
     """
 
-    def __init__(self, rig: Rig, clearance: float) -> None:
-        """Finds the pairs of cables and the ends that they share.
-
-        Args:
-            rig: The robot.
-            clearance: Required between cables, [m].
-        """
+    def __init__(self, rig: Rig) -> None:
+        """Finds the pairs of cables and the ends that they share, where they touch."""
         self.rig = rig
         self.stub = _STUB_SHARE * 2.0 * float(np.min(rig.half_size))
         pairs = np.array(list(combinations(range(rig.cable_count), 2)), dtype=np.int64)
         self.pairs: NDArray[np.int64] = pairs.reshape(-1, 2)
         ends = np.stack([rig.anchors, rig.outlets], axis=1)
         apart = np.linalg.norm(ends[self.pairs[:, 0]] - ends[self.pairs[:, 1]], axis=-1)
-        self.stubs: Array = np.where(
-            apart <= 2.0 * rig.cable_radius + clearance + _SAME, self.stub, 0.0
-        )
+        self.stubs: Array = np.where(apart <= 2.0 * rig.cable_radius + _SAME, self.stub, 0.0)
 
     def cable_pairs(self, cables: Cables) -> Gaps:
         """Distances of the cable pairs in `pairs`; ``cables`` of one pose or a batch."""
@@ -248,7 +241,7 @@ class ClearanceModel:
         self.obstacle_names = tuple(obstacle.name for obstacle in scene.obstacles)
         self._body_names = (*(cable_name(i) for i in range(rig.cable_count)), PLATFORM)
         self._radii = np.append(np.full(rig.cable_count, rig.cable_radius), 0.0)
-        self._self = SelfModel(rig, scene.self_clearance)
+        self._self = SelfModel(rig)
         self._obstacles = [
             _ObstacleDistances(convex_bodies(o.shape, o.pose), rig) for o in scene.obstacles
         ]

@@ -152,7 +152,7 @@ def unproved_robot(rig: Rig, world: World, clearance: float) -> Robot:
             f"the self clearance must be 0 mm or more (it is {clearance * 1000.0:g} mm)",
             where="exact edge checks",
         )
-    model = SelfModel(rig, clearance)
+    model = SelfModel(rig)
     guard = ROUND_OFF * float(max(np.abs(rig.outlets).max(), np.abs(world.limits).max()))
     return Robot(
         pairs=np.array(model.pairs),

@@ -150,8 +150,7 @@ def _volume(robots: _Robots) -> Array:
 
 def _own_clearance(robots: _Robots) -> Array:
     question = robots.question
-    scene = question.scene
-    model = SelfModel(question.rig, 0.0 if scene is None else scene.self_clearance)
+    model = SelfModel(question.rig)
     pairs = model.cable_pairs(robots.cables).distances.min(axis=-1, initial=np.inf)
     platform = model.to_platform(robots.cables, robots.positions, question.rotation).distances
     return np.asarray(np.minimum(pairs, platform.min(axis=-1)))

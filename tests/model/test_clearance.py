@@ -210,7 +210,7 @@ def test_start_and_goal_of_the_paper_have_the_known_clearances() -> None:
 @given(st.tuples(st.floats(-0.25, 0.25), st.floats(-0.25, 0.25), st.floats(0.15, 0.65)))
 def test_crossing_cables_pass_at_11_to_16_mm_over_the_workspace(position) -> None:
     model = ClearanceModel(GACHON, scene_with())
-    pairs = SelfModel(GACHON, 0.005)
+    pairs = SelfModel(GACHON)
     gaps = pairs.cable_pairs(cables_at(GACHON, Pose.level(position)))
     k = int(np.argmin(gaps.distances))
     assert tuple(pairs.pairs[k] + 1) in {(1, 5), (2, 6), (3, 7), (4, 8)}
@@ -295,14 +295,14 @@ def test_cables_that_share_an_anchor_are_compared_beyond_a_stub() -> None:
     anchors = [list(a) for a in document.anchors_mm]
     anchors[1] = anchors[0]
     rig = rig_from_document(document.model_copy(update={"anchors_mm": anchors}))
-    model = SelfModel(rig, 0.005)
+    model = SelfModel(rig)
     cables = cables_at(rig, rig.home)
     shared = model.cable_pairs(cables).distances[0]
     angle = np.arccos(cables.directions[0] @ cables.directions[1])
     assert shared == pytest.approx(2 * model.stub * np.sin(angle / 2))
 
 
-@pytest.mark.parametrize("apart_mm", [0.0, 8.9, 9.1, 30.0])
+@pytest.mark.parametrize("apart_mm", [0.0, 3.9, 4.1, 30.0])
 def test_ends_that_are_only_near_each_other_leave_nothing_out(apart_mm: float) -> None:
     """Two posts with outlets close together, whose cables cross just below them."""
     document = GACHON.document
@@ -311,9 +311,9 @@ def test_ends_that_are_only_near_each_other_leave_nothing_out(apart_mm: float) -
     cables = document.cables.model_copy(update={"radius_mm": 2.0})
     update = {"outlets_mm": outlets, "cables": cables}
     rig = rig_from_document(document.model_copy(update=update))
-    model = SelfModel(rig, 0.005)
+    model = SelfModel(rig)
     assert model.stub == pytest.approx(0.0325)
-    assert (model.stubs[0] > 0.0).tolist() == [False, apart_mm < 9.0]
+    assert (model.stubs[0] > 0.0).tolist() == [False, apart_mm < 4.0]
 
 
 def test_the_cable_radius_reduces_every_distance() -> None:

@@ -47,7 +47,7 @@ def shared_anchors(rig: Rig) -> Rig:
 
 def gaps(rig: Rig, positions: Array, rotations: Array) -> Array:
     """Smallest self clearance at each pose, shape (k,)."""
-    model = SelfModel(rig, 0.005)
+    model = SelfModel(rig)
     anchors = np.einsum("kij,mj->kmi", rotations, rig.anchors) + positions[:, None, :]
     cables = cables_to(rig, anchors)
     between = model.cable_pairs(cables).distances.min(axis=-1)
