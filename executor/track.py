@@ -18,7 +18,7 @@ from executor.kernels import ready_to_measure
 from executor.recording.mcap import write_track_mcap
 from executor.trajectory.setpoints import prepare
 from model.clearance import ClearanceModel
-from model.errors import BadInput
+from model.errors import BadInput, CdprError
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -55,7 +55,7 @@ class TrackResult:
         together: Images of several cameras without partners; None for one camera.
         unused: Why files were not used, by camera and name.
         with_clearance: Whether obstacles are known.
-        began: Start time, [ns since 1970].
+        began: Time 0 of the measurements, [ns since 1970]; for live cameras that of their clock.
         seconds: Total time, [s].
     """
 
@@ -163,6 +163,7 @@ def track_sources(
     overlay: Path | None = None,
     replace_overlay: bool = False,
     stopped: Callable[[], bool] = lambda: False,
+    keep: Callable[[TrackResult], None] = lambda _partial: None,
     listener: Listener = SILENT,
 ) -> TrackResult:
     """Measures the platform's pose image by image, by one camera or several together.
@@ -177,6 +178,8 @@ def track_sources(
         overlay: Folder or video for the images with measurements drawn in.
         replace_overlay: Whether it may exist.
         stopped: Called before each image; True ends tracking.
+        keep: Called with what was measured before an error that ends tracking, unless no image gave
+            a pose; the error is then raised.
         listener: Receives progress, and files that are not used.
 
     Raises:
@@ -202,7 +205,9 @@ def track_sources(
     ]
     totals = [total for _, total in opened if total is not None]
     total = max(totals) if len(totals) == len(opened) else None
-    result.began = time.time_ns()
+    started = time.monotonic_ns()
+    is_live = any(length is None for _, length in opened)  # then times are of the monotonic clock
+    result.began = time.time_ns() - (started if is_live else 0)
     with ExitStack() as drawing, listener.progress("tracking", pictures or total) as advance:
         streams: dict[str, Iterator[LoggedPicture]] = {}
         for camera, (frames, length) in zip(sources, opened, strict=True):
@@ -217,8 +222,14 @@ def track_sources(
             )
         # The fastest camera defines the time window of simultaneous images.
         within = 0.5 / max(camera.rate for camera in sources)
-        _measure(_together(streams, within, result.together, model), result, advance)
-    result.seconds = (time.time_ns() - result.began) * 1e-9
+        try:
+            _measure(_together(streams, within, result.together, model), result, advance)
+        except CdprError:
+            result.seconds = (time.monotonic_ns() - started) * 1e-9
+            if result.count.poses:
+                keep(result)
+            raise
+    result.seconds = (time.monotonic_ns() - started) * 1e-9
     return result
 
 

@@ -11,10 +11,16 @@ import typer
 
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
-from cdpr.cli.output import Terminal, show_facts, show_json
+from cdpr.cli.output import Terminal, err, show_facts, show_json, show_line
 from executor.cameras.sources import parse_camera_sources
 from executor.supervision import LocalRequests
-from executor.track import own_drawing, own_file, require_plan_used, track_sources
+from executor.track import (
+    TrackResult,
+    own_drawing,
+    own_file,
+    require_plan_used,
+    track_sources,
+)
 from model.files.output import refuse_overwriting, require_new_file
 from model.plan import load_plan, require_same_rig
 from model.rig import Camera, load_rig
@@ -87,6 +93,11 @@ def track(
     if plan is not None and the_plan is not None:
         require_same_rig(the_plan, the_rig, plan)
     requests = LocalRequests()
+
+    def keep(partial: TrackResult) -> None:
+        partial.save(output, mcap)
+        show_line(f"{len(partial.pictures)} images before the error are in {output}", err)
+
     with stop_requests(requests):
         result = track_sources(
             the_rig,
@@ -97,6 +108,7 @@ def track(
             overlay=overlay,
             replace_overlay=force,
             stopped=lambda: requests.read().stop,
+            keep=keep,
             listener=Terminal(quiet=as_json),
         )
     result.save(output, mcap)

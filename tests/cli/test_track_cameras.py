@@ -19,6 +19,8 @@ from model.rig import load_rig
 from simulation.camera.camera import SyntheticCamera
 from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan
 from tests.cli.program import call, nothing_written, one_message
+from tracking.shared_errors import CameraMoved
+from tracking.tracker import Tracker
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +53,27 @@ def plan(rig_file: Path) -> Path:
 def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as stream:
         return list(csv.DictReader(stream))
+
+
+def test_what_was_measured_before_a_fault_is_kept(
+    plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as a camera that is bumped, or unplugged, after an hour."""
+    log, observe = tmp_path / "poses.csv", Tracker.observe
+    images: list[float] = []
+
+    def bumped(self: Tracker, picture: np.ndarray, time: float, *rest: object) -> object:
+        images.append(time)
+        if len(images) == 5:
+            raise CameraMoved("the camera has moved", where="camera front")
+        return observe(self, picture, time, *rest)
+
+    monkeypatch.setattr(Tracker, "observe", bumped)
+    answer = call("track", RIG, "synthetic", "--plan", plan, "--pictures", "9", "-o", log)
+    assert answer.code == 1
+    assert "the camera has moved" in answer.err
+    assert f"4 images before the error are in {log}" in " ".join(answer.err.split())
+    assert len(rows_of(log)) == 4
 
 
 def test_two_cameras_are_logged_together_and_alone(
