@@ -205,9 +205,8 @@ def track_sources(
     ]
     totals = [total for _, total in opened if total is not None]
     total = max(totals) if len(totals) == len(opened) else None
-    started = time.monotonic_ns()
     is_live = any(length is None for _, length in opened)  # then times are of the monotonic clock
-    result.began = time.time_ns() - (started if is_live else 0)
+    result.began = time.time_ns() - (time.monotonic_ns() if is_live else 0)
     with ExitStack() as drawing, listener.progress("tracking", pictures or total) as advance:
         streams: dict[str, Iterator[LoggedPicture]] = {}
         for camera, (frames, length) in zip(sources, opened, strict=True):
@@ -225,11 +224,9 @@ def track_sources(
         try:
             _measure(_together(streams, within, result.together, model), result, advance)
         except CdprError:
-            result.seconds = (time.monotonic_ns() - started) * 1e-9
             if result.count.poses:
                 keep(result)
             raise
-    result.seconds = (time.monotonic_ns() - started) * 1e-9
     return result
 
 
@@ -239,13 +236,15 @@ def _measure(
     advance: Callable[[float, str], None],
 ) -> None:
     """Adds all measurements to the result."""
-    pace = FrameRate()
+    pace, began = FrameRate(), time.monotonic()
     for found, alone in measured:
         result.pictures.append(found)
         for name, own in result.by_camera.items():
             if name in alone:
                 own.append(alone[name])
-        pace.take(time.monotonic(), result.count.seconds[-1])
+        now = time.monotonic()
+        result.seconds = now - began
+        pace.take(now, result.count.seconds[-1])
         seen = found.observation
         tags = len(seen.tags) if isinstance(seen, PoseMeasurement) else 0
         advance(len(result.pictures), pace.text(tags))

@@ -45,6 +45,8 @@ from planner.check_report import (
 from planner.path import PosePath
 
 SPACING = 0.005
+AXIS_RADII = 4.0
+"""Smallest distance of an anchor from its pulley's swivel axis, in pulley radii."""
 CLEARANCE_TOLERANCE = 0.1e-3
 """Tolerance of the smallest clearances, [m]."""
 MARGIN_TOLERANCE = 0.02
@@ -214,14 +216,12 @@ class _Check:
             return
         for sample in self.samples.tolist():
             pose = self._pose(sample)
-            offset = pose.apply(self.rig.anchors) - self.rig.outlets
-            along = np.sum(offset * self.rig.feed_directions, axis=-1, keepdims=True)
-            reach = np.linalg.norm(offset - along * self.rig.feed_directions, axis=-1)
+            reach = axis_distances(self.rig, pose)
             k = int(np.argmin(reach))
             nearest = float(reach[k]) - SPACING  # it may come nearer between samples
-            if not nearest >= 4.0 * radius:
+            if not nearest >= AXIS_RADII * radius:
                 what = f"cable {k + 1} is too close to its pulley's axis to bound its motion"
-                self._violation(what, nearest, 4.0 * radius, "mm", pose.position)
+                self._violation(what, nearest, AXIS_RADII * radius, "mm", pose.position)
                 return
 
     def _obstacle_clearance(self) -> tuple[Closest | None, Smallest | None]:
@@ -383,3 +383,11 @@ class _Check:
         self, what: str, measured: float, limit: float, unit: str, position: Array
     ) -> None:
         self.violations.append(Violation(what, float(measured), float(limit), unit, position))
+
+
+def axis_distances(rig: Rig, pose: Pose) -> Array:
+    """Distances of the anchors from the swivel axes of their pulleys, shape (m,), [m]."""
+    offset = pose.apply(rig.anchors) - rig.outlets
+    along = np.sum(offset * rig.feed_directions, axis=-1, keepdims=True)
+    distances: Array = np.linalg.norm(offset - along * rig.feed_directions, axis=-1)
+    return distances

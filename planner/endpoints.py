@@ -9,7 +9,7 @@ from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Leg, Scene, legs_of
-from planner.check import SPACING
+from planner.check import AXIS_RADII, SPACING, axis_distances
 from planner.costs import capacity_margins
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
@@ -89,11 +89,11 @@ def _require_in_workspace(rig: Rig, name: str, pose: Pose) -> None:
 
 def _require_off_pulley_axes(rig: Rig, name: str, pose: Pose) -> None:
     """As the check of a path requires: four pulley radii, and its distance between samples."""
-    offset = pose.apply(rig.anchors) - rig.outlets
-    along = np.sum(offset * rig.feed_directions, axis=-1, keepdims=True)
-    reach = np.linalg.norm(offset - along * rig.feed_directions, axis=-1)
-    cable, needed = int(np.argmin(reach)), 4.0 * rig.pulley_radius + SPACING
-    if rig.pulley_radius == 0.0 or reach[cable] >= needed:
+    if rig.pulley_radius == 0.0:
+        return
+    reach, needed = axis_distances(rig, pose), AXIS_RADII * rig.pulley_radius + SPACING
+    cable = int(np.argmin(reach))
+    if reach[cable] >= needed:
         return
     raise BadInput(
         f"at the {name} the anchor of cable {cable + 1} is {reach[cable] * 1e3:.1f} mm from the"

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Generic, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
@@ -96,7 +96,7 @@ class PlanCommand(_Command):
         scene: File of the scene; None for the taught poses.
         objective: What the path minimizes.
         from_here: The path begins at the current pose, then goes through the taught poses in order.
-        pose: Only to this taught pose, from the present one.
+        pose: Only to this taught pose, from the current one.
     """
 
     command: Literal["plan"]
@@ -209,16 +209,47 @@ def parse_message(text: str) -> Message | Held | LetGo:
         raise NotAMessage("; ".join(str(problem["msg"]) for problem in problems[:3])) from None
 
 
+T = TypeVar("T")
+
+
+class Newest(Generic[T]):
+    """Keeps the newest of several values until it is taken."""
+
+    def __init__(self) -> None:
+        """Starts empty."""
+        self.value: T | None = None
+        self._is_there = asyncio.Event()
+
+    def put(self, value: T) -> None:
+        """Replaces what is not taken yet."""
+        self.value = value
+        self._is_there.set()
+
+    async def take(self) -> T:
+        """Waits for a value."""
+        while self.value is None:
+            self._is_there.clear()
+            await self._is_there.wait()
+        value, self.value = self.value, None
+        return value
+
+
 class Inbox:
-    """Messages of a page that are not yet executed: bounded, however many it sends."""
+    """Messages of a page that are not yet executed: bounded, however many it sends.
+
+    Attributes:
+        commands: To be executed in order.
+        refused: Refused commands, by number, and why.
+        held: The newest report of a press: its number, the message, and when it arrived.
+        released: The newest press that is over.
+    """
 
     def __init__(self) -> None:
         """Starts empty."""
         self.commands: asyncio.Queue[Message] = asyncio.Queue(MOST_WAITING)
         self.refused: asyncio.Queue[tuple[int, str]] = asyncio.Queue(MOST_WAITING)
-        self._held: tuple[int, Held, float] | None = None
-        self._release: int | None = None
-        self._has_held, self._has_release = asyncio.Event(), asyncio.Event()
+        self.held = Newest[tuple[int, Held, float]]()
+        self.released = Newest[int]()
 
     def refuse(self, command: int, why: str) -> None:
         """Queues the answer to a refused message; drops it if the page does not read answers."""
@@ -226,35 +257,17 @@ class Inbox:
             self.refused.put_nowait((command, why))
 
     def hold(self, press: int | None, message: Held) -> None:
-        """Keeps the newest report of a press, with the time of its arrival."""
+        """Keeps a report of a press, with the time of its arrival."""
         if press is not None:
-            self._held = press, message, time.monotonic()
-            self._has_held.set()
+            self.held.put((press, message, time.monotonic()))
 
     def let_go(self, press: int | None) -> None:
-        """Keeps the newest press that is over, and drops its reports."""
+        """Keeps a press that is over, and drops its reports."""
         if press is None:
             return
-        if self._held is not None and self._held[0] <= press:
-            self._held = None
-        self._release = max(press, self._release or 0)
-        self._has_release.set()
-
-    async def next_held(self) -> tuple[int, Held, float]:
-        """Waits for a report of a press; returns both with the time of its arrival."""
-        while self._held is None:
-            self._has_held.clear()
-            await self._has_held.wait()
-        held, self._held = self._held, None
-        return held
-
-    async def next_release(self) -> int:
-        """Waits for a press that is over."""
-        while self._release is None:
-            self._has_release.clear()
-            await self._has_release.wait()
-        release, self._release = self._release, None
-        return release
+        if self.held.value is not None and self.held.value[0] <= press:
+            self.held.value = None
+        self.released.put(max(press, self.released.value or 0))
 
 
 # Which page has control, and the numbers of its jog presses. Pure.

@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager, contextmanager, suppress
 from importlib.resources import files
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 import uvicorn
@@ -45,6 +45,9 @@ _KINDS = {
     ".txt": "text/plain",
     ".md": "text/plain; charset=utf-8",
 }
+
+
+T = TypeVar("T")
 
 
 class ConsoleServer:
@@ -188,12 +191,8 @@ class ConsoleServer:
 
     async def _stop(self) -> Response:
         """STOP without a socket; needs no token."""
-        why_not = await self._run_stop(self._console.stop)
+        why_not = await _run_in(self._stops, self._console.stop)
         return JSONResponse({"ok": not why_not, "what": why_not})
-
-    async def _run_stop(self, stop: Callable[..., str], *arguments: Any) -> str:
-        """Runs STOP in its own threads, so that it waits for no other request."""
-        return await asyncio.get_running_loop().run_in_executor(self._stops, stop, *arguments)
 
     # The socket.
 
@@ -281,7 +280,7 @@ class ConsoleServer:
             inbox.commands.put_nowait(message)
 
     async def _stop_and_answer(self, page: WebSocket, number: int, message: Message) -> None:
-        why_not = await self._run_stop(self._console.command, number, message)
+        why_not = await _run_in(self._stops, self._console.command, number, message)
         await _answer(page, message.id, why_not)
 
     async def _execute_commands(self, page: WebSocket, number: int, inbox: Inbox) -> None:
@@ -293,14 +292,18 @@ class ConsoleServer:
     async def _forward_held(self, inbox: Inbox) -> None:
         """Forwards the newest report of a held control; one that waited too long is dropped."""
         while True:
-            await self._run_press(self._console.forward_held, *await inbox.next_held())
+            report = await inbox.held.take()
+            await _run_in(self._presses, self._console.forward_held, *report)
 
     async def _forward_releases(self, inbox: Inbox) -> None:
         while True:
-            await self._run_press(self._console.end_press, await inbox.next_release())
+            press = await inbox.released.take()
+            await _run_in(self._presses, self._console.end_press, press)
 
-    async def _run_press(self, forward: Callable[..., None], *arguments: Any) -> None:
-        await asyncio.get_running_loop().run_in_executor(self._presses, forward, *arguments)
+
+async def _run_in(pool: ThreadPoolExecutor, work: Callable[..., T], *arguments: Any) -> T:
+    """Works in threads of its own, so that it waits for no other request."""
+    return await asyncio.get_running_loop().run_in_executor(pool, work, *arguments)
 
 
 async def _send_refusals(page: WebSocket, inbox: Inbox) -> None:

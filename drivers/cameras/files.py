@@ -110,17 +110,19 @@ class OneCamerasPictures:
         files = picture_files(folder)
         self.unused: dict[str, str] = {}
         sizes: dict[Path, tuple[int, int]] = {}
+        orientations = set()
         for path in files:
-            image = read_picture(path)
+            data = _data(path)
+            image = _decoded(data)
             if image is None:
                 self.unused[path.name] = _NO_PICTURE
             else:
                 sizes[path] = _size(image)
+                orientations.add(exif_orientation(data))
         if not sizes:
             raise _no_picture(folder, len(files))
         self.upright = True
-        mixed = len({exif_orientation(read_bytes(path, PICTURE_LIMIT)) for path in sizes}) > 1
-        if mixed or set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
+        if len(orientations) > 1 or set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
             as_stored = {path: _size(read_picture(path, upright=False)) for path in sizes}
             if set(as_stored.values()) == {wanted or next(iter(as_stored.values()))}:
                 sizes, self.upright = as_stored, False
@@ -168,10 +170,18 @@ def read_picture(path: Path, upright: bool = True) -> Image | None:
         path: The file.
         upright: Whether to apply the EXIF orientation.
     """
+    return _decoded(_data(path), upright)
+
+
+def _data(path: Path) -> bytes:
+    """The content of a file; empty if it cannot be read."""
     try:
-        data = read_bytes(path, PICTURE_LIMIT)
+        return read_bytes(path, PICTURE_LIMIT)
     except BadInput:
-        return None
+        return b""
+
+
+def _decoded(data: bytes, upright: bool = True) -> Image | None:
     if not data or is_too_large(data):
         return None
     flags = cv2.IMREAD_GRAYSCALE | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)

@@ -11,7 +11,7 @@ from drivers.cia402.sdo import NOT_NOW, SetupNetwork
 from drivers.cia402.sdo_jobs import CSP_MODE, OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
 from model.errors import Refused
-from model.files.drive_profile_file import ProfileDocument, object_key
+from model.files.drive_profile_file import ProfileDocument, object_key, object_name
 from model.files.rig_file import Cia402Document
 from model.rig import Rig
 
@@ -130,10 +130,10 @@ def require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
     """
     if setting.per_mille_of is not None:
         index, sub = setting.per_mille_of
-        rated = Expectation(index, sub, 0xFFFFFFFF, 0, "rated value", "")
-        if not any(network.client(node).read(index, sub, rated.name)):
+        if not any(network.client(node).read(index, sub, "rated value")):
+            name = f"{object_name(index, sub)} rated value"
             why = f"{setting} is a share of it: the drive would have no torque"
-            raise wrong_value(node, str(rated), "0", "the motor's data", why)
+            raise wrong_value(node, name, "0", "the motor's data", why)
     if setting.optional or setting.transient:
         return
     try:

@@ -359,12 +359,12 @@ class Cia402Group(CyclicGroup):
             if all(state is DriveState.OPERATION_ENABLED for state in states) and not idle:
                 self._check_modes()
             elif self._cycles_to_goal > self._patience:
-                self._latch(self._late((DriveState.OPERATION_ENABLED,)) or idle)
+                self._latch(self._late((DriveState.OPERATION_ENABLED,), self._patience) or idle)
         elif self._goal is Goal.RELEASE:
             if all(state in _WITHOUT_TORQUE for state in states):
                 self._goal, self._state = Goal.IDLE, GroupState.RELEASED
             elif self._cycles_to_goal > 2 * self._patience:  # it enables the drives first
-                self._latch(self._late(_WITHOUT_TORQUE))
+                self._latch(self._late(_WITHOUT_TORQUE, 2 * self._patience))
 
     def _check_modes(self) -> None:
         """Enters ENABLED once every drive shows CSP; most profiles check it when configuring."""
@@ -387,8 +387,8 @@ class Cia402Group(CyclicGroup):
         seconds = self._patience * self._cycle_s
         return ignoring_drives(self._rig.drive_names, self._watch.status_words, seconds)
 
-    def _late(self, wanted: tuple[DriveState, ...]) -> list[tuple[int, str]]:
-        words, seconds = self._watch.status_words, self._patience * self._cycle_s
+    def _late(self, wanted: tuple[DriveState, ...], cycles: int) -> list[tuple[int, str]]:
+        words, seconds = self._watch.status_words, cycles * self._cycle_s
         return late_drives(self._rig.drive_names, words, wanted, seconds)
 
     def _status(self) -> CycleStatus:

@@ -130,9 +130,8 @@ class RealClock:
         if self._woke_ns < deadline:
             sleep_until(deadline)
             self._woke_ns = time.monotonic_ns()
-        before, self._suspended_ns = self._suspended_ns, self._suspended()
-        slept = max(0, self._suspended_ns - before)
-        late = (self._woke_ns - deadline + slept) / self._cycle_ns
+        before, self._suspended_ns = self._suspended_ns, max(self._suspended_ns, self._suspended())
+        late = (self._woke_ns - deadline + self._suspended_ns - before) / self._cycle_ns
         self._begin_ns = deadline if late <= self.CAUGHT_UP else self._woke_ns
         return late
 

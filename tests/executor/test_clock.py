@@ -81,6 +81,10 @@ def test_a_suspended_computer_is_late_by_that_time(time):
     assert real.now - before == pytest.approx(60.0)
     assert real.next_cycle() == pytest.approx(6000.0)
     assert real.next_cycle() == 0.0
+    time.between = 1_000_000  # less is seen of the suspension, for once
+    assert real.next_cycle() < 0.5
+    time.between = 0
+    assert real.next_cycle() == pytest.approx(0.0, abs=0.01), "it is counted once"
 
 
 @given(waits=st.lists(st.integers(0, 10**9), min_size=1, max_size=20))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ from simulation.ground_truth import PowerLoss
 from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan
 from tests.cli.program import Answer, call
 from tests.scenarios.faults.samples import WatchedRehearsal, emergencies
-from tests.scenarios.test_processes import program
+from tests.scenarios.test_processes import program, waited_for
 from tests.scenarios.test_real_time import send
 
 MAKERS = ("epos4", "nanotec-c5e", "akd")
@@ -81,13 +80,6 @@ class Day:
     def states(self) -> set[DriveState]:
         return {drive.state for drive in self.rehearsal.drives}
 
-    def _wait_for(self, events: Path, code: str, process: subprocess.Popen[str]) -> None:
-        while process.poll() is None:
-            if events.is_file() and f'"{code}"' in events.read_text():
-                return
-            signal.sigtimedwait([], 0.01)
-        raise AssertionError(f"the run ended before {code!r}: {process.communicate()}")
-
     def doctor(self) -> None:
         """Nothing is missing; a virtual machine may have one processor only."""
         answer = call("doctor", self.rig, "--drives")
@@ -108,7 +100,7 @@ class Day:
         with program(*words) as process:
             events = run / "events.jsonl"
             for code, word in (("moving", "hold"), ("hold", "resume"), ("resume", "")):
-                self._wait_for(events, code, process)
+                waited_for(events, code, process)
                 if word:
                     send(word)
             if stops:
