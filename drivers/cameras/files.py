@@ -6,7 +6,7 @@ import os
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -23,11 +23,16 @@ from model.rig import Camera
 
 #: Suffixes of image files, in lower case.
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
+#: An EXIF block begins within so many bytes and is no longer, [bytes].
+EXIF_WITHIN = 65536
 _NO_PICTURE, _CAMERA = "is not a readable image", "the camera has"
 
 
 class ImageFolder:
     """The images of a folder in natural order of their names.
+
+    They are rotated according to their EXIF orientation or all used as stored, by the rule of
+    `OneCamerasPictures`: a calibration and a measurement see the same pixels.
 
     Args:
         folder: Folder of the images.
@@ -68,8 +73,13 @@ class ImageFolder:
         self.unused.clear()
         wanted = (self._camera.width, self._camera.height)
         none_read = True
+        upright = _have_one_orientation(self.files)
         for number, path in enumerate(self.files):
-            image = read_picture(path)
+            image = read_picture(path, upright)
+            if none_read and image is not None and _size(image) != wanted:
+                other = read_picture(path, not upright)
+                if other is not None and _size(other) == wanted:
+                    image, upright = other, not upright
             none_read &= image is None
             if image is not None and _size(image) == wanted:
                 yield Frame(number / self._rate, image, path.name)
@@ -181,6 +191,23 @@ def _data(path: Path) -> bytes:
         return b""
 
 
+def _have_one_orientation(files: Iterable[Path]) -> bool:
+    """Whether the EXIF orientation of all images is the same; unreadable files do not count."""
+    found = {path: exif_orientation(_head(path)) for path in files}
+    if len(set(found.values())) > 1:  # rare, so images are decoded only here
+        found = {path: value for path, value in found.items() if read_picture(path) is not None}
+    return len(set(found.values())) <= 1
+
+
+def _head(path: Path) -> bytes:
+    """The beginning of a file, as far as its EXIF data may reach; empty if it cannot be read."""
+    with suppress(OSError):
+        if path.is_file():
+            with path.open("rb") as stream:
+                return stream.read(EXIF_WITHIN)
+    return b""
+
+
 def _decoded(data: bytes, upright: bool = True) -> Image | None:
     if not data or is_too_large(data):
         return None
@@ -194,8 +221,8 @@ def _decoded(data: bytes, upright: bool = True) -> Image | None:
 
 def exif_orientation(data: bytes) -> int:
     """The orientation in a JPEG file's EXIF data, 1 to 8; 1 if it states none."""
-    at = data.find(b"Exif\0\0", 0, 65536)
-    tiff = data[at + 6 : at + 65536]
+    at = data.find(b"Exif\0\0", 0, EXIF_WITHIN)
+    tiff = data[at + 6 : at + EXIF_WITHIN]
     order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
     if at < 0 or order is None:
         return 1

@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.cameras.files import ImageFolder
+from drivers.cameras.files import ImageFolder, OneCamerasPictures
 from drivers.cameras.live import Frame, LiveCamera, VideoFile
 from model.errors import BadInput, HardwareMissing
 from model.pose import Pose
 from model.rig import Camera, Rig
 from simulation.camera.camera import SyntheticCamera
+from tests.calibration.exif import jpeg
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.pose_log import POSE_COLUMNS, pose_row, write_pose_log
 from tracking.track import NoPlatformSeen, TrackCount, track
@@ -56,6 +57,25 @@ def test_a_broken_file_among_good_ones_is_named_and_skipped(
         assert isinstance(result.observation, PoseMeasurement)
         assert result.observation.pose.distance_to(truth) < 1e-3
     assert results[1].observation.time == pytest.approx(0.3)  # the gap stays a gap
+
+
+@pytest.mark.parametrize("orientations", [(1, 1), (3, 3), (6, 6), (1, 3), (1, 6)])
+@pytest.mark.parametrize("stored", ["wide", "tall"])
+def test_a_measurement_sees_the_pixels_that_a_calibration_saw(
+    tmp_path: Path, camera: Camera, orientations: tuple[int, ...], stored: str
+) -> None:
+    """Whatever EXIF orientations the images of a camera have."""
+    image = np.add.outer(np.arange(48), np.arange(64)).astype(np.uint8)
+    pixels = image if stored == "wide" else image.T
+    for name, orientation in zip("ab", orientations, strict=True):
+        (tmp_path / f"{name}.jpg").write_bytes(jpeg(pixels, orientation))
+    (tmp_path / "c.jpg").write_bytes(b"not an image")
+    calibrated = OneCamerasPictures(tmp_path)
+    camera = replace(camera, width=calibrated.size[0], height=calibrated.size[1])
+    measured = ImageFolder(tmp_path, camera)
+    for frame, (name, expected) in zip(measured, calibrated, strict=True):
+        assert frame.name == name
+        np.testing.assert_array_equal(frame.image, expected)
 
 
 def test_a_folder_of_broken_files_only_is_refused(tmp_path: Path, camera: Camera) -> None:
