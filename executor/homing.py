@@ -287,4 +287,6 @@ def _referenced(
     samples = measure_at_rest(rig, source, pictures, true_pose, require_no_stop, SILENT)
     found = static_pose(rig, samples)
     how = f"tags in {found.pictures} of {pictures} images, camera {source[0].name!r}"
+    if found.unstated:
+        how += "; systematic errors not stated"
     return reference_at(rig, found.pose, result.counts, result.tensions, how, found.uncertainty)

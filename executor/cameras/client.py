@@ -239,12 +239,14 @@ class RestPose:
         uncertainty: Of the position along its worst direction, standard deviation, [m].
         length_uncertainty: Largest of the cable lengths, standard deviation, [m].
         pictures: Number of images with a pose.
+        unstated: Whether a part of the systematic errors is not stated, so not in these.
     """
 
     pose: Pose
     uncertainty: float
     length_uncertainty: float
     pictures: int
+    unstated: bool
 
 
 def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
@@ -289,7 +291,8 @@ def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
             " or `error_mm`, state an error that large",
         )
     worst = float(np.sqrt(np.max(np.linalg.eigvalsh(covariance[:3, :3]))))
-    return RestPose(pose, worst, lengths, len(found))
+    unstated = any(sample.unstated for sample in found)
+    return RestPose(pose, worst, lengths, len(found), unstated)
 
 
 def _refusal(what: str, why: str) -> Refused:

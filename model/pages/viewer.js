@@ -54,10 +54,13 @@ void main() {
   gl_FragColor = vec4(colour, alpha * opacity);
 }`;
 
+/** The canvas's context; null without WebGL 2. */
+const webglOf = (canvas) => canvas.getContext("webgl2", { alpha: false, antialias: true });
+
 function sceneViewer(canvas, data, shown = () => true) {
   const MARGIN = 24, LINE = 14; // px: around all, for texts beside points; the height of a text
   const UNFITTED = ["tree", "trail", "pick"]; // layers that may lie outside the picture
-  const context = globalThis.THREE && canvas.getContext("webgl2", { alpha: false, antialias: true });
+  const context = globalThis.THREE && webglOf(canvas);
   if (!context) return withoutWebGL(canvas);
 
   THREE.ColorManagement.enabled = false; // colours are those of the page

@@ -166,6 +166,7 @@ def test_people_read_the_verdict_first(folder) -> None:
         (("--pictures", "2"), "--pictures is for a video or a camera"),
         (("--poses", "missing.csv"), "no such file"),
         (("--calibration", RIG), "not a calibration result"),
+        (("--columns", "7", "--rows", "5"), "a board is only for --beside"),
     ],
 )
 def test_options_that_cannot_be_are_refused(folder, tmp_path, options, named: str) -> None:

@@ -13,11 +13,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, FloatRect, Page, expect, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, FloatRect, Page, expect, sync_playwright
 
 ROOT = Path(__file__).parents[2]
 ARGUMENTS = [
@@ -34,6 +35,9 @@ WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gp
 VIEWS = ("live", "operate", "jog", "teach", "events", "service")
 AUDITS = (Path(__file__).parent / "audits.js").read_text(encoding="utf-8")
 SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1400, 900)}
+
+#: The page of each browser that the next visit has, by whether it takes touches.
+_KEPT: WeakKeyDictionary[Browser, dict[bool, Page]] = WeakKeyDictionary()
 
 PATIENCE_S = 30.0  # on a busy computer; what comes is waited for no longer than it takes
 expect.set_options(timeout=1000.0 * PATIENCE_S)
@@ -206,7 +210,7 @@ def chromium() -> str:
 @contextlib.contextmanager
 def browser_at(path: str, webgl: bool = True) -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        arguments = [*ARGUMENTS, *(WEBGL if webgl else ("--disable-gpu",))]
+        arguments = [*ARGUMENTS, *(WEBGL if webgl else ("--disable-gpu", "--disable-3d-apis"))]
         browser = playwright.chromium.launch(executable_path=path, args=arguments)
         yield browser
         browser.close()
@@ -237,28 +241,60 @@ def fake_server() -> Iterator[Fake]:
 def visit(
     browser: Browser, fake: Fake, size: str = "desk", scheme: str = "light", script: str = ""
 ) -> Iterator[Visit]:
-    """A page in a fresh profile, at a server that is new; fails when the page logged an error.
+    """A page at a server that is new; fails when the page logged an error.
 
-    `script` runs before the page's own.
+    `script` runs before the page's own. Without one, a browser's next visit has the same page, with
+    nothing left of this one: a new profile takes as long as most tests.
     """
     width, height = SIZES[size]
     fake.ask(renew=True)
-    context = browser.new_context(
-        viewport={"width": width, "height": height},
-        color_scheme="dark" if scheme == "dark" else "light",
-        has_touch=size != "desk",
-    )
-    context.add_init_script(script)
-    page = context.new_page()
+    kept = _KEPT.setdefault(browser, {})
+    touch = size != "desk"
+    page = None if script else kept.pop(touch, None)
+    if page is None:
+        context = browser.new_context(has_touch=touch)
+        context.add_init_script(script)
+        page = context.new_page()
+    page.set_viewport_size({"width": width, "height": height})
+    page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
     found = Visit(page, fake)
-    page.on("pageerror", lambda error: found.errors.append(str(error)))
-    page.on("console", lambda m: found.errors.append(m.text) if m.type == "error" else None)
-    page.on("request", lambda request: found.asked.append(request.url))
-    page.goto(fake.address)
-    expect(page.locator("#value-x")).to_contain_text(".")
-    expect(page.locator("#layers label")).not_to_have_count(0)  # the scene is there
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(done))")
-    yield found
-    context.close()
+    with contextlib.ExitStack() as whole:
+        whole.callback(page.context.close)
+        with _listening(found):
+            page.goto(fake.address)
+            expect(page.locator("#value-x")).to_contain_text(".")
+            expect(page.locator("#layers label")).not_to_have_count(0)  # the scene is there
+            page.evaluate("() => new Promise((done) => requestAnimationFrame(done))")
+            yield found
+        if not script:
+            for button in ("left", "right"):
+                page.mouse.up(button=button)  # else it is still pressed on the next page
+            page.unroute_all()
+            page.evaluate("() => sessionStorage.clear()")
+            page.goto("about:blank")
+            kept[touch] = page
+            whole.pop_all()
     unexpected = [text for text in found.errors if "WebSocket" not in text]
     assert unexpected == [], unexpected
+
+
+@contextlib.contextmanager
+def _listening(to: Visit) -> Iterator[None]:
+    """Collects a page's errors and requests."""
+
+    def said(message: ConsoleMessage) -> None:
+        if message.type == "error":
+            to.errors.append(message.text)
+
+    listeners: dict[Any, Callable[[Any], None]] = {
+        "pageerror": lambda error: to.errors.append(str(error)),
+        "console": said,
+        "request": lambda request: to.asked.append(request.url),
+    }
+    for event, listener in listeners.items():
+        to.page.on(event, listener)
+    try:
+        yield
+    finally:
+        for event, listener in listeners.items():
+            to.page.remove_listener(event, listener)

@@ -95,6 +95,7 @@ def test_a_key_that_is_held_ends_with_a_finger_and_begins_nothing(desk: Visit) -
     desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
     assert desk.fake.let_pass(desk.page)["received"][-1]["kind"] == "let_go"
     desk.page.mouse.up()
+    desk.page.keyboard.up("ArrowUp")
 
 
 @pytest.mark.parametrize(

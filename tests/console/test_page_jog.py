@@ -139,6 +139,7 @@ def test_a_key_ends_when_the_focus_goes(desk: Visit) -> None:
     desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")
     desk.page.locator("#jog-speed").focus()
     desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
+    desk.page.keyboard.up("ArrowLeft")
 
 
 def test_the_second_of_two_fingers_begins_nothing(phone: Visit) -> None:

@@ -113,6 +113,12 @@ def extrinsics(
         )
         result.show(made)
         return
+    if printed != NO_BOARD:
+        raise BadInput(
+            "a board is only for --beside, where both cameras see it",
+            where="calibrate extrinsics",
+            next_step="leave the board's options out, or pass --beside NAME=SOURCE",
+        )
     made = locate_camera(
         the_rig,
         _opener(source, the_camera, pictures),

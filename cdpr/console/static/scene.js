@@ -104,9 +104,10 @@ export class Scene {
     const response = await fetch(address("/scene"));
     if (!response.ok) return write(at("scene-note"), `The scene cannot be read (${response.status}).`);
     this.#base = { moments: [], ...(await response.json()) };
-    // Loaded here, for STOP must not wait for it; without it the viewer says what is missing.
-    globalThis.THREE = await import("./vendor/three/three.module.min.js").catch(() => null);
-    this.#view = globalThis.sceneViewer(at("scene-canvas"), this.#base, (layer) => !this.#hidden.has(layer));
+    // Loaded here, for STOP must not wait for it, and only where it can draw; else the viewer says what is missing.
+    const canvas = at("scene-canvas");
+    globalThis.THREE = webglOf(canvas) && (await import("./vendor/three/three.module.min.js").catch(() => null));
+    this.#view = globalThis.sceneViewer(canvas, this.#base, (layer) => !this.#hidden.has(layer));
     at("scene-out").addEventListener("click", () => this.#view.zoom(0.8));
     at("scene-in").addEventListener("click", () => this.#view.zoom(1.25));
     at("scene-reset").addEventListener("click", () => this.#view.reset());
