@@ -22,6 +22,7 @@ from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 from cdpr.console.commands import Held, Inbox, LetGo, Message, NotAMessage, parse_message
 from cdpr.console.session import MADE, Console
 from cdpr.console.view import scene_of
+from executor.realtime.scheduling import prompt_threads, take_short_turns
 from executor.recording.record_files import RUNS
 from executor.recording.verdict import fault_codes, page_text
 from model.errors import BadInput
@@ -384,7 +385,9 @@ def run_server(console: Console, host: str, port: int, on_ready: Callable[[str],
         on_ready(f"http://{host}:{listener.getsockname()[1]}/?token={server.token}")
         # A warning for each bad request would fill a pipe that nobody reads, and block the server.
         config = uvicorn.Config(server.app(), log_level="error", ws_max_size=4096)
-        uvicorn.Server(config).run(sockets=[listener])
+        take_short_turns()
+        with prompt_threads():
+            uvicorn.Server(config).run(sockets=[listener])
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from executor.realtime.scheduling import prompt_threads, take_short_turns
 from executor.remote.protocol import Presses, StatusSource, answer_to, status_answer
 from executor.supervision import RequestBoard
 from model.errors import Refused
@@ -235,7 +236,8 @@ def serving(
     thread = threading.Thread(target=server.run, name="cdpr-commands", daemon=True)
     thread.start()
     try:
-        yield
+        with prompt_threads():
+            yield
     finally:
         waker.close()
         thread.join()
@@ -266,6 +268,7 @@ class _Server:
         If the server fails, the run is stopped, as it could no longer be stopped from outside.
         """
         try:
+            take_short_turns()
             while self._serve_ready():
                 pass
             self._send_final_status()

@@ -6,6 +6,7 @@ sceneViewer(canvas, data, shown) draws `data` (scene_data); `shown(layer)` says 
                    and `labels` of its own are drawn in front of everything, and never change the view;
   update(parts)    other surfaces, strokes, labels or moments, kept in view;
   zoom(factor), reset(), redraw(), size() in mm;
+  isSoftware       whether the processor draws, for want of a graphics card: a picture then takes some 50 ms of it;
   pick(x, y, height)  the point at that height [mm] that is drawn at a pixel of the canvas; null where none is.
 The canvas is in a `.stage`, over which texts are laid. A picture is drawn when something changed, and only then.
 tensionColour(share) is a cable's colour, from 0 at the lower limit of its tension to 1 at the upper. */
@@ -392,7 +393,10 @@ function sceneViewer(canvas, data, shown = () => true) {
   }).observe(canvas, exact ? { box: "device-pixel-content-box" } : {});
   readColours();
   update({});
+  const info = context.getExtension("WEBGL_debug_renderer_info");
+  const drawnBy = info ? context.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
   return {
+    isSoftware: /swiftshader|llvmpipe|softpipe|software|basic render/i.test(drawnBy),
     update, zoom, redraw, pick,
     size: () => size, // diagonal of all that is fitted into the picture, [mm]
     show: (moment) => {
@@ -414,5 +418,5 @@ function withoutWebGL(canvas) {
   canvas.hidden = true;
   canvas.after(text);
   const nothing = () => {};
-  return { update: nothing, zoom: nothing, redraw: nothing, show: nothing, reset: nothing, pick: () => null, size: () => 0 };
+  return { isSoftware: false, update: nothing, zoom: nothing, redraw: nothing, show: nothing, reset: nothing, pick: () => null, size: () => 0 };
 }

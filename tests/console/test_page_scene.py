@@ -39,6 +39,30 @@ def test_the_closest_pair_is_drawn_and_can_be_hidden(desk: Visit) -> None:
     until_painted(desk, "limit", 0)
 
 
+#: Pictures drawn by WebGL from now on, and when that began.
+COUNT = """() => {
+  window.drawn = { since: performance.now(), pictures: 0 };
+  const clear = WebGL2RenderingContext.prototype.clear;
+  WebGL2RenderingContext.prototype.clear = function (...given) {
+    drawn.pictures += this.getParameter(this.FRAMEBUFFER_BINDING) === null;
+    return clear.apply(this, given);
+  };
+}"""
+
+
+def test_without_a_graphics_card_the_moving_scene_is_drawn_five_times_a_second(desk: Visit) -> None:
+    """States come twenty times a second, and each picture would take the processor from a run."""
+    desk.take_control()
+    desk.load()
+    desk.run()
+    desk.page.evaluate(COUNT)
+    desk.fake.let_pass(desk.page, 60)
+    seconds, pictures = desk.page.evaluate(
+        "() => [(performance.now() - drawn.since) / 1000, drawn.pictures]"
+    )
+    assert 3 <= pictures <= 5.0 * seconds + 2
+
+
 def test_the_measured_position_is_shown_beside_the_one_by_the_drives(desk: Visit) -> None:
     desk.take_control()
     expect(desk.page.locator("#measured-x")).to_have_text("")

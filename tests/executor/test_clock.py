@@ -1,15 +1,28 @@
-"""The clock: late cycles delay the path and never bunch; small delays do not add up."""
+"""The clock: late cycles delay the path and never bunch; small delays do not add up.
+
+And how soon threads get their turn.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from executor.realtime import scheduling
-from executor.realtime.scheduling import RealClock, SimulatedClock
+from executor.realtime.scheduling import (
+    SWITCH_INTERVAL,
+    RealClock,
+    SimulatedClock,
+    prompt_threads,
+    take_short_turns,
+)
 
 CYCLE = 0.01
 CYCLE_NS = 10_000_000
@@ -182,3 +195,42 @@ def test_what_the_operator_requests_counts_until_a_fifth_of_the_cycle_is_left(wo
                 assert 0.7 * CYCLE_NS <= time.now - begun <= decided
             else:
                 assert time.now - begun >= 0.7 * CYCLE_NS
+
+
+def test_threads_take_turns_sooner_only_while_a_run_is_served() -> None:
+    before = sys.getswitchinterval()
+    with prompt_threads():
+        assert sys.getswitchinterval() == pytest.approx(SWITCH_INTERVAL)
+    assert sys.getswitchinterval() == before
+
+
+def test_short_turns_change_nothing_but_the_slice() -> None:
+    """Policy and priority stay; the slice of threads that begin later is short, too."""
+
+    def slices() -> list[int]:
+        try:
+            lines = Path(f"/proc/self/task/{threading.get_native_id()}/sched").read_text()
+        except OSError:  # a kernel that does not show it
+            return []
+        return [int(line.split(":")[1]) for line in lines.splitlines() if "slice" in line]
+
+    def turns(found: list[object]) -> None:
+        found += [os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0)]
+        take_short_turns()
+        found += [os.sched_getscheduler(0), os.getpriority(os.PRIO_PROCESS, 0), slices()]
+        later = threading.Thread(target=lambda: found.append(slices()))
+        later.start()
+        later.join()
+
+    found: list[object] = []
+    thread = threading.Thread(target=turns, args=(found,))
+    thread.start()
+    thread.join()
+    assert found[:2] == found[2:4]
+    assert found[4] == found[5]
+    if found[4] and _release() >= (6, 12):
+        assert found[4] == [100_000]
+
+
+def _release() -> tuple[int, ...]:
+    return tuple(int(part) for part in os.uname().release.split("-")[0].split(".")[:2])

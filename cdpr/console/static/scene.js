@@ -11,6 +11,7 @@ const LAYERS = {
 const COLOURS = { obstacles: "obstacle", robot: "platform", numbers: "ink", frame: "frame", floor: "line", workspace: "muted", axes: "ink", poses: "ink", path: "ink", raw: "raw", tree: "tree", trail: "encoder", other: "raw", nearest: "limit", measured: "tag" };
 const HIDDEN_AT_FIRST = ["tree", "raw"];
 const TRAIL_STEP_MM = 2, TRAIL_MOST = 600;
+const SOFTWARE_MS = 200; // between pictures that the processor draws: they must not hold up STOP, or the run on this computer
 
 const GRID_LINES = 8;
 
@@ -96,6 +97,8 @@ export class Scene {
   #pick = null; // {height, point}: where a goal is being picked
   #poses = []; // as taught
   #trail = [];
+  #grown = false; // the trail, since it was drawn
+  #drawn = 0; // when a state was, [ms]
   #shown = "";
   #moment = null; // of the plan, while it is looked through
   #hidden = new Set(HIDDEN_AT_FIRST);
@@ -126,6 +129,11 @@ export class Scene {
       this.#layers();
     }
     if ((motion || jog.moving) && platform?.source === "drives") this.#drive(platform.position_mm);
+    const now = performance.now();
+    if (this.#view.isSoftware && now < this.#drawn + SOFTWARE_MS) return; // the next state does
+    this.#drawn = now;
+    if (this.#grown) this.#draw();
+    this.#grown = false;
     if (this.#moment) return;
     const fresh = isFresh(measured) ? { ...measured, age_s: 0 } : null;
     const shown = JSON.stringify([platform, tensions?.map((tension) => Math.round(2 * tension)), clearance, fresh, this.#pick]);
@@ -201,7 +209,7 @@ export class Scene {
     if (last && Math.hypot(...position.map((v, k) => v - last[k])) < TRAIL_STEP_MM) return;
     this.#trail.push(position);
     if (this.#trail.length > TRAIL_MOST) this.#trail.shift();
-    this.#draw();
+    this.#grown = true;
   }
 
   #parts() {
