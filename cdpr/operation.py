@@ -9,6 +9,7 @@ from typing import Any, Literal
 from executor.evaluation import rewrite_report
 from executor.recording.run_folder import RunFolder
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
+from model.errors import BadInput
 from model.plan import Plan, plan_from_document, require_same_rig
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
@@ -182,7 +183,16 @@ def resume(process: int | None = None) -> dict[str, Any]:
 
 
 def set_speed(percent: int, process: int | None = None) -> dict[str, Any]:
-    """Sets the speed along the path, [% of the planned speed], from 1 to 100; else as `hold`."""
+    """Sets the speed along the path, [% of the planned speed], from 1 to 100; else as `hold`.
+
+    Raises:
+        BadInput: It is not a whole number of these, or as for `hold`.
+    """
+    if isinstance(percent, bool) or not isinstance(percent, int) or not 1 <= percent <= 100:
+        raise BadInput(
+            f"the speed must be a whole number of percent from 1 to 100, it is {percent!r}",
+            where="set_speed",
+        )
     return request_run("speed", process, percent)
 
 

@@ -21,7 +21,7 @@ from executor.recording.clearance import (
     tension_noise,
 )
 from executor.recording.mcap import write_mcap
-from executor.recording.record_files import CameraRecord, RunCourse, versions
+from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import (
     CLEARANCE,
     COURSE,
@@ -37,7 +37,7 @@ from executor.recording.run_folder import (
     RunEvent,
     RunFolder,
 )
-from executor.recording.summary import RunContext, summarize
+from executor.recording.summary import RunContext, summarize, versions
 from executor.recording.tables import OK, CycleTable, PoseTable, fused_table, no_poses
 from executor.recording.verdict import HARMLESS, NOT_ENDED, ORDINARY, judge_without_tables
 from executor.report import build_report
@@ -56,6 +56,8 @@ from tracking.measurement import NoPose, PoseMeasurement
 #: Clearances from drive positions are computed this often along a run, [Hz].
 CLEARANCE_RATE = 10.0
 
+#: Files that `rewrite_report` makes from the others.
+_FROM_OTHERS = (FUSED, MCAP, REPORT)
 _File = tuple[str, Callable[[], object]]
 """A file's name, and the function that writes it."""
 
@@ -86,7 +88,6 @@ def evaluate(
     outcome: Outcome,
     seen: CameraRecords,
     course: RunCourse,
-    troubles: Sequence[str] = (),
 ) -> EvaluatedRun:
     """Computes the verdict of a run and its tables; writes nothing.
 
@@ -95,20 +96,19 @@ def evaluate(
         outcome: Of the motion.
         seen: Camera records.
         course: Of the run, with its end.
-        troubles: Missing data, a sentence each; any of them fails the run.
     """
     cycles = outcome.log.table()
     poses = _pose_table(seen.together, cycles)
     alone = {name: _pose_table(samples, cycles) for name, samples in seen.alone.items()}
     clearance = _clearance(prepared.rig, prepared.scene, cycles, seen)
     plan, events = prepared.plan.plan, outcome.log.events
-    context = _context_of(plan, prepared.rig, course, cycles, events, seen.cameras, troubles)
+    context = _context_of(plan, prepared.rig, course, cycles, events)
     summary = summarize(context, cycles, poses, clearance)
     return EvaluatedRun(context, cycles, poses, alone, clearance, summary)
 
 
 def evaluate_cut_short(folder: RunFolder) -> EvaluatedRun:
-    """Evaluates a run whose program was killed, from the files in its folder.
+    """Evaluates a run from the files in its folder, also of a program that was killed.
 
     Raises:
         BadInput: A file of it was changed.
@@ -120,7 +120,9 @@ def evaluate_cut_short(folder: RunFolder) -> EvaluatedRun:
     if not course.final_state:
         course = _ended_by_events(course, cycles, events)
     lost = course.cycles - len(cycles)
-    troubles = [f"Of {course.cycles} cycles the last {lost} are not on record"] if lost > 0 else []
+    troubles = list(course.troubles)
+    if lost > 0:
+        troubles.append(f"Of {course.cycles} cycles the last {lost} are not on record")
     if folder.has(CLEARANCE):
         clearance = folder.clearance()
     else:
@@ -130,7 +132,10 @@ def evaluate_cut_short(folder: RunFolder) -> EvaluatedRun:
     has_images = any((folder.path / PICTURES).glob("**/*.jpg"))  # the first image of each is kept
     if has_images and not folder.has(POSES):
         troubles.append("What the cameras measured is not on record")
-    context = _context_of(plan, rig, course, cycles, events, (), troubles)
+    if len(poses) and not course.cameras:
+        troubles.append("Whether the cameras failed is not on record")
+    course = replace(course, troubles=tuple(troubles))
+    context = _context_of(plan, rig, course, cycles, events)
     summary = summarize(context, cycles, poses, clearance)
     return EvaluatedRun(context, cycles, poses, folder.poses_by_camera(), clearance, summary)
 
@@ -159,8 +164,6 @@ def _context_of(
     course: RunCourse,
     cycles: CycleTable,
     events: Sequence[RunEvent],
-    cameras: tuple[CameraRecord, ...] = (),
-    troubles: Sequence[str] = (),
 ) -> RunContext:
     """Context of a run besides its tables; simulated drives on a bus report themselves."""
     simulated = course.simulated or any(event.code == SIMULATED for event in events)
@@ -176,8 +179,8 @@ def _context_of(
         events=tuple(events),
         versions=versions(),
         cause=course.cause,
-        cameras=cameras,
-        troubles=tuple(troubles),
+        cameras=course.cameras,
+        troubles=course.troubles,
     )
 
 
@@ -215,7 +218,7 @@ def write_end(
         course: With its end.
         result: The evaluation; None if it failed.
         events: All events.
-        given_up: Called before each file; True leaves out the rest.
+        given_up: Called before each file that can be made from the others; True leaves it out.
 
     Returns:
         Names of the files that could not be written, and why.
@@ -249,13 +252,13 @@ def write_results(folder: RunFolder, result: EvaluatedRun) -> None:
 
 
 def rewrite_report(folder: RunFolder) -> None:
-    """Rewrites the report from the files of a run; for an interrupted run, all missing files.
+    """Rewrites the report from the files of a run, and all files that are missing.
 
     Raises:
         BadInput: A file of the run was changed, or the folder cannot be written to.
     """
-    if folder.is_whole:
-        build_report(folder)
+    if folder.is_whole and (not folder.has(COURSE) or all(map(folder.has, (FUSED, MCAP)))):
+        build_report(folder)  # all is there, or the run is of an earlier version
     else:
         write_results(folder, evaluate_cut_short(folder))
 
@@ -288,7 +291,7 @@ def _written(files: Sequence[_File], given_up: Callable[[], bool]) -> dict[str, 
     missing = {}
     for name, write in files:
         try:
-            if given_up():
+            if name in _FROM_OTHERS and given_up():
                 missing[name] = "interrupted"
             elif name == SUMMARY and missing:  # it marks a folder with all its tables
                 missing[name] = next(iter(missing.values()))

@@ -67,7 +67,7 @@ def home(
     *,
     at_home: bool = False,
     pose: Pose | None = None,
-    camera: str | Sequence[str] | None = None,
+    camera: str | int | Sequence[str | int] | None = None,
     tension: float | None = None,
     limit: float | None = None,
     reach: float = REACH,
@@ -113,7 +113,8 @@ def home(
     """
     in_process = is_simulated(rig)
     require_own_time(rig, realtime)
-    sources = [camera] if isinstance(camera, str) else list(camera or [])
+    given = [camera] if isinstance(camera, str | int) else camera or []
+    sources = [str(source) for source in given]
     require_one_pose(at_home, pose, sources)
     _require_slow(reach, speed, pictures)
     source = choose_one_camera(rig, sources, in_process) if sources else None

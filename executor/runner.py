@@ -189,7 +189,7 @@ def run_prepared(
         folder.write_course(course)
         with folder.held():
             _move_and_measure(job, moved)
-            result = _conclude(job, moved, course)
+            result = options.supervisor.conclude(partial(_conclude, job, moved, course))
     finally:
         moved.close()
         if not moved.begun:
@@ -214,6 +214,7 @@ class _MotionData:
 
     Attributes:
         begun: The platform was about to move.
+        started: When that was.
         recorder: Of cycles and events.
         outcome: Of the motion.
         seen: Camera records.
@@ -221,6 +222,7 @@ class _MotionData:
     """
 
     begun: bool = False
+    started: datetime | None = None
     recorder: Recorder | None = None
     outcome: Outcome | None = None
     seen: CameraRecords | None = None
@@ -270,7 +272,8 @@ def _move_and_measure(job: _Job, moved: _MotionData) -> None:
         if moved.outcome is None:
             text = f"the program failed during the motion: {text}"
             log = moved.recorder.log
-            moved.outcome = Outcome(State.LATCHED, text, log, False, datetime.now(UTC))
+            started = moved.started or datetime.now(UTC)
+            moved.outcome = Outcome(State.LATCHED, text, log, False, started)
         else:
             moved.troubles.append(f"writing the results failed: {text}")
 
@@ -323,7 +326,7 @@ def _move(
     """Arms the drives and runs the loop: here in simulated time, else in another process."""
 
     def before_motion() -> None:
-        moved.begun = True
+        moved.begun, moved.started = True, datetime.now(UTC)
         job.options.supervisor.on_motion()
 
     if isinstance(board, SharedRequests):
@@ -386,6 +389,8 @@ def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
         final_state=outcome.state.value,
         cause=outcome.cause,
         cycles=len(outcome.log),
+        cameras=() if moved.seen is None else tuple(moved.seen.cameras),
+        troubles=tuple(moved.troubles),
     )
     evaluated, summary = _evaluated(job.prepared, moved, outcome, course)
     result = RunResult(job.folder.path, summary)
@@ -404,7 +409,7 @@ def _evaluated(
     """The evaluation and its summary; if that fails, a summary without tables."""
     try:
         seen = moved.seen or CameraRecords()
-        evaluated = evaluate(prepared, outcome, seen, course, moved.troubles)
+        evaluated = evaluate(prepared, outcome, seen, course)
     except Exception as error:
         trouble = f"{type(error).__name__}: {error}".rstrip(": ")
         return None, not_evaluated(prepared, outcome, course, trouble)

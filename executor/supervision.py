@@ -126,20 +126,14 @@ class Supervisor:
         Raises:
             KeyboardInterrupt: Interrupted, and stopped before there was a result.
         """
-        thread = _Motion(motion)
+        thread = _Work("cdpr-motion", motion)
         try:
             thread.start()
         except KeyboardInterrupt:
             if thread.cancel():
                 raise
-            self._interrupt(board)
-        # An interrupted `join` may regard the thread as ended (Python 3.11); the event does not.
-        while not thread.is_done.is_set():
-            try:
-                thread.is_done.wait()
-            except KeyboardInterrupt:
-                self._interrupt(board)
-        thread.join()
+            self._interrupt(board.ask_stop)
+        self._wait_for(thread, board.ask_stop)
         try:
             result: _T = thread.result()
         except StoppedByOperator as error:
@@ -148,9 +142,35 @@ class Supervisor:
             raise
         return result
 
-    def _interrupt(self, board: RequestBoard) -> None:
+    def conclude(self, work: Callable[[], _T]) -> _T:
+        """Computes the verdict of a motion and writes its record; no interrupt ends that.
+
+        Args:
+            work: Called once.
+        """
+        thread = _Work("cdpr-record", work)
+        try:
+            thread.start()
+        except KeyboardInterrupt:
+            self._interrupt()
+            if thread.cancel():  # interrupted before it began
+                return work()
+        self._wait_for(thread)
+        result: _T = thread.result()
+        return result
+
+    def _wait_for(self, thread: _Work, on_interrupt: Callable[[], None] = lambda: None) -> None:
+        # An interrupted `join` may regard the thread as ended (Python 3.11); the event does not.
+        while not thread.is_done.is_set():
+            try:
+                thread.is_done.wait()
+            except KeyboardInterrupt:
+                self._interrupt(on_interrupt)
+        thread.join()
+
+    def _interrupt(self, do: Callable[[], None] = lambda: None) -> None:
         self.interrupted = True
-        board.ask_stop()
+        do()
 
     def on_motion(self) -> None:
         """Called when armed: the platform is about to move."""
@@ -170,17 +190,17 @@ class Supervisor:
         """Called at the end.
 
         Raises:
-            KeyboardInterrupt: The motion was stopped by one.
+            KeyboardInterrupt: There was one since the motion began.
         """
         if self.interrupted:
             raise KeyboardInterrupt
 
 
-class _Motion(threading.Thread):
+class _Work(threading.Thread):
     """A function in a thread, with its result or error."""
 
-    def __init__(self, function: Callable[[], Any]) -> None:
-        super().__init__(name="cdpr-motion")
+    def __init__(self, name: str, function: Callable[[], Any]) -> None:
+        super().__init__(name=name)
         self._function = function
         self._result: Any = None
         self._error: BaseException | None = None

@@ -72,8 +72,10 @@ def clearance_of(model: ClearanceModel, measurement: PoseMeasurement) -> Measure
     distance.
 
     Raises:
-        BadInput: A part of these is not stated.
+        BadInput: There are obstacles, and a part of these is not stated.
     """
+    if not model.obstacle_names:
+        return None
     if measurement.unstated:
         raise BadInput(
             "the error of this pose is unknown, so the clearance has no interval",

@@ -216,9 +216,12 @@ class PlatformEstimator:
         self._modules = modules_across(rig.tag_family)
         self._platform = {tag.id: tag for tag in rig.platform_tags}
         self._frame = frozenset(tag.id for tag in rig.frame_tags)
-        # Cables only pull: the platform stays in the box around the outlets plus its own size.
+        # The platform hangs between or below the outlets: it is in the box around them, its
+        # workspace and its home pose, plus its own size.
         size = float(np.linalg.norm(rig.half_size))
-        self._lower, self._upper = rig.outlets.min(axis=0) - size, rig.outlets.max(axis=0) + size
+        corners = [rig.outlets, [rig.workspace_lower, rig.workspace_upper, rig.home.position]]
+        reached = np.concatenate(corners)
+        self._lower, self._upper = reached.min(axis=0) - size, reached.max(axis=0) + size
         self._camera_from_world = camera.world_from_camera.inverse()
         self._shared = SharedErrors(rig, camera)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+import re
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -23,7 +24,7 @@ from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
 from tracking.detection.tags import tag_corners
 from tracking.estimator import UNCERTAIN, UNSHARP
 from tracking.fusion import MultiCameraFusion, synchronize_frames
-from tracking.measurement import NoPose, Observation, PoseMeasurement, rates
+from tracking.measurement import Observation, PoseMeasurement, rates
 from tracking.pose_log import LoggedPicture
 from tracking.shared_errors import require_stated_errors
 from tracking.tracker import Tracker
@@ -89,7 +90,7 @@ def track(
     if model is not None and model.obstacle_names:
         require_stated_errors(tracker.rig, [tracker.camera])
     count = count or TrackCount()
-    reasons: Counter[str] = Counter()
+    reasons = NoPoseReasons()
     last: Picture | None = None
     seen: set[int] = set()
     for picture in source:
@@ -102,7 +103,7 @@ def track(
             count.poses += 1
             clearance = clearance_of(model, observation) if model is not None else None
         else:
-            reasons[_reason(observation)] += 1
+            reasons.add(observation.reason)
             seen.update(observation.seen)
             last = picture
         logged = LoggedPicture(picture.name, observation, clearance)
@@ -115,12 +116,27 @@ def track(
         raise _nothing_seen(tracker, count.pictures, reasons, last, seen)
 
 
-def _reason(observation: NoPose) -> str:
-    return observation.reason
+_NUMBER = re.compile(r"\d+(\.\d+)?")
+
+
+class NoPoseReasons:
+    """Reasons for missing poses; those that differ in numbers only are one."""
+
+    def __init__(self) -> None:
+        """Starts without any."""
+        self._found: dict[str, list[str]] = {}
+
+    def add(self, reason: str) -> None:
+        """Counts a reason."""
+        self._found.setdefault(_NUMBER.sub("#", reason), []).append(reason)
+
+    def most_frequent(self) -> str:
+        """The first text of the most frequent reason."""
+        return max(self._found.values(), key=len)[0]
 
 
 def _nothing_seen(
-    tracker: Tracker, pictures: int, reasons: Counter[str], last: Picture | None, seen: set[int]
+    tracker: Tracker, pictures: int, reasons: NoPoseReasons, last: Picture | None, seen: set[int]
 ) -> NoPlatformSeen:
     where = f"camera {tracker.camera.name!r}"
     if last is None:
@@ -131,7 +147,7 @@ def _nothing_seen(
         "check that the camera sees the platform, that the light suffices, and that the rig file"
         " has the family and numbers of the printed tags"
     )
-    reason = reasons.most_common(1)[0][0]
+    reason = reasons.most_frequent()
     soft = edge_width(last.image) > SOFT
     if UNCERTAIN in reason and not soft:
         next_step = "focus the camera, bring it nearer, or make more tags of the platform visible"

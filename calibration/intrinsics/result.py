@@ -289,7 +289,10 @@ class CameraResult(ResultDocument):
                 next_step="calibrate the camera at the image size in use",
             )
         keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens", "lens_covariance")
-        changes = {k: getattr(self, k) for k in keys} | {"pose_by_lens": None}
+        changes = {k: getattr(self, k) for k in keys} | {
+            "pose_by_lens": None,
+            "pose_covariance": None,
+        }
         return with_camera(rig, camera.model_copy(update=changes))
 
 

@@ -10,7 +10,7 @@ from model.rig import Camera, Rig
 
 SYNTHETIC = "synthetic"
 
-CameraChoice = str | Sequence[str] | Mapping[str, str | int] | None
+CameraChoice = str | int | Sequence[str | int] | Mapping[str, str | int] | None
 """``synthetic`` for all cameras of the rig file, one source, ``NAME=SOURCE`` for each of several, a
 mapping from names to sources, an empty one for no camera; None for the default: all synthetic where
 the drives are simulated in this process, an error on a bus."""
@@ -108,11 +108,11 @@ def resolve_cameras(rig: Rig, wanted: CameraChoice, in_process: bool) -> dict[Ca
     """
     if wanted is None:
         return choose_cameras(rig, [], False, in_process)
-    if isinstance(wanted, str):
-        return choose_cameras(rig, [wanted], False, in_process)
+    if isinstance(wanted, str | int):
+        return choose_cameras(rig, [str(wanted)], False, in_process)
     if isinstance(wanted, Mapping):
         wanted = [f"{name}={source}" for name, source in wanted.items()]
-    return choose_cameras(rig, list(wanted), not wanted, in_process)
+    return choose_cameras(rig, [str(source) for source in wanted], not wanted, in_process)
 
 
 def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Camera, str]:

@@ -22,6 +22,10 @@ _FACTS = 8
 ``planned_x`` and ``x``."""
 
 
+#: A measurement this far in time from a moment is one of that moment, [s].
+MEASURED_WITHIN = 0.5
+
+
 def source_of(camera: str) -> str:
     """Source name of the measurements of one of several cameras."""
     return f"tag:{camera}"

@@ -31,6 +31,7 @@ from executor.recording.mcap_channels import (
 from executor.recording.run_folder import PLAN, RIG, RunFolder
 from executor.recording.summary import RunContext
 from executor.recording.tables import OK, CycleTable, FusedTable, PoseTable
+from executor.recording.verdict import faults_among
 from model.errors import Fault
 from tracking.clearance import COVERAGE, MeasuredClearance
 from tracking.measurement import NoPose
@@ -252,8 +253,9 @@ def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
 
 
 def _events(context: RunContext, start: int) -> Iterator[Message]:
+    faults = faults_among(event.code for event in context.events)
     for event in context.events:
-        level = LogLevel.Info if context.final_state == "finished" else LogLevel.Warning
+        level = LogLevel.Warning if event.code in faults else LogLevel.Info
         stamp = stamp_of(start, event.time_s)
         log = Log(timestamp=stamp, level=level, message=event.text, name=event.code)
         yield "/events", event.time_s, log

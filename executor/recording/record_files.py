@@ -4,20 +4,19 @@ Unknown keys are ignored: a later version may add some. `executor.recording.summ
 keys; a damaged or edited run folder causes one message that names the key.
 
 ``run.json`` (``schema_version`` 1) has ``started`` (ISO 8601, UTC), ``interface``, ``simulated``,
-``fast``, ``final_state``, ``cause`` and ``cycles``. Until the motion is over, and if the program is
-killed, the last three are empty or 0.
+``fast``, ``final_state``, ``cause``, ``cycles``, ``cameras`` (as in ``summary.json``) and
+``troubles`` (missing data, a sentence each). Until the motion is over, and if the program is
+killed, all after ``fast`` are empty or 0.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import platform
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -207,6 +206,8 @@ class CourseDocument(_Record):
     final_state: str
     cause: str
     cycles: Count
+    cameras: list[CameraRecordDocument] = []
+    troubles: list[str] = []
 
 
 def read_course(path: Path) -> CourseDocument:
@@ -297,100 +298,6 @@ def whole_lines(path: Path) -> list[str]:
         return read_text(path).split("\n")  # raises with the reason
 
 
-#: Initial size of the file, [bytes], so that the end of the run fits on a full disk.
-SIZE = 2048
-
-
-@dataclass(frozen=True, slots=True)
-class RunCourse:
-    """Start and end of a run.
-
-    Attributes:
-        started: Start time, UTC.
-        interface: Of the bus.
-        simulated: The drives are simulated in the run's own process.
-        fast: Simulated time.
-        final_state: Of the motion; empty until its end.
-        cause: Why it did not finish, if it did not.
-        cycles: Number of cycles; 0 until the end.
-    """
-
-    started: datetime
-    interface: str
-    simulated: bool
-    fast: bool
-    final_state: str = ""
-    cause: str = ""
-    cycles: int = 0
-
-    @classmethod
-    def load(cls, path: Path) -> RunCourse:
-        """Reads the file.
-
-        Raises:
-            BadInput: It cannot be read.
-            InvalidFile: It has invalid keys; all are named.
-        """
-        kept = read_course(path)
-        return cls(
-            datetime.fromisoformat(kept.started),
-            kept.interface,
-            kept.simulated,
-            kept.fast,
-            kept.final_state,
-            kept.cause,
-            kept.cycles,
-        )
-
-    def save(self, path: Path) -> None:
-        """Writes the file atomically.
-
-        Raises:
-            BadInput: The folder cannot be written to.
-        """
-        write_atomic(path, self._text().ljust(SIZE) + "\n")
-
-    def overwrite(self, path: Path) -> None:
-        """As `save`; on a full disk overwrites the file, with the cause cut to fit.
-
-        Raises:
-            BadInput: The file is gone, or cannot be written to.
-        """
-        try:
-            self.save(path)
-        except BadInput:
-            if not self._overwritten(path):
-                raise
-
-    def _overwritten(self, path: Path) -> bool:
-        text = self._text().encode()
-        if len(text) > SIZE:
-            text = replace(self, cause=self.cause[: SIZE // 8])._text().encode()
-        with suppress(OSError), path.open("r+b", buffering=0) as stream:
-            stream.write(text.ljust(SIZE) + b"\n")
-            os.fsync(stream.fileno())
-            return True
-        return False
-
-    def _text(self) -> str:
-        started = self.started.isoformat(timespec="milliseconds")
-        data = {"schema_version": 1, **asdict(self), "started": started}
-        return json.dumps(data, indent=1, ensure_ascii=False)
-
-
-# Versions of programs, and statistics of cameras.
-
-
-LIBRARIES = (
-    "cdpr",
-    "numpy",
-    "python-can",
-    "canopen",
-    "opencv-python-headless",
-    "python-fcl",
-)
-
-
 @dataclass(frozen=True, slots=True)
 class CameraRecord:
     """Statistics of one camera's images in a run.
@@ -414,15 +321,101 @@ class CameraRecord:
     failed: str
 
 
-def versions() -> dict[str, str]:
-    """Versions of Python and of the main libraries, by name."""
-    found = {"python": platform.python_version()}
-    for name in LIBRARIES:
+#: Initial size of the file, [bytes], so that the end of the run fits on a full disk.
+SIZE = 8192
+
+
+@dataclass(frozen=True, slots=True)
+class RunCourse:
+    """Start and end of a run.
+
+    Attributes:
+        started: Start time, UTC.
+        interface: Of the bus.
+        simulated: The drives are simulated in the run's own process.
+        fast: Simulated time.
+        final_state: Of the motion; empty until its end.
+        cause: Why it did not finish, if it did not.
+        cycles: Number of cycles; 0 until the end.
+        cameras: Statistics of each camera's images; empty until the end.
+        troubles: Missing data, a sentence each; any of them fails the run.
+    """
+
+    started: datetime
+    interface: str
+    simulated: bool
+    fast: bool
+    final_state: str = ""
+    cause: str = ""
+    cycles: int = 0
+    cameras: tuple[CameraRecord, ...] = ()
+    troubles: tuple[str, ...] = ()
+
+    @classmethod
+    def load(cls, path: Path) -> RunCourse:
+        """Reads the file.
+
+        Raises:
+            BadInput: It cannot be read.
+            InvalidFile: It has invalid keys; all are named.
+        """
+        kept = read_course(path)
+        return cls(
+            datetime.fromisoformat(kept.started),
+            kept.interface,
+            kept.simulated,
+            kept.fast,
+            kept.final_state,
+            kept.cause,
+            kept.cycles,
+            tuple(CameraRecord(**dict(camera)) for camera in kept.cameras),
+            tuple(kept.troubles),
+        )
+
+    def save(self, path: Path) -> None:
+        """Writes the file atomically.
+
+        Raises:
+            BadInput: The folder cannot be written to.
+        """
+        write_atomic(path, self._text().ljust(SIZE) + "\n")
+
+    def overwrite(self, path: Path) -> None:
+        """As `save`; on a full disk overwrites the file, with its texts cut to fit.
+
+        Raises:
+            BadInput: The file is gone, or cannot be written to.
+        """
         try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            self.save(path)
+        except BadInput:
+            if not self._overwritten(path):
+                raise
+
+    def _overwritten(self, path: Path) -> bool:
+        text = self._text().encode()
+        if len(text) > SIZE:
+            text = self._short()._text().encode()
+        with suppress(OSError), path.open("r+b", buffering=0) as stream:
+            stream.write(text.ljust(SIZE) + b"\n")
+            os.fsync(stream.fileno())
+            return True
+        return False
+
+    def _short(self) -> RunCourse:
+        cameras = (
+            replace(camera, source=camera.source[:100], failed=camera.failed[:100])
+            for camera in self.cameras
+        )
+        troubles = (trouble[:100] for trouble in self.troubles[:8])
+        return replace(
+            self, cause=self.cause[:256], cameras=tuple(cameras), troubles=tuple(troubles)
+        )
+
+    def _text(self) -> str:
+        started = self.started.isoformat(timespec="milliseconds")
+        data = {"schema_version": 1, **asdict(self), "started": started}
+        return json.dumps(data, indent=1, ensure_ascii=False)
 
 
 # Default run folders.

@@ -342,8 +342,8 @@ class Recorder:
         self._status.take_cycle(record)
         if record.state in ON_PATH:
             for code, text in self._announcements.due(record.index):
-                self.take_event(LoopEvent(record.cycle, record.at, code, text))
                 self._announce(text)
+                self.take_event(LoopEvent(record.cycle, record.at, code, text))
         if record.cycle % self.every == 0:
             self._progress(record.index)
             if self._trigger is not None:
@@ -361,6 +361,8 @@ class Recorder:
         run_event = RunEvent(round(time, 6), event.code, event.text)
         self.log.events.append(run_event)
         self._status.take_event(run_event)
-        self.writer.take_event(run_event)
-        if self._on_event is not None:
-            self._on_event(run_event)
+        try:
+            self.writer.take_event(run_event)
+        finally:
+            if self._on_event is not None:
+                self._on_event(run_event)

@@ -129,12 +129,7 @@ class RunFolder:
             )
         missing = [name for name in NEEDED if not (path / name).is_file()]
         if missing:
-            raise BadInput(
-                f"incomplete run folder: {', '.join(missing)} missing",
-                where=str(path),
-                why="the run was interrupted, or this is another kind of folder",
-                next_step="give a folder that `cdpr run -o` created, or run the plan again",
-            )
+            raise cls(path)._incomplete(missing)
         return cls(path)
 
     @classmethod
@@ -146,24 +141,29 @@ class RunFolder:
         """
         begun = all((path / name).is_file() for name in BEGUN)
         if not begun or (path / SUMMARY).is_file():
-            return cls.open(
-                path
-            )  # ended, or of an earlier version; or raises with the missing files
-        folder = cls(path)
-        if folder.is_active():
-            raise BadInput(
-                "the run is still in progress",
-                where=str(path),
-                next_step="wait until it ends, or follow it with `cdpr monitor`",
-            )
-        return folder
+            return cls.open(path)  # ended, of an earlier version, or raises with what is missing
+        if cls(path).is_active():
+            raise cls(path)._incomplete([])
+        return cls(path)
+
+    def _incomplete(self, missing: Sequence[str]) -> BadInput:
+        what = f"incomplete run folder: {', '.join(missing)} missing"
+        why = "the run was interrupted"
+        if self.is_active():
+            what, why, then = "the run is still in progress", "", "wait, or see `cdpr monitor`"
+        elif all((self.path / name).is_file() for name in BEGUN):
+            then = f"`cdpr report {self.path}` makes them from what was recorded"
+        else:
+            why += ", or this is another kind of folder"
+            then = "give a folder that `cdpr run -o` created, or run the plan again"
+        return BadInput(what, where=str(self.path), why=why, next_step=then)
 
     def has(self, name: str) -> bool:
         """Whether a file exists and ends with a complete line."""
-        try:
-            return (self.path / name).read_bytes().endswith(b"\n")
-        except OSError:
-            return False
+        with suppress(OSError), (self.path / name).open("rb") as stream:
+            stream.seek(-1, os.SEEK_END)
+            return stream.read() == b"\n"
+        return False
 
     @property
     def is_whole(self) -> bool:

@@ -19,15 +19,17 @@ obstacles, ``tension_n`` {``min``, ``max``, ``planned_min``, ``planned_max``, ``
 
 from __future__ import annotations
 
+import platform
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.can_bus import IN_PROCESS
-from executor.recording.clearance import ClearanceTable
+from executor.recording.clearance import MEASURED_WITHIN, ClearanceTable
 from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunEvent
 from executor.recording.tables import CycleTable, PoseTable
@@ -70,6 +72,27 @@ class RunContext:
     cause: str = ""
     cameras: tuple[CameraRecord, ...] = ()
     troubles: tuple[str, ...] = ()
+
+
+LIBRARIES = (
+    "cdpr",
+    "numpy",
+    "python-can",
+    "canopen",
+    "opencv-python-headless",
+    "python-fcl",
+)
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the main libraries, by name."""
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
 
 
 def summarize(
@@ -172,8 +195,8 @@ def _tag_error(poses: PoseTable) -> dict[str, float | int | None] | None:
 
 
 def _clearance(clearance: ClearanceTable, required: float) -> dict[str, Any] | None:
-    """The smallest clearance, measured by the camera if it gave poses, else from the encoders."""
-    for source in ("tag", "encoder"):
+    """The smallest clearance, measured by the camera if it measured there, else by the encoders."""
+    for source in _measuring(clearance):
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():
             at = int(np.nanargmin(rows.distance))
@@ -188,6 +211,22 @@ def _clearance(clearance: ClearanceTable, required: float) -> dict[str, Any] | N
                 "source": source,
             }
     return None
+
+
+def _measuring(clearance: ClearanceTable) -> tuple[str, ...]:
+    """Sources of the smallest clearance, the best first.
+
+    The encoders come first where their smallest is below the camera's, and the camera gave no pose
+    at that time.
+    """
+    seen, counted = clearance.of("tag"), clearance.of("encoder")
+    known = np.isfinite(seen.distance)
+    if not (known.any() and np.isfinite(counted.distance).any()):
+        return ("tag", "encoder")
+    least = int(np.nanargmin(counted.distance))
+    gap = np.abs(seen.time[known] - counted.time[least]).min()
+    missed = gap > MEASURED_WITHIN and counted.distance[least] < np.nanmin(seen.distance)
+    return ("encoder", "tag") if missed else ("tag", "encoder")
 
 
 def _tension(cycles: CycleTable, rig: Rig) -> dict[str, float | None]:

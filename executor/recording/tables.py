@@ -42,7 +42,8 @@ class CycleTable:
     Attributes:
         time: Since the start of the run, shape (n,), [s].
         state: State of the executor, n texts.
-        path_index: Row of the set-point table that was sent, shape (n,).
+        path_index: Row of the set-point table whose set-points the drives took over in this
+            cycle, at its SYNC; the set-points of the row after it are sent in it. Shape (n,).
         leg: Number of the leg between stops, from 1, shape (n,); it ends when its stop is left.
         stop: Name of the stop at which the platform dwells, n texts; empty between stops.
         travelled: Length along the path, shape (n,), [m].

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 
-from executor.recording.clearance import ClearanceTable
+from executor.recording.clearance import MEASURED_WITHIN, ClearanceTable
 from executor.report.figures import (
     clearance_figure,
     length_figure,
@@ -153,8 +154,7 @@ def _moments(run: RunData) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
 
 def _motion(run: RunData) -> tuple[Moment, ...]:
     cycles, rig = run.cycles, run.rig
-    by_tags, by_drives = run.clearance.of("tag"), run.clearance.of("encoder")
-    clearance = by_tags if len(by_tags) else by_drives
+    measured = [run.clearance.of(source) for source in ("tag", "encoder")]
     found = []
     for row in _moments(run).tolist():
         time, position = float(cycles.time[row]), cycles.encoder[row]
@@ -162,16 +162,20 @@ def _motion(run: RunData) -> tuple[Moment, ...]:
         exits = rig.outlets
         if rig.pulley_radius:  # the cable leaves a pulley at another point in every pose
             exits = cables_to(rig, position + rig.anchors @ turn.T).exits
-        found.append(Moment(time, position, turn, exits, _nearest(clearance, time)))
+        found.append(Moment(time, position, turn, exits, _nearest(measured, time)))
     return tuple(found)
 
 
-def _nearest(clearance: ClearanceTable, time: float) -> str:
-    if not len(clearance):
-        return ""
-    near = int(np.argmin(np.abs(clearance.time - time)))
-    distance = float(clearance.distance[near]) * 1e3
-    return f"clearance {distance:.1f} mm ({clearance.body[near]} – {clearance.obstacle[near]})"
+def _nearest(measured: Sequence[ClearanceTable], time: float) -> str:
+    """The clearance at a time, by the first source that measured it then."""
+    for clearance in measured:
+        if not len(clearance):
+            continue
+        near = int(np.argmin(np.abs(clearance.time - time)))
+        if abs(clearance.time[near] - time) <= MEASURED_WITHIN:
+            pair = f"{clearance.body[near]} – {clearance.obstacle[near]}"
+            return f"clearance {clearance.distance[near] * 1e3:.1f} mm ({pair})"
+    return ""
 
 
 def _alternative(run: RunData) -> str:

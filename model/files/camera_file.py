@@ -82,6 +82,7 @@ PoseSlopes = Annotated[list[list[AnyNumber]], AfterValidator(_has_six_rows)]
 
 
 Pixels = Annotated[int, Field(ge=64, le=16384)]
+Gamma = Literal["srgb"] | Annotated[float, Field(ge=1.0, le=4.0)]
 Readout = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 
 
@@ -146,6 +147,10 @@ class CameraDocument(Document):
         default=0.0,
         description="from the exposure of the top row to that of the bottom row (rolling shutter);"
         " 0: all rows at once, negative: from the bottom up",
+    )
+    gamma: Gamma = Field(
+        default=1.0,
+        description="how grey levels encode light: srgb (webcams), an exponent, or 1 for linear",
     )
 
     @field_validator("distortion")

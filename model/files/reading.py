@@ -21,7 +21,7 @@ from model.errors import BadInput
 
 MEGABYTE = 1_000_000
 TEXT_LIMIT = 256 * MEGABYTE
-"""Largest text file, [bytes]: some hours of a run's tables."""
+"""Largest text file, [bytes]: the cycles of a run of 80 minutes, at 10 ms and with 8 cables."""
 YAML_LIMIT = 1 * MEGABYTE
 """Largest YAML file, [bytes]; its parser needs several seconds for that."""
 PICTURE_LIMIT = 256 * MEGABYTE
@@ -65,8 +65,8 @@ def _require_regular(path: Path, found: os.stat_result, limit: int) -> None:
             f"the file has {found.st_size / MEGABYTE:.1f} MB; at most {limit / MEGABYTE:.0f} MB"
             " are read",
             where=str(path),
-            why="a file of this kind is never larger; this is probably the wrong file",
-            next_step="check the path",
+            why="larger files would not fit into the memory of a small computer",
+            next_step="check the path; for a longer run, split its plan",
         )
 
 

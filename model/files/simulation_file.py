@@ -11,7 +11,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from model.files.camera_file import LensName
+from model.files.camera_file import Gamma, LensName
 from model.files.documents import (
     Document,
     Finding,
@@ -80,6 +80,7 @@ class SimulatedCameraDocument(Document):
     readout_ms: Annotated[float, Field(ge=-1000.0, le=1000.0)] | None = Field(
         default=None, description="true readout of the rows; left out, as in `cameras`"
     )
+    gamma: Gamma | None = Field(default=None, description="true gamma; left out, as in `cameras`")
     vignetting: Share = Field(default=0.25, description="share of light lost in the corners")
     light: Positive = Field(default=1.0, description="share of full light")
     cables: bool = Field(default=True, description="cables hide what is behind them")

@@ -366,7 +366,7 @@ class SyntheticCamera:
         """The image after sensor noise and processing."""
         size = (self.camera.width, self.camera.height)
         noisy = self._with_noise(before_the_sensor(picture, self.optics), frame)
-        return processed(noisy, size, self.optics)
+        return processed(self.camera.encoded(noisy), size, self.optics)
 
     def _with_noise(self, picture: Image8, frame: int) -> Image8:
         if self.optics.noise <= 0:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import csv
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+import yaml
+from mcap.reader import make_reader
 
 import cdpr
+from cdpr.operation import set_speed
+from executor.recording.run_folder import RunFolder
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -60,6 +66,73 @@ def test_a_run_is_loaded_from_its_folder_and_reported_again(run: cdpr.RunResult)
     np.testing.assert_array_equal(again.cycles["time_s"], run.cycles["time_s"])
     with pytest.raises(cdpr.BadInput, match="no such run folder"):
         cdpr.load_run(run.folder / "missing")
+
+
+def messages(path: Path) -> dict[str, int]:
+    """Number of messages by topic."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    counts = summary.statistics.channel_message_counts
+    return {summary.channels[number].topic: count for number, count in counts.items()}
+
+
+def test_a_report_makes_what_is_missing_from_the_rest(run: cdpr.RunResult, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(run.folder, folder)
+    fused, counts = (folder / "fused.csv").read_bytes(), messages(folder / "run.mcap")
+    for name in ("fused.csv", "run.mcap"):
+        (folder / name).unlink()
+    cdpr.report(folder)
+    assert (folder / "fused.csv").read_bytes() == fused
+    assert messages(folder / "run.mcap") == counts
+    (folder / "summary.json").unlink()
+    with pytest.raises(cdpr.BadInput, match="cdpr report"):
+        cdpr.load_run(folder)
+    cdpr.report(folder)
+    assert cdpr.load_run(folder).summary == run.summary
+
+
+def test_a_camera_that_failed_fails_the_run_when_it_is_reported_again(tmp_path: Path) -> None:
+    rig = cdpr.load_rig(CONFIGS / "gachon_8_6.yaml")
+    scene = cdpr.load_scene(CONFIGS / "environment_1.yaml")
+    goal = cdpr.Pose.level(np.add(scene.start.position, (-0.01, 0.0, 0.01)))
+    plan = cdpr.plan(rig, scene, goal=goal, rounds=12)
+    run = cdpr.run(plan, rig, folder=tmp_path / "run", realtime=False)
+    assert run.passed
+    course = RunFolder(run.folder).course()
+    assert [camera.name for camera in course.cameras] == ["front"]
+    failed = replace(course.cameras[0], failed="no answer since 0.30 s")
+    RunFolder(run.folder).write_course(replace(course, cameras=(failed,)))
+    (run.folder / "summary.json").unlink()
+    cdpr.report(run.folder)
+    again = cdpr.load_run(run.folder)
+    assert again.verdict == "FAILED"
+    assert any("no answer since 0.30 s" in reason for reason in again.summary["reasons"])
+    assert [camera["name"] for camera in again.summary["cameras"]] == ["front"]
+
+
+def test_a_run_without_obstacles_needs_no_stated_errors(tmp_path: Path) -> None:
+    document = yaml.safe_load((CONFIGS / "gachon_8_6.yaml").read_text())
+    for camera in document["cameras"]:
+        del camera["error_mm"]
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(document))
+    rig = cdpr.load_rig(tmp_path / "rig.yaml")
+    free = yaml.safe_load((CONFIGS / "environment_1.yaml").read_text()) | {"obstacles": []}
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(free))
+    scene = cdpr.load_scene(tmp_path / "scene.yaml")
+    goal = cdpr.Pose.level(np.add(scene.start.position, (-0.01, 0.0, 0.01)))
+    plan = cdpr.plan(rig, scene, goal=goal, rounds=12)
+    run = cdpr.run(plan, rig, folder=tmp_path / "run", realtime=False)
+    assert run.passed, run.summary["reasons"]
+    assert np.isfinite(run.poses["x_mm"]).any()
+
+
+@pytest.mark.parametrize("percent", [0, 101, 50.0, True])
+def test_a_speed_that_cannot_be_is_refused_before_it_is_sent(percent: object) -> None:
+    with pytest.raises(cdpr.BadInput, match="whole number of percent"):
+        set_speed(percent)  # type: ignore[arg-type]
 
 
 def test_a_figure_shows_error_tensions_and_clearance(run: cdpr.RunResult) -> None:

@@ -45,6 +45,26 @@ def test_an_interrupt_before_there_is_a_result_stays_an_interrupt() -> None:
         Supervisor().during(board, until_stopped(board, stopped))
 
 
+def test_an_interrupt_does_not_end_the_writing_of_the_record() -> None:
+    supervisor, went_on = Supervisor(), threading.Event()
+
+    def record() -> str:
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+        assert went_on.wait(PATIENCE_S)
+        return "written"
+
+    interrupt = supervisor._interrupt
+
+    def interrupted(*arguments: object) -> None:
+        interrupt(*arguments)  # type: ignore[arg-type]
+        went_on.set()
+
+    supervisor._interrupt = interrupted  # type: ignore[method-assign]
+    assert supervisor.conclude(record) == "written"
+    with pytest.raises(KeyboardInterrupt):
+        supervisor.finish()
+
+
 def test_an_error_of_the_motion_is_the_callers() -> None:
     board = LocalRequests()
 

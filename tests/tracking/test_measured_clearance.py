@@ -89,8 +89,13 @@ def test_touching_bodies_take_the_worst_direction(rig: Rig, crowded: Scene) -> N
 
 
 def test_a_scene_without_obstacles_has_no_clearance(rig: Rig, crowded: Scene) -> None:
+    """Also where errors are not stated: then there is nothing that they could change."""
     empty = ClearanceModel(rig, replace(crowded, obstacles=()))
-    assert clearance_of(empty, measurement(rig.home, np.eye(6) * 1e-8)) is None
+    measured = measurement(rig.home, np.eye(6) * 1e-8)
+    assert clearance_of(empty, measured) is None
+    assert clearance_of(empty, replace(measured, unstated=True)) is None
+    with pytest.raises(BadInput, match="unknown"):
+        clearance_of(ClearanceModel(rig, crowded), replace(measured, unstated=True))
 
 
 def looking(rig: Rig, **said: object) -> Camera:

@@ -239,7 +239,7 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
     """
     if not len(corners):
         return []
-    pixels = np.ascontiguousarray(image)[:]
+    pixels = np.ascontiguousarray(camera.linear(image))[:]
     pixels.flags.writeable = False  # kernels are compiled for images that are read-only
     rough = np.array(corners, dtype=np.float64)
     inside = _inside(rough, image.shape)

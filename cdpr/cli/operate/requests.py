@@ -38,7 +38,8 @@ def stop(
 
 
 #: States in which requests come too late.
-OVER = {State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED, State.LATCHED}
+_ENDING = (State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED, State.LATCHED)
+OVER = frozenset(state.value for state in _ENDING)
 
 _Process = Annotated[
     int | None, typer.Option("--process", help="process number, if several runs are in progress")
@@ -85,11 +86,14 @@ def speed(
 
 def _request(verb: str, process: int | None, as_json: bool, percent: int | None = None) -> None:
     status = request_run(verb, process, percent)
+    is_over = status["state"] in OVER
     if as_json:
         show_json(status)
-        return
-    if State(status["state"]) in OVER:
+    elif is_over:
         show_line(f"too late: process {status['process']} is {status['state']}")
+    if is_over:
+        raise typer.Exit(1)
+    if as_json:
         return
     request = {"hold": "hold", "resume": "resume", "speed": f"run at {percent} %"}[verb]
     show_line(

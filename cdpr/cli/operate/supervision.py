@@ -139,6 +139,10 @@ class RunSupervisor(SignalSupervisor):
         """Takes over the signals, once the operator agreed to the run."""
         self._signals.enter_context(_handling(self._on_signal))
 
+    def conclude(self, work: Callable[[], _T]) -> _T:
+        """See `Supervisor`; signals are handled already."""
+        return work()
+
     def on_motion(self) -> None:
         """See `Supervisor`."""
         self.moved = True
