@@ -188,7 +188,7 @@ def set_speed(percent: int, process: int | None = None) -> dict[str, Any]:
     Raises:
         BadInput: It is not a whole number of these, or as for `hold`.
     """
-    if isinstance(percent, bool) or not isinstance(percent, int) or not 1 <= percent <= 100:
+    if type(percent) is not int or not 1 <= percent <= 100:
         raise BadInput(
             f"the speed must be a whole number of percent from 1 to 100, it is {percent!r}",
             where="set_speed",

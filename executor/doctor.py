@@ -193,10 +193,12 @@ def rig_cameras(rig: Rig, source: str | None) -> list[MachineCheck]:
         return [
             MachineCheck("camera", source is None, "the rig file has none", "leave out --camera")
         ]
-    camera = rig.cameras[0]
+    camera, gamma = rig.cameras[0], ""
+    if "gamma" not in rig.document.cameras[0].model_fields_set:
+        gamma = "; its `gamma` is not stated: a webcam needs `gamma: srgb`"
     if source is None:
         devices = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*")))
-        text = f"not tested (--camera INDEX tests it); devices here: {devices or 'none'}"
+        text = f"not tested (--camera INDEX tests it); devices here: {devices or 'none'}{gamma}"
         return [MachineCheck(f"camera {camera.name}", True, text)]
     from drivers.cameras.live import LiveCamera  # needs OpenCV
 
@@ -204,7 +206,7 @@ def rig_cameras(rig: Rig, source: str | None) -> list[MachineCheck]:
         LiveCamera(source, camera).close()
     except CdprError as error:
         return [MachineCheck(f"camera {camera.name}", False, error.what, error.next_step)]
-    text = f"{source} opens and delivers images of {camera.width} x {camera.height} px"
+    text = f"{source} opens and delivers images of {camera.width} x {camera.height} px{gamma}"
     return [MachineCheck(f"camera {camera.name}", True, text)]
 
 

@@ -25,6 +25,7 @@ from model.errors import BadInput, Refused, StoppedByOperator
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
+from tracking.shared_errors import require_stated_errors
 
 #: Largest reach, [m], and speed, [m/s], of winding in.
 FURTHEST, FASTEST = 0.200, 0.010
@@ -119,6 +120,7 @@ def home(
     _require_slow(reach, speed, pictures)
     source = choose_one_camera(rig, sources, in_process) if sources else None
     if source is not None:
+        require_stated_errors(rig, source[:1], "set a reference")
         require_synthetic_images(source[1:], not realtime)
     known = None if source is not None else _stated_pose(rig, pose)
     limit = limit_of(rig, limit)
@@ -288,6 +290,4 @@ def _referenced(
     samples = measure_at_rest(rig, source, pictures, true_pose, require_no_stop, SILENT)
     found = static_pose(rig, samples)
     how = f"tags in {found.pictures} of {pictures} images, camera {source[0].name!r}"
-    if found.unstated:
-        how += "; systematic errors not stated"
     return reference_at(rig, found.pose, result.counts, result.tensions, how, found.uncertainty)

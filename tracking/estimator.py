@@ -219,8 +219,9 @@ class PlatformEstimator:
         # The platform hangs between or below the outlets: it is in the box around them, its
         # workspace and its home pose, plus its own size.
         size = float(np.linalg.norm(rig.half_size))
-        corners = [rig.outlets, [rig.workspace_lower, rig.workspace_upper, rig.home.position]]
-        reached = np.concatenate(corners)
+        reached = np.vstack(
+            [rig.outlets, rig.workspace_lower, rig.workspace_upper, rig.home.position]
+        )
         self._lower, self._upper = reached.min(axis=0) - size, reached.max(axis=0) + size
         self._camera_from_world = camera.world_from_camera.inverse()
         self._shared = SharedErrors(rig, camera)

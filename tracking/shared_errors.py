@@ -41,8 +41,15 @@ def missing_errors(rig: Rig, camera: Camera) -> tuple[str, ...]:
     return tuple(key for key, value in stated.items() if value is None)
 
 
-def require_stated_errors(rig: Rig, cameras: Sequence[Camera]) -> None:
-    """Refuses to measure clearance with unknown errors.
+def require_stated_errors(
+    rig: Rig, cameras: Sequence[Camera], use: str = "measure clearance"
+) -> None:
+    """Refuses to measure with unknown errors.
+
+    Args:
+        rig: Its tags.
+        cameras: That measure.
+        use: What they are to do.
 
     Raises:
         BadInput: For a camera with unknown errors; it asks for one number.
@@ -51,8 +58,7 @@ def require_stated_errors(rig: Rig, cameras: Sequence[Camera]) -> None:
         missing = missing_errors(rig, camera)
         if missing and camera.error is None:
             raise BadInput(
-                f"the measuring error of camera {camera.name!r} is unknown, so it cannot measure"
-                " clearance",
+                f"the measuring error of camera {camera.name!r} is unknown, so it cannot {use}",
                 where=f"rig {rig.name}",
                 why=f"calibrations have not stated {', '.join(missing)}",
                 next_step=f"add `error_mm` to camera {camera.name!r} in the rig file: the error of"

@@ -70,6 +70,8 @@ class TagsResult(ResultDocument):
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with the tags at these poses.
 
+        Their error counts only if all were located: the others keep the drawing's poses.
+
         Raises:
             BadInput: The rig's tags differ in number, size or family.
         """
@@ -77,7 +79,8 @@ class TagsResult(ResultDocument):
         assert rig.tags is not None  # or their basis were another
         placed = {tag.id: tag for tag in self.platform}
         tags = [placed.get(tag.id, tag) for tag in rig.tags.platform]
-        changes = {"platform": tags, "error_mm": self.error_mm}
+        is_whole = all(tag.id in placed for tag in rig.tags.platform)
+        changes = {"platform": tags, "error_mm": self.error_mm if is_whole else None}
         return rig.model_copy(update={"tags": rig.tags.model_copy(update=changes)})
 
 

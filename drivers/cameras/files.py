@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.live import Frame, Image, is_too_large
+from drivers.cameras.live import Frame, Image, eight_bits, is_too_large
 from model.errors import AlreadyExists, BadInput, Fault
 from model.files.documents import write_bytes_atomic
 from model.files.reading import PICTURE_LIMIT, read_bytes
@@ -211,12 +211,16 @@ def _head(path: Path) -> bytes:
 def _decoded(data: bytes, upright: bool = True) -> Image | None:
     if not data or is_too_large(data):
         return None
-    flags = cv2.IMREAD_GRAYSCALE | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = (
+        cv2.IMREAD_GRAYSCALE
+        | cv2.IMREAD_ANYDEPTH
+        | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
+    )
     try:
         picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error:
         return None
-    return None if picture is None else np.asarray(picture, dtype=np.uint8)
+    return None if picture is None else eight_bits(picture)
 
 
 def exif_orientation(data: bytes) -> int:

@@ -385,6 +385,19 @@ def _opened(source: int | str) -> cv2.VideoCapture:
 
 
 def _grey(picture: NDArray[np.generic]) -> Image:
-    if picture.ndim == 3:
-        return np.asarray(cv2.cvtColor(picture.astype(np.uint8), cv2.COLOR_BGR2GRAY), np.uint8)
-    return picture.astype(np.uint8)
+    eight = eight_bits(picture)
+    if eight.ndim == 3:
+        return np.asarray(cv2.cvtColor(eight, cv2.COLOR_BGR2GRAY), np.uint8)
+    return eight
+
+
+def eight_bits(picture: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """An image with values of 8 bits, from one with the 8 to 16 bits that its brightest needs.
+
+    Sensors of 10 and 12 bits deliver 16 bits, of which the upper ones are never set.
+    """
+    if picture.dtype == np.uint8:
+        return np.asarray(picture, np.uint8)
+    values = picture.astype(np.uint16)
+    used = max(8, int(values.max(initial=0)).bit_length())
+    return (values >> (used - 8)).astype(np.uint8)

@@ -239,14 +239,12 @@ class RestPose:
         uncertainty: Of the position along its worst direction, standard deviation, [m].
         length_uncertainty: Largest of the cable lengths, standard deviation, [m].
         pictures: Number of images with a pose.
-        unstated: Whether a part of the systematic errors is not stated, so not in these.
     """
 
     pose: Pose
     uncertainty: float
     length_uncertainty: float
     pictures: int
-    unstated: bool
 
 
 def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
@@ -291,8 +289,7 @@ def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
             " or `error_mm`, state an error that large",
         )
     worst = float(np.sqrt(np.max(np.linalg.eigvalsh(covariance[:3, :3]))))
-    unstated = any(sample.unstated for sample in found)
-    return RestPose(pose, worst, lengths, len(found), unstated)
+    return RestPose(pose, worst, lengths, len(found))
 
 
 def _refusal(what: str, why: str) -> Refused:

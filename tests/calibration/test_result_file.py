@@ -20,7 +20,7 @@ from calibration.result_files import load_result
 from calibration.results import CalibrationVerdict, Issue, write_result
 from calibration.statistics import Interval
 from model.errors import BadInput
-from model.rig import Rig, load_rig
+from model.rig import Rig, load_rig, rig_from_document
 from tests.calibration.results import camera_result_of
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -71,6 +71,17 @@ def test_a_camera_result_replaces_the_parameters_of_the_rig_file(rig: Rig) -> No
     assert new.world_from_camera.distance_to(old.world_from_camera) == 0.0
     assert rig.cameras[0].matrix[0, 0] == 900.0  # the rig itself is as it was
     assert better.plan_hash == rig.plan_hash
+
+
+def test_a_pose_found_with_another_lens_states_no_error(rig: Rig) -> None:
+    """It is off by what the lens was off, which its covariance did not know."""
+    document = rig.document.cameras[0].model_copy(
+        update={"pose_covariance": np.eye(6).tolist(), "pose_by_lens": np.zeros((6, 9)).tolist()}
+    )
+    known = rig_from_document(rig.document.model_copy(update={"cameras": [document]}))
+    assert known.cameras[0].pose_covariance is not None
+    camera = known.with_calibration(camera_result_of()).cameras[0]
+    assert (camera.pose_covariance, camera.pose_by_lens) == (None, None)
 
 
 @pytest.mark.parametrize(

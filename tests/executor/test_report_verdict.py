@@ -12,7 +12,7 @@ from executor.evaluation import _context_of
 from executor.recording.clearance import ClearanceTable, no_clearance
 from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunEvent
-from executor.recording.summary import summarize
+from executor.recording.summary import _clearance, summarize
 from executor.recording.tables import CycleTable, no_poses
 from executor.recording.verdict import distances, following, replies, tensions
 from executor.report.tiles import chips
@@ -255,3 +255,33 @@ def test_drives_that_say_they_are_simulated_are_believed_on_every_bus() -> None:
         assert summary["simulated"] is simulated
         assert summary["verdict"] == "PASSED"
         assert ("simulated drives" in chips(summary)) is simulated
+
+
+@pytest.mark.parametrize(("until", "source"), [(1.0, "encoder"), (1e9, "tag")])
+def test_the_smallest_clearance_is_the_encoders_where_no_camera_looked(
+    until: float, source: str
+) -> None:
+    """Of a run that the camera saw only at its beginning, or throughout."""
+    table = fake_run.make(10.0).clearance
+    kept = np.array(
+        [s == "encoder" or t <= until for s, t in zip(table.source, table.time, strict=True)]
+    )
+    distance = np.where(np.array(table.source) == "tag", table.distance + 1e-4, table.distance)
+    seen = replace(
+        table,
+        **{
+            name: np.array(getattr(table, name))[kept]
+            for name in ("time", "uncertainty", "at_most", "planned_distance", "distances")
+        },
+        distance=distance[kept],
+        planned_distances=table.planned_distances[kept],
+        **{
+            name: tuple(np.array(getattr(table, name))[kept].tolist())
+            for name in ("source", "body", "obstacle")
+        },
+    )
+    found = _clearance(seen, 0.0)
+    assert found is not None
+    assert found["source"] == source
+    if source == "encoder":
+        assert found["measured_min"] == pytest.approx(table.of("encoder").distance.min() * 1e3)

@@ -14,11 +14,12 @@ from drivers.cameras.live import Frame, LiveCamera, VideoFile
 from model.errors import BadInput, HardwareMissing
 from model.pose import Pose
 from model.rig import Camera, Rig
+from model.scene import Scene
 from simulation.camera.camera import SyntheticCamera
 from tests.calibration.exif import jpeg
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.pose_log import POSE_COLUMNS, pose_row, write_pose_log
-from tracking.track import NoPlatformSeen, TrackCount, track
+from tracking.track import NoPlatformSeen, NoPoseReasons, TrackCount, track
 from tracking.tracker import Tracker
 
 TRUTH = [Pose.level([0.10 - 0.01 * k, 0.1, 0.4]) for k in range(4)]
@@ -269,3 +270,31 @@ def test_the_pose_log_has_a_row_a_picture_whether_it_gave_a_pose_or_not(
     )
     assert row["tags"].split() == [str(tag) for tag in found.tags]
     assert "detected" in lines[2]
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+def test_images_of_more_bits_keep_their_contrast(tmp_path: Path, camera: Camera, bits: int) -> None:
+    """Cameras store 10 or 12 bits in files of 16."""
+    grey = np.add.outer(np.arange(camera.height), np.arange(camera.width)) % 256
+    wide = (grey.astype(np.uint16) << (bits - 8)) if bits > 8 else grey.astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), wide)
+    (frame,) = ImageFolder(tmp_path, camera)
+    np.testing.assert_array_equal(frame.image, grey)
+
+
+def test_reasons_that_differ_in_numbers_are_one() -> None:
+    reasons = NoPoseReasons()
+    for reason in ("error is 1.39 px", "no tag detected", "error is 0.5 px", "error is 12 px"):
+        reasons.add(reason)
+    reasons.add("no tag detected")
+    assert reasons.most_frequent() == "error is 1.39 px"
+
+
+def test_a_platform_below_its_outlets_is_found(rig: Rig, scene: Scene, camera: Camera) -> None:
+    """As of a suspended robot, whose outlets are all above it."""
+    raised = replace(rig, outlets=np.column_stack([rig.outlets[:, :2], np.full(8, 2.0)]))
+    pose = Pose.level(rig.home.position)
+    image = SyntheticCamera(rig, scene, camera, seed=2).render(pose)
+    found = Tracker(raised, camera).observe(image, 0.0)
+    assert isinstance(found, PoseMeasurement), found
+    assert found.pose.distance_to(pose) < 1e-3
