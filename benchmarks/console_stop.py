@@ -193,6 +193,7 @@ def main() -> int:
         bus = stack.enter_context(drives(RIG, 7, within=ENDS_WITHIN_S))
         _, address = stack.enter_context(console(RIG, bus, within=ENDS_WITHIN_S))
         me = stack.enter_context(operator(address))
+        me.bears_late_cycles = True
         listener = stack.enter_context(Listener(bus))
         browser = stack.enter_context(browser_at(of_an_operator(chromium(), folder)))
         page = browser.new_page()
