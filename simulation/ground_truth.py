@@ -128,6 +128,8 @@ def camera_as_built(rig: Rig, camera: Camera) -> tuple[Camera, Optics]:
     moved = _moved(_with_lens(camera, truth), truth.world_from_camera)
     if truth.readout_ms is not None:
         moved = replace(moved, readout=truth.readout_ms / 1e3)
+    if truth.latency_ms is not None:
+        moved = replace(moved, latency=truth.latency_ms / 1e3)
     if truth.gamma is not None:
         moved = replace(moved, gamma=truth.gamma)
     return moved, optics

@@ -11,7 +11,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from model.files.camera_file import Gamma, LensName
+from model.files.camera_file import Gamma, Latency, LensName
 from model.files.documents import (
     Document,
     Finding,
@@ -79,6 +79,9 @@ class SimulatedCameraDocument(Document):
     )
     readout_ms: Annotated[float, Field(ge=-1000.0, le=1000.0)] | None = Field(
         default=None, description="true readout of the rows; left out, as in `cameras`"
+    )
+    latency_ms: Latency | None = Field(
+        default=None, description="true latency; left out, as in `cameras`"
     )
     gamma: Gamma | None = Field(default=None, description="true gamma; left out, as in `cameras`")
     vignetting: Share = Field(default=0.25, description="share of light lost in the corners")
