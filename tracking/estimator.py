@@ -43,8 +43,8 @@ class TrackerSettings:
             images it is about 1.
         doubt: The same where more than `left_out_share` of the edges were left out.
         left_out_share: Share of edges that may be left out, [1].
-        camera_moved_px: Error of frame tags above which the camera counts as moved, beside that from
-            the stated error of its pose.
+        camera_moved_px: Error of frame tags above which the camera counts as moved, beside that
+            from the stated error of its pose.
         camera_check_period: Images between checks of the camera.
     """
 
