@@ -11,7 +11,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from model.files.camera_file import Gamma, Latency, LensName
+from model.files.camera_file import Gamma, Latency, LensName, TagDocument
 from model.files.documents import (
     Document,
     Finding,
@@ -98,11 +98,32 @@ class SimulatedCameraDocument(Document):
     )
 
 
+class SimulatedTagsDocument(Document):
+    """True poses of tags, which no calibration changes; those left out are as in `tags`."""
+
+    platform: list[TagDocument] = []
+    frame: list[TagDocument] = []
+
+    def misfits(self, known: Mapping[str, set[int]]) -> list[Finding]:
+        """Tags that are not in `tags`.
+
+        Args:
+            known: Numbers of the platform's and the frame's tags.
+        """
+        return [
+            (("simulation", "tags", part, k, "id"), f"`tags.{part}` has no tag {tag.id}")
+            for part, tags in (("platform", self.platform), ("frame", self.frame))
+            for k, tag in enumerate(tags)
+            if tag.id not in known[part]
+        ]
+
+
 class SimulationDocument(Document):
     """Imperfections of a simulated rig; those left out are zero."""
 
     seed: Seed = Field(default=0, description="of all noise")
     as_built: AsBuiltDocument | None = None
+    tags: SimulatedTagsDocument = SimulatedTagsDocument()
     winches: SimulatedWinchesDocument = SimulatedWinchesDocument()
     cameras: list[SimulatedCameraDocument] = []
 
