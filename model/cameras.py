@@ -54,6 +54,7 @@ class Camera:
             [m]; None where the operator does not state it.
         readout: From the exposure of the top row to that of the bottom row, [s]; images are stamped
             with the time of the middle row.
+        latency: From the middle of an image's exposure to its arrival, [s].
         gamma: How grey levels encode light: "srgb", or the exponent of light to grey levels.
     """
 
@@ -70,6 +71,7 @@ class Camera:
     pose_by_lens: Array | None = None
     error: float | None = None
     readout: float = 0.0
+    latency: float = 0.0
     gamma: Gamma = 1.0
 
     def linear(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -155,6 +157,7 @@ def camera_from(document: CameraDocument) -> Camera:
         pose_by_lens=_scaled(document.pose_by_lens, _SCALES[:, None]),
         error=None if document.error_mm is None else document.error_mm / 1e3,
         readout=document.readout_ms / 1e3,
+        latency=document.latency_ms / 1e3,
         gamma=document.gamma,
     )
 

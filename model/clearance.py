@@ -258,6 +258,22 @@ class ClearanceModel:
             for name, obstacle in zip(self.obstacle_names, self._obstacles, strict=True)
         )
 
+    def near(self, pose: Pose, within: float) -> tuple[tuple[Nearest, ...], ...]:
+        """For each obstacle, the nearest body and then the others that are hardly farther away.
+
+        Args:
+            pose: ``world_from_platform``.
+            within: Largest distance beyond that of the nearest, [m].
+        """
+        bodies = RobotBodies(self.rig, pose)
+        return tuple(
+            tuple(
+                self._named(name, body, found)
+                for body, found in obstacle.near(bodies, self._radii, within)
+            )
+            for name, obstacle in zip(self.obstacle_names, self._obstacles, strict=True)
+        )
+
     def smallest(self, pose: Pose) -> Nearest | None:
         """The smallest distance to any obstacle; None in a scene without obstacles."""
         return min(self.obstacles(pose), key=lambda n: n.distance, default=None)
@@ -363,6 +379,21 @@ class _ObstacleDistances:
             if found.distance - radii[body] < smallest:
                 best_body, best, smallest = body, found, found.distance - radii[body]
         return best_body, best
+
+    def near(
+        self, bodies: RobotBodies, radii: Array, within: float
+    ) -> list[tuple[int, Separation]]:
+        """Bodies up to ``within`` [m] farther away than the nearest, in order of distance."""
+        nearest_body, nearest = self.nearest(bodies, radii)
+        limit = nearest.distance - radii[nearest_body] + within
+        found = {nearest_body: nearest}
+        for piece, body in np.argwhere(self._bounds(bodies, radii) <= limit).tolist():
+            _, one = self._distance(bodies, piece, body)
+            if one.distance - radii[body] <= limit and (
+                body not in found or one.distance < found[body].distance
+            ):
+                found[body] = one
+        return sorted(found.items(), key=lambda item: item[1].distance - radii[item[0]])
 
     def at_least(
         self, bodies: RobotBodies, shifted: ShiftedBodies, radii: Array, wanted: float

@@ -13,8 +13,10 @@ import numpy as np
 from model.errors import BadInput
 from model.files.camera_file import require_coefficients
 from model.files.documents import PoseDocument
+from model.files.rig_file import RigDocument
 from model.files.simulation_file import (
     SimulatedCameraDocument,
+    SimulatedTagsDocument,
     SimulatedWinchesDocument,
     SimulationDocument,
 )
@@ -63,15 +65,14 @@ def simulation_of(rig: Rig) -> SimulationDocument:
 
 
 def rig_as_built(rig: Rig) -> Rig:
-    """The rig with its true geometry: outlets, anchors, drums, pulleys, counts at home.
+    """The rig with its true geometry: outlets, anchors, drums, pulleys, counts at home, and tags.
 
     Raises:
         BadInput: The true geometry is invalid.
     """
-    truth = simulation_of(rig).as_built
+    truth, document = simulation_of(rig).as_built, _with_true_tags(rig.document)
     if truth is None:
-        return rig
-    document = rig.document
+        return rig if document is rig.document else rig_from_document(document)
     winches = [
         winch.model_copy(update={"drum_mm_per_rev": drum, "home_counts": round(home)})
         for winch, drum, home in zip(
@@ -87,6 +88,18 @@ def rig_as_built(rig: Rig) -> Rig:
         radius = {"radius_mm": truth.pulley_radius_mm}
         changes["pulleys"] = document.pulleys.model_copy(update=radius)
     return rig_from_document(document.model_copy(update=changes))
+
+
+def _with_true_tags(document: RigDocument) -> RigDocument:
+    """The rig file's content with the true tags; itself if none are stated."""
+    true = document.simulation.tags if document.simulation else SimulatedTagsDocument()
+    if document.tags is None or not (true.platform or true.frame):
+        return document
+    changes = {}
+    for part, tags in (("platform", true.platform), ("frame", true.frame)):
+        placed = {tag.id: tag for tag in tags}
+        changes[part] = [placed.get(tag.id, tag) for tag in getattr(document.tags, part)]
+    return document.model_copy(update={"tags": document.tags.model_copy(update=changes)})
 
 
 def stiffness_as_built(rig: Rig) -> Array | None:
@@ -128,6 +141,8 @@ def camera_as_built(rig: Rig, camera: Camera) -> tuple[Camera, Optics]:
     moved = _moved(_with_lens(camera, truth), truth.world_from_camera)
     if truth.readout_ms is not None:
         moved = replace(moved, readout=truth.readout_ms / 1e3)
+    if truth.latency_ms is not None:
+        moved = replace(moved, latency=truth.latency_ms / 1e3)
     if truth.gamma is not None:
         moved = replace(moved, gamma=truth.gamma)
     return moved, optics

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from model.clearance import ClearanceModel, Nearest, cable_name
 from model.errors import BadInput
 from model.kinematics import Cables, cables_at
 from model.pose import Array, Pose, read_only, skew
+from model.rig import Rig
 from tracking.measurement import PoseMeasurement
 
 COVERAGE = 0.95
@@ -27,10 +29,13 @@ class MeasuredClearance:
         nearest: In the order of the scene's obstacles.
         uncertainties: Half widths of each distance's interval with `COVERAGE`, from the measured
             pose, outlets and anchors; shape (k,), [m].
+        others: Bodies hardly farther away, which may be nearer: index of the obstacle, distance
+            and uncertainty, [m].
     """
 
     nearest: tuple[Nearest, ...]
     uncertainties: Array
+    others: tuple[tuple[int, float, float], ...] = ()
 
     @property
     def distance(self) -> float:
@@ -41,10 +46,10 @@ class MeasuredClearance:
     def uncertainty(self) -> float:
         """`distance` minus the lower bound of the smallest true distance, [m].
 
-        It exceeds the nearest obstacle's own uncertainty if one slightly farther away is less
-        certain.
+        It exceeds the nearest pair's own uncertainty if one slightly farther away is less certain.
         """
         lows = [n.distance - u for n, u in zip(self.nearest, self.uncertainties, strict=True)]
+        lows += [distance - u for _, distance, u in self.others]
         return self.distance - float(min(lows))
 
     @property
@@ -62,7 +67,10 @@ class MeasuredClearance:
 
     @property
     def _highs(self) -> Array:
-        return np.array([n.distance for n in self.nearest]) + self.uncertainties
+        highs = np.array([n.distance for n in self.nearest]) + self.uncertainties
+        for obstacle, distance, uncertainty in self.others:
+            highs[obstacle] = min(highs[obstacle], distance + uncertainty)
+        return highs
 
 
 def clearance_of(model: ClearanceModel, measurement: PoseMeasurement) -> MeasuredClearance | None:
@@ -107,15 +115,35 @@ def clearance_at(
         cable_error: Error of cable exits, 95 %, [m]; 0 to use the rig's `outlet_error` and
             `anchor_error`.
     """
-    nearest = model.obstacles(pose)
-    if not nearest:
+    if not model.obstacle_names:
         return None
     cables = cables_at(model.rig, pose)
     names = {cable_name(i): i for i in range(model.rig.cable_count)}
     at_ends = (model.rig.outlet_error or 0.0, model.rig.anchor_error or 0.0)
     ends = np.array((cable_error, 0.0) if cable_error > 0.0 else at_ends) / Z_95
-    variances = [_variance(n, names.get(n.first), cables, pose, covariance, ends) for n in nearest]
-    return MeasuredClearance(nearest, read_only(Z_95 * np.sqrt(variances) + allowance))
+
+    def uncertainty(near: Nearest) -> float:
+        variance = _variance(near, names.get(near.first), cables, pose, covariance, ends)
+        return Z_95 * math.sqrt(variance) + allowance
+
+    nearby = model.near(pose, _largest_difference(model.rig, covariance, ends))
+    nearest = tuple(bodies[0] for bodies in nearby)
+    others = tuple(
+        (obstacle, near.distance, uncertainty(near))
+        for obstacle, bodies in enumerate(nearby)
+        for near in bodies[1:]
+    )
+    own = read_only(np.array([uncertainty(near) for near in nearest]))
+    return MeasuredClearance(nearest, own, others)
+
+
+def _largest_difference(rig: Rig, covariance: Array, ends: Array) -> float:
+    """Largest possible uncertainty of any distance, 95 %, without the allowance, [m]."""
+    points = np.vstack([rig.anchors, rig.platform_corners])
+    reach = float(np.linalg.norm(points, axis=1).max())
+    position, turn = (np.linalg.norm(covariance[k : k + 3, k : k + 3], 2) for k in (0, 3))
+    by_pose = math.sqrt(position) + reach * math.sqrt(turn)
+    return Z_95 * math.hypot(by_pose, float(ends.max()))
 
 
 def _variance(

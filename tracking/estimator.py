@@ -39,7 +39,12 @@ class TrackerSettings:
         turn: Largest rotation from the home pose, [rad]; no cable robot rotates by a right angle.
         single_tag_margin: Required cost difference of a single tag's pose to its mirror pose, in
             variances.
-        camera_moved_px: Error of frame tags above which the camera counts as moved.
+        contradiction: Largest misfit of the edges: their mean squared error, in variances. In good
+            images it is about 1.
+        doubt: The same where more than `left_out_share` of the edges were left out.
+        left_out_share: Share of edges that may be left out, [1].
+        camera_moved_px: Error of frame tags above which the camera counts as moved, beside that
+            from the stated error of its pose.
         camera_check_period: Images between checks of the camera.
     """
 
@@ -51,6 +56,9 @@ class TrackerSettings:
     speed: float = 0.2
     turn: float = float(np.radians(80.0))
     single_tag_margin: float = 30.0
+    contradiction: float = 50.0
+    doubt: float = 10.0
+    left_out_share: float = 0.25
     camera_moved_px: float = 1.0
     camera_check_period: int = 10
 
@@ -138,7 +146,11 @@ UNSHARP = "are too blurred to be measured"
 
 
 def rejection_reason(
-    limits: TrackerSettings, views: Sequence[TagView], bundle: BundlePose, prior: Pose | None
+    limits: TrackerSettings,
+    views: Sequence[TagView],
+    bundle: BundlePose,
+    prior: Pose | None,
+    measured: int,
 ) -> str:
     """Why a pose is rejected; empty when it is accepted.
 
@@ -148,7 +160,17 @@ def rejection_reason(
         bundle: The pose, in the camera frame.
         prior: Pose expected from camera measurements, in the same frame; it resolves the ambiguity
             of a single tag.
+        measured: Number of edges found on these tags and on those that were left out.
     """
+    left_out = measured - sum(int(view.seen.edges.sum()) for view in views)
+    misfit = bundle.cost / max(1, bundle.freedom)
+    some_left_out = left_out > limits.left_out_share * measured
+    if misfit > (limits.doubt if some_left_out else limits.contradiction):
+        out = f", with {left_out} of {measured} left out" if left_out else ""
+        return (
+            f"its tags contradict each other: the misfit of their edges is {misfit:.0f} times the"
+            f" expected one{out}"
+        )
     if bundle.reprojection > limits.reprojection_px:
         return (
             f"the reprojection error is {bundle.reprojection:.2f} px,"
@@ -273,6 +295,7 @@ class PlatformEstimator:
         expected: Pose | None,
         status: str,
     ) -> Observation:
+        detected = views
         agreed, measured = self._agreed(views), len(views) > 0
         if agreed.ambiguous:
             twice = ", ".join(map(str, agreed.ambiguous))
@@ -292,8 +315,11 @@ class PlatformEstimator:
             fitted = None if by_rows is None else (by_rows.views, by_rows.bundle)
         if fitted is None:
             return NoPose(time, "no tag of the platform fits a pose", seen)
+        faced = [v for v in views if self._faces(v.tag, fitted[1].camera_from_body)]
+        edges = sum(int(view.seen.edges.sum()) for view in faced)
         views, bundle = fitted
-        reason = rejection_reason(self._settings, views, bundle, prior)
+        reason = rejection_reason(self._settings, views, bundle, prior, edges)
+        reason = reason or self._other_place(detected, views, bundle.camera_from_body)
         faults = edge_faults(image, self._camera, [view.seen for view in views], self._modules)
         if reason or faults.unusable:
             return NoPose(time, "; ".join(filter(None, (reason, str(faults)))), seen)
@@ -324,6 +350,23 @@ class PlatformEstimator:
         others = [number for number in seen if number not in self._frame]
         also = f"; detected instead: {', '.join(map(str, others))}" if others else ""
         return f"no platform tag ({self._rig.tag_family} {wanted}) detected{also}"
+
+    def _other_place(self, detected: Sequence[TagView], used: Sequence[TagView], pose: Pose) -> str:
+        """Why the pose of a single tag is rejected: another one is near, but not where it puts it.
+
+        A second print of a tag is farther away than a tag's side.
+        """
+        if len(used) > 1:
+            return ""
+        for view in detected:
+            if view.tag.id == used[0].tag.id or not self._faces(view.tag, pose):
+                continue
+            seen = view.seen.corners
+            side = np.linalg.norm(seen[1] - seen[0])
+            there = project_undistorted(self._camera, pose.apply(tag_corners(view.tag)))
+            if np.linalg.norm(np.mean(there - seen, axis=0)) < side:
+                return f"its tags contradict each other: {used[0].tag.id} and {view.tag.id}"
+        return ""
 
     def _find_predicted(self, image: Image, pose: Pose, known: set[int]) -> list[TagView]:
         """Tags that the detector missed, searched at their positions predicted by a pose.

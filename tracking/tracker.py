@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from model.cameras import Z_95
 from model.errors import BadInput
 from model.pose import Array, Pose, interpolate
 from model.rig import Camera, Rig
@@ -58,6 +60,17 @@ class EncoderPrior:
         """
         self._shift = measured.position - by_drives.position
         self._turn = measured.rotation @ by_drives.rotation.T
+
+
+def _stated_error_px(rig: Rig, camera: Camera) -> float:
+    """Error of frame tags in an image, 95 %, from the stated error of the camera's pose, [px]."""
+    covariance = camera.pose_covariance
+    if covariance is None or not rig.frame_tags:
+        return 0.0
+    places = np.array([tag.pose.position for tag in rig.frame_tags])
+    nearest = np.linalg.norm(places - camera.world_from_camera.position, axis=1).min()
+    position, turn = (np.linalg.norm(covariance[k : k + 3, k : k + 3], 2) for k in (0, 3))
+    return float(Z_95 * camera.matrix[0, 0] * np.sqrt(position / nearest**2 + turn))
 
 
 class EncoderExtrapolator:
@@ -117,6 +130,7 @@ class Tracker:
         self._last: PoseMeasurement | None = None
         self._before: PoseMeasurement | None = None
         self._prior = EncoderPrior()
+        self._stated_px = _stated_error_px(rig, camera)
         self._pictures = 0
 
     @property
@@ -222,6 +236,6 @@ class Tracker:
         views = self._estimator.views(
             image, nearest_to_expected(self.camera, self._frame, detections), self._frame
         )
-        limit = self.settings.camera_moved_px
+        limit = math.hypot(self.settings.camera_moved_px, self._stated_px)
         check = require_unmoved_camera(self.camera, views, limit)
         self.camera_check = check or self.camera_check

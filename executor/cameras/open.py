@@ -25,7 +25,7 @@ from model.clearance import ClearanceModel
 from model.errors import Fault, StoppedByOperator
 from model.files.rig_file import RigDocument
 from model.files.scene_file import SceneDocument
-from model.pose import Pose
+from model.pose import Pose, interpolate
 from model.progress import Listener
 from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene, empty_scene, scene_from_document
@@ -145,36 +145,62 @@ def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> ImageSource:
         from simulation.camera.camera import ImageSequence
         from simulation.factory import make_synthetic_camera
 
-        return RenderedImages(ImageSequence(make_synthetic_camera(rig, scene, camera)))
-    return LiveImages(LiveCamera(name, camera))
+        synthetic = make_synthetic_camera(rig, scene, camera)
+        true = synthetic.camera.latency
+        return RenderedImages(ImageSequence(synthetic), camera.latency, true)
+    return LiveImages(LiveCamera(name, camera), camera.latency)
 
 
 class RenderedImages:
-    """The synthetic camera as a source of images."""
+    """The synthetic camera as a source of images, which arrive when they are requested.
 
-    def __init__(self, film: ImageSequence) -> None:
-        self._film = film
+    Args:
+        film: Its images.
+        latency: As the rig file states it, [s].
+        true_latency: Of the images, [s].
+    """
+
+    def __init__(self, film: ImageSequence, latency: float, true_latency: float) -> None:
+        self._film, self._latency, self._true_latency = film, latency, true_latency
+        self._poses: list[tuple[float, Pose]] = []
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
-        """Renders the platform at its true pose."""
+        """Renders the platform at its true pose, of the true latency ago."""
         if trigger.true_pose is None:
             raise Fault("the synthetic camera has no platform pose")
-        return self._film.picture(trigger.time, trigger.true_pose, trigger.frame), 0.0
+        self._poses.append((trigger.time, trigger.true_pose))
+        exposed = trigger.time - self._true_latency
+        image = self._film.picture(exposed, self._pose_at(exposed), trigger.frame)
+        return image, -self._latency
+
+    def _pose_at(self, time: float) -> Pose:
+        """Interpolated; before the first image the platform was at rest."""
+        while len(self._poses) > 1 and self._poses[1][0] <= time:
+            self._poses.pop(0)
+        (before, first), (after, second) = self._poses[0], self._poses[min(1, len(self._poses) - 1)]
+        if time <= before or after <= before:
+            return first
+        return interpolate(first, second, (time - before) / (after - before))
 
     def close(self) -> None:
         """Nothing to close."""
 
 
 class LiveImages:
-    """A real camera as a source of images."""
+    """A real camera as a source of images.
 
-    def __init__(self, camera: LiveCamera) -> None:
-        self._camera = camera
+    Args:
+        camera: The camera.
+        latency: Of its images, [s].
+    """
+
+    def __init__(self, camera: LiveCamera, latency: float) -> None:
+        self._camera, self._latency = camera, latency
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
-        """The next image, and its delay after the request, [s]."""
+        """The next image, and the middle of its exposure after the request, [s]."""
         frame = self._camera.read()
-        return frame.image, frame.time - trigger.asked
+        return frame.image, frame.time - self._latency - trigger.asked
 
     def close(self) -> None:
         """Closes the camera."""

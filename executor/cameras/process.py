@@ -78,7 +78,7 @@ class ImageSource(Protocol):
     """A camera, real or rendered, that delivers images on request."""
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
-        """A grey image, and its delay after the request, [s]."""
+        """A grey image, and the middle of its exposure after the request, [s]."""
         ...
 
     def close(self) -> None:

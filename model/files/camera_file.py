@@ -82,6 +82,7 @@ PoseSlopes = Annotated[list[list[AnyNumber]], AfterValidator(_has_six_rows)]
 
 
 Pixels = Annotated[int, Field(ge=64, le=16384)]
+Latency = Annotated[float, Field(ge=0.0, le=5000.0)]
 Gamma = Literal["srgb"] | Annotated[float, Field(ge=1.0, le=4.0)]
 Readout = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 
@@ -147,6 +148,11 @@ class CameraDocument(Document):
         default=0.0,
         description="from the exposure of the top row to that of the bottom row (rolling shutter);"
         " 0: all rows at once, negative: from the bottom up",
+    )
+    latency_ms: Latency = Field(
+        default=0.0,
+        description="from the middle of an image's exposure to its arrival in a live camera's"
+        " program",
     )
     gamma: Gamma = Field(
         default=1.0,

@@ -326,7 +326,11 @@ class RigDocument(Document):
         if self.simulation is None:
             return []
         rates = {camera.name: camera.rate_hz for camera in self.cameras}
-        return self.simulation.misfits(len(self.outlets_mm), self.pulleys is not None, rates)
+        tags = {
+            part: {tag.id for tag in getattr(self.tags, part, [])} for part in ("platform", "frame")
+        }
+        found = self.simulation.misfits(len(self.outlets_mm), self.pulleys is not None, rates)
+        return found + self.simulation.tags.misfits(tags)
 
 
 def _repeated(

@@ -11,7 +11,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from model.files.camera_file import Gamma, LensName
+from model.files.camera_file import Gamma, Latency, LensName, TagDocument
 from model.files.documents import (
     Document,
     Finding,
@@ -80,6 +80,9 @@ class SimulatedCameraDocument(Document):
     readout_ms: Annotated[float, Field(ge=-1000.0, le=1000.0)] | None = Field(
         default=None, description="true readout of the rows; left out, as in `cameras`"
     )
+    latency_ms: Latency | None = Field(
+        default=None, description="true latency; left out, as in `cameras`"
+    )
     gamma: Gamma | None = Field(default=None, description="true gamma; left out, as in `cameras`")
     vignetting: Share = Field(default=0.25, description="share of light lost in the corners")
     light: Positive = Field(default=1.0, description="share of full light")
@@ -95,11 +98,32 @@ class SimulatedCameraDocument(Document):
     )
 
 
+class SimulatedTagsDocument(Document):
+    """True poses of tags, which no calibration changes; those left out are as in `tags`."""
+
+    platform: list[TagDocument] = []
+    frame: list[TagDocument] = []
+
+    def misfits(self, known: Mapping[str, set[int]]) -> list[Finding]:
+        """Tags that are not in `tags`.
+
+        Args:
+            known: Numbers of the platform's and the frame's tags.
+        """
+        return [
+            (("simulation", "tags", part, k, "id"), f"`tags.{part}` has no tag {tag.id}")
+            for part, tags in (("platform", self.platform), ("frame", self.frame))
+            for k, tag in enumerate(tags)
+            if tag.id not in known[part]
+        ]
+
+
 class SimulationDocument(Document):
     """Imperfections of a simulated rig; those left out are zero."""
 
     seed: Seed = Field(default=0, description="of all noise")
     as_built: AsBuiltDocument | None = None
+    tags: SimulatedTagsDocument = SimulatedTagsDocument()
     winches: SimulatedWinchesDocument = SimulatedWinchesDocument()
     cameras: list[SimulatedCameraDocument] = []
 

@@ -28,6 +28,8 @@ from simulation.factory import make_synthetic_camera
 from simulation.ground_truth import camera_as_built, rig_as_built
 from simulation.plant import Plant
 from simulation.rig import Transmission
+from tracking.measurement import PoseMeasurement
+from tracking.tracker import Tracker
 
 ROOT = Path(__file__).resolve().parents[2]
 _CHANNELS = itertools.count()
@@ -202,6 +204,25 @@ def test_two_cameras_at_one_pose_differ_only_by_their_noise(rig: Rig, scene: Sce
     assert 1.0 < apart.std() < 3.0  # of 1.5 grey levels each
 
 
+def test_true_tags_stay_where_they_are_whatever_the_rig_file_says(rig: Rig, scene: Scene) -> None:
+    """So that a rehearsal shows what a wrong calibration of tags costs."""
+    true = rig.document.tags
+    assert true is not None
+    truth = {"platform": [tag.model_dump(mode="json") for tag in true.platform]}
+    shifted = [
+        tag.model_copy(update={"position_mm": [tag.position_mm[0] + 10.0, *tag.position_mm[1:]]})
+        for tag in true.platform
+    ]
+    robot = imperfect(rig, tags=truth)
+    wrong = rig_from_document(
+        robot.document.model_copy(update={"tags": true.model_copy(update={"platform": shifted})})
+    )
+    image = make_synthetic_camera(wrong, scene, wrong.cameras[0]).render(rig.home)
+    found = Tracker(wrong, wrong.cameras[0]).observe(image, 0.0)
+    assert isinstance(found, PoseMeasurement)
+    assert found.pose.position - rig.home.position == pytest.approx([-0.01, 0.0, 0.0], abs=5e-4)
+
+
 @pytest.mark.parametrize(
     ("simulation", "key", "what"),
     [
@@ -209,6 +230,11 @@ def test_two_cameras_at_one_pose_differ_only_by_their_noise(rig: Rig, scene: Sce
         ({"as_built": "pulleys"}, "pulley_radius_mm", "the rig has no pulleys"),
         ({"cameras": [{"name": "rear"}]}, "simulation.cameras[0].name", "there is no camera"),
         ({"cameras": [{"name": "front"}] * 2}, "simulation.cameras[1].name", "appears twice"),
+        (
+            {"tags": {"platform": [{"id": 999, "size_mm": 96, "position_mm": [0, 0, 65]}]}},
+            "simulation.tags.platform[0].id",
+            "has no tag 999",
+        ),
         (
             {"cameras": [{"name": "front", "exposure_ms": 101}]},
             "simulation.cameras[0].exposure_ms",

@@ -196,3 +196,19 @@ def test_the_stated_covariance_is_that_of_the_errors(
             error = error_of(found, truth)
             values.append(error @ np.linalg.solve(found.covariance, error))
     assert 4.5 < np.mean(values) < 7.5
+
+
+@pytest.mark.parametrize("off_mm", [2.0, 4.0, 6.0])
+def test_two_tags_that_contradict_each_other_give_no_pose(
+    rig: Rig, scene: Scene, off_mm: float
+) -> None:
+    """One of them is elsewhere than the rig file says; a wrong pose would be stated as certain."""
+    two = tuple(tag for tag in rig.platform_tags if tag.id in (301, 303))
+    shift = np.array([0.0, off_mm / 1e3, 0.0])
+    moved = replace(two[0], pose=Pose(two[0].pose.position + shift, two[0].pose.rotation))
+    camera = rig.cameras[0]
+    synthetic = SyntheticCamera(replace(rig, platform_tags=two), scene, camera)
+    tracker = Tracker(replace(rig, platform_tags=(moved, two[1])), camera)
+    found = tracker.observe(synthetic.render(Pose.level([0.045, -0.021, 0.42])), 0.0)
+    assert isinstance(found, NoPose)
+    assert "contradict each other" in found.reason

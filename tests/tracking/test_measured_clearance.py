@@ -7,15 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from model.cameras import Z_95
 from model.clearance import ClearanceModel
 from model.errors import BadInput
 from model.files.rig_file import RigDocument
+from model.files.scene_file import SceneDocument
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, rig_from_document
-from model.scene import Scene, load_scene
+from model.scene import Scene, load_scene, scene_from_document
 from simulation.camera.camera import SyntheticCamera
 from tracking.camera_model import distort_pixels, project_undistorted, undistort_pixels
 from tracking.clearance import MeasuredClearance, clearance_of
@@ -38,6 +41,17 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 @pytest.fixture(scope="module")
 def crowded() -> Scene:
     return load_scene(CONFIGS / "environment_3.yaml")
+
+
+@pytest.fixture(scope="module")
+def ball() -> Scene:
+    """One as far from the platform at home as from cable 5."""
+    document = load_scene(CONFIGS / "environment_3.yaml").document
+    plain = document.model_dump(mode="json", exclude_unset=True)
+    sphere = {"sphere": {"radius_mm": 20.0}, "position_mm": [0.0, 300.0, 300.0]}
+    return scene_from_document(
+        SceneDocument.model_validate(plain | {"obstacles": [{"name": "ball", **sphere}]})
+    )
 
 
 def measurement(pose: Pose, covariance: np.ndarray) -> PoseMeasurement:
@@ -76,6 +90,48 @@ def test_the_smallest_distance_counts_the_others_uncertainty_too(rig: Rig, crowd
     measured = MeasuredClearance((first, second), np.array([0.001, 0.004]))
     assert measured.distance == pytest.approx(0.010)
     assert measured.uncertainty == pytest.approx(0.003)  # the second may be only 7 mm away
+
+
+def test_a_less_certain_body_behind_the_nearest_counts(rig: Rig, ball: Scene) -> None:
+    """Where outlets are known badly, a cable may be nearer than the platform that is measured."""
+    error = 8e-3
+    known = replace(rig, outlet_error=error, anchor_error=0.0)
+    model = ClearanceModel(known, ball)
+    (bodies,) = model.near(rig.home, within=0.05)
+    assert [body.first for body in bodies[:2]] == ["platform", "cable 5"], bodies
+    assert bodies[1].distance - bodies[0].distance < 0.002
+    stated = clearance_of(model, measurement(rig.home, np.eye(6) * 1e-10))
+    assert stated is not None
+    assert stated.distance == pytest.approx(bodies[0].distance)
+    draw, low = np.random.default_rng(5), stated.distance - stated.uncertainty
+    true = [
+        ClearanceModel(
+            replace(rig, outlets=rig.outlets + draw.normal(0.0, error / Z_95, (8, 3))), ball
+        )
+        .obstacles(rig.home)[0]
+        .distance
+        for _ in range(300)
+    ]
+    assert np.mean(np.array(true) < low) < 0.05
+    assert np.mean(np.array(true) < stated.distance - 1e-3) > 0.1, "so the nearest alone misleads"
+
+
+@given(seed=st.integers(0, 2**32 - 1), within=st.floats(0.0, 0.3))
+@settings(max_examples=25)
+def test_bodies_near_an_obstacle_are_those_that_comparing_all_finds(
+    rig: Rig, crowded: Scene, seed: int, within: float
+) -> None:
+    pose = Pose.level(rig.home.position + np.random.default_rng(seed).uniform(-0.15, 0.15, 3))
+    model = ClearanceModel(rig, crowded)
+    everything = model.near(pose, within=10.0)
+    for all_bodies, some, nearest in zip(
+        everything, model.near(pose, within), model.obstacles(pose), strict=True
+    ):
+        assert len(all_bodies) == rig.cable_count + 1
+        assert some[0].distance == pytest.approx(nearest.distance, abs=1e-12)
+        limit = nearest.distance + within
+        expected = [near.first for near in all_bodies if near.distance <= limit]
+        assert {near.first for near in some} == set(expected)
 
 
 def test_touching_bodies_take_the_worst_direction(rig: Rig, crowded: Scene) -> None:
