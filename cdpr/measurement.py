@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from calibration.result_files import load_result
@@ -49,6 +49,8 @@ def track(
     plan: Plan | None = None,
     pictures: int | None = None,
     overlay: str | Path | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+    keep: Callable[[TrackResult], None] = lambda _partial: None,
     listener: Listener = SILENT,
 ) -> TrackResult:
     """Measures the platform's pose image by image, with one camera or several fused.
@@ -62,6 +64,9 @@ def track(
         plan: Path of the platform in synthetic images.
         pictures: Largest number of images per camera.
         overlay: New folder or video for the images with the measurements drawn in.
+        stopped: Called before each image; True ends tracking, such as that of a live camera.
+        keep: Called with what was measured before an error or Ctrl-C ends tracking, unless no image
+            gave a pose; the error is then raised.
         listener: Receives the progress, and the files that are not used.
 
     Raises:
@@ -79,6 +84,8 @@ def track(
         plan=plan,
         pictures=pictures,
         overlay=None if overlay is None else Path(overlay),
+        stopped=stopped,
+        keep=keep,
         listener=listener,
     )
 

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from executor.evaluation import rewrite_report
+from executor.recording.resume import passing, require_room, scene_after
 from executor.recording.run_folder import RunFolder
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
 from model.errors import BadInput
+from model.files.scene_file import StopDocument
 from model.plan import Plan, plan_from_document, require_same_rig
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
@@ -18,7 +20,13 @@ from model.scene import Scene
 from planner.check import verify
 from planner.check_report import CheckReport
 from planner.planning import plan_path
-from planner.settings import Objective, PlannerName, PlanningOptions, settings_from_options
+from planner.settings import (
+    Mode,
+    Objective,
+    PlannerName,
+    PlanningOptions,
+    settings_from_options,
+)
 from planner.workspace.compute import Maps, map_workspace, workspace_grids
 from planner.workspace.maps import Question
 
@@ -37,7 +45,10 @@ def plan(
     free_rotation: bool = False,
     start: Pose | None = None,
     goal: Pose | None = None,
+    via: Sequence[Pose] = (),
+    from_run: Path | str | None = None,
     clearance: float | None = None,
+    mode: Mode | None = None,
     max_iterations: int | None = None,
     listener: Listener = SILENT,
 ) -> Plan:
@@ -58,7 +69,11 @@ def plan(
         free_rotation: The platform may rotate, within the scene's limits.
         start: Overrides the scene's start, ``world_from_platform``.
         goal: Overrides the scene's goal, ``world_from_platform``.
+        via: Poses to pass before the scene's stops; short rests there are joined where possible.
+        from_run: Folder of a run that ended early: the plan starts there and visits the remaining
+            stops.
         clearance: Overrides the scene's obstacle clearance, [m].
+        mode: The paper's planners: ``rewire`` (RRT*), or ``paper`` to stop at the first path.
         max_iterations: The paper's planners: largest number of samples.
         listener: Receives the progress of a long search.
 
@@ -67,8 +82,11 @@ def plan(
 
     Raises:
         BadInput: Start, goal or a stop cannot be used, or arguments contradict each other.
+        Refused: The pose at the end of the run is unknown.
         NoSolution: There is no path, or the search ended at its limit.
     """
+    if from_run is not None and start is not None:
+        raise BadInput("from_run and start contradict each other", next_step="leave out one")
     of_legs = [rounds] if isinstance(rounds, int) else list(rounds or ())
     settings = settings_from_options(
         PlanningOptions(
@@ -80,12 +98,18 @@ def plan(
             rounds=of_legs,
             longest_mm=None if longest is None else longest * 1000.0,
             free_rotation=free_rotation,
+            mode=mode,
             max_iterations=max_iterations,
         )
     )
     scene = scene.changed(start=start, goal=goal, clearance=clearance)
+    done: Sequence[StopDocument] = ()
+    if from_run is not None:
+        scene, done, _ = scene_after(scene, rig, Path(from_run))
+        require_room(scene, rig)
+    scene = passing(scene, via)
     each = of_legs if len(of_legs) > 1 else ()
-    return plan_from_document(plan_path(rig, scene, settings, listener, rounds=each))
+    return plan_from_document(plan_path(rig, scene, settings, listener, rounds=each, done=done))
 
 
 def check(plan: Plan, rig: Rig | None = None) -> CheckReport:

@@ -223,7 +223,7 @@ def track_sources(
         within = 0.5 / max(camera.rate for camera in sources)
         try:
             _measure(_together(streams, within, result.together, model), result, advance)
-        except CdprError:
+        except (CdprError, KeyboardInterrupt):
             if result.count.poses:
                 keep(result)
             raise

@@ -24,13 +24,14 @@ from cdpr.cli.options import (
     with_option_groups,
 )
 from cdpr.cli.output import Terminal, show_facts, show_json
-from executor.recording.resume import require_room, scene_after
+from executor.recording.resume import passing, require_room, scene_after
 from model.errors import BadInput
 from model.files.output import require_new_file
 from model.files.scene_file import StopDocument
 from model.plan import plan_as_dict, plan_facts, save_plan
+from model.pose import Pose
 from model.rig import load_rig
-from model.scene import Scene, load_scene
+from model.scene import load_scene
 from planner.planning import plan_path
 from planner.rrt.variants import ConeDraw, FailureRate, Focus, Steer
 from planner.settings import Mode, Objective, PlannerName, PlanningOptions, settings_from_options
@@ -184,7 +185,7 @@ def plan(
         the_scene, done, end = scene_after(the_scene, the_rig, from_run)
         require_room(the_scene, the_rig)
         begun = end.facts(from_run, len(done), len(the_scene.stops))
-    the_scene = _with_via_points(the_scene, via_mm or [])
+    the_scene = passing(the_scene, [_via_point(text) for text in via_mm or []])
     require_new_file(output, force)
     settings = settings_from_options(search.with_seed(seed))
     of_legs = search.rounds if search.rounds and len(search.rounds) > 1 else []
@@ -201,23 +202,20 @@ def plan(
     show_facts(f"plan {output}", [*begun, *plan_facts(document), ("next", next_step)])
 
 
-def _with_via_points(scene: Scene, via_mm: Sequence[str]) -> Scene:
-    """The scene with level poses at ``x y z`` (`joined_points`) before its own stops.
+def _via_point(text: str) -> Pose:
+    """The level pose at ``x y z``.
 
     Raises:
-        BadInput: A position cannot be read.
+        BadInput: It cannot be read.
     """
-    points = []
-    for number, text in enumerate(via_mm, start=1):
-        try:
-            x, y, z = map(float, text.split())
-        except ValueError:
-            raise BadInput(
-                f"--via-mm {text}: three numbers are required", next_step="write --via-mm 0 40 430"
-            ) from None
-        if not all(map(math.isfinite, (x, y, z))):
-            raise BadInput(
-                f"--via-mm {text}: finite numbers are required", next_step="write --via-mm 0 40 430"
-            )
-        points.append(StopDocument(name=f"via {number}", position_mm=[x, y, z]))
-    return scene.changed(stops=[*points, *scene.document.stops]) if points else scene
+    try:
+        x, y, z = map(float, text.split())
+    except ValueError:
+        raise BadInput(
+            f"--via-mm {text}: three numbers are required", next_step="write --via-mm 0 40 430"
+        ) from None
+    if not all(map(math.isfinite, (x, y, z))):
+        raise BadInput(
+            f"--via-mm {text}: finite numbers are required", next_step="write --via-mm 0 40 430"
+        )
+    return Pose.level([x / 1e3, y / 1e3, z / 1e3])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from executor.recording.tables import CycleTable
 from executor.recording.verdict import NOT_ENDED
 from model.clearance import ClearanceModel
 from model.errors import BadInput, Refused
+from model.files.documents import PoseDocument
 from model.files.scene_file import Payload, StopDocument, payloads
 from model.kinematics import cable_lengths, forward_kinematics
 from model.plan import require_same_rig
@@ -216,3 +218,12 @@ def require_room(scene: Scene, rig: Rig) -> None:
             where="start of the new plan",
             next_step=step,
         )
+
+
+def passing(scene: Scene, via: Sequence[Pose]) -> Scene:
+    """The scene with poses to pass before its own stops."""
+    points = []
+    for number, pose in enumerate(via, start=1):
+        given = PoseDocument.of(pose).model_dump(exclude_defaults=True)
+        points.append(StopDocument(name=f"via {number}", **given))
+    return scene.changed(stops=[*points, *scene.document.stops]) if points else scene

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import cdpr
 from drivers import ImageFolder
+from tracking.tracker import Tracker
 
 ROOT = Path(__file__).parents[2]
 SESSION = ROOT / "examples" / "rig_session"
@@ -24,6 +26,25 @@ def test_a_folder_of_images_is_tracked_and_logged(rig: cdpr.Rig, tmp_path: Path)
     assert repr(result) == "<TrackResult 1 poses in 1 images>"
     result.save(str(tmp_path / "poses.csv"))
     assert len((tmp_path / "poses.csv").read_text().splitlines()) == 2
+
+
+def test_what_was_measured_before_ctrl_c_is_kept_and_tracking_ends_when_told(
+    rig: cdpr.Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, kept = iter(range(100)), []
+    result = cdpr.track(rig, SESSION / "pictures", stopped=lambda: next(seen) >= 2)
+    assert len(result.pictures) == 2
+    observe, calls = Tracker.observe, iter(range(100))
+
+    def interrupted(self: Tracker, *arguments: Any) -> Any:
+        if next(calls) == 3:
+            raise KeyboardInterrupt
+        return observe(self, *arguments)
+
+    monkeypatch.setattr(Tracker, "observe", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        cdpr.track(rig, SESSION / "pictures", keep=kept.append)
+    assert [len(partial.pictures) for partial in kept] == [3]
 
 
 def test_a_source_of_images_is_opened_by_what_it_is(rig: cdpr.Rig) -> None:

@@ -68,6 +68,22 @@ def test_a_run_is_loaded_from_its_folder_and_reported_again(run: cdpr.RunResult)
         cdpr.load_run(run.folder / "missing")
 
 
+def test_a_plan_continues_a_run_and_passes_poses(run: cdpr.RunResult) -> None:
+    rig = cdpr.load_rig(CONFIGS / "gachon_8_6.yaml")
+    scene = cdpr.load_scene(CONFIGS / "environment_1.yaml")
+    end = cdpr.Pose.level(np.add(scene.start.position, (-0.01, 0.0, 0.01)))
+    goal, between = (cdpr.Pose.level(np.add(end.position, (dx, 0.0, 0.02))) for dx in (0.0, 0.02))
+    plan = cdpr.plan(rig, scene, goal=goal, via=[between], from_run=run.folder, rounds=12)
+    assert plan.waypoints[0].distance_to(end) < 1e-3
+    assert plan.waypoints[plan.stops[0]].distance_to(between) < 1e-8
+    assert plan.waypoints[-1].distance_to(goal) < 1e-8
+    assert cdpr.check(plan, rig)
+    with pytest.raises(cdpr.BadInput, match="contradict"):
+        cdpr.plan(rig, scene, start=end, from_run=run.folder)
+    with pytest.raises(cdpr.BadInput, match="nothing remains"):
+        cdpr.plan(rig, scene, goal=end, from_run=run.folder)
+
+
 def messages(path: Path) -> dict[str, int]:
     """Number of messages by topic."""
     with path.open("rb") as stream:
