@@ -37,6 +37,8 @@ class DriveBehaviour:
         ranges: Smallest and largest value by object, replacing the EDS file's.
         mode_delay: Delay of the mode (6061h) after 6060h, [s].
         mode_when_enabled: The mode follows only while the drive is enabled.
+        enable_delay: Time from the command to enable to "operation enabled", [s]: the motor is
+            magnetised and its brake opens.
         warning: EMCY code of a warning that comes and goes while enabled; 0: none.
         flicker: Bits 4, 7 and 8 to 15 of the status word change at every SYNC.
         boot_delay: Time from power-on or reset to the boot-up message, [s].
@@ -57,6 +59,7 @@ class DriveBehaviour:
     ranges: Mapping[tuple[int, int], tuple[int, int]] = field(default_factory=_nothing)
     mode_delay: float = 0.0
     mode_when_enabled: bool = False
+    enable_delay: float = 0.0
     warning: int = 0
     flicker: bool = False
     boot_delay: float = 0.0
@@ -218,6 +221,13 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "",
         "6061h follows 6060h only while the drive is enabled",
         _switch(mode_when_enabled=True),
+    ),
+    NamedBehaviour(
+        "enable-late",
+        "MS",
+        "200",
+        "delay of the state operation enabled: the motor is magnetised and its brake opens",
+        _number("enable_delay", 1e-3),
     ),
     NamedBehaviour(
         "warning",

@@ -51,8 +51,8 @@ from simulation.drives.power import (
     MODE_FOLLOWS,
     NO_WINDOW,
     POSITION_UNIT,
+    TIMED,
     VELOCITY_UNIT,
-    WARNING_CHANGES,
     Motor,
     PowerStage,
     counts_in,
@@ -353,10 +353,8 @@ class SimulatedDrive(PowerStage):
         for what in self._deadlines.passed(self._now):
             if what == _BOOT:
                 self._booted()
-            elif what == MODE_FOLLOWS:
-                self._mode = self._wanted_mode
-            elif what == WARNING_CHANGES:
-                self._warn()
+            elif what in TIMED:
+                self._happens(what)
             elif what == _SYNC:
                 self._raise_error(_SYNC, SYNC_OVERDUE)
                 self._connection_lost(SYNC_OVERDUE)

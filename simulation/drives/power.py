@@ -144,7 +144,8 @@ FOLLOWING_ERROR = 0x8611
 NO_WINDOW = 0xFFFFFFFF
 """Value of 6065h that disables following-error monitoring."""
 
-MODE_FOLLOWS, WARNING_CHANGES = "mode", "warning"
+MODE_FOLLOWS, WARNING_CHANGES, ENABLES = TIMED = ("mode", "warning", "enabling")
+"""Timed events of the power stage."""
 
 _STATUS_CODES = {
     DriveState.NOT_READY: 0x0000,
@@ -396,18 +397,33 @@ class PowerStage(ABC):
 
     def _command_enable(self) -> None:
         """Transitions 4 and 16, and 3 with 4; 16 only if 605Ah holds after a quick stop."""
-        stopped = self.state is DriveState.QUICK_STOP_ACTIVE
-        if (stopped and self._stop_option >= 5) or self.state in (
-            DriveState.READY_TO_SWITCH_ON,
-            DriveState.SWITCHED_ON,
-        ):
-            self.state = DriveState.OPERATION_ENABLED
-            if self._mode != self._wanted_mode and MODE_FOLLOWS not in self._deadlines:
-                self._change_mode()
-            if self._mode != CYCLIC_POSITION:
-                self._target = self.motor.demand
-            if self.behaviour.warning and WARNING_CHANGES not in self._deadlines:
-                self._deadlines.expect(WARNING_CHANGES, self._now + WARNING_LASTS)
+        if self.state is DriveState.QUICK_STOP_ACTIVE:
+            if self._stop_option >= 5:
+                self._enable()
+        elif self.state in (DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON):
+            if not self.behaviour.enable_delay:
+                self._enable()
+            elif ENABLES not in self._deadlines:
+                self.state = DriveState.SWITCHED_ON
+                self._deadlines.expect(ENABLES, self._now + self.behaviour.enable_delay)
+
+    def _enable(self) -> None:
+        self.state = DriveState.OPERATION_ENABLED
+        if self._mode != self._wanted_mode and MODE_FOLLOWS not in self._deadlines:
+            self._change_mode()
+        if self._mode != CYCLIC_POSITION:
+            self._target = self.motor.demand
+        if self.behaviour.warning and WARNING_CHANGES not in self._deadlines:
+            self._deadlines.expect(WARNING_CHANGES, self._now + WARNING_LASTS)
+
+    def _happens(self, what: object) -> None:
+        """An event of `TIMED` is due."""
+        if what == MODE_FOLLOWS:
+            self._mode = self._wanted_mode
+        elif what == ENABLES:
+            self._enable()
+        else:
+            self._warn()
 
     def _warn(self) -> None:
         """Raises or clears a warning, without other effects."""
@@ -426,6 +442,7 @@ class PowerStage(ABC):
 
     def _power_off(self, state: DriveState) -> None:
         """Brake closed, torque off."""
+        self._deadlines.forget(ENABLES)
         self.state, self.torque = state, 0.0
         self.motor.release()
         self._error_time = 0.0

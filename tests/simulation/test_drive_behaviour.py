@@ -217,6 +217,18 @@ def test_mode_when_enabled() -> None:
     assert line.drive.motor.position == 1100
 
 
+def test_enable_late() -> None:
+    """It is switched on meanwhile, without torque; another command cancels it."""
+    line = named("enable-late=45")
+    for _ in range(3):
+        line.sync(0x06)
+        states = [line.sync(0x0F) for _ in range(3)]
+        assert ENABLED not in states
+        assert line.drive.torque == 0.0
+    line.sync(0x06)
+    assert [line.sync(0x0F) for _ in range(9)][-1] == ENABLED
+
+
 def test_a_warning_comes_and_goes_and_the_drive_goes_on() -> None:
     line = named("warning=4310")
     line.enable()

@@ -118,6 +118,7 @@ DRIVES: dict[str, Fault] = {
     "D mode shown 200 ms after enabling": with_drives(
         "mode-when-enabled", "mode-late=200", profile=ONCE_ENABLED
     ),
+    "D enabled 400 ms late": with_drives("enable-late=400"),
     "D boot-up 1.5 s late": with_drives("boot-late=1500"),
     "D a warning of the profile": with_drives("warning=4210", profile={"warnings": ["42xxh"]}),
     "D a warning that the profile lacks": Fault(
