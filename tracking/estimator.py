@@ -7,11 +7,13 @@ the body's, and of a tag detected twice the square that fits it is used.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from model.cameras import Z_95
 from model.pose import Array, Pose, read_only
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, distort_pixels, pixels_of, project_undistorted
@@ -30,7 +32,8 @@ class TrackerSettings:
     """Acceptance limits of a pose, and the camera check.
 
     Attributes:
-        reprojection_px: Largest RMS error of the corners.
+        reprojection_px: Largest RMS error of the corners, beside that from the stated error of the
+            tags.
         view_angle: Largest angle between line of sight and a tag's normal, [rad].
         position_deviation: Largest standard deviation of the position along any direction, [m].
         jump: Largest distance from the last pose beyond what `speed` allows, [m].
@@ -39,8 +42,8 @@ class TrackerSettings:
         turn: Largest rotation from the home pose, [rad]; no cable robot rotates by a right angle.
         single_tag_margin: Required cost difference of a single tag's pose to its mirror pose, in
             variances.
-        contradiction: Largest misfit of the edges: their mean squared error, in variances. In good
-            images it is about 1.
+        contradiction: Largest misfit of the edges: their mean squared error, in variances of edges
+            and of the tags' error. In good images it is about 1.
         doubt: The same where more than `left_out_share` of the edges were left out.
         left_out_share: Share of edges that may be left out, [1].
         camera_moved_px: Error of frame tags above which the camera counts as moved, beside that
@@ -56,8 +59,8 @@ class TrackerSettings:
     speed: float = 0.2
     turn: float = float(np.radians(80.0))
     single_tag_margin: float = 30.0
-    contradiction: float = 50.0
-    doubt: float = 10.0
+    contradiction: float = 7.0
+    doubt: float = 2.0
     left_out_share: float = 0.25
     camera_moved_px: float = 1.0
     camera_check_period: int = 10
@@ -139,6 +142,8 @@ def _fitting(
 # Acceptance tests of a pose.
 
 
+LIKELY_TAG_ERROR = 5e-5
+"""Standard deviation of a tag's corners on the platform, where none is stated, [m]."""
 UNCERTAIN = "the position's uncertainty is"
 """Message about a pose from edges that are too soft, too few or too far away."""
 UNSHARP = "are too blurred to be measured"
@@ -151,6 +156,7 @@ def rejection_reason(
     bundle: BundlePose,
     prior: Pose | None,
     measured: int,
+    tag_error_px: float,
 ) -> str:
     """Why a pose is rejected; empty when it is accepted.
 
@@ -161,9 +167,11 @@ def rejection_reason(
         prior: Pose expected from camera measurements, in the same frame; it resolves the ambiguity
             of a single tag.
         measured: Number of edges found on these tags and on those that were left out.
+        tag_error_px: Standard deviation of the tags' corners on the platform, [px].
     """
     left_out = measured - sum(int(view.seen.edges.sum()) for view in views)
-    misfit = bundle.cost / max(1, bundle.freedom)
+    expected = 1.0 + tag_error_px**2 * float(np.mean(bundle.certainties))
+    misfit = bundle.cost / max(1, bundle.freedom) / expected
     some_left_out = left_out > limits.left_out_share * measured
     if misfit > (limits.doubt if some_left_out else limits.contradiction):
         out = f", with {left_out} of {measured} left out" if left_out else ""
@@ -318,7 +326,10 @@ class PlatformEstimator:
         faced = [v for v in views if self._faces(v.tag, fitted[1].camera_from_body)]
         edges = sum(int(view.seen.edges.sum()) for view in faced)
         views, bundle = fitted
-        reason = rejection_reason(self._settings, views, bundle, prior, edges)
+        stated, likely = self._tag_error_px(bundle)
+        reprojection = math.hypot(self._settings.reprojection_px, stated)
+        limits = replace(self._settings, reprojection_px=reprojection)
+        reason = rejection_reason(limits, views, bundle, prior, edges, likely)
         reason = reason or self._other_place(detected, views, bundle.camera_from_body)
         faults = edge_faults(image, self._camera, [view.seen for view in views], self._modules)
         if reason or faults.unusable:
@@ -350,6 +361,15 @@ class PlatformEstimator:
         others = [number for number in seen if number not in self._frame]
         also = f"; detected instead: {', '.join(map(str, others))}" if others else ""
         return f"no platform tag ({self._rig.tag_family} {wanted}) detected{also}"
+
+    def _tag_error_px(self, bundle: BundlePose) -> tuple[float, float]:
+        """Stated 95 % error of the tags at this distance, and its likely standard deviation, [px].
+
+        The likely one is that of a careful print where none is stated.
+        """
+        scale = self._camera.matrix[0, 0] / float(np.linalg.norm(bundle.camera_from_body.position))
+        stated = self._rig.tag_error or 0.0
+        return stated * scale, max(stated / Z_95, LIKELY_TAG_ERROR) * scale
 
     def _other_place(self, detected: Sequence[TagView], used: Sequence[TagView], pose: Pose) -> str:
         """Why the pose of a single tag is rejected: another one is near, but not where it puts it.

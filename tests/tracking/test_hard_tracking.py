@@ -212,3 +212,26 @@ def test_two_tags_that_contradict_each_other_give_no_pose(
     found = tracker.observe(synthetic.render(Pose.level([0.045, -0.021, 0.42])), 0.0)
     assert isinstance(found, NoPose)
     assert "contradict each other" in found.reason
+
+
+def test_the_stated_error_of_tags_widens_the_limit_of_their_residuals(
+    rig: Rig, scene: Scene
+) -> None:
+    """As it does in pixels: in an image of three times as many pixels, three times as far."""
+    draw = np.random.default_rng(2)
+    camera = replace(
+        rig.cameras[0],
+        width=3 * rig.cameras[0].width,
+        height=3 * rig.cameras[0].height,
+        matrix=rig.cameras[0].matrix * np.array([[3.0], [3.0], [1.0]]),
+    )
+    off = tuple(
+        replace(tag, pose=Pose(tag.pose.position + draw.normal(0.0, 1e-3, 3), tag.pose.rotation))
+        for tag in rig.platform_tags
+    )
+    image = SyntheticCamera(replace(rig, platform_tags=off), scene, camera).render(HERE)
+    unstated = Tracker(replace(rig, tag_error=None), camera).observe(image, 0.0)
+    assert isinstance(unstated, NoPose)
+    assert "reprojection error" in unstated.reason
+    stated = Tracker(replace(rig, tag_error=2e-3), camera).observe(image, 0.0)
+    assert isinstance(stated, PoseMeasurement)
