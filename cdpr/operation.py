@@ -10,6 +10,7 @@ from executor.evaluation import rewrite_report
 from executor.recording.resume import passing, require_room, scene_after
 from executor.recording.run_folder import RunFolder
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
+from executor.supervision import FASTEST, SLOWEST
 from model.errors import BadInput
 from model.files.scene_file import StopDocument
 from model.plan import Plan, plan_from_document, require_same_rig
@@ -207,14 +208,15 @@ def resume(process: int | None = None) -> dict[str, Any]:
 
 
 def set_speed(percent: int, process: int | None = None) -> dict[str, Any]:
-    """Sets the speed along the path, [% of the planned speed], from 1 to 100; else as `hold`.
+    """Sets the speed along the path, [% of the planned speed]; else as `hold`.
 
     Raises:
-        BadInput: It is not a whole number of these, or as for `hold`.
+        BadInput: It is not a whole number from 1 to 100, or as for `hold`.
     """
-    if type(percent) is not int or not 1 <= percent <= 100:
+    if type(percent) is not int or not SLOWEST <= percent <= FASTEST:
         raise BadInput(
-            f"the speed must be a whole number of percent from 1 to 100, it is {percent!r}",
+            f"the speed must be a whole number of percent from {SLOWEST} to {FASTEST}, it is"
+            f" {percent!r}",
             where="set_speed",
         )
     return request_run("speed", process, percent)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.files.camera_file import CameraDocument, Gamma, TagDocument
 from model.pose import Array, Pose, read_only
@@ -74,21 +72,6 @@ class Camera:
     latency: float = 0.0
     gamma: Gamma = 1.0
 
-    def linear(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """An image with grey levels in proportion to light, in which edges are where they are.
-
-        A bright region looks larger in an image with gamma: half way between the grey levels of
-        black and white there is less than half the light.
-
-        Args:
-            image: Grey, of this camera.
-        """
-        return image if self.gamma == 1.0 else _decoding(self.gamma)[image]
-
-    def encoded(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The inverse of `linear`."""
-        return image if self.gamma == 1.0 else _encoding(self.gamma)[image]
-
     def row_times(self, pixels: Array) -> Array:
         """Exposure times of rows relative to the middle row.
 
@@ -99,36 +82,6 @@ class Camera:
             Shape (...), [s].
         """
         return np.asarray(self.readout * ((pixels[..., 1] + 0.5) / self.height - 0.5))
-
-
-_LEVELS = np.arange(256) / 255.0
-
-
-@cache
-def _decoding(gamma: Gamma) -> NDArray[np.uint8]:
-    """Light of each grey level. Source: IEC 61966-2-1 for sRGB."""
-    if gamma == "srgb":
-        light = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4)
-    else:
-        light = _LEVELS**gamma
-    return _table(light)
-
-
-@cache
-def _encoding(gamma: Gamma) -> NDArray[np.uint8]:
-    """Grey level of each light. Source: IEC 61966-2-1 for sRGB."""
-    if gamma == "srgb":
-        power = 1.055 * _LEVELS ** (1.0 / 2.4) - 0.055
-        levels = np.where(_LEVELS <= 0.0031308, 12.92 * _LEVELS, power)
-    else:
-        levels = _LEVELS ** (1.0 / gamma)
-    return _table(levels)
-
-
-def _table(values: Array) -> NDArray[np.uint8]:
-    table = np.round(255.0 * values).astype(np.uint8)
-    table.flags.writeable = False
-    return table
 
 
 def tag_from(document: TagDocument) -> Tag:

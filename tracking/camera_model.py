@@ -7,13 +7,14 @@ solved there. Pixel centres have integer coordinates, as in OpenCV.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput
-from model.files.camera_file import FISHEYE
+from model.files.camera_file import FISHEYE, Gamma
 from model.pose import Array
 from model.rig import Camera
 
@@ -214,3 +215,58 @@ def require_image_format(image: Image, camera: Camera, rig: str) -> None:
             where=f"rig {rig}",
             next_step="use full-size images of this camera, or correct the rig file",
         )
+
+
+# Gamma.
+
+
+def linear(camera: Camera, image: Image) -> Image:
+    """An image with grey levels in proportion to light, in which edges are where they are.
+
+    A bright region looks larger in an image with gamma: half way between the grey levels of black
+    and white there is less than half the light.
+
+    Args:
+        camera: Of the image.
+        image: Grey, shape (h, w).
+    """
+    return image if camera.gamma == 1.0 else _by_table(image, _decoding(camera.gamma))
+
+
+def encoded(camera: Camera, image: Image) -> Image:
+    """The inverse of `linear`."""
+    return image if camera.gamma == 1.0 else _by_table(image, _encoding(camera.gamma))
+
+
+_LEVELS = np.arange(256) / 255.0
+
+
+@cache
+def _decoding(gamma: Gamma) -> NDArray[np.uint8]:
+    """Light of each grey level. Source: IEC 61966-2-1 for sRGB."""
+    if gamma == "srgb":
+        light = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4)
+    else:
+        light = _LEVELS**gamma
+    return _table(light)
+
+
+@cache
+def _encoding(gamma: Gamma) -> NDArray[np.uint8]:
+    """Grey level of each light. Source: IEC 61966-2-1 for sRGB."""
+    if gamma == "srgb":
+        power = 1.055 * _LEVELS ** (1.0 / 2.4) - 0.055
+        levels = np.where(_LEVELS <= 0.0031308, 12.92 * _LEVELS, power)
+    else:
+        levels = _LEVELS ** (1.0 / gamma)
+    return _table(levels)
+
+
+def _table(values: Array) -> NDArray[np.uint8]:
+    table = np.round(255.0 * values).astype(np.uint8)
+    table.flags.writeable = False
+    return table
+
+
+def _by_table(image: Image, table: Image) -> Image:
+    return np.asarray(cv2.LUT(image, table), np.uint8)

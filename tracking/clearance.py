@@ -13,7 +13,7 @@ from model.errors import BadInput
 from model.kinematics import Cables, cables_at
 from model.pose import Array, Pose, read_only, skew
 from model.rig import Rig
-from tracking.measurement import PoseMeasurement
+from tracking.measurement import PoseMeasurement, largest_deviations
 
 COVERAGE = 0.95
 """Share of true distances that lie within the stated uncertainty."""
@@ -141,9 +141,8 @@ def _largest_difference(rig: Rig, covariance: Array, ends: Array) -> float:
     """Largest possible uncertainty of any distance, 95 %, without the allowance, [m]."""
     points = np.vstack([rig.anchors, rig.platform_corners])
     reach = float(np.linalg.norm(points, axis=1).max())
-    position, turn = (np.linalg.norm(covariance[k : k + 3, k : k + 3], 2) for k in (0, 3))
-    by_pose = math.sqrt(position) + reach * math.sqrt(turn)
-    return Z_95 * math.hypot(by_pose, float(ends.max()))
+    position, turn = largest_deviations(covariance)
+    return Z_95 * math.hypot(position + reach * turn, float(ends.max()))
 
 
 def _variance(

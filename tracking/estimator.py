@@ -21,7 +21,7 @@ from tracking.detection.detector import Detection
 from tracking.detection.diagnostics import edge_faults
 from tracking.detection.tags import carries_tag, modules_across, tag_corners
 from tracking.edges.refine import refine
-from tracking.measurement import NoPose, Observation, PoseMeasurement
+from tracking.measurement import NoPose, Observation, PoseMeasurement, largest_deviations
 from tracking.pnp import BundlePose, TagView, refine_pnp, solve_pnp, square_poses
 from tracking.rolling_shutter import FitByRows, RecentMotion, RollingShutter
 from tracking.shared_errors import SharedErrors
@@ -188,7 +188,7 @@ def rejection_reason(
         near = prior is not None and prior.angle_to(bundle.camera_from_body) < 0.1
         if not near:
             return f"only tag {views[0].tag.id} is detected, and it allows two poses"
-    largest = float(np.sqrt(np.linalg.norm(bundle.covariance[:3, :3], 2)))
+    largest, _ = largest_deviations(bundle.covariance)
     if not largest <= limits.position_deviation:
         return (
             f"{UNCERTAIN} {largest * 1e3:.1f} mm,"

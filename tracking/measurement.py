@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,6 +14,16 @@ from model.pose import (
     read_only,
     rotation_vector_from_matrix,
 )
+
+
+def largest_deviations(covariance: Array) -> tuple[float, float]:
+    """Standard deviations of position [m] and rotation [rad] along their worst directions.
+
+    Args:
+        covariance: Of position and rotation vector, shape (6, 6), [m, rad].
+    """
+    position, turn = (np.linalg.norm(covariance[k : k + 3, k : k + 3], 2) for k in (0, 3))
+    return math.sqrt(position), math.sqrt(turn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -124,15 +124,18 @@ class NoPoseReasons:
 
     def __init__(self) -> None:
         """Starts without any."""
-        self._found: dict[str, list[str]] = {}
+        self._counts: Counter[str] = Counter()
+        self._first: dict[str, str] = {}
 
     def add(self, reason: str) -> None:
         """Counts a reason."""
-        self._found.setdefault(_NUMBER.sub("#", reason), []).append(reason)
+        kind = _NUMBER.sub("#", reason)
+        self._counts[kind] += 1
+        self._first.setdefault(kind, reason)
 
     def most_frequent(self) -> str:
         """The first text of the most frequent reason."""
-        return max(self._found.values(), key=len)[0]
+        return self._first[self._counts.most_common(1)[0][0]]
 
 
 def _nothing_seen(

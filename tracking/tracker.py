@@ -20,7 +20,13 @@ from tracking.detection.detector import (
     region_around,
 )
 from tracking.estimator import PlatformEstimator, TrackerSettings
-from tracking.measurement import NoPose, Observation, PoseMeasurement, predict
+from tracking.measurement import (
+    NoPose,
+    Observation,
+    PoseMeasurement,
+    largest_deviations,
+    predict,
+)
 from tracking.rolling_shutter import RecentMotion
 from tracking.shared_errors import CameraCheck, require_unmoved_camera
 
@@ -69,8 +75,8 @@ def _stated_error_px(rig: Rig, camera: Camera) -> float:
         return 0.0
     places = np.array([tag.pose.position for tag in rig.frame_tags])
     nearest = np.linalg.norm(places - camera.world_from_camera.position, axis=1).min()
-    position, turn = (np.linalg.norm(covariance[k : k + 3, k : k + 3], 2) for k in (0, 3))
-    return float(Z_95 * camera.matrix[0, 0] * np.sqrt(position / nearest**2 + turn))
+    position, turn = largest_deviations(covariance)
+    return float(Z_95 * camera.matrix[0, 0] * math.hypot(position / nearest, turn))
 
 
 class EncoderExtrapolator:

@@ -26,6 +26,7 @@ from cdpr.cli.options import (
 from cdpr.cli.output import Terminal, show_facts, show_json
 from executor.recording.resume import passing, require_room, scene_after
 from model.errors import BadInput
+from model.files.documents import millimetres
 from model.files.output import require_new_file
 from model.files.scene_file import StopDocument
 from model.plan import plan_as_dict, plan_facts, save_plan
@@ -218,4 +219,4 @@ def _via_point(text: str) -> Pose:
         raise BadInput(
             f"--via-mm {text}: finite numbers are required", next_step="write --via-mm 0 40 430"
         )
-    return Pose.level([x / 1e3, y / 1e3, z / 1e3])
+    return Pose.level(millimetres([x, y, z]))

@@ -15,7 +15,7 @@ from model.errors import CdprError, Fault, Refused
 from model.kinematics import structure_matrix
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Rig
-from tracking.measurement import Observation, PoseMeasurement
+from tracking.measurement import Observation, PoseMeasurement, largest_deviations
 from tracking.track import FrameRate
 
 # Health of a camera: whether it still measures the platform.
@@ -288,7 +288,7 @@ def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
             "few tags are visible, from far away or at a steep angle, or the camera's calibrations,"
             " or `error_mm`, state an error that large",
         )
-    worst = float(np.sqrt(np.max(np.linalg.eigvalsh(covariance[:3, :3]))))
+    worst, _ = largest_deviations(covariance)
     return RestPose(pose, worst, lengths, len(found))
 
 

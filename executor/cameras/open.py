@@ -177,9 +177,10 @@ class RenderedImages:
         """Interpolated; before the first image the platform was at rest."""
         while len(self._poses) > 1 and self._poses[1][0] <= time:
             self._poses.pop(0)
-        (before, first), (after, second) = self._poses[0], self._poses[min(1, len(self._poses) - 1)]
-        if time <= before or after <= before:
+        before, first = self._poses[0]
+        if time <= before or len(self._poses) == 1:
             return first
+        after, second = self._poses[1]
         return interpolate(first, second, (time - before) / (after - before))
 
     def close(self) -> None:

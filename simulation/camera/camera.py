@@ -34,7 +34,7 @@ from simulation.camera.rendering import (
     shade,
 )
 from simulation.ground_truth import Optics
-from tracking.camera_model import pixels_of, rays_of
+from tracking.camera_model import encoded, pixels_of, rays_of
 
 if TYPE_CHECKING:
     from simulation.camera.rendering import Image8
@@ -366,7 +366,7 @@ class SyntheticCamera:
         """The image after sensor noise and processing."""
         size = (self.camera.width, self.camera.height)
         noisy = self._with_noise(before_the_sensor(picture, self.optics), frame)
-        return processed(self.camera.encoded(noisy), size, self.optics)
+        return processed(encoded(self.camera, noisy), size, self.optics)
 
     def _with_noise(self, picture: Image8, frame: int) -> Image8:
         if self.optics.noise <= 0:

@@ -20,12 +20,25 @@ from executor.recording.run_folder import RunFolder
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 
+def ready() -> tuple[cdpr.Rig, cdpr.Scene]:
+    return (
+        cdpr.load_rig(CONFIGS / "gachon_8_6.yaml"),
+        cdpr.load_scene(CONFIGS / "environment_1.yaml"),
+    )
+
+
+def short_goal(scene: cdpr.Scene) -> cdpr.Pose:
+    return cdpr.Pose.level(np.add(scene.start.position, (-0.01, 0.0, 0.01)))
+
+
+def short_plan(rig: cdpr.Rig, scene: cdpr.Scene) -> cdpr.Plan:
+    return cdpr.plan(rig, scene, goal=short_goal(scene), rounds=12)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> cdpr.RunResult:
-    rig = cdpr.load_rig(CONFIGS / "gachon_8_6.yaml")
-    scene = cdpr.load_scene(CONFIGS / "environment_1.yaml")
-    goal = cdpr.Pose.level(np.add(scene.start.position, (-0.01, 0.0, 0.01)))
-    plan = cdpr.plan(rig, scene, goal=goal, rounds=12)
+    rig, scene = ready()
+    plan = short_plan(rig, scene)
     folder = tmp_path_factory.mktemp("runs") / "short"
     return cdpr.run(plan, rig, folder=str(folder), cameras=[], realtime=False)
 
@@ -69,9 +82,8 @@ def test_a_run_is_loaded_from_its_folder_and_reported_again(run: cdpr.RunResult)
 
 
 def test_a_plan_continues_a_run_and_passes_poses(run: cdpr.RunResult) -> None:
-    rig = cdpr.load_rig(CONFIGS / "gachon_8_6.yaml")
-    scene = cdpr.load_scene(CONFIGS / "environment_1.yaml")
-    end = cdpr.Pose.level(np.add(scene.start.position, (-0.01, 0.0, 0.01)))
+    rig, scene = ready()
+    end = short_goal(scene)
     goal, between = (cdpr.Pose.level(np.add(end.position, (dx, 0.0, 0.02))) for dx in (0.0, 0.02))
     plan = cdpr.plan(rig, scene, goal=goal, via=[between], from_run=run.folder, rounds=12)
     assert plan.waypoints[0].distance_to(end) < 1e-3
@@ -111,10 +123,8 @@ def test_a_report_makes_what_is_missing_from_the_rest(run: cdpr.RunResult, tmp_p
 
 
 def test_a_camera_that_failed_fails_the_run_when_it_is_reported_again(tmp_path: Path) -> None:
-    rig = cdpr.load_rig(CONFIGS / "gachon_8_6.yaml")
-    scene = cdpr.load_scene(CONFIGS / "environment_1.yaml")
-    goal = cdpr.Pose.level(np.add(scene.start.position, (-0.01, 0.0, 0.01)))
-    plan = cdpr.plan(rig, scene, goal=goal, rounds=12)
+    rig, scene = ready()
+    plan = short_plan(rig, scene)
     run = cdpr.run(plan, rig, folder=tmp_path / "run", realtime=False)
     assert run.passed
     course = RunFolder(run.folder).course()
@@ -138,8 +148,7 @@ def test_a_run_without_obstacles_needs_no_stated_errors(tmp_path: Path) -> None:
     free = yaml.safe_load((CONFIGS / "environment_1.yaml").read_text()) | {"obstacles": []}
     (tmp_path / "scene.yaml").write_text(yaml.safe_dump(free))
     scene = cdpr.load_scene(tmp_path / "scene.yaml")
-    goal = cdpr.Pose.level(np.add(scene.start.position, (-0.01, 0.0, 0.01)))
-    plan = cdpr.plan(rig, scene, goal=goal, rounds=12)
+    plan = short_plan(rig, scene)
     run = cdpr.run(plan, rig, folder=tmp_path / "run", realtime=False)
     assert run.passed, run.summary["reasons"]
     assert np.isfinite(run.poses["x_mm"]).any()

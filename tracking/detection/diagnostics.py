@@ -11,7 +11,7 @@ import numpy as np
 from model.pose import Array
 from model.rig import Camera
 from model.tag_families import APRILTAG_FAMILIES
-from tracking.camera_model import Image, distort_pixels
+from tracking.camera_model import Image, distort_pixels, linear
 from tracking.detection.detector import TagDetector
 from tracking.edges.refine import RefinedTag
 
@@ -138,7 +138,7 @@ def edge_faults(
     spreads = np.array([square.spreads for square in squares])[measured]
     opposite = np.roll(corners, -2, axis=1)[measured] - starts
     widths = np.abs(np.sum(opposite * outward, axis=1)) / modules
-    overshoot, clipped = _beside_edges(camera.linear(image), starts, along, outward, widths)
+    overshoot, clipped = _beside_edges(linear(camera, image), starts, along, outward, widths)
     return EdgeFaults(_smear(outward, spreads), float(np.median(spreads)), overshoot, clipped)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from model.pose import Array, read_only
 from model.rig import Camera
-from tracking.camera_model import Image, distort_pixels, undistort_pixels
+from tracking.camera_model import Image, distort_pixels, linear, undistort_pixels
 from tracking.edges.coarse import locate_edges
 from tracking.edges.fit import fit_edges
 from tracking.edges.sampling import (
@@ -239,7 +239,7 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
     """
     if not len(corners):
         return []
-    pixels = np.ascontiguousarray(camera.linear(image))[:]
+    pixels = np.ascontiguousarray(linear(camera, image))[:]
     pixels.flags.writeable = False  # kernels are compiled for images that are read-only
     rough = np.array(corners, dtype=np.float64)
     inside = _inside(rough, image.shape)

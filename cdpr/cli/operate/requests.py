@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import typer
 
@@ -10,6 +11,7 @@ from cdpr.cli.options import JsonOption
 from cdpr.cli.output import out, show_json, show_line
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
 from executor.state_machine import State
+from executor.supervision import FASTEST, SLOWEST
 
 
 def stop(
@@ -70,7 +72,9 @@ def resume(process: _Process = None, as_json: _Json = False) -> None:
 def speed(
     percent: Annotated[
         int,
-        typer.Argument(min=1, max=100, help="percentage of the planned speed", metavar="PERCENT"),
+        typer.Argument(
+            min=SLOWEST, max=FASTEST, help="percentage of the planned speed", metavar="PERCENT"
+        ),
     ],
     process: _Process = None,
     as_json: _Json = False,
@@ -91,10 +95,13 @@ def _request(verb: str, process: int | None, as_json: bool, percent: int | None 
         show_json(status)
     elif is_over:
         show_line(f"too late: process {status['process']} is {status['state']}")
+    else:
+        _confirm(verb, status, percent)
     if is_over:
         raise typer.Exit(1)
-    if as_json:
-        return
+
+
+def _confirm(verb: str, status: Mapping[str, Any], percent: int | None) -> None:
     request = {"hold": "hold", "resume": "resume", "speed": f"run at {percent} %"}[verb]
     show_line(
         f"process {status['process']} received the request to {request}; state {status['state']}"
