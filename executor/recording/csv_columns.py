@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from executor.recording.record_files import LARGEST_RECORDED
 from model.errors import BadInput
 from model.files.documents import write_atomic
 from model.files.reading import CsvFile
@@ -146,7 +147,7 @@ class TableFile:
         """A column of numbers divided by ``scale``, shape (n,).
 
         Raises:
-            BadInput: The column is missing or has a value that is not a number.
+            BadInput: The column is missing, or a value is no number or beyond ±1e15.
         """
         return self._numbers(name, self.texts(name)) / scale
 
@@ -168,7 +169,7 @@ class TableFile:
         """Columns side by side, shape (n, len(names)), divided by ``scale``.
 
         Raises:
-            BadInput: A column is missing or has a value that is not a number.
+            BadInput: A column is missing, or a value is no number or beyond ±1e15.
         """
         if not names:
             return np.empty((len(self._columns[0]), 0))
@@ -178,7 +179,7 @@ class TableFile:
         """As `matrix`, with columns selected by index, as names may appear twice.
 
         Raises:
-            BadInput: A column has a value that is not a number.
+            BadInput: A value is no number or beyond ±1e15.
         """
         if not indices:
             return np.empty((len(self._columns[0]), 0))
@@ -205,11 +206,17 @@ class TableFile:
 
     def _numbers(self, name: str, values: Sequence[str]) -> Array:
         try:
-            return np.fromiter(map(float, values), np.float64, len(values))
+            found = np.fromiter(map(float, values), np.float64, len(values))
         except ValueError as error:
             raise self._bad(
                 f"the column {name!r} has a value that is not a number: {error}"
             ) from None
+        beyond = found[np.isfinite(found) & (np.abs(found) > LARGEST_RECORDED)]
+        if len(beyond):
+            raise self._bad(
+                f"the column {name!r} has a value beyond ±{LARGEST_RECORDED:g}: {beyond[0]:g}"
+            )
+        return found
 
     def _bad(self, what: str) -> BadInput:
         return BadInput(

@@ -30,7 +30,10 @@ from model.files.validation import problems_of
 
 AGAIN = "restore the file, or run the plan again into a new folder"
 
-Number = Annotated[float, Field(ge=-1e15, le=1e15, allow_inf_nan=False)]
+#: No run has a larger number; squares of these are finite.
+LARGEST_RECORDED = 1e15
+
+Number = Annotated[float, Field(ge=-LARGEST_RECORDED, le=LARGEST_RECORDED, allow_inf_nan=False)]
 Maybe = Number | None
 Count = Annotated[int, Field(ge=0, le=2**53)]
 

@@ -82,6 +82,16 @@ def test_a_whole_number_past_64_bits_in_a_table_is_reported(tmp_path: Path) -> N
         TableFile(tmp_path / "a.csv").ints("n")
 
 
+@pytest.mark.parametrize("value", ["-1e308", "1.1e15"])
+def test_a_number_that_no_run_records_is_reported(tmp_path: Path, value: str) -> None:
+    (tmp_path / "a.csv").write_text(f"x_mm,y_mm\n1,2\nnan,{value}\n")
+    table = TableFile(tmp_path / "a.csv")
+    assert table.floats("x_mm")[0] == 1.0
+    for read in (lambda: table.floats("y_mm"), lambda: table.matrix_at(range(1, 2))):
+        with pytest.raises(BadInput, match="'y_mm' has a value beyond"):
+            read()
+
+
 def changed(tmp_path: Path, name: str, old: str, new: str) -> Path:
     text = (CONFIGS / name).read_text()
     assert old in text

@@ -97,6 +97,9 @@ def _all(options: argparse.Namespace, folder: Path, keep: Path) -> Counter[str]:
                 task = (options, corpus, folder, keep, number, starts[number], end)
                 running[number] = context.Process(target=_work, args=task)
                 running[number].start()
+        started = len(running) == options.workers
+        if started and all(worker.exitcode == 0 for worker in running.values()):
+            break
         if time.monotonic() > end and not any(w.is_alive() for w in running.values()):
             break
         time.sleep(0.5)
