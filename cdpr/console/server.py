@@ -380,25 +380,32 @@ def run_server(console: Console, host: str, port: int, on_ready: Callable[[str],
     Raises:
         BadInput: The address cannot be used.
     """
-    with _listening(host, port) as listener:
+    with listening(host, port) as listener:
         server = ConsoleServer(console, host=host)
         on_ready(f"http://{host}:{listener.getsockname()[1]}/?token={server.token}")
-        # A warning for each bad request would fill a pipe that nobody reads, and block the server.
-        config = uvicorn.Config(server.app(), log_level="error", ws_max_size=4096)
         take_short_turns()
         with prompt_threads():
-            uvicorn.Server(config).run(sockets=[listener])
+            web_server(server.app()).run(sockets=[listener])
+
+
+def web_server(app: FastAPI) -> uvicorn.Server:
+    """The HTTP and WebSocket server of a console's application."""
+    # A warning for each bad request would fill a pipe that nobody reads, and block the server.
+    # Compression would cost processor time, and 40 kB for each page until it is collected.
+    config = uvicorn.Config(app, log_level="error", ws_max_size=4096, ws_per_message_deflate=False)
+    return uvicorn.Server(config)
 
 
 @contextmanager
-def _listening(host: str, port: int) -> Iterator[socket.socket]:
+def listening(host: str, port: int) -> Iterator[socket.socket]:
     """A listening socket.
 
     Raises:
         BadInput: The address cannot be used.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as listener:
+    # With its protocol, for asyncio sends without delay (TCP_NODELAY) only where it is stated.
+    with socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((host, port))

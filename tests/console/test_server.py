@@ -17,14 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import uvicorn
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from cdpr.console.commands import MOST_WAITING, Held, LetGo, parse_message
-from cdpr.console.server import MOST_PAGES, ConsoleServer
+from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
 from cdpr.console.session import Console, ConsoleFiles
 from cdpr.console.state import VerbOutcome, _without_commands
 from cdpr.console.watch import RunWatch
@@ -89,18 +88,16 @@ class Served:
 
 @contextmanager
 def serving(served: Served) -> Iterator[Served]:
-    listener = socket.create_server(("127.0.0.1", 0))
-    served.host = f"127.0.0.1:{listener.getsockname()[1]}"
-    config = uvicorn.Config(served.server.app(), log_level="error", ws_max_size=4096)
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=lambda: server.run(sockets=[listener]))
-    thread.start()
-    try:
-        yield served
-    finally:
-        server.should_exit = True
-        thread.join()
-        listener.close()
+    server = web_server(served.server.app())
+    with listening("127.0.0.1", 0) as listener:
+        served.host = f"127.0.0.1:{listener.getsockname()[1]}"
+        thread = threading.Thread(target=lambda: server.run(sockets=[listener]))
+        thread.start()
+        try:
+            yield served
+        finally:
+            server.should_exit = True
+            thread.join()
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +167,16 @@ def said(served: Served, page: ClientConnection, names: list[str]) -> bool:
     found = [name for name, _ in served.said]
     assert found == names
     return True
+
+
+def test_nothing_that_is_sent_waits_for_the_other_side() -> None:
+    with listening("127.0.0.1", 0) as listener:
+        assert listener.proto == socket.IPPROTO_TCP, "asyncio sets TCP_NODELAY by it"
+
+
+def test_messages_are_not_compressed(served: Served) -> None:
+    with served.page() as page:
+        assert page.protocol.extensions == []
 
 
 REPORTS = itertools.count(1)
