@@ -107,7 +107,7 @@ def evaluate(
     return EvaluatedRun(context, cycles, poses, alone, clearance, summary)
 
 
-def evaluate_cut_short(folder: RunFolder) -> EvaluatedRun:
+def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
     """Evaluates a run from the files in its folder, also of a program that was killed.
 
     Raises:
@@ -260,7 +260,7 @@ def rewrite_report(folder: RunFolder) -> None:
     if folder.is_whole and (not folder.has(COURSE) or all(map(folder.has, (FUSED, MCAP)))):
         build_report(folder)  # all is there, or the run is of an earlier version
     else:
-        write_results(folder, evaluate_cut_short(folder))
+        write_results(folder, evaluate_folder(folder))
 
 
 def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:

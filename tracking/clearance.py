@@ -29,13 +29,12 @@ class MeasuredClearance:
         nearest: In the order of the scene's obstacles.
         uncertainties: Half widths of each distance's interval with `COVERAGE`, from the measured
             pose, outlets and anchors; shape (k,), [m].
-        others: Bodies hardly farther away, which may be nearer: index of the obstacle, distance
-            and uncertainty, [m].
+        others: Pairs hardly farther apart, which may be nearer, each with its uncertainty, [m].
     """
 
     nearest: tuple[Nearest, ...]
     uncertainties: Array
-    others: tuple[tuple[int, float, float], ...] = ()
+    others: tuple[tuple[Nearest, float], ...] = ()
 
     @property
     def distance(self) -> float:
@@ -48,29 +47,26 @@ class MeasuredClearance:
 
         It exceeds the nearest pair's own uncertainty if one slightly farther away is less certain.
         """
-        lows = [n.distance - u for n, u in zip(self.nearest, self.uncertainties, strict=True)]
-        lows += [distance - u for _, distance, u in self.others]
-        return self.distance - float(min(lows))
+        return self.distance - min(near.distance - spread for near, spread in self._pairs)
 
     @property
-    def worst_case_obstacle(self) -> int:
-        """Index of the obstacle that determines `at_most`."""
-        return int(np.argmin(self._highs))
+    def upper_bound(self) -> tuple[Nearest, float]:
+        """The pair that determines `at_most`, and its uncertainty, [m]."""
+        return min(self._pairs, key=lambda pair: pair[0].distance + pair[1])
 
     @property
     def at_most(self) -> float:
         """Upper bound of the smallest true distance, [m].
 
-        Each obstacle counts with its own uncertainty.
+        Each pair counts with its own uncertainty.
         """
-        return float(np.min(self._highs))
+        near, spread = self.upper_bound
+        return near.distance + spread
 
     @property
-    def _highs(self) -> Array:
-        highs = np.array([n.distance for n in self.nearest]) + self.uncertainties
-        for obstacle, distance, uncertainty in self.others:
-            highs[obstacle] = min(highs[obstacle], distance + uncertainty)
-        return highs
+    def _pairs(self) -> list[tuple[Nearest, float]]:
+        own: list[float] = self.uncertainties.tolist()
+        return [*zip(self.nearest, own, strict=True), *self.others]
 
 
 def clearance_of(model: ClearanceModel, measurement: PoseMeasurement) -> MeasuredClearance | None:
@@ -128,11 +124,7 @@ def clearance_at(
 
     nearby = model.near(pose, _largest_difference(model.rig, covariance, ends))
     nearest = tuple(bodies[0] for bodies in nearby)
-    others = tuple(
-        (obstacle, near.distance, uncertainty(near))
-        for obstacle, bodies in enumerate(nearby)
-        for near in bodies[1:]
-    )
+    others = tuple((near, uncertainty(near)) for bodies in nearby for near in bodies[1:])
     own = read_only(np.array([uncertainty(near) for near in nearest]))
     return MeasuredClearance(nearest, own, others)
 

@@ -51,8 +51,7 @@ class ClearanceMonitor:
         self._pictures += 1
         if self._pictures < NEAR_IMAGES:
             return ""
-        at = clearance.worst_case_obstacle
-        near, spread = clearance.nearest[at], float(clearance.uncertainties[at])
+        near, spread = clearance.upper_bound
         return (
             f"{near.first} to {near.second}: {near.distance * 1e3:.1f} ± {spread * 1e3:.1f} mm"
             f" ({INTERVAL});"

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.can_bus import BusSettings
-from executor.evaluation import evaluate_cut_short
+from executor.evaluation import evaluate_folder
 from executor.interlock.fault_latch import FaultLatch
 from executor.recording.record_files import RunCourse
 from executor.recording.resume import run_end
@@ -91,7 +91,7 @@ def test_wherever_the_files_were_cut_there_is_a_verdict(
         for name in ("cycles.csv", "events.jsonl")
     }
     folder = cut(killed, tmp_path_factory.getbasetemp() / "cut", **sizes)
-    summary = evaluate_cut_short(folder).summary
+    summary = evaluate_folder(folder).summary
     assert (summary["verdict"], summary["final_state"]) == ("FAILED", "not_ended")
     assert summary["sentence"] == "The run did not finish."
     assert (summary["interface"], summary["simulated"]) == ("socketcan", False)
@@ -123,11 +123,11 @@ def test_cycles_that_are_not_on_record_are_reported_of_a_run_whose_end_is(
     course = replace(folder.course(), final_state="finished", cause="", cycles=there + 7)
     folder.write_end_of_course(course)
     assert folder.course() == course
-    summary = evaluate_cut_short(folder).summary
+    summary = evaluate_folder(folder).summary
     assert (summary["verdict"], summary["final_state"]) == ("FAILED", "finished")
     assert f"Of {there + 7} cycles the last 7 are not on record." in summary["reasons"]
     folder.write_end_of_course(replace(course, cycles=there))
-    assert evaluate_cut_short(folder).summary["verdict"] == "PASSED"
+    assert evaluate_folder(folder).summary["verdict"] == "PASSED"
 
 
 STOP = RunEvent(98.0, "stop", "stop requested; slowing down along the path")
@@ -173,13 +173,13 @@ def test_a_kill_after_the_verdict_changes_it_in_no_report(
 def test_held_counts_only_with_the_cycles_up_to_it(killed: RunFolder, tmp_path: Path) -> None:
     folder = cut(killed, tmp_path / "run")
     folder.write_events([HELD])
-    assert evaluate_cut_short(folder).summary["final_state"] == "not_ended"
+    assert evaluate_folder(folder).summary["final_state"] == "not_ended"
 
 
 def test_a_run_does_not_pass_without_what_its_cameras_measured(at_rest: RunFolder) -> None:
     at_rest.append_event(HELD)
     at_rest.write_picture(0, np.zeros((4, 4), dtype=np.uint8))
-    summary = evaluate_cut_short(at_rest).summary
+    summary = evaluate_folder(at_rest).summary
     assert (summary["verdict"], summary["final_state"]) == ("FAILED", "finished")
     assert "What the cameras measured is not on record." in summary["reasons"]
 

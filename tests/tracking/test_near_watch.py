@@ -5,6 +5,8 @@ Here this is evaluated obstacle by obstacle; an uncertain one must not hide a ce
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -52,6 +54,16 @@ def test_the_run_stops_exactly_when_one_obstacle_is_certainly_too_near(
     told = [watch.take(measured(obstacles_mm)) for _ in range(NEAR_IMAGES)]
     assert not any(told[:-1])
     assert bool(told[-1]) is certainly_too_near(obstacles_mm)
+
+
+def test_the_pair_that_is_certainly_too_near_is_named() -> None:
+    """Here the platform is nearest, but its distance is less certain than that of a cable."""
+    (platform,) = nearest([10.0])
+    cable = replace(platform, first="cable 5", distance=0.012)
+    clearance = MeasuredClearance((platform,), np.array([0.02]), ((cable, 0.001),))
+    watch = ClearanceMonitor(LIMIT_MM / 1e3)
+    told = [watch.take(clearance) for _ in range(NEAR_IMAGES)]
+    assert told[-1].startswith("cable 5 to post 0: 12.0 ± 1.0 mm")
 
 
 @given(obstacles_mm=OBSTACLES)

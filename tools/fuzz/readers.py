@@ -136,10 +136,10 @@ def _again(path: Path) -> object:
 
 def _cut(path: Path) -> object:
     """Evaluates the folder of a killed run as `cdpr report` does."""
-    from executor.evaluation import evaluate_cut_short
+    from executor.evaluation import evaluate_folder
     from executor.recording.run_folder import RunFolder
 
-    return evaluate_cut_short(RunFolder.open_cut_short(path.parent))
+    return evaluate_folder(RunFolder.open_cut_short(path.parent))
 
 
 def _run_part(name: str) -> Callable[[Path], object]:
