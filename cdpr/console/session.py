@@ -117,7 +117,8 @@ class Console:
         self._at_rest: Future[StatusResult] | None = None
         self._asks = ThreadPoolExecutor(1, "cdpr-drives")
         self._was_busy = True  # so that the drives are read at the start
-        self._stored_at, self._stored = float("-inf"), StoredState(None, False, None)
+        self._stored = StoredState(None, False, None)
+        self._stored_for: tuple[float, str | None] = (float("-inf"), None)
 
     # State.
     def update(self) -> dict[str, Any]:
@@ -202,11 +203,11 @@ class Console:
         }
 
     def _read_stored(self) -> None:
-        """Reads the fault latch and the reference of the bus from their files."""
-        now = time.monotonic()
-        if now - self._stored_at < STORED_EVERY:
+        """Reads the bus's fault latch and reference from their files, at once when a verb ends."""
+        now, verb = time.monotonic(), self.verbs.verb
+        if verb == self._stored_for[1] and now - self._stored_for[0] < STORED_EVERY:
             return
-        self._stored_at = now
+        self._stored_for = now, verb
         self._stored = read_stored(self.rig, is_moving=self.watch.last.status is not None)
 
     # Commands.

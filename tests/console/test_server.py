@@ -6,8 +6,10 @@ import itertools
 import json
 import os
 import socket
+import subprocess
 import tempfile
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -25,7 +27,7 @@ from websockets.sync.client import ClientConnection, connect
 from cdpr.console.commands import MOST_WAITING, Held, LetGo, parse_message
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
 from cdpr.console.session import Console, ConsoleFiles
-from cdpr.console.state import VerbOutcome, _without_commands
+from cdpr.console.state import StoredState, VerbOutcome, _without_commands
 from cdpr.console.watch import RunWatch
 from executor.remote.command_socket import advertised
 from executor.remote.command_socket import serving as commands
@@ -172,6 +174,24 @@ def said(served: Served, page: ClientConnection, names: list[str]) -> bool:
 def test_nothing_that_is_sent_waits_for_the_other_side() -> None:
     with listening("127.0.0.1", 0) as listener:
         assert listener.proto == socket.IPPROTO_TCP, "asyncio sets TCP_NODELAY by it"
+
+
+def test_a_latch_is_shown_together_with_the_end_of_the_verb_that_left_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    console, latched = Served().console, StoredState("cable 4 is slack", False, None)
+    monkeypatch.setattr(time, "monotonic", lambda: 1000.0)
+    assert console.update()["latched"] is None
+    verbs, output = console.verbs, tmp_path / "output"
+    output.touch()
+    verbs.verb, verbs._output, verbs._process = "jog", output, subprocess.Popen(["sleep", "60"])
+    with verbs._process as process:
+        assert console.update()["busy"]["verb"] == "jog"
+        process.kill()
+    monkeypatch.setattr("cdpr.console.session.read_stored", lambda *_, **__: latched)
+    state = console.update()
+    assert (state["busy"], state["latched"]) == (None, "cable 4 is slack")
+    console.close()
 
 
 def test_messages_are_not_compressed(served: Served) -> None:
