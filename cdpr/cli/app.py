@@ -11,7 +11,7 @@ import re
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -149,8 +149,10 @@ def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
     module, _, function = verb.target.partition(":")
     app = typer.Typer(rich_markup_mode="rich", add_completion=False)
     called = getattr(import_module(f"cdpr.cli.{module}"), function)
-    app.command(verb.name, cls=_VerbCommand)(_guarded(called))
+    typed: dict[str, str] = {}
+    app.command(verb.name, cls=_VerbCommand)(_guarded(called, typed))
     command: Any = typer.main.get_command(app)
+    typed.update((one.name, max(one.opts, key=len)) for one in command.params)
     return command  # type: ignore[no-any-return]
 
 
@@ -176,13 +178,13 @@ def joined_points(arguments: Sequence[str]) -> list[str]:
     return joined
 
 
-def _guarded(verb: Callable[..., None]) -> Callable[..., None]:
+def _guarded(verb: Callable[..., None], typed: Mapping[str, str]) -> Callable[..., None]:
     """Checks the arguments first; Ctrl-C outside a run counts as the operator's stop."""
 
     @functools.wraps(verb)
     def guarded(*args: object, **options: object) -> None:
         try:
-            check_arguments(options)
+            check_arguments(options, typed)
             verb(*args, **options)
         except KeyboardInterrupt:
             raise StoppedByOperator("interrupted") from None

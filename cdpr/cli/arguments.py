@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 from model.errors import BadInput
@@ -28,75 +27,65 @@ LONGEST_TEXT = 100
 NAMES = ("name", "channel", "interface")
 
 
-def check_arguments(arguments: Mapping[str, object]) -> None:
+def check_arguments(arguments: Mapping[str, object], options: Mapping[str, str]) -> None:
     """Refuses arguments that are invalid for every verb.
 
     Args:
         arguments: The verb's arguments, by parameter name.
+        options: How the user types them, such as ``--at-mm``, by parameter name.
 
     Raises:
         BadInput: A path or number is invalid, or an output is also an input or another output.
     """
-    given = dict(_single(arguments))
+    given = {
+        name: list(value) if isinstance(value, (list, tuple)) else [value]
+        for name, value in arguments.items()
+    }
     for name, values in given.items():
         for value in values:
-            _check(name, value)
-    outputs = {_option(n): p for n in OUTPUTS for p in _paths(n, given.get(n, ()))}
+            _check(name, options[name], value)
+    outputs = {options[n]: p for n in OUTPUTS if n in given for p in _paths(n, given[n])}
     inputs = [p for n, values in given.items() if n not in OUTPUTS for p in _inputs(values)]
     refuse_overwriting(outputs, inputs)
 
 
-def _single(arguments: Mapping[str, object]) -> Iterator[tuple[str, list[object]]]:
-    """Each argument's values; a dataclass of options counts as its fields."""
-    for name, value in arguments.items():
-        if is_dataclass(value) and not isinstance(value, type):
-            yield from _single({field.name: getattr(value, field.name) for field in fields(value)})
-        elif isinstance(value, (list, tuple)):
-            yield name, list(value)
-        else:
-            yield name, [value]
-
-
-def _check(name: str, value: object) -> None:
+def _check(name: str, option: str, value: object) -> None:
     match value:
         case bool() | None:
             return
         case int():
-            _check_whole(name, value)
+            _check_whole(option, value, MOST_OF.get(name, MOST_WHOLE))
         case float():
-            _check_number(name, value)
+            _check_number(option, value)
         case Path():
             file_identity(value)
         case str():
-            _check_text(name, value)
+            _check_text(option, value, is_name=name in NAMES)
 
 
-def _check_whole(name: str, value: int) -> None:
-    most = MOST_OF.get(name, MOST_WHOLE)
+def _check_whole(option: str, value: int, most: int) -> None:
     if abs(value) > most:
-        what = f"{_option(name)} is {str(value)[:40]}; the limit is {most}"
+        what = f"{option} is {str(value)[:40]}; the limit is {most}"
         raise BadInput(what, where="command line", next_step="give a smaller number")
 
 
-def _check_number(name: str, value: float) -> None:
-    if not math.isfinite(value) or abs(value) > MOST:
-        what = f"{_option(name)} is {value:g}; it must be a finite number, at most {MOST:g}"
-        raise BadInput(
-            what, where="command line", next_step="give a smaller number, in the option's unit"
-        )
+def _check_number(option: str, value: float) -> None:
+    what, hint = f"{option} is {value:g}", "in the option's unit"
+    if not math.isfinite(value):
+        raise BadInput(what, where="command line", next_step=f"give a finite number, {hint}")
+    if abs(value) > MOST:
+        what = f"{what}; the limit is {MOST:g}"
+        raise BadInput(what, where="command line", next_step=f"give a smaller number, {hint}")
 
 
-def _check_text(name: str, text: str) -> None:
-    if "\0" in text or (name in NAMES and len(os.fsencode(text)) > LONGEST_TEXT):
-        what = f"{_option(name)} has {len(text)} characters and is not a valid name"
+def _check_text(option: str, text: str, *, is_name: bool) -> None:
+    size = len(os.fsencode(text))
+    if "\0" in text or (is_name and size > LONGEST_TEXT):
+        what = f"{option} has {size} bytes and is not a valid name"
         hint = f"give a name of {LONGEST_TEXT} bytes at most"
         raise BadInput(what, where=shown(text), next_step=hint)
     if "://" not in text:
         file_identity(Path(text))
-
-
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 def _paths(name: str, values: Iterable[object]) -> list[Path]:

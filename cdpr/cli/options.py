@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
@@ -66,17 +65,6 @@ def simulated_start(rig: Rig, position_mm: Triple | None, wxyz: Quaternion | Non
         return None
     position = millimetres(list(position_mm))
     return Pose(position, rig.home.rotation if rotation is None else rotation)
-
-
-def finite(value: float | None) -> float | None:
-    """Option callback that refuses `inf` and `nan`, which pass min and max.
-
-    Raises:
-        typer.BadParameter: It is not finite.
-    """
-    if value is not None and not math.isfinite(value):
-        raise typer.BadParameter(f"{value} is not a finite number")
-    return value
 
 
 def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:

@@ -8,17 +8,22 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 import yaml
 
-from cdpr.cli.arguments import check_arguments
+from cdpr.cli import arguments
 from model.errors import BadInput
 from tests.cli.plans import CONFIGS, RIG, write_short_plan
 from tests.cli.program import call, nothing_written, one_message
 
 SCENE = CONFIGS / "environment_1.yaml"
+
+
+def check_arguments(given: Mapping[str, object]) -> None:
+    arguments.check_arguments(given, {name: f"--{name}" for name in given})
 
 
 @pytest.fixture
@@ -104,6 +109,20 @@ def test_a_number_or_name_past_any_machine_is_refused(given: dict[str, object]) 
     with pytest.raises(BadInput) as caught:
         check_arguments(given)
     assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize(
+    ("verb", "words", "option"),
+    [
+        ("sim", (RIG, "--at-mm", "inf", "0", "0"), "--at-mm is inf"),
+        ("calibrate", ("tags", RIG, "images", "--wanted-mm", "inf"), "--wanted-mm is inf"),
+        ("workspace", (RIG, SCENE, "--characteristic-length-mm", "1e300"), "--characteristic-"),
+    ],
+)
+def test_the_option_is_named_as_it_was_typed(
+    verb: str, words: tuple[object, ...], option: str
+) -> None:
+    one_message(call(verb, *words), 2, option)
 
 
 def test_track_never_draws_into_its_source_pictures(tmp_path: Path) -> None:

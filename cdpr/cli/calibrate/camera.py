@@ -28,7 +28,6 @@ from cdpr.cli.options import (
     CalibrationOption,
     RigArgument,
     calibrated_rig,
-    finite,
     with_option_groups,
 )
 from cdpr.cli.output import err, show_line
@@ -162,15 +161,11 @@ def readout(
     camera: CameraOption = None,
     rate_hz: Annotated[
         float | None,
-        typer.Option(
-            min=0.1, callback=finite, help="images per second of a folder (default: the camera's)"
-        ),
+        typer.Option(min=0.1, help="images per second of a folder (default: the camera's)"),
     ] = None,
     speed_mm_s: Annotated[
         float | None,
-        typer.Option(
-            min=0.1, callback=finite, help="speed for the error bound (default: the motion's)"
-        ),
+        typer.Option(min=0.1, help="speed for the error bound (default: the motion's)"),
     ] = None,
     calibration: CalibrationOption = None,
     wanted_mm: WantedOption = 0.1,

@@ -26,7 +26,6 @@ from cdpr.cli.options import (
     CalibrationOption,
     RigArgument,
     calibrated_rig,
-    finite,
     with_option_groups,
 )
 from model.errors import BadInput
@@ -58,7 +57,6 @@ def extrinsics(
         float,
         typer.Option(
             min=0.0,
-            callback=finite,
             help="standard deviation of the surveyed corners of frame tags",
         ),
     ] = 0.5,
@@ -66,7 +64,6 @@ def extrinsics(
         float | None,
         typer.Option(
             min=0.0,
-            callback=finite,
             help="standard deviation of frame tags' rotations; --survey-mm then applies to whole"
             " tags (default: each corner was surveyed separately)",
         ),

@@ -12,15 +12,13 @@ from calibration.intrinsics.exchange import FORMATS, FormatName, write_rig_with_
 from calibration.intrinsics.result import camera_named
 from calibration.result_files import compare, load_result, write_calibrated_rig
 from calibration.results import Calibration, Destination
-from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig, finite
+from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
 from cdpr.cli.output import Terminal, err, show_facts, show_json, show_line
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
 from model.rig import load_rig
 
-WantedOption = Annotated[
-    float, typer.Option(min=0.001, callback=finite, help="required accuracy, 95 %")
-]
+WantedOption = Annotated[float, typer.Option(min=0.001, help="required accuracy, 95 %")]
 SourceArgument = Annotated[
     str,
     typer.Argument(help="folder of images, video file or camera index", metavar="SOURCE"),

@@ -22,7 +22,6 @@ from cdpr.cli.options import (
     RigArgument,
     SceneArgument,
     calibrated_rig,
-    finite,
     with_option_groups,
 )
 from cdpr.cli.output import Terminal, show_facts, show_json
@@ -109,7 +108,7 @@ class GroupName(StrEnum):
 
 def _deviation(of: str, most: float | None = None) -> Any:
     """An option that is a standard deviation."""
-    return typer.Option(min=1e-6, max=most, callback=finite, help=f"standard deviation of {of}")
+    return typer.Option(min=1e-6, max=most, help=f"standard deviation of {of}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,9 +205,7 @@ def rig(
     accuracies: Accuracies = DEFAULT_ACCURACIES,
     tilt_deg: Annotated[
         float,
-        typer.Option(
-            min=0.0, max=90.0, callback=finite, help="largest rotation of the platform in use"
-        ),
+        typer.Option(min=0.0, max=90.0, help="largest rotation of the platform in use"),
     ] = 5.0,
     wanted_mm: WantedOption = 1.0,
     name: Annotated[str, typer.Option(help="name of the result")] = "rig",
