@@ -17,13 +17,11 @@ class LostMaster:
     Attributes:
         noticed_by: Missing message: SYNC, the heartbeat, or set-points.
         notice: Time until the last drive begins to stop, [s].
-        ramp: Time of its ramp to rest, [s].
         distance: Travel of the platform meanwhile at the rig's speed along the path, [m].
     """
 
     noticed_by: str
     notice: float
-    ramp: float
     distance: float
 
 
@@ -43,7 +41,7 @@ def lost_master(rig: Rig) -> LostMaster:
     else:
         noticed_by, notice, ramp = "set-points", _watchdog(drives), cycle
     distance = rig.motion.speed * (notice + 0.5 * ramp)
-    return LostMaster(noticed_by, notice, ramp, distance)
+    return LostMaster(noticed_by, notice, distance)
 
 
 def _cia402_times(rig: Rig) -> tuple[str, float, float]:

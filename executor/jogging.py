@@ -173,7 +173,13 @@ def require_distance(by: Array | None, *, to_home: bool) -> None:
         BadInput: None or both are given, or the distance is zero.
         Refused: The distance is too long.
     """
-    if (by is None) != to_home:
+    if by is not None and to_home:
+        raise BadInput(
+            "--by-mm and --to-home exclude each other",
+            where="cdpr jog",
+            next_step="leave one of them out",
+        )
+    if by is None and not to_home:
         raise BadInput(
             "no motion given: use --by-mm X Y Z, --to-home, or --cable N --mm X",
             where="cdpr jog",

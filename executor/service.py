@@ -15,7 +15,14 @@ import numpy as np
 from drivers.can_bus import BusSettings, open_bus
 from drivers.drive_group import CycleStatus
 from drivers.factory import drive_states, read_drives
-from executor.control.standstill import FaultReset, Release, StandstillMotion
+from executor.control.standstill import (
+    FaultReset,
+    Release,
+    StandstillMotion,
+    is_braked,
+    release_drives,
+    reset_drives,
+)
 from executor.drives import (
     abandoned_drives_fault,
     current_pose,
@@ -32,7 +39,6 @@ from executor.remote.command_socket import advertised, serving
 from executor.remote.status import WinchStatus
 from executor.state_machine import State
 from executor.supervision import Supervisor
-from executor.winch_runs import is_braked, release_drives, reset_drives
 from model.errors import CdprError
 from model.files.documents import PoseDocument
 from model.pose import Pose

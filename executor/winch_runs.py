@@ -1,32 +1,32 @@
-"""Winch motion without a path: common part of homing and jogging one cable."""
+"""Motions without a planned path: the common part of homing, jogging one cable and jog sessions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from drivers.drive_group import CycleStatus
 from executor.control.winch_loop import LawMotion, MakeLaw, WinchesHere, WinchMover
 from executor.control.winch_motion import WinchRecord, WinchResult, move_winches, recording
 from executor.drives import abandoned_drives_fault, is_simulated, unreferenced_drives_of
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.kernels import ready_for_simulating_process
-from executor.realtime.child import Armed, Ended, MotionTask, ReadyDrives
-from executor.realtime.process import RealTimeProcess, real_time_process
+from executor.realtime.child import MotionTask, ReadyDrives
+from executor.realtime.process import real_time_process
 from executor.realtime.scheduling import Clock, SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import free_folder
 from executor.remote.command_socket import advertised, serving
+from executor.remote.protocol import Presses
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests, RequestBoard, Supervisor
 from model.errors import Fault, Refused, StoppedByOperator
 from model.pose import Pose
-from model.progress import Advance, Listener
+from model.progress import Listener
 from model.rig import Rig
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 #: Default tension limit, as a share of the range from smallest to largest tension.
 LIMIT_SHARE = 0.6
-#: Events that are not reported: those of every motion, and one for defect reports.
-_ROUTINE = frozenset({"enabled", "moving", "held", "traceback"})
+#: Events of every motion, and one for defect reports.
+_UNREPORTED = frozenset({"enabled", "moving", "held", "traceback"})
 
 AtRest = Callable[[WinchResult, Pose | None, RequestBoard], HomingReference | None]
 """Called after a finished motion with its result, the simulated platform's pose and the requests;
@@ -85,11 +85,11 @@ def limit_of(rig: Rig, limit: float | None) -> float:
         return rig.min_tension + LIMIT_SHARE * (rig.max_tension - rig.min_tension)
     if not rig.min_tension < limit <= rig.max_tension:
         raise Refused(
-            f"a limit of {limit:g} N is not above {rig.min_tension:g} and up to"
+            f"the tension limit of {limit:g} N is not above {rig.min_tension:g} N and at most"
             f" {rig.max_tension:g} N",
             where="--limit-n",
-            why="the rig file allows such tensions only",
-            next_step="name another limit",
+            why="that is the range of tensions in the rig file",
+            next_step="choose a limit in this range",
         )
     return limit
 
@@ -158,26 +158,77 @@ def with_board(
 def _supervised(
     motion: WinchMotion, board: LocalRequests | SharedRequests, at_rest: AtRest
 ) -> WinchResult:
-    """Moves while the command socket accepts requests such as `cdpr stop`."""
-    rig, interlock = motion.rig, MotionInterlock(motion.rig)
-    status = WinchStatus(rig, board, simulated_time=not motion.realtime)
+    return move_supervised(
+        motion.rig,
+        board,
+        _mover(motion, board),
+        WinchStatus(motion.rig, board, simulated_time=not motion.realtime),
+        motion.name,
+        listener=motion.listener,
+        showing=_progress(motion.listener),
+        rehome=motion.rehome,
+        at_rest=lambda result, true_pose: at_rest(result, true_pose, board),
+    )
+
+
+@contextmanager
+def _progress(listener: Listener) -> Iterator[Callable[[CycleRecord], None]]:
+    """Shows the progress of a law, which is the record's index."""
+    with listener.progress("moving, %", 100.0) as advance:
+
+        def take(record: CycleRecord) -> None:
+            if record.cycle % 10 == 0:
+                advance(record.index)
+
+        yield take
+
+
+def move_supervised(
+    rig: Rig,
+    board: LocalRequests | SharedRequests,
+    mover: AbstractContextManager[WinchMover],
+    status: WinchStatus,
+    name: str,
+    *,
+    listener: Listener,
+    showing: AbstractContextManager[Callable[[CycleRecord], None]],
+    presses: Presses | None = None,
+    unreported: Collection[str] = _UNREPORTED,
+    rehome: bool = False,
+    at_rest: Callable[[WinchResult, Pose | None], HomingReference | None] = lambda _, __: None,
+) -> WinchResult:
+    """Moves while the command socket accepts requests such as `cdpr stop`, and records it.
+
+    Args:
+        rig: The robot.
+        board: Of operator requests.
+        mover: See `winch_mover`.
+        status: Answers on the command socket.
+        name: Of the record folder in ``runs``; simulated drives leave none.
+        listener: Receives events.
+        showing: Called after every cycle, before the status.
+        presses: Where the command socket writes held controls.
+        unreported: Codes of events that the listener does not get.
+        rehome: The drives are referenced again afterwards.
+        at_rest: See `move_winches`.
+    """
+    interlock = MotionInterlock(rig)
     with ExitStack() as stack:
         listeners = stack.enter_context(advertised())
-        stack.enter_context(serving(listeners, board, status))
-        mover = stack.enter_context(_mover(motion, board))
+        stack.enter_context(serving(listeners, board, status, presses))
+        moving = stack.enter_context(mover)
         log = stack.enter_context(
-            nullcontext() if is_simulated(rig) else recording(free_folder(motion.name))
+            nullcontext() if is_simulated(rig) else recording(free_folder(name))
         )
         status.folder = None if log is None else log.folder
-        advance = stack.enter_context(motion.listener.progress("moving, %", 100.0))
         result = move_winches(
-            mover,
+            moving,
             rig,
             interlock,
-            _EventSink(status, log, advance, motion.listener),
+            _Records(status, log, stack.enter_context(showing), listener, unreported),
             record=log.folder if log is not None else interlock.file.path,
-            rehome=motion.rehome,
-            at_rest=lambda result, true_pose: at_rest(result, true_pose, board),
+            rehome=rehome,
+            at_rest=at_rest,
         )
         status.take_end(result.state, result.cause)
     return result
@@ -239,18 +290,18 @@ def winch_mover(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _EventSink:
+class _Records:
     """Forwards cycles and events to the status, the listener and the record."""
 
     status: WinchStatus
     log: WinchRecord | None
-    advance: Advance
+    show: Callable[[CycleRecord], None]
     listener: Listener
+    unreported: Collection[str]
 
     def take_cycle(self, record: CycleRecord, _true_pose: Pose | None) -> None:
+        self.show(record)
         self.status.take_cycle(record)
-        if record.cycle % 10 == 0:
-            self.advance(record.index)
         if self.log is not None:
             self.log.take_cycle(record)
 
@@ -258,112 +309,7 @@ class _EventSink:
         self.status.take_event(event)
         if event.code == "no_real_time":
             self.listener.remark(event.text)
-        elif event.code not in _ROUTINE:
+        elif event.code not in self.unreported:
             self.listener.note(f"{event.code}: {event.text}")
         if self.log is not None:  # last: a full disk must not prevent the report
             self.log.take_event(event)
-
-
-# Release and reset of drives in the real-time process, with their effect on latch and reference.
-
-
-#: Why the reference is lost where no brake holds the drums.
-_RELEASED = "the drives were released by the operator, and no brake holds the cables"
-_CUT_SHORT = Ended(State.LATCHED, "the program was terminated", holding=False, true_pose=None)
-
-
-class Unrecorded:
-    """Discards records of cycles without motion; see `executor.realtime.child.Records`."""
-
-    def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
-        """Discards it."""
-
-    def take_event(self, event: LoopEvent) -> None:
-        """Discards it."""
-
-
-def is_braked(rig: Rig) -> bool:
-    """Whether every winch has a brake that closes when its drive is released."""
-    return all(winch.brake for winch in rig.winches)
-
-
-def release_drives(
-    rig: Rig, interlock: MotionInterlock, process: RealTimeProcess, on_armed: Callable[[str], None]
-) -> CycleStatus:
-    """Switches off the torque, and updates latch and reference.
-
-    Args:
-        rig: The robot.
-        interlock: Of that rig.
-        process: For `executor.control.standstill.Release`.
-        on_armed: Called when armed, with what the system denied.
-
-    Returns:
-        The drives' last status, without torque.
-
-    Raises:
-        StoppedByOperator: Stopped by the operator.
-        CdprError: They could not be configured, or were not released; then a fault is latched.
-    """
-    record = interlock.file.path.parent
-    armed = process.arm(Unrecorded())
-    on_armed(armed.denied)
-    interlock.begin(record, interlock.still_counts(armed.positions))
-    ended = _CUT_SHORT
-    try:
-        ended = process.run()
-        left = process.read_status() if ended.state is State.FINISHED else None
-    except BaseException:
-        ended = _CUT_SHORT
-        raise
-    finally:
-        if ended.state is not State.FINISHED:
-            cause = f"while releasing the drives: {ended.cause}"
-            interlock.end(State.LATCHED, cause, record, holding=False, positions=None)
-    if left is None:
-        raise ended.error or Fault(ended.cause, where="release")
-    interlock.end(
-        State.FINISHED,
-        "",
-        record,
-        holding=is_braked(rig),
-        positions=left.positions.tolist(),
-        release_reason=_RELEASED,
-    )
-    return left
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DrivesReset:
-    """State of drives after a reset.
-
-    Attributes:
-        left: Their last status.
-        restarted: Nodes found without their configuration.
-    """
-
-    left: CycleStatus
-    restarted: tuple[int, ...]
-
-
-def reset_drives(interlock: MotionInterlock, process: RealTimeProcess) -> DrivesReset:
-    """Resets drives in fault; those that hold keep holding.
-
-    If all held throughout, as after a program was killed, their reference remains valid at their
-    present positions.
-
-    Args:
-        interlock: Of their rig.
-        process: For `executor.control.standstill.FaultReset`.
-
-    Raises:
-        CdprError: A drive does not answer, may not be reset now, or stays in fault.
-    """
-    armed: Armed = process.arm(Unrecorded())
-    ended = process.run()
-    if ended.state is not State.FINISHED:
-        raise ended.error or Fault(ended.cause, where="reset")
-    left = process.read_status()
-    if ended.holding and not armed.restarted:
-        interlock.confirm_held(left.positions.tolist())
-    return DrivesReset(left, armed.restarted)

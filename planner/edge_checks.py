@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.pose import Array, Pose, rotation_vector_from_matrix
+from model.pose import Array
 from model.rig import Rig
 from model.scene import Scene
 from planner.collision.edges import edge_clearance, in_workspace, obstacles_free
@@ -155,13 +155,6 @@ class ExactChecks:
         """Smallest distance to an obstacle along a translation, [m], its body and obstacle."""
         distance, body, obstacle = edge_clearance(self.world, _own(start), _own(end))
         return float(distance), int(body), int(obstacle)
-
-    def turning_problem(self, start: Pose, end: Pose) -> int:
-        """What forbids a straight move with a steady rotation; see `edge_problem`."""
-        turn = _own(rotation_vector_from_matrix(start.rotation.T @ end.rotation))
-        poses = (_own(start.position), _own(end.position), _own(start.rotation), turn)
-        args = (self.world, self.robot, self.load, self.holding.reserve)
-        return int(turning_edge_problem(*args, *poses))
 
 
 def _own(values: ArrayLike) -> Array:

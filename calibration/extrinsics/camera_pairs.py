@@ -261,7 +261,7 @@ def locate_camera_by_another(
     if camera.name == reference.name:
         raise BadInput(
             f"camera {camera.name!r} cannot be located relative to itself",
-            next_step="name another camera of the rig whose pose is known",
+            next_step="choose another camera of the rig whose pose is known",
         )
     if board is None:
         require_tags(rig, None)

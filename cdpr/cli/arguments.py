@@ -40,6 +40,7 @@ def check_arguments(arguments: Mapping[str, object], options: Mapping[str, str])
     given = {
         name: list(value) if isinstance(value, (list, tuple)) else [value]
         for name, value in arguments.items()
+        if name in options  # all but Typer's context
     }
     for name, values in given.items():
         for value in values:

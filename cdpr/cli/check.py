@@ -18,7 +18,7 @@ def check(
     plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
     rig: Annotated[
         Path | None,
-        typer.Option(help="check against this rig file's present content"),
+        typer.Option(help="also require that the plan fits this rig file"),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

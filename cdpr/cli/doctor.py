@@ -26,7 +26,8 @@ def doctor(
         typer.Argument(help="also check this rig's bus and cameras", metavar="[RIG]"),
     ] = None,
     camera: Annotated[
-        str | None, typer.Option(help="also capture an image with the camera of this index")
+        str | None,
+        typer.Option(help="also capture an image with this camera: index, device or address"),
     ] = None,
     drives: Annotated[
         bool, typer.Option("--drives", help="also read every object of every CANopen drive")

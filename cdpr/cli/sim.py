@@ -86,6 +86,8 @@ def sim(
       cdpr sim configs/gachon_8_6.yaml --interface udp_multicast --channel 239.74.163.2
       --plan plan.json
 
+    [dim]In another terminal:[/dim]
+
       cdpr run plan.json --rig configs/gachon_8_6.yaml --interface udp_multicast
       --channel 239.74.163.2 --no-camera -o runs/udp --yes
       --without-real-time

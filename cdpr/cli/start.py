@@ -100,7 +100,9 @@ def new(
     ] = None,
     radius_mm: Annotated[float | None, typer.Option(help="radius of the cables")] = None,
     stiffness_n: Annotated[float | None, typer.Option(help="axial stiffness of a cable")] = None,
-    min_tension_n: Annotated[float | None, typer.Option(help="least tension of a cable")] = None,
+    min_tension_n: Annotated[
+        float | None, typer.Option(help="smallest allowed tension of a cable")
+    ] = None,
     max_tension_n: Annotated[float | None, typer.Option(help="largest tension of a cable")] = None,
     drum_radius_mm: Annotated[float | None, typer.Option(help="radius of the drums")] = None,
     gear_ratio: Annotated[float | None, typer.Option(help="motor turns per drum turn")] = None,

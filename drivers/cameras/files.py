@@ -387,5 +387,5 @@ def _unwritable(path: Path, why: str) -> Fault:
         "the image cannot be written",
         where=str(path),
         why=why,
-        next_step="free some space, or name another folder",
+        next_step="free some space, or choose another folder",
     )

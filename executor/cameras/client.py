@@ -237,13 +237,11 @@ class RestPose:
     Attributes:
         pose: ``world_from_platform``.
         uncertainty: Of the position along its worst direction, standard deviation, [m].
-        length_uncertainty: Largest of the cable lengths, standard deviation, [m].
         pictures: Number of images with a pose.
     """
 
     pose: Pose
     uncertainty: float
-    length_uncertainty: float
     pictures: int
 
 
@@ -289,7 +287,7 @@ def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
             " or `error_mm`, state an error that large",
         )
     worst, _ = largest_deviations(covariance)
-    return RestPose(pose, worst, lengths, len(found))
+    return RestPose(pose, worst, len(found))
 
 
 def _refusal(what: str, why: str) -> Refused:

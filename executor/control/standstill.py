@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from executor.control.preconditions import require_capabilities
 from executor.control.sync_master import ReplyTimeout, SyncMaster, changed_states, late_fault
-from executor.realtime.child import ReadyDrives
+from executor.interlock.interlock import MotionInterlock
+from executor.realtime.child import Armed, Ended, ReadyDrives
+from executor.realtime.process import RealTimeProcess
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import OperatorRequests
 from model.errors import CdprError, Fault, StoppedByOperator
@@ -289,3 +291,108 @@ class StandstillMotion:
 
     def close(self) -> None:
         """See `MotionTask`; no memory is shared."""
+
+
+# In the real-time process, with their effect on latch and reference.
+
+
+#: Why the reference is lost where no brake holds the drums.
+_RELEASED = "the drives were released by the operator, and no brake holds the cables"
+_CUT_SHORT = Ended(State.LATCHED, "the program was terminated", holding=False, true_pose=None)
+
+
+class Unrecorded:
+    """Discards records of cycles without motion; see `executor.realtime.child.Records`."""
+
+    def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
+        """Discards it."""
+
+    def take_event(self, event: LoopEvent) -> None:
+        """Discards it."""
+
+
+def is_braked(rig: Rig) -> bool:
+    """Whether every winch has a brake that closes when its drive is released."""
+    return all(winch.brake for winch in rig.winches)
+
+
+def release_drives(
+    rig: Rig, interlock: MotionInterlock, process: RealTimeProcess, on_armed: Callable[[str], None]
+) -> CycleStatus:
+    """Switches off the torque, and updates latch and reference.
+
+    Args:
+        rig: The robot.
+        interlock: Of that rig.
+        process: For `Release`.
+        on_armed: Called when armed, with what the system denied.
+
+    Returns:
+        The drives' last status, without torque.
+
+    Raises:
+        StoppedByOperator: Stopped by the operator.
+        CdprError: They could not be configured, or were not released; then a fault is latched.
+    """
+    record = interlock.file.path.parent
+    armed = process.arm(Unrecorded())
+    on_armed(armed.denied)
+    interlock.begin(record, interlock.still_counts(armed.positions))
+    ended = _CUT_SHORT
+    try:
+        ended = process.run()
+        left = process.read_status() if ended.state is State.FINISHED else None
+    except BaseException:
+        ended = _CUT_SHORT
+        raise
+    finally:
+        if ended.state is not State.FINISHED:
+            cause = f"while releasing the drives: {ended.cause}"
+            interlock.end(State.LATCHED, cause, record, holding=False, positions=None)
+    if left is None:
+        raise ended.error or Fault(ended.cause, where="release")
+    interlock.end(
+        State.FINISHED,
+        "",
+        record,
+        holding=is_braked(rig),
+        positions=left.positions.tolist(),
+        release_reason=_RELEASED,
+    )
+    return left
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivesReset:
+    """State of drives after a reset.
+
+    Attributes:
+        left: Their last status.
+        restarted: Nodes found without their configuration.
+    """
+
+    left: CycleStatus
+    restarted: tuple[int, ...]
+
+
+def reset_drives(interlock: MotionInterlock, process: RealTimeProcess) -> DrivesReset:
+    """Resets drives in fault; those that hold keep holding.
+
+    If all held throughout, as after a program was killed, their reference remains valid at their
+    present positions.
+
+    Args:
+        interlock: Of their rig.
+        process: For `FaultReset`.
+
+    Raises:
+        CdprError: A drive does not answer, may not be reset now, or stays in fault.
+    """
+    armed: Armed = process.arm(Unrecorded())
+    ended = process.run()
+    if ended.state is not State.FINISHED:
+        raise ended.error or Fault(ended.cause, where="reset")
+    left = process.read_status()
+    if ended.holding and not armed.restarted:
+        interlock.confirm_held(left.positions.tolist())
+    return DrivesReset(left, armed.restarted)

@@ -15,7 +15,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from executor.control.winch_motion import WinchRecord, WinchResult, move_winches, recording
+from executor.control.winch_motion import WinchResult
 from executor.drives import (
     drives_of,
     is_simulated,
@@ -33,12 +33,10 @@ from executor.proposals import CablesProposal, JogProposal, require_confirmed
 from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedMemory, SharedRequests
-from executor.recording.record_files import free_folder
-from executor.remote.command_socket import advertised, serving
 from executor.remote.status import CableStatus, JogStatus, SessionStatus
-from executor.state_machine import CycleRecord, LoopEvent
+from executor.state_machine import CycleRecord
 from executor.supervision import LocalRequests, RequestBoard, Supervisor
-from executor.winch_runs import limit_of, winch_mover, with_board
+from executor.winch_runs import limit_of, move_supervised, winch_mover, with_board
 from model.kinematics import cable_lengths
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -167,8 +165,8 @@ class _Parts:
         task: For the real-time process.
         make_drives: See `winch_mover`.
         status: Reported status.
-        take_cycle: Called after every cycle, before the status.
-        on_cycle: Called after the status.
+        take_cycle: Called after every cycle.
+        on_cycle: Called after that.
     """
 
     task: MotionTask
@@ -287,68 +285,39 @@ class _Session:
 
     def run(self, board: LocalRequests | SharedRequests) -> WinchResult:
         """Runs the session; the command socket takes the presses."""
-        rig, interlock = self.rig, MotionInterlock(self.rig)
-        clock = SimulatedClock(rig.cycle)
+        rig, clock = self.rig, SimulatedClock(self.rig.cycle)
         now = time.monotonic if self.realtime else lambda: clock.now
         with ExitStack() as stack:
             presses = PressBoard(now, self.kind.cables)
             stack.callback(presses.close)
             parts = self.kind.parts(board, presses, stack, realtime=self.realtime)
-            status = parts.status
-            listeners = stack.enter_context(advertised())
-            stack.enter_context(serving(listeners, board, status, presses))
-            mover = stack.enter_context(
-                winch_mover(
-                    rig,
-                    parts.task,
-                    parts.make_drives,
-                    board,
-                    clock=clock,
-                    need_real_time_rights=self.need_real_time_rights,
-                    listener=self.listener,
-                )
-            )
-            log = stack.enter_context(
-                nullcontext() if is_simulated(rig) else recording(free_folder(self.kind.folder))
-            )
-            status.folder = None if log is None else log.folder
-            result = move_winches(
-                mover,
+
+            def take_cycle(record: CycleRecord) -> None:
+                parts.take_cycle(record)
+                if record.at - presses.last_heard > IDLE:
+                    presses.end()
+                parts.on_cycle(record)
+
+            mover = winch_mover(
                 rig,
-                interlock,
-                _Sink(parts, presses, log, self.listener),
-                record=log.folder if log is not None else interlock.file.path,
-                rehome=False,
-                at_rest=lambda result, _true_pose: None,
+                parts.task,
+                parts.make_drives,
+                board,
+                clock=clock,
+                need_real_time_rights=self.need_real_time_rights,
+                listener=self.listener,
             )
-            status.take_end(result.state, result.cause)
-        return result
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sink:
-    """Forwards cycles and events to the parts of the session and the record."""
-
-    parts: _Parts
-    presses: PressBoard
-    log: WinchRecord | None
-    listener: Listener
-
-    def take_cycle(self, record: CycleRecord, _true_pose: Pose | None) -> None:
-        self.parts.take_cycle(record)
-        self.parts.status.take_cycle(record)
-        if record.at - self.presses.last_heard > IDLE:
-            self.presses.end()
-        self.parts.on_cycle(record)
-        if self.log is not None:
-            self.log.take_cycle(record)
-
-    def take_event(self, event: LoopEvent) -> None:
-        self.parts.status.take_event(event)
-        if event.code not in ("moving", "traceback"):
-            self.listener.note(f"{event.code}: {event.text}")
-        if self.log is not None:  # last: a full disk must not prevent the report
-            self.log.take_event(event)
+            return move_supervised(
+                rig,
+                board,
+                mover,
+                parts.status,
+                self.kind.folder,
+                listener=self.listener,
+                showing=nullcontext(take_cycle),
+                presses=presses,
+                unreported={"moving", "traceback"},  # its user must know when drives are enabled
+            )
 
 
 def _counts_at(rig: Rig, pose: Pose, load: Load) -> tuple[int, ...]:

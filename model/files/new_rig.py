@@ -176,7 +176,7 @@ def _box_around_home(value: list[float], answers: Answers, side: int) -> str:
 
 def _above_least(value: float, answers: Answers) -> str:
     least = answers["min_tension_n"]
-    return "" if value > least else f"it must be more than the least tension, {least:g} N"
+    return "" if value > least else f"it must be more than the smallest tension, {least:g} N"
 
 
 def coordinate_questions(answers: Answers) -> list[RigQuestion]:
@@ -233,7 +233,9 @@ AFTER_COORDINATES = (
     RigQuestion(
         "stiffness_n", "axial stiffness E·A of the cables", "N", _number(), _always(50000.0)
     ),
-    RigQuestion("min_tension_n", "least tension of a cable", "N", _number(), _always(5.0)),
+    RigQuestion(
+        "min_tension_n", "smallest allowed tension of a cable", "N", _number(), _always(5.0)
+    ),
     RigQuestion(
         "max_tension_n",
         "largest tension of a cable",

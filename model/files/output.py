@@ -30,7 +30,7 @@ def require_new_file(path: Path, replace: bool = False) -> None:
     if not folder.is_dir():
         why = f"{folder} is not a folder" if folder.exists() else f"there is no folder {folder}"
         raise BadInput(
-            what, where=str(path), why=why, next_step="create the folder, or name another file"
+            what, where=str(path), why=why, next_step="create the folder, or choose another file"
         )
     if not os.access(folder, os.W_OK):
         raise BadInput(

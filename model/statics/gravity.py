@@ -26,7 +26,6 @@ def gravity_wrench(
     *,
     payload_mass: float = 0.0,
     payload_offset: ArrayLike = (0.0, 0.0, 0.0),
-    gravity: float = STANDARD_GRAVITY,
 ) -> NDArray[np.float64]:
     """Return the wrench of the weight of platform and payload about the platform origin.
 
@@ -37,7 +36,6 @@ def gravity_wrench(
         payload_mass: Mass of the payload [kg].
         payload_offset: From the platform origin to the payload's centre of mass, shape
             (..., 3), [m], world frame.
-        gravity: [m/s²], along -z of the world frame.
 
     Returns:
         External wrench, shape (..., 6), [N, N·m], world frame.
@@ -45,17 +43,17 @@ def gravity_wrench(
     Raises:
         BadInput: A mass is negative, a value is not finite, or a shape is wrong.
     """
-    platform = _weight(mass, centre_of_mass_offset, gravity, "platform")
-    return platform + _weight(payload_mass, payload_offset, gravity, "payload")
+    platform = _weight(mass, centre_of_mass_offset, "platform")
+    return platform + _weight(payload_mass, payload_offset, "payload")
 
 
-def _weight(mass: float, offset: ArrayLike, gravity: float, name: str) -> NDArray[np.float64]:
+def _weight(mass: float, offset: ArrayLike, name: str) -> NDArray[np.float64]:
     arm = np.asarray(offset, dtype=np.float64)
     if arm.ndim < 1 or arm.shape[-1] != 3:
         raise BadInput(f"the offset of the {name} has shape {arm.shape}, not (..., 3)")
-    if not (0.0 <= mass < np.inf and np.isfinite(gravity) and np.isfinite(arm).all()):
-        raise BadInput(f"mass {mass} kg, gravity or offset of the {name} is not a usable number")
-    weight = mass * gravity
+    if not (0.0 <= mass < np.inf and np.isfinite(arm).all()):
+        raise BadInput(f"mass {mass} kg or offset of the {name} is not a usable number")
+    weight = mass * STANDARD_GRAVITY
     wrench = np.zeros((*arm.shape[:-1], 6))
     wrench[..., 2] = -weight
     # offset × (0, 0, -weight), written out.

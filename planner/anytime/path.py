@@ -292,13 +292,11 @@ class OptimalRoute:
     Attributes:
         route: The path; its nodes are those of the first path found.
         rounds: Number of rounds done; `OptimalSettings.rounds` repeats them.
-        preparation_time: [s].
         search_time: [s].
     """
 
     route: Route
     rounds: int
-    preparation_time: float
     search_time: float
 
 
@@ -324,7 +322,6 @@ def optimal_route(
     Raises:
         NoSolution: There is no path, none was found, or none is short enough.
     """
-    began = clock()
     problem = problem_of(rig, scene, settings.weights, kinematic)
     start, goal = np.array(scene.start.position), np.array(scene.goal.position)
     search = new_search(start, goal, settings.seed)
@@ -342,7 +339,7 @@ def optimal_route(
         iterations=int(search.totals[0]),
         edge_checks=int(search.totals[2] + search.grown[2] + search.counts[:, 1].sum()),
     )
-    return OptimalRoute(route, route.iterations, prepared - began, clock() - prepared)
+    return OptimalRoute(route, route.iterations, clock() - prepared)
 
 
 def _load(problem: PathProblem, search: AnytimeSearch) -> None:

@@ -53,15 +53,6 @@ def edges_free(world: World, starts: Array, ends: Array) -> NDArray[np.bool_]:
     return free
 
 
-@kernel
-def points_free(world: World, positions: Array) -> NDArray[np.bool_]:
-    """Whether the platform may be at positions, shape (k, 3), [m]; shape (k,)."""
-    free = np.empty(len(positions), dtype=np.bool_)
-    for i in range(len(positions)):
-        free[i] = edge_free(world, positions[i], positions[i])
-    return free
-
-
 @leaf
 def edge_clearance(world: World, start: Array, end: Array) -> tuple[float, int, int]:
     """The smallest distance of any body to any obstacle along an edge, exact.

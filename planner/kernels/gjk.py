@@ -255,24 +255,3 @@ def _origin_inside(corners: Points) -> bool:
         and _volume(a, b, d) / whole > 0.0
         and -_volume(a, b, c) / whole > 0.0
     )
-
-
-def hulls_definition(first: Points, second: Points) -> float:
-    """The distance of two hulls of points, [m], as a quadratic program over their weights.
-
-    Args:
-        first: Shape (k, 3), [m].
-        second: Shape (l, 3), [m].
-    """
-    from scipy.optimize import nnls
-
-    # Weights u, v ≥ 0, each set summing to 1, with the smallest ‖uᵀ first − vᵀ second‖: the two
-    # sums are rows of a least-squares problem, weighted so heavily that they hold to round-off.
-    scale = 1e4 * max(1.0, float(np.abs(first).max()), float(np.abs(second).max()))
-    count = len(first)
-    matrix = np.zeros((5, count + len(second)))
-    matrix[:3, :count], matrix[:3, count:] = first.T, -second.T
-    matrix[3, :count], matrix[4, count:] = scale, scale
-    weights = nnls(matrix, np.array([0.0, 0.0, 0.0, scale, scale]))[0]
-    u, v = weights[:count], weights[count:]
-    return float(np.linalg.norm(u @ first / u.sum() - v @ second / v.sum()))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,29 +129,7 @@ def _excess(point: Vector, half: Vector) -> Vector:
     )
 
 
-def segment_box_definition(
-    start: NDArray[np.float64], end: NDArray[np.float64], half: NDArray[np.float64]
-) -> float:
-    """The same distance, [m], by trying each of the 27 regions about the box.
-
-    Args:
-        start: Box frame, shape (3,), [m].
-        end: Box frame, shape (3,), [m].
-        half: Half extents of the box, shape (3,), [m].
-    """
-    delta = end - start
-    shares = [0.0, 1.0]
-    for region in np.ndindex(3, 3, 3):
-        side = np.array(region) - 1
-        slope = np.where(side != 0, delta, 0.0)
-        offset = np.where(side != 0, start - side * half, 0.0)
-        if slope @ slope > 0.0:
-            shares.append(float(np.clip(-(offset @ slope) / (slope @ slope), 0.0, 1.0)))
-    points = start + np.array(shares)[:, None] * delta
-    return float(np.min(np.linalg.norm(points - np.clip(points, -half, half), axis=1)))
-
-
-# The distance of two segments, in closed form; its definition is `model.distances`.
+# The distance of two segments, in closed form.
 
 
 @kernel
@@ -247,26 +224,6 @@ def face_point_squared(a: Vector, b: Vector, c: Vector, point: Vector) -> float:
     return dot(away, away)
 
 
-def triangle_point_definition(corners: NDArray[np.float64], point: NDArray[np.float64]) -> float:
-    """The same distance, [m]: the least over face, edges and corners, each where it applies.
-
-    Args:
-        corners: Shape (3, 3), [m].
-        point: Shape (3,), [m].
-    """
-    found = [float(np.min(np.linalg.norm(corners - point, axis=1)))]
-    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        delta = end - start
-        if delta @ delta > 0.0:
-            share = np.clip((point - start) @ delta / (delta @ delta), 0.0, 1.0)
-            found.append(float(np.linalg.norm(start + share * delta - point)))
-    sides = (corners[1:] - corners[0]).T
-    shares = np.linalg.lstsq(sides, point - corners[0], rcond=None)[0]
-    if np.all(shares >= 0.0) and shares.sum() <= 1.0:
-        found.append(float(np.linalg.norm(corners[0] + sides @ shares - point)))
-    return min(found)
-
-
 # The distance of a triangle to a box about the origin, in closed form.
 #
 # The nearest point of the triangle is on an edge (three segments against the box) or in its
@@ -319,45 +276,6 @@ def _face_box_squared(a: Vector, b: Vector, c: Vector, half: Vector) -> float:
     return face_point_squared(a, b, c, corner)
 
 
-def triangle_box_definition(corners: NDArray[np.float64], half: NDArray[np.float64]) -> float:
-    """The same distance, [m], by trying every pair of features.
-
-    Args:
-        corners: Box frame, shape (3, 3), [m].
-        half: Half extents of the box, shape (3,), [m].
-    """
-    sides = list(zip(corners, np.roll(corners, -1, axis=0), strict=True))
-    found = [segment_box_definition(start, end, half) for start, end in sides]
-    vertices = np.array(list(product((-1.0, 1.0), repeat=3))) * half
-    found += [triangle_point_definition(corners, vertex) for vertex in vertices]
-    if any(_crosses(corners, *edge) for edge in _box_edges(vertices)):
-        return 0.0
-    return min(found)
-
-
-def _box_edges(
-    vertices: NDArray[np.float64],
-) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    signs = np.sign(vertices)
-    return [
-        (vertices[i], vertices[j])
-        for i in range(8)
-        for j in range(i)
-        if np.count_nonzero(signs[i] != signs[j]) == 1
-    ]
-
-
-def _crosses(
-    corners: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
-) -> bool:
-    """Whether a segment passes through a triangle that is not coplanar with it."""
-    matrix = np.column_stack([start - end, corners[1] - corners[0], corners[2] - corners[0]])
-    if abs(np.linalg.det(matrix)) < 1e-300:
-        return False
-    share, first, second = np.linalg.solve(matrix, start - corners[0])
-    return bool(0.0 <= share <= 1.0 and first >= 0.0 and second >= 0.0 and first + second <= 1.0)
-
-
 # The distance of a triangle to a segment, in closed form.
 
 
@@ -381,29 +299,3 @@ def triangle_segment_squared(a: Vector, b: Vector, c: Vector, start: Vector, end
         ),
         min(face_point_squared(a, b, c, start), face_point_squared(a, b, c, end)),
     )
-
-
-def triangle_segment_definition(
-    corners: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]
-) -> float:
-    """The same distance, [m]: the minimum of a convex function of position along the segment.
-
-    Args:
-        corners: Of the triangle, shape (3, 3), [m].
-        start: Of the segment, shape (3,), [m].
-        end: Of the segment, shape (3,), [m].
-    """
-    golden = (np.sqrt(5.0) - 1.0) / 2.0
-    low, high = 0.0, 1.0
-    for _ in range(120):
-        left, right = high - golden * (high - low), low + golden * (high - low)
-        at_left, at_right = (
-            triangle_point_definition(corners, start + s * (end - start)) for s in (left, right)
-        )
-        if at_left < at_right:
-            high = right
-        else:
-            low = left
-    middle = start + (low + high) / 2.0 * (end - start)
-    ends = (triangle_point_definition(corners, p) for p in (start, middle, end))
-    return min(ends)

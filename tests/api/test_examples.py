@@ -105,4 +105,4 @@ def test_the_python_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> No
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     exec(compile(block, "README.md", "exec"), {"__name__": "__main__"})
     assert "PASSED" in capsys.readouterr().out
-    assert Path("runs/first/report.html").is_file()
+    assert Path("runs/second/report.html").is_file()

@@ -116,7 +116,7 @@ def test_a_number_or_name_past_any_machine_is_refused(given: dict[str, object]) 
     [
         ("sim", (RIG, "--at-mm", "inf", "0", "0"), "--at-mm is inf"),
         ("calibrate", ("tags", RIG, "images", "--wanted-mm", "inf"), "--wanted-mm is inf"),
-        ("workspace", (RIG, SCENE, "--characteristic-length-mm", "1e300"), "--characteristic-"),
+        ("workspace", (RIG, "-o", "w", "--characteristic-length-mm", "1e300"), "--characteristic-"),
     ],
 )
 def test_the_option_is_named_as_it_was_typed(

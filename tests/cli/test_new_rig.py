@@ -55,7 +55,7 @@ def test_each_question_shows_its_default_and_its_unit(tmp_path: Path) -> None:
         (2, "nan", "finite number"),
         (3, "5", "not a whole number from 6 to 64"),
         (21, "0 0 500", "would be outside"),
-        (26, "4", "more than the least tension, 5 N"),
+        (26, "4", "more than the smallest tension, 5 N"),
         (30, "sometimes", "not one of absolute, incremental"),
     ],
 )
@@ -103,7 +103,7 @@ def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:
     table = cables_csv(tmp_path)
     with nothing_written(tmp_path):
         low = call("new", tmp_path / "rig.yaml", "--from", table, "--max-tension-n", "3")
-    one_message(low, 2, "--max-tension-n", "more than the least tension, 5 N")
+    one_message(low, 2, "--max-tension-n", "more than the smallest tension, 5 N")
     table.write_text(table.read_text().replace("864.7443", "high"))
     high = call("new", tmp_path / "rig.yaml", "--from", table)
     one_message(high, 2, f"{table}:2", "'high' is not a number")

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import load_rig
 from model.scene import load_scene
 from planner.edge_checks import FREE, OBSTACLE, SELF, WORKSPACE, WRENCH, ExactChecks
@@ -41,17 +40,6 @@ def test_many_edges_and_frozen_arrays_are_taken_as_one_by_one() -> None:
     assert found == [made.problem(a, b) for a, b in zip(starts, ends, strict=True)]
     distance, body, obstacle = made.clearance(SCENE.start.position, SCENE.start.position)
     assert (round(distance, 4), body, obstacle) == (0.0322, 6, 0)
-
-
-def test_turning_edges_report_their_reason_too() -> None:
-    made = checks()
-    rotated = Pose(HOME, matrix_from_rotation_vector([0.0, 0.0, 0.05]))
-    assert made.turning_problem(Pose.level(HOME), rotated) == FREE
-    assert (
-        made.turning_problem(SCENE.start, Pose(SCENE.goal.position, rotated.rotation)) == OBSTACLE
-    )
-    assert made.turning_problem(Pose.level(HOME), Pose.level([0.0, 0.0, 2.0])) == WORKSPACE
-    assert checks(self_clearance=0.05).turning_problem(Pose.level(HOME), rotated) == SELF
 
 
 def test_importing_the_checks_compiles_nothing() -> None:

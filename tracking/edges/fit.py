@@ -24,7 +24,6 @@ from tracking.edges.sampling import (
     DARK_SLOPE,
     HALF,
     HIDDEN,
-    INFLATION,
     INK,
     INNER,
     MIDDLE,
@@ -437,11 +436,9 @@ def _write(
     for weight in weights:
         used += 1 if weight > 0.1 else 0
     found[SHARE] = used / len(weights)
-    found[INFLATION] = 1.0
     if used > 2 * LAGS:
         wider *= used / (used - LAGS - 1.0)  # the fit absorbs what all parts have in common
         wider = max(1.0, (INDEPENDENT + used * wider) / (INDEPENDENT + used))
         found[OFFSET_VARIANCE] *= wider
         found[COVARIANCE] *= wider
         found[TILT_VARIANCE] *= wider
-        found[INFLATION] = wider

@@ -22,7 +22,6 @@ from tracking.edges.sampling import (
     COVARIANCE,
     HALF,
     HIDDEN,
-    INFLATION,
     MIDDLE,
     OFFSET,
     OFFSET_VARIANCE,
@@ -202,7 +201,6 @@ class RefinedTag:
         target: Shape (8,).
         edges: Which edges were measured, shape (4,).
         spreads: Standard deviations of the blur across them, shape (4,), [px].
-        inflation: Variance inflation from correlated errors, shape (4,).
     """
 
     corners: Array
@@ -210,7 +208,6 @@ class RefinedTag:
     target: Array
     edges: NDArray[np.bool_]
     spreads: Array = field(default_factory=lambda: np.zeros(4))
-    inflation: Array = field(default_factory=lambda: np.ones(4))
 
     @property
     def whole(self) -> bool:
@@ -334,5 +331,4 @@ def _refined(corners: Array, lines: Lines, found: Array, tag: int) -> RefinedTag
         read_only(target),
         edges.copy(),
         read_only(found[tag, :, SPREAD]),
-        read_only(found[tag, :, INFLATION]),
     )

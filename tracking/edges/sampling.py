@@ -87,11 +87,9 @@ COVARIANCE = 7
 TILT_VARIANCE = 8
 SHARE = 9
 """Share of the edge that fits the model."""
-INFLATION = 10
-"""Variance inflation from errors correlated along the edge."""
-HIDDEN = 11
+HIDDEN = 10
 """Share of the step from ink to paper above the pixels' saturation."""
-COLUMNS = 12
+COLUMNS = 11
 
 
 # Brightness profile across a blurred edge.

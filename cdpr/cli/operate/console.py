@@ -140,7 +140,8 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
 
 def demo(
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="folder to create", metavar="DIR")
+        Path | None,
+        typer.Option("-o", "--output", help="folder to create (default: runs/demo)", metavar="DIR"),
     ] = None,
     environment: Annotated[
         int, typer.Option(min=1, max=3, help="number of the paper's environment")

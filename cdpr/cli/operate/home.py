@@ -36,7 +36,7 @@ from executor.homing import (
 )
 from model.rig import Rig
 
-FURTHEST_MM, FASTEST_MM_S = 1000.0 * FURTHEST, 1000.0 * FASTEST
+FASTEST_MM_S = 1000.0 * FASTEST
 REACH_MM, SPEED_MM_S, SLACK_MM = 1000.0 * REACH, 1000.0 * SPEED, 1000.0 * SLACK
 
 
@@ -52,7 +52,7 @@ class WindingOptions:
     ] = None
     reach_mm: Annotated[
         float,
-        typer.Option(min=0.1, max=1000.0 * FURTHEST, help="largest length to take up per cable"),
+        typer.Option(min=0.1, max=1000.0 * FURTHEST, help="largest length to wind in per cable"),
     ] = REACH_MM
     speed_mm_s: Annotated[
         float, typer.Option(min=0.01, max=FASTEST_MM_S, help="largest winch speed")

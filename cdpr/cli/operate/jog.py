@@ -214,7 +214,9 @@ def jog(
         _held_cables(the_rig, path, held, limit_n, speed, drives)
         return
     require_unused(
-        "cdpr jog", {"--limit-n": limit_n}, "only with --cable; a path uses the rig's limits"
+        "cdpr jog",
+        {"--limit-n": limit_n},
+        "only with --cable or --one-cable; a path uses the rig's limits",
     )
     if held != DEFAULT_HELD:
         _held(the_rig, path, held, speed, drives)

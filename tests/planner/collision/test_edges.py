@@ -13,7 +13,7 @@ from model.kinematics import cables_at
 from model.pose import Array, Pose
 from model.rig import Rig, load_rig
 from model.scene import load_scene
-from planner.collision.edges import edge_clearance, edge_free, edges_free, points_free
+from planner.collision.edges import edge_clearance, edge_free, edges_free
 from planner.collision.world import build_world
 from tests.planner.collision.sampled_oracle import KINDS, CoalScene, changed_rig, random_scene
 
@@ -135,7 +135,6 @@ def test_many_edges_and_points_are_answered_as_one_by_one() -> None:
     one_by_one = [edge_free(world, a, b) for a, b in zip(starts, ends, strict=True)]
     assert edges_free(world, starts, ends).tolist() == one_by_one
     assert edges_free(world, ends, starts).tolist() == one_by_one
-    assert points_free(world, starts).tolist() == [edge_free(world, a, a) for a in starts]
 
 
 def test_positions_outside_the_workspace_or_not_numbers_are_never_free() -> None:

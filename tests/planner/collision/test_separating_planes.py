@@ -14,9 +14,9 @@ from model.scene import load_scene
 from planner.collision.edges import edge_clearance
 from planner.collision.separating_planes import cable_core, core_of
 from planner.collision.world import build_world
-from planner.kernels.primitives import segment_box_definition
 from planner.kernels.scene_arrays import pieces_of
 from tests.planner.collision.sampled_oracle import KINDS, random_scene
+from tests.planner.kernels.definitions import segment_box_definition
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")

@@ -9,19 +9,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from planner.kernels.gjk import hulls_apart, hulls_definition, hulls_distance
+from planner.kernels.gjk import hulls_apart, hulls_distance
 from planner.kernels.primitives import (
-    segment_box_definition,
     segment_box_squared,
     triangle_box_apart,
-    triangle_box_definition,
     triangle_box_squared,
-    triangle_point_definition,
     triangle_point_squared,
-    triangle_segment_definition,
     triangle_segment_squared,
 )
 from tests.planner.collision.sampled_oracle import triangle
+from tests.planner.kernels.definitions import (
+    hulls_definition,
+    segment_box_definition,
+    triangle_box_definition,
+    triangle_point_definition,
+    triangle_segment_definition,
+)
 
 EXACT = 1e-12
 """Of the largest coordinate: round-off of the definitions themselves."""
