@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import socket
+import stat
 import struct
 import subprocess
 import time
@@ -150,7 +151,11 @@ def open_bus(settings: BusSettings) -> can.BusABC:
     # Back ends raise errors of their vendors' libraries; each means that the bus did not open.
     except Exception as error:
         raise _cannot_open(settings, error) from error
-    _prepare_socket(bus)
+    try:
+        _prepare_socket(bus)
+    except OSError as error:
+        bus.shutdown()
+        raise _cannot_open(settings, error) from error
     return bus
 
 
@@ -225,6 +230,11 @@ def _cannot_open(settings: BusSettings, error: Exception) -> HardwareMissing:
     cause = error.__cause__ or error
     number = getattr(cause, "errno", None)
     step = "check the adapter, its driver and the channel name, then run `cdpr doctor`"
+    if isinstance(error, (ImportError, can.CanInterfaceNotImplementedError)):
+        step = (
+            "install the adapter's Python package into this environment; for serial adapters"
+            " (slcan, robotell, seeedstudio, serial): pip install 'python-can[serial]'"
+        )
     if settings.interface == "socketcan":
         step = bring_up(settings)
         if number == errno.EAFNOSUPPORT:
@@ -241,17 +251,24 @@ def _cannot_open(settings: BusSettings, error: Exception) -> HardwareMissing:
 
 def _prepare_socket(bus: can.BusABC) -> None:
     """Enlarges the receive buffer; on IP sockets refuses groups joined by other sockets."""
-    try:
-        descriptor = bus.fileno()
-    except NotImplementedError:  # not every bus has a socket
-        return
-    if descriptor < 0:
+    descriptor = _socket_of(bus)
+    if descriptor is None:
         return
     with socket.socket(fileno=os.dup(descriptor)) as bus_socket:
         bus_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         if bus_socket.family == socket.AF_INET:
             ip_multicast_all = 49  # Source: linux/in.h; Python names it from 3.14
             bus_socket.setsockopt(socket.IPPROTO_IP, ip_multicast_all, 0)
+
+
+def _socket_of(bus: can.BusABC) -> int | None:
+    """Descriptor of a bus's socket; None where it has none, as with a serial adapter."""
+    try:
+        descriptor = bus.fileno()
+        is_socket = descriptor >= 0 and stat.S_ISSOCK(os.fstat(descriptor).st_mode)
+    except (NotImplementedError, OSError):
+        return None
+    return descriptor if is_socket else None
 
 
 def echoes_own_frames(bus: can.BusABC) -> bool:
@@ -264,11 +281,8 @@ def lost_frames(bus: can.BusABC) -> int:
 
     0 for buses without a socket, where only missing replies indicate a loss.
     """
-    try:
-        descriptor = bus.fileno()
-    except NotImplementedError:
-        return 0
-    if descriptor < 0:
+    descriptor = _socket_of(bus)
+    if descriptor is None:
         return 0
     bus_socket = socket.socket(fileno=descriptor)
     try:
@@ -321,15 +335,21 @@ class EchoFilter:
     #: Largest number of pending echoes per identifier, which limits the credit of lost frames.
     MOST_CREDIT = 8
 
-    def __init__(self, ids: frozenset[int], *, echoes_own_frames: bool) -> None:
-        """Takes the identifiers to watch, and whether the bus echoes sent frames."""
-        self._ids = ids
+    def __init__(self, ids: frozenset[int], *, echoes_own_frames: bool, batch: int = 0) -> None:
+        """Starts without a frame sent.
+
+        Args:
+            ids: Identifiers to watch.
+            echoes_own_frames: Whether the bus echoes sent frames.
+            batch: Largest number of frames of one identifier sent before an echo is read.
+        """
+        self._ids, self._most = ids, max(self.MOST_CREDIT, batch)
         self._credit: dict[int, int] | None = dict.fromkeys(ids, 0) if echoes_own_frames else None
 
     def sent(self, can_id: int) -> None:
         """Counts a sent frame."""
         if self._credit is not None and can_id in self._credit:
-            self._credit[can_id] = min(self.MOST_CREDIT, self._credit[can_id] + 1)
+            self._credit[can_id] = min(self._most, self._credit[can_id] + 1)
 
     def is_foreign(self, can_id: int) -> bool:
         """Whether a received frame is another master's."""

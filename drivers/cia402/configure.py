@@ -25,6 +25,7 @@ from drivers.cia402.expected_objects import (
     require_absent,
     require_expected,
     require_idle,
+    require_no_wrap,
     require_there,
     wrong_value,
 )
@@ -112,7 +113,7 @@ def configure_drives(
     nodes = [winch.node_id for winch in rig.winches]
     network = SetupNetwork(bus, pump, nodes, timeout=profile.sdo_timeout_ms / 1000.0)
     network.discard_waiting()
-    require_answers(network, nodes)
+    require_answers(network, nodes, revive=to_reset)
     _refuse_duplicates(network)
     refusals = Refusals()
     entries: list[int] = []
@@ -124,6 +125,7 @@ def configure_drives(
             refusals.note(require_there, network, node, setting)
         for setting in stated_absent(rig, drive, winch_map, max_tension):
             refusals.note(require_absent, network, node, setting)
+        refusals.note(require_no_wrap, network, node, settings[drive])
         refusals.note(count_heartbeats, network, node, profile, entries)
     refusals.raise_any()
     _refuse_duplicates(network)
@@ -238,14 +240,34 @@ def _unwatched_peers(
         )
 
 
-def require_answers(network: SetupNetwork, nodes: Sequence[int]) -> None:
+def require_answers(network: SetupNetwork, nodes: Sequence[int], *, revive: bool = False) -> None:
     """Contacts all drives at once, and reports all silent ones together.
+
+    Args:
+        network: The bus.
+        nodes: The drives.
+        revive: Takes drives that are in NMT *stopped* to *pre-operational*.
 
     Raises:
         HardwareMissing: Drives do not answer.
-        Refused: The single silent drive gives a wrong answer.
+        Refused: Drives are in NMT *stopped*, or the single silent drive gives a wrong answer.
     """
     nothing = network.silent_nodes(nodes)
+    stopped = [node for node in nothing if network.is_stopped(node)]
+    if stopped and revive:
+        for node in stopped:
+            network.command(NmtCommand.PRE_OPERATIONAL, node)
+        nothing = network.silent_nodes(nothing)
+    elif stopped:
+        names = ", ".join(str(node) for node in stopped)
+        raise Refused(
+            f"drive {names}: in the NMT state 'stopped', by its heartbeat",
+            where=SETTING_UP,
+            why="another program, or the drive's own reaction to a communication error (1029h),"
+            " stopped its communication",
+            next_step="end other programs, then run `cdpr reset RIG`",
+            values={"nodes": names},
+        )
     if len(nothing) == 1:
         where = f"drive {nothing[0]}, object 1000h:00 device type"
         raise network.client(nothing[0]).no_answer(where)
@@ -304,9 +326,12 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
         code = error.values.get("abort_code")
         if code in NOT_NOW or not (setting.optional or code in READ_ONLY):
             raise
-        if _holds(network, node, setting):
+        if setting.transient and code in READ_ONLY:
+            return  # a fixed object, whose final value is checked later
+        fixed = _fixed_value(network, node, setting)
+        if fixed is not None and setting.is_kept(fixed):
             return
-        if not setting.optional:
+        if not setting.optional or (fixed is not None and not setting.instead):
             raise
         if setting.instead:
             lost = "there is no" if code in OBJECT_DOES_NOT_EXIST else "the drive refuses"
@@ -321,13 +346,12 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
         raise wrong_value(node, str(setting), found, str(setting.value), setting.why)
 
 
-def _holds(network: SetupNetwork, node: int, setting: Setting) -> bool:
-    """Whether an object that cannot be written holds the required value."""
+def _fixed_value(network: SetupNetwork, node: int, setting: Setting) -> bytes | None:
+    """Value of an object that cannot be written; None if it cannot be read either."""
     try:
-        kept = network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
+        return network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
     except Refused:
-        return False
-    return setting.is_kept(kept)
+        return None
 
 
 def _switch_off_used(network: SetupNetwork, node: int, profile: ProfileDocument) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from drivers.can_errors import in_fault, moved_by_another, wrong_setting
-from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, Setting
+from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork
 from drivers.cia402.sdo_jobs import CSP_MODE, OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
@@ -45,18 +46,26 @@ BEFORE = (
         "bit 7 inverts positions but not torques; `direction` of the winch inverts both",
         optional=True,
     ),
+    Expectation(
+        *(0x607C, 0, 0xFFFFFFFF, 0, "home offset"),
+        "drives subtract it from the position limits 607Dh; `home_counts` of the winch replaces it",
+        optional=True,
+    ),
 )
 
 
 def identifiers(node: int) -> tuple[Expectation, ...]:
-    """Identifiers on which a drive receives SYNC and sends emergencies; CiA 301, 7.5.2."""
+    """Identifiers on which a drive receives SYNC and sends emergencies; CiA 301, 7.5.2.
+
+    Bit 30 of 1005h makes the drive send SYNC, bit 29 selects 29-bit identifiers.
+    """
     sync, emergency = (
-        "SYNC is sent as 80h, without a counter",
+        "the program alone sends SYNC, as 80h without a counter",
         "emergencies are received as 80h + node",
     )
     return (
-        Expectation(0x1005, 0, 0x7FF, 0x80, "COB-ID SYNC", sync, optional=True),
-        Expectation(0x1014, 0, 0x800007FF, 0x80 + node, "COB-ID EMCY", emergency, optional=True),
+        Expectation(0x1005, 0, 0x600007FF, 0x80, "COB-ID SYNC", sync, optional=True),
+        Expectation(0x1014, 0, 0xA00007FF, 0x80 + node, "COB-ID EMCY", emergency, optional=True),
         Expectation(0x1019, 0, 0xFF, 0, "synchronous counter overflow", sync, optional=True),
     )
 
@@ -120,6 +129,46 @@ def require_expected(network: SetupNetwork, node: int, expected: Expectation) ->
     if value & expected.mask != expected.expected:
         found, wanted = f"{value:X}h", f"{expected.expected:X}h"
         raise wrong_value(node, str(expected), found, wanted, expected.why)
+
+
+POSITION_RANGE = 0x607B
+"""Positions wrap around at its sub-indices 1 and 2, unless both are 0. Source: CiA 402-2."""
+
+
+def position_range(
+    read: Callable[[int, int, str], bytes | None],
+) -> tuple[int, int] | None:
+    """The position range limits of a drive, [counts]; None if there are none.
+
+    Args:
+        read: Reads an optional object by index, sub-index and name.
+    """
+    data = [read(POSITION_RANGE, sub, f"{name} position range limit") for sub, name in _ENDS]
+    low, high = (int.from_bytes(each or b"", "little", signed=True) for each in data)
+    return (low, high) if low or high else None
+
+
+_ENDS = ((1, "min"), (2, "max"))
+
+
+def holds_limits(wraps: tuple[int, int] | None, settings: Sequence[Setting]) -> bool:
+    """Whether positions do not wrap around within the software limits 607Dh of the settings."""
+    limits = [setting.value for setting in settings if setting.index == SOFTWARE_LIMITS]
+    return wraps is None or (bool(limits) and wraps[0] <= min(limits) and max(limits) <= wraps[1])
+
+
+def require_no_wrap(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> None:
+    """Requires a position range, if there is one, that holds the software limits.
+
+    Raises:
+        Refused: Positions would wrap around.
+    """
+    found = position_range(network.client(node).read_if_there)
+    if not holds_limits(found, settings):
+        raise wrong_value(
+            *(node, f"{POSITION_RANGE:04X}h position range limit", str(found)),
+            *("0 and 0, or more than 607Dh", "positions would wrap around"),
+        )
 
 
 def require_there(network: SetupNetwork, node: int, setting: Setting) -> None:

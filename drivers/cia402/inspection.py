@@ -15,11 +15,14 @@ from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
     BEFORE,
     MODE_DISPLAY,
+    POSITION_RANGE,
     Expectation,
     expected_by,
+    holds_limits,
     how_to_set,
     identifiers,
     identity,
+    position_range,
 )
 from drivers.cia402.object_dictionary import (
     HEARTBEAT_CONSUMERS,
@@ -166,6 +169,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
             reader.at_setting(setting, _needed(setting))
         for setting in stated_absent(rig, drive, winch_map):
             reader.at_absent(setting)
+        reader.at_position_range(settings_for(rig, drive, winch_map, None))
         for_unused_pdos(profile, reader.at_unused)
     answered = tuple(node for node in all_nodes if node not in silent)
     return Examined(answered, tuple(silent), tuple(rows.values()))
@@ -269,10 +273,27 @@ class _Reader:
         if encoder:
             ratios["608Fh"] = encoder
         text = ", ".join(f"{value:.10g} from {name}" for name, value in ratios.items()) or "absent"
-        if not ratios or counts_per_turn in ratios.values():
+        # A factor group scales positions; where it is not set (1 per turn) the encoder does.
+        scales = [value for value in ratios.values() if value != 1.0]
+        if not scales or scales[0] == counts_per_turn:
             row.note(self._node, text)
         else:
             row.note(self._node, text, "remark", "compare with 6064h over one motor turn")
+
+    def at_position_range(self, settings: Sequence[Setting]) -> None:
+        """Where positions wrap around, if anywhere."""
+        needed = "0 and 0, or more than 607Dh"
+        row = self._row(POSITION_RANGE, 1, f"{POSITION_RANGE:04X}h position range limit", needed)
+        row.meaning = "positions must not wrap around"
+        try:
+            found = position_range(self._client.read_if_there)
+        except Refused as error:
+            if "abort_code" not in error.values:
+                raise
+            found = None
+        good = holds_limits(found, settings)
+        change = "" if good else "set it with the manufacturer's tool and store it"
+        row.note(self._node, str(found or "none"), "ok" if good else "wrong", change)
 
     def at_setting(self, setting: Setting, needed: str) -> None:
         """An object written by the configuration, which must exist with the right length."""

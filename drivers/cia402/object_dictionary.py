@@ -96,6 +96,7 @@ class Setting:
 
 
 HEARTBEAT_CONSUMERS = 0x1016
+SOFTWARE_LIMITS = 0x607D
 
 
 def settings_for(
@@ -114,7 +115,8 @@ def settings_for(
     """
     profile = profile_of(rig)
     settings = _all_settings(rig, drive, winch_map, max_tension, profile)
-    return tuple(_within(each, profile) for each in settings if profile.has(each.index, each.sub))
+    present = [each for each in settings if profile.has(each.index, each.sub)]
+    return tuple(_within(each, profile, rig.cycle) for each in present)
 
 
 def stated_absent(
@@ -165,11 +167,14 @@ def left_out(profile: ProfileDocument) -> tuple[str, ...]:
     )
 
 
-CLAMPED = (0x6066, 0x6085)
+FOLLOWING_TIMEOUT, QUICK_STOP_RAMP = 0x6066, 0x6085
 """Objects clamped to the drive's range: an earlier trip, and the steepest possible ramp."""
 
+LONGEST_QUICK_STOP = 0.5
+"""Longest time of a quick stop from top speed, [s]."""
 
-def _within(setting: Setting, profile: ProfileDocument) -> Setting:
+
+def _within(setting: Setting, profile: ProfileDocument, cycle: float) -> Setting:
     """The setting within the drive's range.
 
     Raises:
@@ -178,8 +183,20 @@ def _within(setting: Setting, profile: ProfileDocument) -> Setting:
     allowed = profile.range_of(setting.index, setting.sub)
     if allowed is None or allowed.holds(setting.value):
         return setting
-    if setting.index in CLAMPED and setting.value > allowed.high:
-        return replace(setting, value=allowed.high)
+    clamped = replace(setting, value=min(setting.value, allowed.high))
+    if setting.index == FOLLOWING_TIMEOUT and allowed.holds(clamped.value):
+        return clamped
+    if setting.index == QUICK_STOP_RAMP and allowed.holds(clamped.value):
+        takes = cycle * setting.value / max(1, allowed.high)
+        if takes <= LONGEST_QUICK_STOP:
+            return clamped
+        raise BadInput(
+            f"the steepest {setting} of {profile.name}, {allowed.high}, stops a drive from top"
+            f" speed in {takes:.3g} s, limit {LONGEST_QUICK_STOP:g} s",
+            where="drives.profile",
+            why="a quick stop must be over before cables go slack or the platform goes far",
+            next_step="check the range and the unit in the profile, and max_speed of the winches",
+        )
     raise BadInput(
         f"{setting} must hold {setting.value}; {profile.name} accepts {allowed.low} to"
         f" {allowed.high}",
@@ -351,9 +368,17 @@ def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> 
         Setting(0x6007, 0, "<h", 3, "abort connection option code", "stop when the bus is lost"),
         Setting(0x605A, 0, "<h", 6, "quick stop option code", "ramp down, then hold under torque"),
         *_options(),
-        _capped(0x6085, "quick stop deceleration", ramp, "at rest within one cycle"),
+        *_offsets(),
+        _capped(QUICK_STOP_RAMP, "quick stop deceleration", ramp, "at rest within one cycle"),
         _capped(0x6065, "following error window", window, "motion.following_error_mm"),
-        Setting(0x6066, 0, "<H", math.ceil(1000 * cycle), "following error time out", "one cycle"),
+        Setting(
+            FOLLOWING_TIMEOUT,
+            0,
+            "<H",
+            math.ceil(1000 * cycle),
+            "following error time out",
+            "one cycle",
+        ),
     )
 
 
@@ -382,6 +407,18 @@ def _options() -> tuple[Setting, ...]:
     )
 
 
+def _offsets() -> tuple[Setting, ...]:
+    """Offsets that drives add to set-points, which a former master may have left."""
+    return tuple(
+        Setting(index, 0, form, 0, f"{of} offset", "set-points are used as sent", optional=True)
+        for index, form, of in (
+            (0x60B0, "<i", "position"),
+            (0x60B1, "<i", "velocity"),
+            (0x60B2, "<h", "torque"),
+        )
+    )
+
+
 def _limits(
     rig: Rig, drive: int, winch_map: WinchMap, max_tension: float, profile: ProfileDocument
 ) -> tuple[Setting, ...]:
@@ -398,8 +435,8 @@ def _limits(
     why = "longest and shortest cable in the workspace"
     return (
         _torque_limit(torque, profile),
-        Setting(0x607D, 1, "<i", low, "min position limit", why),
-        Setting(0x607D, 2, "<i", high, "max position limit", why),
+        Setting(SOFTWARE_LIMITS, 1, "<i", low, "min position limit", why),
+        Setting(SOFTWARE_LIMITS, 2, "<i", high, "max position limit", why),
     )
 
 

@@ -21,12 +21,16 @@ from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, receive_fra
 from drivers.can_errors import SETTING_UP, ForeignMaster, error_frame_fault
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import (
+    HEARTBEAT_BASE,
+    MASTER_NODE,
     NMT_ID,
     SDO_REPLY_BASE,
     SDO_REQUEST_BASE,
     NmtCommand,
+    NmtState,
     foreign_master_message,
     make_nmt,
+    parse_heartbeat,
     set_up_ids,
 )
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
@@ -94,13 +98,20 @@ class SetupNetwork:
         self._bus, self._pump = bus, pump
         self.timeout, self.clock = timeout, clock
         self._clients: dict[int, Client] = {}
-        self._own = EchoFilter(set_up_ids(nodes), echoes_own_frames=echoes_own_frames(bus))
+        self._states: dict[int, int | None] = {}
+        self._own = EchoFilter(
+            set_up_ids(nodes), echoes_own_frames=echoes_own_frames(bus), batch=len(nodes)
+        )
 
     def client(self, node: int) -> Client:
         """The SDO client for a node."""
         if node not in self._clients:
             self._clients[node] = Client(node, self)
         return self._clients[node]
+
+    def is_stopped(self, node: int) -> bool:
+        """Whether the node's last heartbeat says NMT *stopped*, where it answers no SDO."""
+        return self._states.get(node) == NmtState.STOPPED
 
     def command(self, command: NmtCommand, node: int) -> None:
         """Sends an NMT command to one node."""
@@ -171,6 +182,9 @@ class SetupNetwork:
             self._judge_error(message)
         elif not (message.is_remote_frame or message.is_extended_id):
             self._refuse_foreign(message.arbitration_id)
+            node = message.arbitration_id - HEARTBEAT_BASE
+            if 0 < node < MASTER_NODE:
+                self._states[node] = parse_heartbeat(message.data)
             client = self._clients.get(message.arbitration_id - SDO_REPLY_BASE)
             if client is not None:
                 client.take(bytes(message.data))

@@ -111,7 +111,7 @@ class Endpoints:
 
 def wanted_settings(document: OdriveDocument) -> tuple[Wanted, ...]:
     """Required settings of every drive of a rig; limits are set by separate messages."""
-    can, config = "axis0.config.can", "axis0.config"
+    can, config, controller = "axis0.config.can", "axis0.config", "axis0.controller.config"
     watchdog = (document.watchdog_ms or 0.0) / 1000.0
     return (
         Wanted(f"{config}.watchdog_timeout", watchdog, "drives.watchdog_ms"),
@@ -121,9 +121,8 @@ def wanted_settings(document: OdriveDocument) -> tuple[Wanted, ...]:
         Wanted(f"{can}.torques_msg_rate_ms", document.torques_ms, "drives.torques_ms"),
         Wanted(f"{can}.input_vel_scale", 1000, "feed-forward comes in steps of 0.001 turns/s"),
         Wanted(f"{can}.input_torque_scale", 1000, "feed-forward comes in steps of 0.001 N·m"),
-        Wanted(
-            "axis0.controller.config.circular_setpoints", False, "cable travel does not wrap around"
-        ),
+        Wanted(f"{controller}.circular_setpoints", False, "cable travel does not wrap around"),
+        Wanted(f"{controller}.absolute_setpoints", True, "positions survive a power cycle"),
     )
 
 

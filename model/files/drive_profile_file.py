@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from model.files.documents import Document, Finding
 
@@ -33,6 +33,9 @@ OBJECTS: Mapping[str, str] = {
     "607Dh:01": "min position limit",
     "607Dh:02": "max position limit",
     "6085h:00": "quick stop deceleration",
+    "60B0h:00": "position offset",
+    "60B1h:00": "velocity offset",
+    "60B2h:00": "torque offset",
     "60C2h:01": "interpolation time period value",
     "60C2h:02": "interpolation time index",
 }
@@ -84,6 +87,12 @@ class Range(Document):
 
     low: int
     high: int
+
+    @model_validator(mode="after")
+    def _is_ordered(self) -> Self:
+        if self.low > self.high:
+            raise ValueError(f"low {self.low} is above high {self.high}")
+        return self
 
     def holds(self, value: int) -> bool:
         """Whether a value is within."""

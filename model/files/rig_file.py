@@ -264,7 +264,7 @@ class RigDocument(Document):
     def _nodes_of_odrives(self) -> list[Finding]:
         if self.drives.type != "odrive":
             return []
-        what = f"an ODrive has a node id from 0 to {ODRIVE_LAST_NODE}"
+        what = f"an ODrive of a rig has a node id from 1 to {ODRIVE_LAST_NODE}"
         return [
             (("winches", i, "node_id"), what)
             for i, winch in enumerate(self.winches)

@@ -111,14 +111,20 @@ class ScriptedBus:
         self.times, self.now = times, 0.0
         self.sent: list[can.Message] = []
         self.coming: list[tuple[float, can.Message]] = []
+        self.stopped: set[int] = set()  # in this NMT state a node answers no SDO
 
     def clock(self) -> float:
         return self.now
 
     def send(self, message: can.Message) -> None:
         self.sent.append(message)
+        if message.arbitration_id == 0 and message.data[0] == 0x80:
+            self.stopped.discard(message.data[1])
         drive = self.drives.get(message.arbitration_id - 0x600)
         if drive is None:
+            return
+        if drive.node in self.stopped:
+            self._receive(0.02, 0x700 + drive.node, b"\x04")
             return
         request = bytes(message.data)
         reply = drive.answer(request)
@@ -127,7 +133,10 @@ class ScriptedBus:
             self.later(delay, drive.node, reply)
 
     def later(self, delay: float, node: int, data: bytes) -> None:
-        message = can.Message(arbitration_id=0x580 + node, data=data, is_extended_id=False)
+        self._receive(delay, 0x580 + node, data)
+
+    def _receive(self, delay: float, identifier: int, data: bytes) -> None:
+        message = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
         self.coming.append((self.now + delay, message))
         self.coming.sort(key=lambda each: each[0])
 

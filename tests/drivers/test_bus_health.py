@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import socket
 from collections.abc import Callable
 
@@ -31,7 +32,7 @@ from drivers.cia402.pdo import commanding_ids
 from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import WHOLE_BUS, GroupCommand, GroupState
 from drivers.plausibility import ReplyCheck
-from model.errors import Fault, Refused
+from model.errors import Fault, HardwareMissing, Refused
 from tests.drivers.drive_bench import Bench, free_udp_channel
 
 HOLDING = DriveState.QUICK_STOP_ACTIVE
@@ -353,6 +354,51 @@ def test_where_a_sender_hears_itself_only_what_was_not_sent_is_foreign(script: l
             assert not own.is_foreign(0x080)
         elif what == "foreign" and not waiting:
             assert own.is_foreign(0x080)
+
+
+@pytest.mark.parametrize("count", [4, 12, 40])
+def test_a_batch_to_many_drives_may_be_sent_before_its_echoes_are_read(count: int) -> None:
+    own = EchoFilter(frozenset({0}), echoes_own_frames=True, batch=count)
+    for _ in range(count):
+        own.sent(0)
+    assert not any(own.is_foreign(0) for _ in range(count))
+    assert own.is_foreign(0)
+
+
+class Serial(can.BusABC):
+    """A serial adapter: its descriptor is no socket."""
+
+    channel_info = "serial"
+
+    def __init__(self, **_options: object) -> None:
+        self._inner, self.outer = os.openpty()
+
+    def fileno(self) -> int:
+        return self.outer
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise NotImplementedError
+
+    def shutdown(self) -> None:
+        os.close(self._inner)
+        os.close(self.outer)
+
+
+def test_a_serial_adapter_is_opened_and_reports_no_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(can, "Bus", Serial)
+    bus = open_bus(BusSettings("slcan", "/dev/ttyACM0"))
+    assert lost_frames(bus) == 0
+    bus.shutdown()
+
+
+def test_a_missing_package_of_an_adapter_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(**_options: object) -> None:
+        raise can.CanInterfaceNotImplementedError("The serial module is not installed")
+
+    monkeypatch.setattr(can, "Bus", missing)
+    with pytest.raises(HardwareMissing) as caught:
+        open_bus(BusSettings("slcan", "/dev/ttyACM0"))
+    assert "pip install 'python-can[serial]'" in caught.value.next_step
 
 
 def test_drives_with_few_heartbeat_entries_are_reported(bench: Bench) -> None:

@@ -53,14 +53,14 @@ def _simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(examine, "SetupNetwork", Timed)
 
 
-def set_up(rig: Rig, bus: ScriptedBus) -> tuple[str, ...]:
+def set_up(rig: Rig, bus: ScriptedBus, *, to_reset: bool = False) -> tuple[str, ...]:
     ignored: Callable[[tuple[int, ...]], None] = lambda _nodes: None  # noqa: E731
     return configure_drives(
         rig,
         bus,
         None,
         max_tension=None,
-        to_reset=False,
+        to_reset=to_reset,
         on_restarted=ignored,  # type: ignore[arg-type]
     ).remarks
 
@@ -81,13 +81,12 @@ def test_drives_of_a_profile_are_set_up_with_it(rig: Rig, name: str) -> None:
     for drive, node in enumerate(range(1, 9)):
         values = bus.drives[node].values
         for setting in settings_for(theirs, drive, WinchMap(theirs)):
-            if (
-                setting.transient
-                or setting.per_mille_of
-                or (setting.index, setting.sub) == (0x1800, 3)
-            ):
+            place = (setting.index, setting.sub)
+            if setting.transient or setting.per_mille_of:
                 continue
-            held = values[setting.index, setting.sub]
+            if setting.optional and not setting.instead and place not in values:
+                continue
+            held = values[place]
             assert not (held ^ setting.value) & (setting.mask or 0xFFFFFFFF), setting
         assert values.get((0x1800, 3), 0) == 0
 
@@ -154,6 +153,98 @@ def test_positions_that_are_inverted_without_their_torques_are_refused(
     with pytest.raises(Refused, match="607Eh"):
         set_up(rig, bus)
     assert not downloads(bus)
+
+
+OFFSETS = {(0x60B0, 0): -1000, (0x60B1, 0): 20, (0x60B2, 0): 5}
+
+
+def test_offsets_that_another_master_left_are_cleared(rig: Rig) -> None:
+    """Drives add 60B0h to every set-point: all cables would jump when they are enabled."""
+    bus = eight_of("cia402")
+    bus.drives[4].values |= OFFSETS
+    set_up(rig, bus)
+    assert [bus.drives[4].values[key] for key in OFFSETS] == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("left", "allowed"), [(0, True), (7, False)])
+def test_an_offset_that_cannot_be_cleared_must_be_zero(rig: Rig, left: int, allowed: bool) -> None:
+    bus = eight_of("cia402")
+    drive = bus.drives[4]
+    drive.objects[0x60B0, 0] = drive.objects[0x1000, 0]  # read-only
+    drive.values[0x60B0, 0] = left
+    if allowed:
+        assert set_up(rig, bus) == ()
+        return
+    with pytest.raises(Refused, match="drive 4, object 60B0h:00"):
+        set_up(rig, bus)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ((0x607C, 0), 2_000_000, "607Ch:00 home offset"),
+        ((0x1005, 0), 0x40000080, "1005h:00 COB-ID SYNC"),  # the drive sends SYNC
+        ((0x1005, 0), 0x20000080, "1005h:00 COB-ID SYNC"),  # 29 bits
+        ((0x1014, 0), 0x20000084, "1014h:00 COB-ID EMCY"),
+        ((0x607B, 2), 131_071, "607Bh position range limit"),  # of one turn
+    ],
+)
+def test_what_would_move_positions_or_frames_is_refused_before_anything_is_written(
+    rig: Rig, key: tuple[int, int], value: int, said: str
+) -> None:
+    bus = eight_of("cia402")
+    assert examined(rig, bus).good
+    bus.drives[4].values[key] = value
+    wrong = [row.object for row in examined(rig, bus).rows if row.verdict == "wrong"]
+    assert len(wrong) == 1, wrong
+    assert wrong[0][:4] == said[:4]
+    with pytest.raises(Refused, match=said):
+        set_up(rig, bus)
+    assert not downloads(bus)
+
+
+def test_positions_may_wrap_around_beyond_the_software_limits(rig: Rig) -> None:
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values |= {(0x607B, 1): -(2**31), (0x607B, 2): 2**31 - 1}
+    assert set_up(rig, bus) == ()
+    assert examined(rig, bus).good
+
+
+def test_a_fixed_mapping_that_is_the_required_one_is_used(rig: Rig) -> None:
+    bus = eight_of("cia402")
+    fixed = {(0x1600, 0): 2, (0x1600, 1): 0x60400010, (0x1600, 2): 0x607A0020}
+    for drive in bus.drives.values():
+        drive.values |= fixed
+        drive.objects |= {key: drive.objects[0x1000, 0] for key in fixed}  # read-only
+        drive.objects[0x1600, 0] = drive.objects[0x607D, 0]
+    assert set_up(rig, bus) == ()
+    bus.drives[2].values[0x1600, 2] = 0x60FF0020
+    with pytest.raises(Refused, match="drive 2, object 1600h:02"):
+        set_up(rig, bus)
+
+
+@pytest.mark.parametrize(
+    ("high", "said"), [(1, "stops a drive from top speed in"), (-1, "low 0 is above high -1")]
+)
+def test_a_quick_stop_that_takes_too_long_is_refused(
+    rig: Rig, tmp_path: Path, high: int, said: str
+) -> None:
+    profile = tmp_path / "slow.yaml"
+    profile.write_text(
+        f'name: slow\nsources: [a test]\nranges: {{"6085h:00": {{low: 0, high: {high}}}}}\n'
+    )
+    with pytest.raises(CdprError, match=said):
+        settings_for(with_profile(rig, str(profile)), 0, WinchMap(rig))
+
+
+def test_drives_in_nmt_stopped_are_named_and_reset_takes_them_back(rig: Rig) -> None:
+    bus = eight_of("cia402")
+    bus.stopped = {3, 5}
+    with pytest.raises(Refused, match="drive 3, 5: in the NMT state 'stopped'"):
+        set_up(rig, bus)
+    set_up(rig, bus, to_reset=True)
+    assert not bus.stopped
 
 
 def test_a_cycle_that_the_drives_cannot_take_is_refused(rig: Rig) -> None:
