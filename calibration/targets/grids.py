@@ -222,6 +222,8 @@ ORDERS = {
 """Numbering of the tags, by name."""
 _SADDLE = 0.12
 """Half width of the refinement window for corners that black squares touch, in tag sides."""
+_SADDLE_NEAR = 0.25
+"""The same of the first window, which is not wider than the squares."""
 _BETTER, _OFF = 3.0, 0.05
 """The other order is right if it fits better by this factor and this order misfits by that share
 of a tag's side."""
@@ -331,10 +333,14 @@ class TagGrid:
                 continue
             corners = upright_corners(self.family, np.reshape(square, (4, 2)))
             side = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min()
-            half = max(2, int(_SADDLE * side))
             start = corners.astype(np.float32).reshape(-1, 1, 2)
-            better = cv2.cornerSubPix(image, start, (half, half), (-1, -1), stop)
-            squares[number] = np.asarray(better, dtype=np.float64).reshape(4, 2)
+            # From the contour's corner, which may be some pixels off, in a large window first.
+            for share in (_SADDLE_NEAR, _SADDLE):
+                half = max(2, int(share * side))
+                better = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), stop)
+                moved, start = np.any(better != start, axis=2), better
+            if moved.all():  # OpenCV leaves a corner unchanged if the saddle is not in its window
+                squares[number] = np.asarray(better, dtype=np.float64).reshape(4, 2)
         return squares, tuple(number for number, count in counts.items() if count > 1)
 
     def _misfit(self, squares: dict[int, Array]) -> float:
