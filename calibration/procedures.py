@@ -291,7 +291,7 @@ def measure_readout(
 
 def calibrate_rig(
     rig: Rig,
-    data: Sequence[str | Path],
+    data: str | Path | Sequence[str | Path],
     *,
     deviations: Mapping[str, float] = DEFAULT_DEVIATIONS,
     length_deviation: float = 0.1e-3,
@@ -332,7 +332,8 @@ def calibrate_rig(
         BadInput: The data cannot be read, are too few, or do not fit the rig file.
     """
     require_file_name(name, "--name")
-    counted, measured = rig_measurements(rig, [Path(path) for path in data])
+    paths = [Path(path) for path in ([data] if isinstance(data, (str, Path)) else data)]
+    counted, measured = rig_measurements(rig, paths)
     length, turn = pose_deviations
     measured = replace(
         measured.with_added_deviation(np.array([length] * 3 + [turn] * 3)),
@@ -352,10 +353,10 @@ def calibrate_rig(
         except (Fault, NoCable, Refused) as error:
             raise BadInput(
                 f"the measurements do not fit the rig file {rig_file or rig.name}",
-                where=", ".join(map(str, data)),
+                where=", ".join(map(str, paths)),
                 why=error.what,
-                next_step="check units, the order of the cables, the homing of the drives and"
-                " the rig file",
+                next_step="check units, the sign of the counts (`direction` of the winches), the"
+                " order of the cables, the homing of the drives and the rig file",
             ) from error
     page, facts = rig_page(found, quality, name, result.date), quality.facts(found)
     return Calibration(result, page, found, quality, facts).saved_in(to.folder)

@@ -81,14 +81,17 @@ class CableCompliances:
 
 
 def estimate_compliance(result: RigCalibration) -> Compliance | None:
-    """Estimates the compliance; None where tensions are missing in some samples.
+    """Estimates the compliance; None where tensions are missing, or the data do not determine it.
 
     Args:
         result: The fit with the rig file's stiffness.
     """
     if not np.isfinite(result.measured.tensions).all():
         return None
-    information, pull = _compliance_information(result, np.ones((result.rig.cable_count, 1)))
+    found = _compliance_information(result, np.ones((result.rig.cable_count, 1)))
+    if found is None:
+        return None
+    information, pull = found
     nominal, own = float(_nominal_compliance(result).mean()), float(information[0, 0])
     compliance = float(np.mean(1.0 / result.rig.cable_stiffness))
     change, deviation = -float(pull[0]) / own, own**-0.5
@@ -96,7 +99,7 @@ def estimate_compliance(result: RigCalibration) -> Compliance | None:
 
 
 def estimate_cable_compliances(result: RigCalibration) -> CableCompliances | None:
-    """Estimates each cable's compliance; None where tensions are missing in some samples.
+    """Estimates each cable's compliance; None as for `estimate_compliance`.
 
     Args:
         result: The fit with one stiffness for all cables.
@@ -104,7 +107,10 @@ def estimate_cable_compliances(result: RigCalibration) -> CableCompliances | Non
     if not np.isfinite(result.measured.tensions).all():
         return None
     cables = result.rig.cable_count
-    information, pull = _compliance_information(result, np.eye(cables))
+    found = _compliance_information(result, np.eye(cables))
+    if found is None:
+        return None
+    information, pull = found
     change = -np.asarray(np.linalg.solve(information, pull))
     chance = float(chi2.sf(-pull @ change, cables))
     estimated: Array = (_nominal_compliance(result) + change) / result.rig.cable_stiffness
@@ -122,7 +128,11 @@ def _nominal_compliance(result: RigCalibration) -> Array:
     return shares
 
 
-def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Array, Array]:
+_ROUND_OFF = 1e-9
+"""Information below this share of that with all else known is round-off."""
+
+
+def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Array, Array] | None:
     """Information on compliances relative to the rig file's, all else eliminated, per variance.
 
     Args:
@@ -130,7 +140,8 @@ def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Arra
         groups: 1 where a cable is in a group of one compliance, shape (m, q).
 
     Returns:
-        Information, shape (q, q), and half the gradient of the squares, shape (q,).
+        Information, shape (q, q), and half the gradient of the squares, shape (q,); None where the
+        information is round-off, as with six lengths and no pose, which fit any compliance.
     """
     data, fit, parameters = result.measured, result.fit, result.parameters
     model = RigModel(parameters, data)
@@ -150,10 +161,14 @@ def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Arra
     information = np.einsum("nmp,nm,nmq->pq", by_all, weights, by_all)
     information -= np.einsum("npi,niq->pq", mixed, gained)
     r = free.shape[1]
+    with_all_known = np.einsum("nmp,nm,nmp->p", by_compliance, weights, by_compliance)
     information[:r, :r] += np.eye(r)
     own = information[r:, r:] - information[r:, :r] @ np.linalg.solve(
         information[:r, :r], information[:r, r:]
     )
+    scale = np.sqrt(with_all_known)
+    if not scale.all() or np.linalg.eigvalsh(own / np.outer(scale, scale))[0] < _ROUND_OFF:
+        return None
     pull = np.einsum("nmq,nm,nm->q", by_compliance, weights, fit.residuals)
     return own / result.uncertainty.scatter, pull / result.uncertainty.scatter
 

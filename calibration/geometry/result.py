@@ -12,7 +12,7 @@ from pydantic import Field
 from calibration.geometry.calibrate import RigCalibration
 from calibration.geometry.quality import RigQuality, workspace_poses
 from calibration.results import ResultDocument, common_keys
-from model.errors import BadInput
+from model.errors import BadInput, Fault
 from model.files.documents import AnyNonNegative, AnyNumber, Finding, Positive, Vector
 from model.files.rig_file import RigDocument
 from model.pose import Array
@@ -173,9 +173,14 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
         quality: Its quality.
         name: Name of the result.
         on: The date.
+
+    Raises:
+        Fault: The fit is not physical.
     """
     rig, geometry = result.rig, result.geometry
-    drums = [w.drum_mm_per_rev for w in rig.document.winches] * (1.0 + geometry.drum_scale)
+    nominal = np.array([w.drum_mm_per_rev for w in rig.document.winches])
+    drums = nominal * (1.0 + geometry.drum_scale)
+    require_physical(drums, geometry.pulley_radius if rig.pulley_radius else None)
     numbers: dict[str, Any] = {
         "outlets_mm": _rows(geometry.outlets),
         "anchors_mm": _rows(geometry.anchors),
@@ -215,6 +220,27 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
             zip(result.fit.sensors, np.degrees(result.fit.sensor_rms).tolist(), strict=True)
         ),
     )
+
+
+def require_physical(drums: Array, pulley_radius: float | None) -> None:
+    """Requires positive sizes.
+
+    Args:
+        drums: Circumferences, shape (m,), [mm].
+        pulley_radius: [m]; None without pulleys.
+
+    Raises:
+        Fault: The first one that is not.
+    """
+    wrong = np.flatnonzero(~(drums > 0.0))
+    if len(wrong) == len(drums):
+        raise Fault("all lengths change the other way: the sign of all counts is inverted")
+    if len(wrong):
+        cable = int(wrong[0])
+        size = f"{drums[cable]:.1f} mm per revolution"
+        raise Fault(f"the drum of cable {cable + 1} comes out as {size}")
+    if pulley_radius is not None and not pulley_radius > 0.0:
+        raise Fault(f"the radius of the pulleys comes out as {pulley_radius * 1e3:.1f} mm")
 
 
 def nominal_geometry(rig: RigDocument) -> object:

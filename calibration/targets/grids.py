@@ -19,10 +19,11 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.targets.boards import LEAST_POINTS, DetectedBoard, generic_camera, require_board
 from model.pose import Array
@@ -333,7 +334,7 @@ class TagGrid:
                 continue
             corners = upright_corners(self.family, np.reshape(square, (4, 2)))
             side = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min()
-            start = corners.astype(np.float32).reshape(-1, 1, 2)
+            start: NDArray[Any] = corners.astype(np.float32).reshape(-1, 1, 2)
             # From the contour's corner, which may be some pixels off, in a large window first.
             for share in (_SADDLE_NEAR, _SADDLE):
                 half = max(2, int(share * side))
