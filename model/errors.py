@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -60,8 +61,13 @@ class CdprError(Exception):
             "where": self.where,
             "why": self.why,
             "next_step": self.next_step,
-            "values": self.values,
+            "values": {key: _finite(value) for key, value in self.values.items()},
         }
+
+
+def _finite(value: object) -> object:
+    """The value for JSON, which has no number for infinity."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _restored(kind: type[CdprError], args: tuple[object, ...], state: dict[str, object]) -> object:

@@ -87,7 +87,7 @@ class KinematicCost:
         self.lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
         key = [rig.plan_hash, rotation.tolist(), _version()]
         condition, inverse = stored("cost", key, (2, self.lattice.count), self._on_lattice)
-        self.extremes = [_extremes(v) for v in (condition, inverse)]
+        self.extremes = [finite_range(v) for v in (condition, inverse)]
         self.values = self._scaled(condition, inverse)
 
     def at(self, positions: Array) -> Array:
@@ -165,7 +165,7 @@ class KinematicCost:
         return total
 
 
-def _extremes(values: Array) -> tuple[float, float]:
+def finite_range(values: Array) -> tuple[float, float]:
     """The smallest and the largest finite value; 0 without any."""
     finite = values[np.isfinite(values)]
     return (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)

@@ -144,6 +144,13 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
     reserve = MARGIN_RESERVE * rig.max_tension
     if margin >= reserve:
         return
+    if not np.isfinite(margin):
+        raise BadInput(
+            f"at the {name} the cables cannot hold the platform, however hard they pull",
+            where=f"scene {scene.name}",
+            why="they act in too few directions: the structure matrix has not full rank there",
+            next_step=f"move the {name}, or change the rig's outlets and anchors",
+        )
     raise BadInput(
         f"at the {name} the cables cannot hold the platform: the capacity margin is"
         f" {margin:.2f} N, required {reserve:.2f} N",

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from model.errors import Fault
+
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
@@ -35,6 +37,7 @@ def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
 
     Raises:
         BadInput: Dask is not installed, or no scheduler answers.
+        Fault: The processes ended, as in a script without the guard of `multiprocessing`.
     """
     if dask is not None:
         with _dask_client(dask) as client:
@@ -44,13 +47,27 @@ def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
         yield None
         return
     from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
+    from concurrent.futures.process import BrokenProcessPool
+    from multiprocessing import get_context, parent_process
 
+    if parent_process() is not None:
+        raise _without_guard()
     pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin_worker)
     try:
         yield pool
+    except BrokenProcessPool as error:
+        raise _without_guard() from error
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _without_guard() -> Fault:
+    return Fault(
+        "the processes that share the work ended at once",
+        why="they import the script that started them, and it starts them again; or the computer"
+        " has too little memory",
+        next_step='put the script\'s calls below `if __name__ == "__main__":`, or pass workers=1',
+    )
 
 
 def _begin_worker() -> None:

@@ -30,6 +30,7 @@ from model.rig import Rig, rig_from_document
 
 _ROS_MODELS = {"plumb_bob": ("pinhole", 5), "rational_polynomial": ("pinhole", 8)}
 _ROS_FISHEYE = ("equidistant", "fisheye")
+_ROS_LENS = "distortion_coefficients"
 _KALIBR_MODELS = {"radtan": ("pinhole", 4), "equidistant": ("fisheye", 4), "none": ("pinhole", 0)}
 _MRCAL_MODELS = {
     "LENSMODEL_PINHOLE": 0,
@@ -290,15 +291,28 @@ def _from_ros(plain: object, path: Path) -> dict[str, Any]:
         raise _unusable(path, "it is not a file of OpenCV, ROS, Kalibr or mrcal")
     try:
         model = plain["distortion_model"]
-        matrix = np.array(plain["camera_matrix"]["data"], dtype=np.float64)
-        lens = np.array(plain["distortion_coefficients"]["data"], dtype=np.float64)
-        width, height = plain["image_width"], plain["image_height"]
+        if "camera_matrix" in plain:  # a file of camera_calibration_parsers
+            matrix, lens = (plain[key]["data"] for key in ("camera_matrix", _ROS_LENS))
+            width, height = plain["image_width"], plain["image_height"]
+        else:  # a message; ROS 2 names its fields k and d
+            matrix, lens = (plain[key if key in plain else key.lower()] for key in "KD")
+            width, height = plain["width"], plain["height"]
+            _require_whole_image(plain, path)
+        matrix, lens = (np.array(each, dtype=np.float64) for each in (matrix, lens))
     except (KeyError, *_BAD_NUMBERS) as error:
         raise _unusable(path, f"{type(error).__name__}: {error}") from None
     if str(model) not in (*_ROS_MODELS, *_ROS_FISHEYE):
         raise _unusable(path, f"its distortion_model {model!r} is unknown")
     kind = "fisheye" if model in _ROS_FISHEYE else "pinhole"
     return _numbers(path, width, height, matrix, lens, kind)
+
+
+def _require_whole_image(message: Mapping[Any, Any], path: Path) -> None:
+    """Refuses a message for binned images, or for a part of the image."""
+    roi = message.get("roi") or {}
+    binned = any(message.get(key, 0) not in (0, 1) for key in ("binning_x", "binning_y"))
+    if binned or roi.get("x_offset") or roi.get("y_offset"):
+        raise _unusable(path, "its images are binned, or a part of the sensor's")
 
 
 def _is_entry(key: object) -> bool:

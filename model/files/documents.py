@@ -196,7 +196,8 @@ def read_yaml(path: Path) -> YamlTree:
         InvalidFile: It is not YAML.
     """
     try:
-        return parse_yaml(read_text(path, YAML_LIMIT))
+        # `rostopic echo` ends every message with the mark of a next document.
+        return parse_yaml(read_text(path, YAML_LIMIT).rstrip().removesuffix("\n---") + "\n")
     except YamlSyntaxError as error:
         problem = Problem("", error.what, error.line, error.column)
         raise InvalidFile(str(path), [problem], error.next_step) from None

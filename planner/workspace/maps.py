@@ -24,6 +24,7 @@ from model.statics.wrench_sets import (
     force_volume,
     rms_anchor_radius,
 )
+from planner.costs import finite_range
 from planner.space import Lattice
 
 Values = dict[str, Array]
@@ -201,11 +202,9 @@ class Extremes:
         lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
         points = lattice.points(np.arange(lattice.count))
         values = values_at(replace(question, quantities=INDICES), points)
-        condition, inverse = values["condition_number"], 1.0 / values["force_volume"]
-        return cls(
-            (float(np.nanmin(condition)), float(np.nanmax(condition))),
-            (float(np.nanmin(inverse)), float(np.nanmax(inverse))),
-        )
+        with np.errstate(divide="ignore"):
+            inverse = 1.0 / values["force_volume"]
+        return cls(finite_range(values["condition_number"]), finite_range(inverse))
 
 
 def costs(values: Values, extremes: Extremes) -> Values:
@@ -218,7 +217,6 @@ def costs(values: Values, extremes: Extremes) -> Values:
 
 
 def _scaled(values: Array, low: float, high: float) -> Array:
-    if not low < high:
-        return np.zeros_like(values)
-    scaled: Array = (values - low) / (high - low)
-    return scaled
+    """From 0 to 1 within the workspace, and 1 where the platform is singular, as plans have it."""
+    scaled: Array = (values - low) / (high - low if high > low else 1.0)
+    return np.where(np.isinf(values), 1.0, scaled)

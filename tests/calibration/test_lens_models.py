@@ -334,6 +334,41 @@ def test_a_camera_of_a_kalibr_chain_is_read_by_its_entry(rig, tmp_path) -> None:
     assert "not 'cam7'" in str(caught.value.why)
 
 
+MESSAGE = """header: {stamp: {sec: 1, nanosec: 2}, frame_id: camera}
+height: 720
+width: 1280
+distortion_model: plumb_bob
+D: [-0.36, 0.11, 0.001, 0.0005, 0.0]
+K: [900.0, 0.0, 640.5, 0.0, 901.0, 359.5, 0.0, 0.0, 1.0]
+binning_x: 0
+binning_y: 0
+roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
+"""
+
+
+ROS_2 = MESSAGE.replace("D:", "d:").replace("K:", "k:") + "---\n"
+
+
+@pytest.mark.parametrize("text", [MESSAGE, ROS_2])
+def test_a_message_of_ros_as_it_is_printed_can_be_read(rig, tmp_path, text: str) -> None:
+    file = tmp_path / "message.yaml"
+    file.write_text(text)
+    found = imported_camera(file, rig.document.cameras[0])
+    assert (found.width_px, found.height_px, found.fx_px, found.cy_px) == (1280, 720, 900.0, 359.5)
+    assert found.distortion == [-0.36, 0.11, 0.001, 0.0005, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("binning_x: 0", "binning_x: 2"), ("x_offset: 0", "x_offset: 8")]
+)
+def test_a_message_of_ros_for_a_part_of_the_pixels_is_refused(rig, tmp_path, old, new) -> None:
+    file = tmp_path / "message.yaml"
+    file.write_text(MESSAGE.replace(old, new, 1))
+    with pytest.raises(BadInput) as caught:
+        imported_camera(file, rig.document.cameras[0])
+    assert "binned, or a part" in str(caught.value.why)
+
+
 def test_kalibr_models_that_rig_files_lack_are_named(rig, tmp_path) -> None:
     file = tmp_path / "camchain.yaml"
     file.write_text(KALIBR.replace("camera_model: pinhole", "camera_model: ds", 1))

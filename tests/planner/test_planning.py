@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from model.errors import BadInput, NoSolution
 from model.plan import plan_from_document
 from model.pose import Pose
+from model.scene import empty_scene
 from planner.check import verify
+from planner.endpoints import require_usable_ends
 from planner.planning import make_plan
 from planner.settings import PlannerSettings
 
@@ -160,6 +164,18 @@ def test_a_start_nearer_than_the_clearance_asked_for_states_both_figures(
 def test_a_load_too_heavy_for_the_cables_is_bad_input(gachon, scene_with) -> None:
     with pytest.raises(BadInput, match="cannot hold the platform"):
         make_plan(gachon, scene_with(load={"payload_kg": 60.0}), QUICK)
+
+
+def test_cables_that_act_in_too_few_directions_are_named(gachon) -> None:
+    to_one_point = replace(gachon, anchors=np.zeros((8, 3)))
+    with pytest.raises(BadInput, match="however hard they pull") as caught:
+        require_usable_ends(to_one_point, empty_scene(to_one_point))
+    assert "too few directions" in caught.value.why
+
+
+def test_infinite_values_of_an_error_are_null_in_json() -> None:
+    values = {"margin_n": float("-inf"), "required_n": 0.1, "nodes": "3"}
+    assert BadInput("no", values=values).as_dict()["values"] == {**values, "margin_n": None}
 
 
 def test_start_and_goal_of_different_orientation_are_bad_input(gachon, scene_with) -> None:

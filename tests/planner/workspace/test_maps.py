@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,18 +16,44 @@ from model.clearance import ClearanceModel
 from model.kinematics import structure_matrix
 from model.pose import Pose, matrix_from_rotation_vector
 from model.statics.feasibility import wrench_closure
-from planner.costs import KinematicCost, capacity_margins
+from planner.costs import KinematicCost, capacity_margins, finite_range
 from planner.workspace import compute as computing
 from planner.workspace.compute import compute
 from planner.workspace.grid import slice_through, volume
-from planner.workspace.maps import Extremes, Question, values_at
+from planner.workspace.maps import Extremes, Question, costs, values_at
 
 LEVEL = np.eye(3)
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(scope="module")
 def extremes(gachon):
     return Extremes.over_workspace(Question.about(gachon))
+
+
+def test_costs_of_singular_poses_are_the_worst_as_in_plans() -> None:
+    condition, volume = np.array([1.0, np.inf, 3.0]), np.array([2.0, 0.0, 1.0])
+    values = {"condition_number": condition, "force_volume": volume}
+    found = costs(values, Extremes((1.0, 3.0), (0.5, 1.0)))
+    assert found["dexterity_cost"].tolist() == [0.0, 1.0, 1.0]
+    assert found["wrench_cost"].tolist() == [0.0, 1.0, 1.0]
+    same = costs(values, Extremes((1.0, 1.0), (0.5, 0.5)))  # of a workspace of one point
+    assert same["dexterity_cost"][:2].tolist() == [0.0, 1.0]
+    assert finite_range(np.array([2.0, np.inf, 1.0])) == (1.0, 2.0)
+
+
+def test_a_script_without_the_guard_is_told_of_it(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from planner.parallel import worker_pool\n"
+        "with worker_pool(2, None) as pool:\n    print(list(pool.map(abs, [1, -2])))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, script], cwd=ROOT, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert 'if __name__ == "__main__"' in done.stderr.splitlines()[-1]
 
 
 @pytest.fixture(scope="module")
