@@ -6,12 +6,15 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import can
+
 from drivers.can_errors import in_fault, moved_by_another, wrong_setting
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork
 from drivers.cia402.sdo_jobs import CSP_MODE, OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
-from model.errors import Refused
+from drivers.drive_group import Pump
+from model.errors import CdprError, Refused
 from model.files.drive_profile_file import ProfileDocument, object_key, object_name
 from model.files.rig_file import Cia402Document
 from model.rig import Rig
@@ -261,3 +264,30 @@ def number_text(data: bytes, form: str) -> str:
 def wrong_value(node: int, name: str, found: str, wanted: str, why: str) -> Refused:
     """An object of a drive holds a wrong value."""
     return wrong_setting(node, f"object {name}", found, wanted, why, "the drive's manual")
+
+
+# Whether drives identify themselves as simulated.
+#: Manufacturer device name (1008h) of simulated drives. Source: CiA 301, 7.5.2.8.
+SIMULATED = b"cdpr simulated drive"
+
+
+def are_simulated(bus: can.BusABC, pump: Pump | None, nodes: Sequence[int]) -> bool:
+    """Whether every drive has the device name of a simulated one.
+
+    Reads the drives in turn up to the first real one. A drive that does not answer counts as real;
+    the following configuration reports what is wrong.
+
+    Args:
+        bus: An open bus.
+        pump: As for `drivers.factory.make_drive_group`.
+        nodes: All drives.
+    """
+    network = SetupNetwork(bus, pump, nodes)
+    network.discard_waiting()
+    try:
+        return all(
+            network.client(node).read_if_there(0x1008, 0, "manufacturer device name") == SIMULATED
+            for node in nodes
+        )
+    except CdprError:
+        return False

@@ -10,7 +10,7 @@ import numpy as np
 from drivers.can_bus import SentFrame
 from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.configure import configure_drives
-from drivers.cia402.inspection import are_simulated
+from drivers.cia402.expected_objects import are_simulated
 from drivers.cia402.monitor import DriveMonitor
 from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_message
 from drivers.cia402.profile import profile_of

@@ -36,7 +36,7 @@ from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power
 from drivers.drive_group import DriveSnapshot, Pump
 from drivers.plausibility import winding_signs
-from model.errors import CdprError, Refused
+from model.errors import Refused
 from model.files.drive_profile_file import NEEDED, OBJECTS, ProfileDocument, object_name
 from model.rig import Rig
 from model.winches import WinchMap
@@ -433,30 +433,3 @@ def read_states(rig: Rig, bus: can.BusABC, pump: Pump | None) -> DriveSnapshot:
             if not is_still_set_up(network, node, settings_for(rig, drive, winch_map, None))
         ),
     )
-
-
-# Whether drives identify themselves as simulated.
-#: Manufacturer device name (1008h) of simulated drives. Source: CiA 301, 7.5.2.8.
-SIMULATED = b"cdpr simulated drive"
-
-
-def are_simulated(bus: can.BusABC, pump: Pump | None, nodes: Sequence[int]) -> bool:
-    """Whether every drive has the device name of a simulated one.
-
-    Reads the drives in turn up to the first real one. A drive that does not answer counts as real;
-    the following configuration reports what is wrong.
-
-    Args:
-        bus: An open bus.
-        pump: As for `drivers.factory.make_drive_group`.
-        nodes: All drives.
-    """
-    network = SetupNetwork(bus, pump, nodes)
-    network.discard_waiting()
-    try:
-        return all(
-            network.client(node).read_if_there(0x1008, 0, "manufacturer device name") == SIMULATED
-            for node in nodes
-        )
-    except CdprError:
-        return False

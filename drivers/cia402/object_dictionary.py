@@ -170,8 +170,7 @@ def left_out(profile: ProfileDocument) -> tuple[str, ...]:
 FOLLOWING_TIMEOUT, QUICK_STOP_RAMP = 0x6066, 0x6085
 """Objects clamped to the drive's range: an earlier trip, and the steepest possible ramp."""
 
-LONGEST_QUICK_STOP = 0.5
-"""Longest time of a quick stop from top speed, [s]."""
+LONGEST_QUICK_STOP = 0.5  # from top speed, [s]
 
 
 def _within(setting: Setting, profile: ProfileDocument, cycle: float) -> Setting:
@@ -184,17 +183,14 @@ def _within(setting: Setting, profile: ProfileDocument, cycle: float) -> Setting
     if allowed is None or allowed.holds(setting.value):
         return setting
     clamped = replace(setting, value=min(setting.value, allowed.high))
-    if setting.index == FOLLOWING_TIMEOUT and allowed.holds(clamped.value):
-        return clamped
-    if setting.index == QUICK_STOP_RAMP and allowed.holds(clamped.value):
+    if setting.index in (FOLLOWING_TIMEOUT, QUICK_STOP_RAMP) and allowed.holds(clamped.value):
         takes = cycle * setting.value / max(1, allowed.high)
-        if takes <= LONGEST_QUICK_STOP:
+        if setting.index == FOLLOWING_TIMEOUT or takes <= LONGEST_QUICK_STOP:
             return clamped
         raise BadInput(
             f"the steepest {setting} of {profile.name}, {allowed.high}, stops a drive from top"
             f" speed in {takes:.3g} s, limit {LONGEST_QUICK_STOP:g} s",
             where="drives.profile",
-            why="a quick stop must be over before cables go slack or the platform goes far",
             next_step="check the range and the unit in the profile, and max_speed of the winches",
         )
     raise BadInput(
@@ -409,13 +405,10 @@ def _options() -> tuple[Setting, ...]:
 
 def _offsets() -> tuple[Setting, ...]:
     """Offsets that drives add to set-points, which a former master may have left."""
+    why, offsets = "set-points are used as sent", ("position", "velocity", "torque")
     return tuple(
-        Setting(index, 0, form, 0, f"{of} offset", "set-points are used as sent", optional=True)
-        for index, form, of in (
-            (0x60B0, "<i", "position"),
-            (0x60B1, "<i", "velocity"),
-            (0x60B2, "<h", "torque"),
-        )
+        Setting(0x60B0 + k, 0, form, 0, f"{offset} offset", why, optional=True)
+        for k, (form, offset) in enumerate(zip(("<i", "<i", "<h"), offsets, strict=True))
     )
 
 

@@ -217,10 +217,8 @@ class PowerStage(ABC):
         self._max_torque = get((0x6072, 0), 0xFFFF)
         self._window = get((0x6065, 0), NO_WINDOW)
         self._window_time = get((0x6066, 0), 0) / 1000.0
-        # Limits are counted from the machine's zero, targets from the home position; CiA 402-2.
-        home = get((0x607C, 0), 0)
+        home, self._offset = get((0x607C, 0), 0), get((0x60B0, 0), 0)  # CiA 402-2
         self._limits = get((0x607D, 1), -(2**31)) - home, get((0x607D, 2), 2**31 - 1) - home
-        self._offset = get((0x60B0, 0), 0)
         self._interpolation = get((0x60C2, 1), 1) * 10.0 ** get((0x60C2, 2), -3)
         self._stop_option = get((0x605A, 0), 2)
 

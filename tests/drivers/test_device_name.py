@@ -7,8 +7,8 @@ from typing import Any
 import can
 import pytest
 
-from drivers.cia402 import inspection
-from drivers.cia402.inspection import SIMULATED, are_simulated
+from drivers.cia402 import expected_objects
+from drivers.cia402.expected_objects import SIMULATED, are_simulated
 from model.errors import HardwareMissing, Refused
 
 Answer = bytes | None | Exception
@@ -50,7 +50,7 @@ def test_only_drives_that_all_say_so_are_simulated(
     monkeypatch: pytest.MonkeyPatch, answers: list[Answer], simulated: bool, asked: int
 ) -> None:
     network = Network(answers)
-    monkeypatch.setattr(inspection, "SetupNetwork", lambda *_: network)
+    monkeypatch.setattr(expected_objects, "SetupNetwork", lambda *_: network)
     bus: Any = can.BusABC
     assert are_simulated(bus, None, range(1, len(answers) + 1)) is simulated
     assert network.asked == asked

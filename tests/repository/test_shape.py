@@ -33,7 +33,6 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "model/statics/tension_distribution.py",
         "model/statics/feasibility.py",
         "planner/campaign/page.py",
-        "planner/kernels/gjk.py",
         "planner/workspace/files.py",
         "planner/workspace/figures.py",
     },
