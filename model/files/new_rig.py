@@ -149,16 +149,31 @@ def _suggested_anchor(outlet: list[float], answers: Answers) -> list[float]:
     ]
 
 
+_LEVEL = 0.2
+"""Outlets are level, and the robot is suspended, if heights differ by less, as a share of width."""
+
+
 def _middle(answers: Answers) -> list[float]:
+    """Between the outlets; below them if they are level."""
     columns = list(zip(*answers["outlets_mm"], strict=True))
-    return [round((min(column) + max(column)) / 2.0, 1) for column in columns]
+    x, y, z = ((min(column) + max(column)) / 2.0 for column in columns)
+    wide = max(max(column) - min(column) for column in columns[:2])
+    lowest, height = min(columns[2]), max(columns[2]) - min(columns[2])
+    if height < _LEVEL * wide:
+        z = max(lowest - 0.4 * wide, 0.3 * lowest) if lowest > 0.0 else lowest - 0.4 * wide
+    return [round(value, 1) for value in (x, y, z)]
 
 
 def _box(answers: Answers, side: int) -> list[float]:
-    """Halfway from home to the outlets on that side, and at least 10 mm."""
+    """Halfway from home to the outlets on that side, and at least 10 mm.
+
+    Below a suspended robot's home there are none: there a quarter of the height up to them counts.
+    """
     columns = list(zip(*answers["outlets_mm"], strict=True))
     ends = [(min(column), max(column))[side] for column in columns]
-    least = (-10.0, 10.0)[side]
+    least, (low, home_z) = (-10.0, 10.0)[side], (ends[2], answers["home_mm"][2])
+    if not side and low > home_z:
+        ends[2] = home_z - (low - home_z) / 2.0
     return [
         round(home + (min, max)[side](least, (end - home) / 2.0), 1)
         for home, end in zip(answers["home_mm"], ends, strict=True)

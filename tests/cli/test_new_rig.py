@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -97,6 +98,30 @@ def test_coordinates_from_a_table_ask_nothing(tmp_path: Path) -> None:
     assert document.anchors_mm == PAPER.document.anchors_mm
     assert document.platform.mass_kg == 0.7
     assert document.winches[7].drum_mm_per_rev == pytest.approx(314.159265)
+
+
+def test_a_suspended_robot_gets_a_home_below_its_outlets(tmp_path: Path) -> None:
+    """RoboCrane: pairs of cables from three points to three corners of the platform."""
+
+    def corner(radius: float, angle: float, height: float) -> list[float]:
+        return [radius * math.cos(angle), radius * math.sin(angle), height]
+
+    ends = [(0, 0), (0, 1), (1, 1), (1, 2), (2, 2), (2, 0)]
+    rows = [
+        [*corner(3000.0, math.radians(120 * a + 90), 5000.0),
+         *corner(600.0, math.radians(120 * b + 30), 0.0)]
+        for a, b in ends
+    ]  # fmt: skip
+    table = tmp_path / "cables.csv"
+    lines = [",".join(CSV_COLUMNS), *(",".join(map(str, row)) for row in rows)]
+    table.write_text("\n".join(lines) + "\n")
+    limits = ("--mass-kg", "200", "--max-tension-n", "5000")
+    made = call("new", tmp_path / "rig.yaml", "--from", table, *limits)
+    assert made.code == 0, made
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert 0.0 < rig.home.position[2] < 4.0
+    assert rig.workspace_lower[2] < rig.home.position[2] - 0.3
+    assert rig.at(rig.home).is_wrench_feasible
 
 
 def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:
