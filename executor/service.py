@@ -32,6 +32,7 @@ from executor.drives import (
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock, ReferenceStatus, reference_status
 from executor.interlock.locks import SetUpLock
+from executor.interlock.reference import RESTARTED
 from executor.proposals import Facts, ReleaseProposal, ResetProposal, require_confirmed
 from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedRequests
@@ -234,7 +235,7 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
     restarted = [w.node_id for w in rig.winches if not w.absolute and w.node_id in seen.restarted]
     if reference.counts and restarted:
         names = ", ".join(rig.drive_names[node] for node in restarted)
-        why = f"{names}: power-cycled after homing"
+        why = f"{names}: {RESTARTED}"
         reference = replace(reference, counts=False, why_not=why)
     columns = zip(
         rig.winches,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from drivers.drive_group import Capabilities, DriveSnapshot
-from executor.interlock.reference import HomingReference, moved_since
+from executor.interlock.reference import RESTARTED, HomingReference, moved_since
 from executor.trajectory.setpoints import CheckedSetpoints
 from model.errors import Refused
 from model.kinematics import cable_lengths
@@ -122,7 +122,7 @@ def require_still_referenced(
     moved = moved_since(rig, reference, positions)
     for drive, (winch, off) in enumerate(zip(rig.winches, moved, strict=True)):
         if not winch.absolute and winch.node_id in restarted:
-            raise _lost(rig, drive, "it was power-cycled after homing")
+            raise _lost(rig, drive, f"it was {RESTARTED}")
         if not off <= rig.motion.start_tolerance:
             raise _lost(
                 rig, drive, f"it is {off * 1000:.1f} mm of cable from its last known position"

@@ -14,6 +14,7 @@ from drivers.can_bus import IN_PROCESS, BusSettings
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.reference import (
     AGAIN,
+    RESTARTED,
     HomingReference,
     ReferenceFile,
     as_in_the_file,
@@ -128,7 +129,7 @@ class MotionInterlock:
         restarted = {winch.node_id for winch in self._rig.winches if not winch.absolute} & {*nodes}
         if restarted:
             names = [name for node, name in self._rig.drive_names.items() if node in restarted]
-            self._lose(f"{', '.join(names)}: power-cycled after homing")
+            self._lose(f"{', '.join(names)}: {RESTARTED}")
 
     def confirm_held(self, positions: Sequence[int]) -> None:
         """Stores the positions [counts] of drives that held throughout: the reference stays valid.

@@ -26,6 +26,9 @@ from model.winches import WinchMap
 
 AGAIN = "home the drives with `cdpr home RIG`; nothing was moved"
 
+#: Why a drive lost its configuration, and with it the reference of an incremental encoder.
+RESTARTED = "power-cycled, or `bus.cycle_ms` was changed, after homing"
+
 
 class HomingReference(Document):
     """Drive counts of a rig at home, and how they were determined."""

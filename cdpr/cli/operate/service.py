@@ -75,7 +75,7 @@ def reset(
     show_line(f"drives: {', '.join(sorted(set(result.drives)))}")
     if result.restarted:
         names = ", ".join(the_rig.drive_names[node] for node in result.restarted)
-        show_line(f"power-cycled since their last configuration: {names}")
+        show_line(f"power-cycled since their last set-up, or set up for another cycle: {names}")
     show_line(f"reference: {result.reference}")
     latch_now = "the fault latch is cleared" if result.was_latched else "no fault was latched"
     out.print(f"{latch_now}; the next run must start from the platform's current pose")
