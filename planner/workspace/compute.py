@@ -22,7 +22,6 @@ from planner.workspace.maps import OBSTACLE_CLEARANCE, Extremes, Question, Value
 POINTS_IN_A_PART = 4096
 VERDICTS = (
     "allowed",
-    "no wrench closure",
     "not wrench feasible",
     "self clearance too small",
     "obstacle clearance too small",
@@ -73,10 +72,13 @@ class Maps:
 
     @property
     def verdict(self) -> NDArray[np.int64]:
-        """Index in `VERDICTS` of what forbids a pose first; 0 where nothing does."""
+        """Index in `VERDICTS` of what forbids a pose first; 0 where nothing does.
+
+        As for a plan, wrench closure is not required: suspended robots have none.
+        """
         scene = self.question.scene
         own = scene.self_clearance if scene else 0.0
-        tests = [self.closed, self.feasible, self.values["self_clearance"] >= own]
+        tests = [self.feasible, self.values["self_clearance"] >= own]
         if OBSTACLE_CLEARANCE in self.values:
             tests.append(self.collision_free)
         return np.asarray(np.select([~test for test in tests], range(1, len(tests) + 1), 0))
