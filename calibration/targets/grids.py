@@ -301,6 +301,10 @@ class TagGrid:
             squares, twice = max((squares, twice), self._saddles(image), key=lambda f: len(f[0]))
         if 4 * len(squares) < LEAST_POINTS:
             return None
+        # OpenCV draws some families upside down compared to AprilTag's images.
+        turned = {number: np.roll(square, 2, axis=0) for number, square in squares.items()}
+        if self._misfit(turned) < min(self._misfit(squares) / _BETTER, _OFF):
+            squares = turned
         corners = np.concatenate(list(squares.values()))
         other = replace(self, order=self._other_order())
         ours, others = (grid._misfit(squares) for grid in (self, other))

@@ -58,15 +58,18 @@ SHIFTED = CircleGrid(4, 9, 0.022, 0.018, asymmetric=True)
 MARGIN = 0.025
 
 
-def kalibr_print() -> np.ndarray:
-    """As kalibr_create_target_pdf draws it: wide borders, black squares at all corners."""
+def kalibr_print(*, by_opencv: bool = False) -> np.ndarray:
+    """As kalibr_create_target_pdf draws it: wide borders, black squares at all corners.
+
+    OpenCV draws the tags themselves upside down.
+    """
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36H11)
     sheet = np.full((4 * 104 + 76, 5 * 104 + 76), 255, np.uint8)
     for number in range(20):
         row, column = divmod(number, 5)
         tag = cv2.aruco.generateImageMarker(dictionary, 20 + number, 80, borderBits=2)
         top, left = 50 + (3 - row) * 104, 50 + column * 104
-        sheet[top : top + 80, left : left + 80] = tag[::-1, ::-1]
+        sheet[top : top + 80, left : left + 80] = tag if by_opencv else tag[::-1, ::-1]
     for row in range(5):
         for column in range(6):
             top, left = 26 + row * 104, 26 + column * 104
@@ -117,6 +120,14 @@ def test_centres_and_saddles_are_found_where_they_are(board, points: int, limit:
     assert len(errors) > points
     assert np.sqrt(np.mean(errors**2)) < limit
     assert np.abs(errors.mean(axis=0)).max() < 0.02
+
+
+def test_tags_drawn_upside_down_are_found_where_they_are() -> None:
+    sheet, origin = kalibr_print(by_opencv=True), np.full(2, 0.025)
+    poses = poses_before_the_camera(np.array([0.12, 0.1, 0.0]), 4, spread=0.03)
+    errors = off(KALIBR, [(picture_of(sheet, PIXEL, origin, pose), pose) for pose in poses])
+    assert len(errors) > 200
+    assert np.abs(errors).max() < 0.5
 
 
 def test_small_tags_of_kalibr_are_refined_or_left_out() -> None:
