@@ -1,6 +1,6 @@
 """Plan, prove, run and measure paths of cable-driven parallel robots.
 
-One function per verb of the command line, with the same defaults; lengths in metres, forces in
+Functions as the verbs of the command line, with the same defaults; lengths in metres, forces in
 newtons, angles in radians. Every name is loaded at first use.
 """
 

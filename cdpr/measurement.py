@@ -1,4 +1,4 @@
-"""Functions behind `cdpr track`, and cameras and calibration results for scripts."""
+"""For scripts: what `cdpr track` does, cameras, and calibration results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Functions behind `cdpr plan`, `check`, `workspace`, `stop`, `hold` … `report`."""
+"""For scripts: what `cdpr plan`, `check`, `workspace`, `stop`, `hold` … `report` do."""
 
 from __future__ import annotations
 

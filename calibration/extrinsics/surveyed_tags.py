@@ -258,7 +258,7 @@ def _offset_message(camera: Camera, tag: _SeenTag, best: Pose) -> str:
     depth = float(best.apply(tag.corners)[:, 2].mean())
     pixels = float(np.sqrt(2.0 * np.mean(tag.errors(camera, best) ** 2)))
     away = pixels * depth / float(camera.matrix[0, 0])
-    return f"is measured {away * 1e3:.1f} mm from its position in the rig file"
+    return f"is measured at least {away * 1e3:.1f} mm from its position in the rig file"
 
 
 def _slopes(camera: Camera, tags: Sequence[_SeenTag], best: Pose) -> Array:
