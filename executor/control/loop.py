@@ -68,7 +68,7 @@ class Loop:
         self._reported: set[tuple[str, str]] = set()
         self._listener_error = ""
         self._held = _HELD if self._group.capabilities.holds_on_quick_stop else _BRAKED
-        self.cause = ""
+        self.cause = self._requested = ""
         self.error: CdprError | None = None
         """None here: the end of a run is reported by its cause."""
         self.holding = True
@@ -315,7 +315,8 @@ class Loop:
             text = f"{requests.for_what.text}; slowing down {self.motion_phrase}"
             self._report_cause(requests.for_what.code, text)
         else:
-            self._report_cause("stop", f"stop requested; slowing down {self.motion_phrase}")
+            self._requested = f"stop requested; slowing down {self.motion_phrase}"
+            self._report_cause("stop", self._requested)
         self._feed.stop()
         self.machine.on(Event.STOP)
         return True
@@ -331,7 +332,7 @@ class Loop:
 
     def _react(self, alarm: Alarm) -> None:
         if alarm.reaction is StopReaction.PATH_STOP and self.machine.state in _WITHOUT_QUICK_STOP:
-            self.cause = self.cause or f"{alarm.text}; stopped {self.motion_phrase}"
+            self._note_cause(f"{alarm.text}; stopped {self.motion_phrase}")
             self._feed.stop()
             self.machine.on(Event.PATH_FAULT)
         elif alarm.reaction is not StopReaction.NOTE:
@@ -391,9 +392,14 @@ class Loop:
                 self._report_once(alarm)
 
     def _report_cause(self, code: str, text: str) -> None:
-        """Reports why the run does not finish; the first cause is kept."""
-        self.cause = self.cause or text
+        """Reports why the run does not finish."""
+        self._note_cause(text)
         self._report(code, text)
+
+    def _note_cause(self, text: str) -> None:
+        """Keeps the first cause, except that a fault outweighs the operator's stop before it."""
+        if self.cause in ("", self._requested):
+            self.cause = text
 
     def _report(self, code: str, text: str) -> None:
         event = LoopEvent(self._cycle, self._clock.time, code, text)

@@ -338,6 +338,7 @@ def test_a_stop_request_does_not_hide_a_fault(prepared: PreparedRun, tmp_path: P
     assert outcome.state is State.LATCHED
     assert summary["verdict"] == "FAILED"
     assert any("(drive 4) did not answer" in event["text"] for event in summary["events"])
+    assert "(drive 4) did not answer" in outcome.cause, "what is latched is not the operator's stop"
 
 
 @pytest.mark.usefixtures("no_pictures")
