@@ -46,13 +46,13 @@ def lost_master(rig: Rig) -> LostMaster:
 
 def _cia402_times(rig: Rig) -> tuple[str, float, float]:
     """Missing message, time until the last CiA 402 drive notices, and its ramp, [s]."""
-    from drivers.cia402.object_dictionary import quick_stop_ramp
+    from drivers.cia402.object_dictionary import QUICK_STOP_RAMP, quick_stop_ramp, quick_stop_time
     from drivers.cia402.profile import profile_of
 
     cycle, profile = rig.cycle, profile_of(rig)
-    steepest = profile.range_of(0x6085, 0)
+    allowed = profile.range_of(QUICK_STOP_RAMP, 0)
     wanted = max(quick_stop_ramp(rig, i, cycle, profile) for i in range(rig.cable_count))
-    ramp = cycle if steepest is None else cycle * max(1.0, wanted / max(1, steepest.high))
+    ramp = cycle if allowed is None else quick_stop_time(wanted, allowed, cycle)
     if profile.monitoring == "heartbeat":
         return "heartbeat", heartbeat_timeout(cycle), ramp
     return "SYNC", profile.sync_timeout_periods * cycle, ramp

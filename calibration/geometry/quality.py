@@ -86,8 +86,6 @@ def estimate_compliance(result: RigCalibration) -> Compliance | None:
     Args:
         result: The fit with the rig file's stiffness.
     """
-    if not np.isfinite(result.measured.tensions).all():
-        return None
     found = _compliance_information(result, np.ones((result.rig.cable_count, 1)))
     if found is None:
         return None
@@ -104,8 +102,6 @@ def estimate_cable_compliances(result: RigCalibration) -> CableCompliances | Non
     Args:
         result: The fit with one stiffness for all cables.
     """
-    if not np.isfinite(result.measured.tensions).all():
-        return None
     cables = result.rig.cable_count
     found = _compliance_information(result, np.eye(cables))
     if found is None:
@@ -140,9 +136,12 @@ def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Arra
         groups: 1 where a cable is in a group of one compliance, shape (m, q).
 
     Returns:
-        Information, shape (q, q), and half the gradient of the squares, shape (q,); None where the
-        information is round-off, as with six lengths and no pose, which fit any compliance.
+        Information, shape (q, q), and half the gradient of the squares, shape (q,); None where
+        tensions are missing in some samples, or the information is round-off, as with six lengths
+        and no pose, which fit any compliance.
     """
+    if not np.isfinite(result.measured.tensions).all():
+        return None
     data, fit, parameters = result.measured, result.fit, result.parameters
     model = RigModel(parameters, data)
     line = model.linearised(fit.values, fit.positions, fit.rotations)

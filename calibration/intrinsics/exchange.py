@@ -30,7 +30,6 @@ from model.rig import Rig, rig_from_document
 
 _ROS_MODELS = {"plumb_bob": ("pinhole", 5), "rational_polynomial": ("pinhole", 8)}
 _ROS_FISHEYE = ("equidistant", "fisheye")
-_ROS_LENS = "distortion_coefficients"
 _KALIBR_MODELS = {"radtan": ("pinhole", 4), "equidistant": ("fisheye", 4), "none": ("pinhole", 0)}
 _MRCAL_MODELS = {
     "LENSMODEL_PINHOLE": 0,
@@ -292,7 +291,8 @@ def _from_ros(plain: object, path: Path) -> dict[str, Any]:
     try:
         model = plain["distortion_model"]
         if "camera_matrix" in plain:  # a file of camera_calibration_parsers
-            matrix, lens = (plain[key]["data"] for key in ("camera_matrix", _ROS_LENS))
+            matrix = plain["camera_matrix"]["data"]
+            lens = plain["distortion_coefficients"]["data"]
             width, height = plain["image_width"], plain["image_height"]
         else:  # a message; ROS 2 names its fields k and d
             matrix, lens = (plain[key if key in plain else key.lower()] for key in "KD")

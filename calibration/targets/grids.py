@@ -303,11 +303,11 @@ class TagGrid:
             return None
         # OpenCV draws some families upside down compared to AprilTag's images.
         turned = {number: np.roll(square, 2, axis=0) for number, square in squares.items()}
-        if self._misfit(turned) < min(self._misfit(squares) / _BETTER, _OFF):
-            squares = turned
+        ours, as_turned = self._misfit(squares), self._misfit(turned)
+        if as_turned < min(ours / _BETTER, _OFF):
+            squares, ours = turned, as_turned
         corners = np.concatenate(list(squares.values()))
-        other = replace(self, order=self._other_order())
-        ours, others = (grid._misfit(squares) for grid in (self, other))
+        others = replace(self, order=self._other_order())._misfit(squares)
         if ours > max(_BETTER * others, _OFF):
             return None
         return DetectedBoard(self.points_of(squares), corners, twice)

@@ -110,7 +110,10 @@ def how_to_set(expected: Expectation) -> str:
         )
     if expected.index in (0x1000, 0x1018):
         return "check the node id, and vendor_id and product_code of the rig file"
-    return "set it with the manufacturer's tool and store it"
+    return BY_MAKERS_TOOL
+
+
+BY_MAKERS_TOOL = "set it with the manufacturer's tool and store it"
 
 
 # Checks of one drive before anything is written.
@@ -136,6 +139,8 @@ def require_expected(network: SetupNetwork, node: int, expected: Expectation) ->
 
 POSITION_RANGE = 0x607B
 """Positions wrap around at its sub-indices 1 and 2, unless both are 0. Source: CiA 402-2."""
+NO_WRAP = "0 and 0, or more than 607Dh"
+"""The required position range."""
 
 
 def position_range(
@@ -170,7 +175,7 @@ def require_no_wrap(network: SetupNetwork, node: int, settings: Sequence[Setting
     if not holds_limits(found, settings):
         raise wrong_value(
             *(node, f"{POSITION_RANGE:04X}h position range limit", str(found)),
-            *("0 and 0, or more than 607Dh", "positions would wrap around"),
+            *(NO_WRAP, "positions would wrap around"),
         )
 
 

@@ -14,7 +14,9 @@ from drivers.cia402.configure import is_still_set_up, require_answers
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
     BEFORE,
+    BY_MAKERS_TOOL,
     MODE_DISPLAY,
+    NO_WRAP,
     POSITION_RANGE,
     Expectation,
     expected_by,
@@ -165,11 +167,12 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
             reader.at_setting(Setting(index, 0, form, 0, name, why), "readable")
         reader.at_scale(rig.document.winches[drive].counts_per_rev)
         reader.at_heartbeats(profile, rig.cable_count)
-        for setting in _last_of_each(settings_for(rig, drive, winch_map, None)):
+        settings = settings_for(rig, drive, winch_map, None)
+        for setting in _last_of_each(settings):
             reader.at_setting(setting, _needed(setting))
         for setting in stated_absent(rig, drive, winch_map):
             reader.at_absent(setting)
-        reader.at_position_range(settings_for(rig, drive, winch_map, None))
+        reader.at_position_range(settings)
         for_unused_pdos(profile, reader.at_unused)
     answered = tuple(node for node in all_nodes if node not in silent)
     return Examined(answered, tuple(silent), tuple(rows.values()))
@@ -282,8 +285,7 @@ class _Reader:
 
     def at_position_range(self, settings: Sequence[Setting]) -> None:
         """Where positions wrap around, if anywhere."""
-        needed = "0 and 0, or more than 607Dh"
-        row = self._row(POSITION_RANGE, 1, f"{POSITION_RANGE:04X}h position range limit", needed)
+        row = self._row(POSITION_RANGE, 1, f"{POSITION_RANGE:04X}h position range limit", NO_WRAP)
         row.meaning = "positions must not wrap around"
         try:
             found = position_range(self._client.read_if_there)
@@ -292,7 +294,7 @@ class _Reader:
                 raise
             found = None
         good = holds_limits(found, settings)
-        change = "" if good else "set it with the manufacturer's tool and store it"
+        change = "" if good else BY_MAKERS_TOOL
         row.note(self._node, str(found or "none"), "ok" if good else "wrong", change)
 
     def at_setting(self, setting: Setting, needed: str) -> None:

@@ -168,6 +168,7 @@ def left_out(profile: ProfileDocument) -> tuple[str, ...]:
 
 
 FOLLOWING_TIMEOUT, QUICK_STOP_RAMP = 0x6066, 0x6085
+CLAMPED = (FOLLOWING_TIMEOUT, QUICK_STOP_RAMP)
 """Objects clamped to the drive's range: an earlier trip, and the steepest possible ramp."""
 
 LONGEST_QUICK_STOP = 0.5  # from top speed, [s]
@@ -182,17 +183,16 @@ def _within(setting: Setting, profile: ProfileDocument, cycle: float) -> Setting
     allowed = profile.range_of(setting.index, setting.sub)
     if allowed is None or allowed.holds(setting.value):
         return setting
-    clamped = replace(setting, value=min(setting.value, allowed.high))
-    if setting.index in (FOLLOWING_TIMEOUT, QUICK_STOP_RAMP) and allowed.holds(clamped.value):
-        takes = cycle * setting.value / max(1, allowed.high)
-        if setting.index == FOLLOWING_TIMEOUT or takes <= LONGEST_QUICK_STOP:
-            return clamped
-        raise BadInput(
-            f"the steepest {setting} of {profile.name}, {allowed.high}, stops a drive from top"
-            f" speed in {takes:.3g} s, limit {LONGEST_QUICK_STOP:g} s",
-            where="drives.profile",
-            next_step="check the range and the unit in the profile, and max_speed of the winches",
-        )
+    if setting.index in CLAMPED and setting.value > allowed.high:
+        takes = quick_stop_time(setting.value, allowed, cycle)
+        if setting.index == QUICK_STOP_RAMP and takes > LONGEST_QUICK_STOP:
+            raise BadInput(
+                f"the steepest {setting} of {profile.name}, {allowed.high}, stops a drive from top"
+                f" speed in {takes:.3g} s, limit {LONGEST_QUICK_STOP:g} s",
+                where="drives.profile",
+                next_step="check range and unit in the profile, and max_speed of the winches",
+            )
+        return replace(setting, value=allowed.high)
     raise BadInput(
         f"{setting} must hold {setting.value}; {profile.name} accepts {allowed.low} to"
         f" {allowed.high}",
@@ -360,6 +360,7 @@ def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> 
     # other and the tensions change little.
     ramp = quick_stop_ramp(rig, drive, cycle, profile)
     window = rig.motion.following_error * abs(winch.counts_per_metre)
+    timeout = math.ceil(1000 * cycle)
     return (
         Setting(0x6007, 0, "<h", 3, "abort connection option code", "stop when the bus is lost"),
         Setting(0x605A, 0, "<h", 6, "quick stop option code", "ramp down, then hold under torque"),
@@ -367,14 +368,7 @@ def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> 
         *_offsets(),
         _capped(QUICK_STOP_RAMP, "quick stop deceleration", ramp, "at rest within one cycle"),
         _capped(0x6065, "following error window", window, "motion.following_error_mm"),
-        Setting(
-            FOLLOWING_TIMEOUT,
-            0,
-            "<H",
-            math.ceil(1000 * cycle),
-            "following error time out",
-            "one cycle",
-        ),
+        Setting(FOLLOWING_TIMEOUT, 0, "<H", timeout, "following error time out", "one cycle"),
     )
 
 
@@ -385,6 +379,11 @@ def quick_stop_ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument
     turns = ramp / winch.counts_per_turn
     in_unit = {"counts/s^2": ramp, "rpm/s": 60.0 * turns, "rev/s^2": turns}
     return in_unit[profile.acceleration_unit] / profile.acceleration_step
+
+
+def quick_stop_time(ramp: float, allowed: Range, cycle: float) -> float:
+    """Time of a quick stop from top speed, [s]: ``ramp`` would take a cycle, the drive may not."""
+    return cycle * max(1.0, ramp / max(1, allowed.high))
 
 
 def _options() -> tuple[Setting, ...]:
@@ -405,10 +404,11 @@ def _options() -> tuple[Setting, ...]:
 
 def _offsets() -> tuple[Setting, ...]:
     """Offsets that drives add to set-points, which a former master may have left."""
-    why, offsets = "set-points are used as sent", ("position", "velocity", "torque")
-    return tuple(
-        Setting(0x60B0 + k, 0, form, 0, f"{offset} offset", why, optional=True)
-        for k, (form, offset) in enumerate(zip(("<i", "<i", "<h"), offsets, strict=True))
+    why = "set-points are used as sent"
+    return (
+        Setting(0x60B0, 0, "<i", 0, "position offset", why, optional=True),
+        Setting(0x60B1, 0, "<i", 0, "velocity offset", why, optional=True),
+        Setting(0x60B2, 0, "<h", 0, "torque offset", why, optional=True),
     )
 
 
