@@ -322,29 +322,27 @@ def _duration(cycles: CycleTable, cycle: float) -> float:
 def _pose_table(samples: Sequence[CameraSample], cycles: CycleTable) -> PoseTable:
     if not samples:
         return no_poses()
-    unknown = PoseMeasurement(
-        float("nan"),
-        Pose(np.full(3, np.nan), np.full((3, 3), np.nan)),
-        np.full((6, 6), np.nan),
-        (),
-        float("nan"),
-        "",
-    )
-    found = [
-        sample.found if isinstance(sample.found, PoseMeasurement) else unknown for sample in samples
-    ]
-    nothing = np.full(4, np.nan)
+    position, rotation = np.full((len(samples), 3), np.nan), np.full((len(samples), 4), np.nan)
+    covariance = np.full((len(samples), 6, 6), np.nan)
+    reprojection = np.full(len(samples), np.nan)
+    tags = [""] * len(samples)
+    for k, sample in enumerate(samples):
+        found = sample.found
+        if isinstance(found, PoseMeasurement):
+            position[k], rotation[k] = found.pose.position, found.pose.quaternion
+            covariance[k], reprojection[k] = found.covariance, found.reprojection
+            tags[k] = " ".join(map(str, found.tags))
     return PoseTable(
         frame=np.array([sample.frame for sample in samples], dtype=np.int64),
         time=np.array([sample.found.time for sample in samples]),
         status=tuple(
             sample.found.reason if isinstance(sample.found, NoPose) else OK for sample in samples
         ),
-        position=np.array([one.pose.position for one in found]),
-        rotation=np.array([nothing if one is unknown else one.pose.quaternion for one in found]),
-        covariance=np.array([one.covariance for one in found]),
-        tags=tuple(" ".join(map(str, one.tags)) for one in found),
-        reprojection=np.array([one.reprojection for one in found]),
+        position=position,
+        rotation=rotation,
+        covariance=covariance,
+        tags=tuple(tags),
+        reprojection=reprojection,
         planned=_planned_positions(samples, cycles),
         picture=tuple(sample.picture for sample in samples),
     )

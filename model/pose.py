@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from model.errors import BadInput
+
 Array = NDArray[np.float64]
 
 
@@ -98,6 +100,17 @@ def rotation_vector_from_matrix(matrix: ArrayLike) -> Array:
     return vector
 
 
+def _is_rotation(matrix: Array) -> bool:
+    """Right-handed and orthonormal to about 1e-3, as of a quaternion written with four digits."""
+    (a, b, c), (d, e, f), third = matrix.tolist()
+    cross = (b * f - c * e, c * d - a * f, a * e - b * d)
+    return (
+        abs(a * a + b * b + c * c - 1.0) < 2e-3
+        and abs(d * d + e * e + f * f - 1.0) < 2e-3
+        and all(abs(x - y) < 2e-3 for x, y in zip(cross, third, strict=True))
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
     """Position and orientation of a frame in another, usually ``world_from_platform``.
@@ -105,6 +118,9 @@ class Pose:
     Attributes:
         position: Shape (3,), [m].
         rotation: Rotation matrix, shape (3, 3).
+
+    Raises:
+        BadInput: A wrong shape, or no rotation: a reflection, a scaled matrix, NaN.
     """
 
     position: Array
@@ -114,6 +130,19 @@ class Pose:
         """Copies the arrays and makes them read-only."""
         object.__setattr__(self, "position", read_only(self.position))
         object.__setattr__(self, "rotation", read_only(self.rotation))
+        if self.position.shape != (3,) or self.rotation.shape != (3, 3):
+            raise BadInput(
+                f"a pose of shapes {self.position.shape} and {self.rotation.shape}",
+                where="Pose(position, rotation)",
+                next_step="pass a position of shape (3,) in m and a rotation matrix of shape (3, 3)",
+            )
+        if not _is_rotation(self.rotation):
+            raise BadInput(
+                "the matrix of a pose is no rotation",
+                where="Pose(position, rotation)",
+                why="its rows are not of length 1, not at right angles, or mirrored",
+                next_step="compute it from a unit quaternion: Pose.from_quaternion(position, wxyz)",
+            )
 
     @classmethod
     def level(cls, position: ArrayLike) -> Pose:

@@ -177,12 +177,16 @@ class _FrameSet:
     asked: frozenset[str]
     samples: dict[str, CameraSample] = field(default_factory=dict)
 
+    @property
+    def has_pose(self) -> bool:
+        return any(isinstance(one.found, PoseMeasurement) for one in self.samples.values())
+
 
 class RunCameras:
     """All cameras of one run.
 
-    A frame is complete when all requested cameras have answered, or one frame later with the
-    answers so far.
+    A frame is complete when all requested cameras have answered, or one frame later if one of them
+    gave a pose. Without a pose it waits for the others, and later frames do not wait for it.
     """
 
     def __init__(
@@ -268,7 +272,7 @@ class RunCameras:
         self._report_trouble()
         several = len(self._clients) > 1
         return CameraRecords(
-            tuple(self._together),
+            tuple(sorted(self._together, key=lambda sample: sample.frame)),
             {client.name: tuple(client.samples) for client in self._clients} if several else {},
             tuple(client.record() for client in self._clients),
         )
@@ -289,20 +293,26 @@ class RunCameras:
                 frame_set.samples[client.name] = sample
 
     def _process_complete(self, last: bool = False) -> None:
-        """Fuses complete frames, in order."""
+        """Fuses complete frames; in order, except that none waits for a late one without a pose."""
         gone = {client.name for client in self._clients if client.failed is not None}
-        while self._open:
-            frame_set = self._open[0]
+        waiting: list[_FrameSet] = []
+        for frame_set in self._open:
             answered = frame_set.asked - gone <= frame_set.samples.keys()
-            late = bool(frame_set.samples) and frame_set.trigger.frame < self._frame - 1
-            if not (answered or late or last):
-                return
-            self._keep(self._fused(self._open.pop(0)))
+            late = frame_set.trigger.frame < self._frame - 1
+            in_order = all(one.trigger.frame < self._frame - 1 for one in waiting)
+            if in_order and (answered or (late and frame_set.has_pose) or last):
+                self._keep(self._fused(frame_set))
+            else:
+                waiting.append(frame_set)
+        self._open = waiting
 
     def _keep(self, sample: CameraSample) -> None:
         self._together.append(sample)
-        if isinstance(sample.found, PoseMeasurement):
-            self.newest = sample.found, sample.clearance
+        found = sample.found
+        if not isinstance(found, PoseMeasurement):
+            return
+        if self.newest is None or self.newest[0].time < found.time:
+            self.newest = found, sample.clearance
 
     def _fused(self, frame_set: _FrameSet) -> CameraSample:
         """The fused sample of a frame."""

@@ -18,7 +18,12 @@ from executor.cameras import multi_camera as run_cameras
 from executor.cameras import process as camera_process
 from executor.cameras.client import BLIND_IMAGES, CameraClient, wait_until_ready
 from executor.cameras.multi_camera import HURRY, PATIENCE, ROUND, RunCameras
-from executor.cameras.process import CameraProcess, CameraSample, FrameRequest
+from executor.cameras.process import (
+    CameraProcess,
+    CameraSample,
+    FrameRequest,
+    sample_without_pose,
+)
 from executor.remote.client import camera_line
 from model.clearance import ClearanceModel
 from model.errors import BadInput, Fault
@@ -34,6 +39,10 @@ HERE = Pose.level([0.0, 0.0, 0.445])
 _RIG = load_rig(RIG)
 _SCENE = free_scene([0.0, 0.0, 445.0], [0.0, 30.0, 495.0])
 MODEL = ClearanceModel(_RIG, _SCENE)
+
+
+BLIND = 100
+"""Added to a delay: the camera answers without a pose."""
 
 
 def seen_at(
@@ -55,13 +64,14 @@ class Scripted:
         self, name: str, delays: Sequence[int], shift: float = 0.0, late: float = 0.0
     ) -> None:
         self.name, self.unanswered, self._off = name, None, {"shift": shift, "late": late}
-        self._delays, self._left = list(delays), 0
+        self._delays, self._left, self._blind = list(delays), 0, False
         self.waited = 0.0
 
     unanswered: FrameRequest | None
 
     def ask(self, trigger: FrameRequest) -> None:
-        self._left = self._delays[trigger.frame % len(self._delays)]
+        delay = self._delays[trigger.frame % len(self._delays)]
+        self._blind, self._left = delay >= BLIND, delay % BLIND if delay >= 0 else delay
         if self._left == -2:
             raise Fault(f"the process of camera {self.name} ended without an answer")
         self.unanswered = trigger
@@ -76,8 +86,10 @@ class Scripted:
         self.waited += patience
         if self.unanswered is None or self._left < 0:
             return None
-        look, self.unanswered = seen_at(self.unanswered, **self._off), None
-        return look
+        trigger, self.unanswered = self.unanswered, None
+        if self._blind:
+            return sample_without_pose(trigger.frame, trigger.time, "no tag")
+        return seen_at(trigger, **self._off)
 
 
 def never() -> bool:
@@ -122,6 +134,42 @@ def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
     for k in range(5):
         run.trigger(k / RATE, k / RATE, None, None)
     assert "the scene requires 10000 mm" in run.near
+
+
+@pytest.mark.parametrize(
+    ("front", "side"),
+    [
+        pytest.param([1], [0, -1], id="hangs in a frame in which the other was not asked"),
+        pytest.param([BLIND], [3], id="is late, and the other sees nothing"),
+        pytest.param([0], [-1], id="hangs from the beginning"),
+        pytest.param([BLIND + 1, 1, 1], [-1], id="hangs, and the other sees nothing now and then"),
+    ],
+)
+def test_too_small_a_clearance_is_noticed_whatever_a_camera(
+    front: list[int], side: list[int]
+) -> None:
+    limit = 10.0  # every clearance is too small
+    cameras: list[Any] = [Scripted("front", front), Scripted("side", side)]
+    run = RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE)
+    for k in range(10):
+        run.trigger(k / RATE, k / RATE, None, None)
+    assert "the scene requires 10000 mm" in run.near
+    frames = [look.frame for look in run.finish(never).together]
+    assert frames == sorted(set(frames))
+
+
+@given(
+    front=st.lists(st.sampled_from([0, 1, 4, BLIND, BLIND + 3]), min_size=1, max_size=6),
+    side=st.lists(st.sampled_from([0, 2, 5, BLIND + 1]), min_size=1, max_size=6),
+)
+def test_no_pose_of_any_camera_is_lost(front: list[int], side: list[int]) -> None:
+    run, _ = run_of(20, Scripted("front", front), Scripted("side", side))
+    seen = run.finish(never)
+    with_pose = [
+        {look.frame for look in looks if isinstance(look.found, PoseMeasurement)}
+        for looks in (*seen.alone.values(), seen.together)
+    ]
+    assert with_pose[0] | with_pose[1] == with_pose[2]
 
 
 def test_images_of_both_make_a_better_pose() -> None:

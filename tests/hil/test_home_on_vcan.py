@@ -11,7 +11,7 @@ import pytest
 from drivers.can_bus import BusSettings, open_bus
 from drivers.cia402.state_machine import DriveState
 from tests.cli.plans import RIG
-from tests.hil.conftest import LISTENS_FOR_S, Program, Rig, stopped_programs
+from tests.hil.conftest import Program, Rig, next_message, stopped_programs
 
 pytestmark = [pytest.mark.hil, pytest.mark.slow]
 
@@ -25,7 +25,7 @@ def test_slack_cables_are_taut_and_referenced_afterwards(
     with stopped_programs(started), open_bus(BusSettings("socketcan", channel)) as ear:
         drives = Program(tmp_path / "drives.txt", ("sim", RIG, *bus, *lost))
         started.append(drives)
-        assert ear.recv(LISTENS_FOR_S) is not None, drives.said.read_text()
+        next_message(ear, drives)
         words = ("home", RIG, "--at-home", "--speed-mm-s", "10", *bus, "--yes", "--json")
         home = Program(tmp_path / "home.txt", words)
         started.append(home)

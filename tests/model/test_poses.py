@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from model.errors import BadInput
 from model.files.documents import PoseDocument
 from model.pose import (
     Pose,
@@ -52,6 +53,27 @@ def test_a_rotation_vector_makes_the_rotation_that_scipy_makes(turn: Vector) -> 
     np.testing.assert_allclose(matrix, Rotation.from_rotvec(turn).as_matrix(), atol=1e-14)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-14)
     assert np.linalg.det(matrix) == pytest.approx(1.0)
+
+
+@given(turns, st.sampled_from([-1.0, 1.01, 0.0, np.nan]), st.integers(0, 2))
+def test_no_pose_has_a_matrix_that_is_no_rotation(turn: Vector, factor: float, row: int) -> None:
+    """Mirrored, stretched, flat or unknown along one axis."""
+    matrix = matrix_from_rotation_vector(turn)
+    matrix[row] *= factor
+    with pytest.raises(BadInput, match="no rotation"):
+        Pose(np.zeros(3), matrix)
+
+
+@given(turns)
+def test_a_quaternion_written_with_four_digits_is_a_rotation(turn: Vector) -> None:
+    written = np.round(quaternion_from_matrix(matrix_from_rotation_vector(turn)), 4)
+    assert Pose.from_quaternion([0.0, 0.0, 0.0], written).position.shape == (3,)
+
+
+@pytest.mark.parametrize(("position", "rotation"), [([0.0] * 2, np.eye(3)), ([0.0] * 3, np.eye(4))])
+def test_a_pose_of_other_shapes_is_refused(position: list[float], rotation: Vector) -> None:
+    with pytest.raises(BadInput, match="shapes"):
+        Pose(np.array(position), rotation)
 
 
 @given(turns)
