@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import secrets
+import signal
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -115,10 +117,11 @@ class ConsoleServer:
         loop = asyncio.get_running_loop()
         while True:
             began = loop.time()
-            self._state = await run_in_threadpool(self._console.update)
-            async with self._news:
-                self._seq += 1
-                self._news.notify_all()
+            with suppress(Exception):  # such as a removed file; it is tried again
+                self._state = await run_in_threadpool(self._console.update)
+                async with self._news:
+                    self._seq += 1
+                    self._news.notify_all()
             await asyncio.sleep(max(0.005, began + 1.0 / RATE - loop.time()))
 
     # Access.
@@ -384,8 +387,22 @@ def run_server(console: Console, host: str, port: int, on_ready: Callable[[str],
         server = ConsoleServer(console, host=host)
         on_ready(f"http://{host}:{listener.getsockname()[1]}/?token={server.token}")
         take_short_turns()
-        with prompt_threads():
+        with prompt_threads(), _closed_terminal_ends():
             web_server(server.app()).run(sockets=[listener])
+
+
+@contextmanager
+def _closed_terminal_ends() -> Iterator[None]:
+    """A closed terminal ends the server as SIGTERM does, and with it a session of jogs."""
+    before = signal.getsignal(signal.SIGHUP)
+    if before is signal.SIG_IGN:  # started with nohup: outlives its terminal
+        yield
+        return
+    signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def web_server(app: FastAPI) -> uvicorn.Server:

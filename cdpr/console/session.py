@@ -127,6 +127,7 @@ class Console:
         self._line = self.verbs.update()
         self._load_planned()
         if report.status is not None:
+            self.verbs.is_under_way = True
             seen = self.view.take(report.status)
             self._robot = seen or self._robot
         self.pictures.watch(report.status, self.view.rig)
@@ -136,8 +137,8 @@ class Console:
 
     def close(self) -> None:
         """Ends a session of jogs begun here, and closes all connections; a run continues."""
-        if self.verbs.verb == "jog":
-            self.watch.send("end")
+        if self.verbs.verb == "jog" and self.watch.send("end"):
+            self.verbs.stop_before_motion()
         self._asks.shutdown()
         self.pictures.close()
         self.watch.close()
@@ -184,6 +185,8 @@ class Console:
             "rig": rig.name,
             "bus": bus_name(rig),
             "simulated": is_simulated(rig),
+            "homes_by": self.files.cameras[0] if self.files.cameras else None,
+            "home_mm": np.round(1e3 * rig.home.position, 1).tolist(),
             **stored_state(self._stored),
             "busy": None if verb is None else {"verb": verb, "text": self._line},
             "outcome": outcome_state(self.verbs.outcome),
@@ -213,11 +216,16 @@ class Console:
     # Commands.
 
     def stop(self) -> str:
-        """Stops every run of this user; returns why not, or an empty text."""
+        """Stops every run of this user, and a verb that is still being prepared.
+
+        Returns:
+            Why not, or an empty text.
+        """
         result = stop_runs()
-        if not (result.stopped or result.silent):
-            return "nothing moves"
-        return "" if not result.silent else "a run does not answer: press the emergency stop"
+        ended = self.verbs.stop_before_motion()
+        if result.silent:
+            return "a run does not answer: press the emergency stop"
+        return "" if result.stopped or ended else "nothing moves"
 
     def command(self, page: int, message: Message) -> str:
         """Executes a page's command; returns why not, or an empty text."""
@@ -229,6 +237,8 @@ class Console:
             return self._command(page, message)
         except CdprError as error:
             return str(error)
+        except Exception as error:  # such as a full disk; the page's next command is executed
+            return f"{message.command} failed: {type(error).__name__}: {error}"
 
     def begin_with(self, path: Path) -> None:
         """Loads a plan; a platform with drives simulated by each run begins at its start.
@@ -316,7 +326,8 @@ class Console:
         if not (cameras or is_simulated(self.rig)):
             cameras = ["--no-camera"]
         rig = ["--rig", str(self.files.rig_file)]
-        return self._start_verb("run", [self.plan.preview["name"], *rig, *cameras])
+        seen = ["--plan-hash", self.plan.hash]
+        return self._start_verb("run", [self.plan.preview["name"], *rig, *cameras, *seen])
 
     def _jog_begin(self) -> str:
         scene = self.files.scene_file

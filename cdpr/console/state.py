@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -37,6 +38,9 @@ from model.rig import Rig
 SHOWN = 4000
 #: Exit code of a verb that the operator stopped.
 STOPPED = 130
+BEFORE_MOTION = "Stopped during the preparation: nothing was moved."
+#: Verbs after which drives move, or let go.
+MOVING = frozenset({"home", "jog", "release", "run"})
 _REPORT = re.compile(r"(\S+/report\.html)")
 _HELP = re.compile(r"docs/faults/(\w+)\.md")
 
@@ -72,6 +76,8 @@ class StartedVerb:
         """Name of the running verb."""
         self.outcome: VerbOutcome | None = None
         """Result of the last verb."""
+        self.is_under_way = False
+        """Whether the running verb has answered as a run, and takes its requests."""
 
     def start(self, verb: str, arguments: Sequence[str]) -> None:
         """Starts a verb without a terminal.
@@ -95,6 +101,17 @@ class StartedVerb:
             if self.outcome is not None:
                 self.outcome = replace(self.outcome, exit_code=error.exit_code, text=str(error))
 
+    def stop_before_motion(self) -> bool:
+        """Ends a verb that would move drives but is still being prepared; returns whether it did.
+
+        One that has just begun to move takes the signal as a request to stop.
+        """
+        with self._lock:
+            if self._process is None or self.verb not in MOVING or self.is_under_way:
+                return False
+            self._process.terminate()
+            return True
+
     def update(self) -> str:
         """The last line of the verb's output; records its end."""
         with self._lock:
@@ -115,6 +132,7 @@ class StartedVerb:
         finally:
             os.close(descriptor)
         self._output, self.verb, self.outcome = Path(name), verb, None
+        self.is_under_way = False
 
     def _update(self) -> str:
         if self._process is None or self.verb is None:
@@ -130,6 +148,8 @@ class StartedVerb:
 
 
 def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
+    if code == -signal.SIGTERM:
+        code, text = STOPPED, f"{text}\n{BEFORE_MOTION}"
     report, fault = _REPORT.findall(text), _HELP.findall(text)
     return VerbOutcome(
         verb=verb,
@@ -298,6 +318,8 @@ class LoadedPlan:
         self.preview: dict[str, Any] | None = None
         self.compared: dict[str, Any] | None = None
         self.start: Pose | None = None
+        self.hash = ""
+        """Of the plan: its file may be replaced before a run."""
 
     def load(self, path: Path) -> None:
         """Loads a plan for preview.
@@ -308,6 +330,7 @@ class LoadedPlan:
         self.forget()
         plan = self._read(path)
         self.preview, self.start = preview(path, plan, self._rig), plan.waypoints[0]
+        self.hash = plan.document.hash
 
     def forget(self) -> None:
         """No plan is loaded; another takes its place."""

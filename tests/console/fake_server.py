@@ -258,6 +258,8 @@ class Fake:
             "rig": RIG.name,
             "bus": "udp_multicast 239.74.163.2",
             "simulated": True,
+            "homes_by": None,
+            "home_mm": [0.0, 0.0, 445.0],
             "control": {
                 "yours": reader is self.in_control,
                 "held_by": name,

@@ -291,6 +291,20 @@ def test_everything_has_a_name_and_is_reached_by_keyboard(desk: Visit) -> None:
         assert desk.audit("unnamed") == [], view
 
 
+def test_homing_without_a_camera_says_that_the_pose_is_stated_and_not_measured(desk: Visit) -> None:
+    """Else the platform would be taken to be at home wherever it hangs."""
+    desk.take_control()
+    desk.page.locator("#home").click()
+    expect(desk.page.locator("#dialog .cause")).to_contain_text("held by the jig")
+    expect(desk.page.locator("#dialog .cause")).to_contain_text("0, 0, 445 mm")
+    expect(desk.page.locator(".confirm")).to_contain_text("On the jig")
+    desk.page.locator("#dialog button", has_text="Cancel").click()
+    desk.fake.ask(state={"homes_by": "front=0"})
+    desk.page.locator("#home").click()
+    expect(desk.page.locator("#dialog .cause")).to_contain_text("Camera front=0 measures")
+    assert desk.fake.received("home") == []
+
+
 def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     """The fake server takes anything; what the real one takes is in `cdpr.console.commands`."""
     page = desk.page

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import os
+import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -32,11 +35,12 @@ from cdpr.console.watch import RunWatch
 from executor.remote.command_socket import advertised
 from executor.remote.command_socket import serving as commands
 from executor.supervision import LocalRequests
-from model.plan import load_plan
+from model.plan import load_plan, save_plan
 from model.pose import Pose
 from model.rig import load_rig
 from model.scene import load_scene
-from tests.cli.plans import RIG, write_short_plan
+from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan, write_short_plan
+from tests.cli.program import call
 from tests.console import fake_server
 
 
@@ -192,6 +196,58 @@ def test_a_latch_is_shown_together_with_the_end_of_the_verb_that_left_it(
     state = console.update()
     assert (state["busy"], state["latched"]) == (None, "cable 4 is slack")
     console.close()
+
+
+@pytest.mark.parametrize("verb", ["home", "release", "run", "jog"])
+def test_stop_ends_a_verb_that_is_still_being_prepared(verb: str) -> None:
+    """It reads files and drives for seconds before it can be asked to stop."""
+    console = Served().console
+    del console.verbs.start
+    console.verbs.start(verb, ["--help"])
+    process = console.verbs._process
+    assert process is not None
+    os.kill(process.pid, signal.SIGSTOP)  # however soon it would end
+    assert console.stop() == ""
+    os.kill(process.pid, signal.SIGCONT)
+    process.wait()
+    state = console.update()
+    assert (state["busy"], state["outcome"]["stopped"]) == (None, True)
+    assert "nothing was moved" in state["outcome"]["text"]
+    assert console.stop() == "nothing moves"
+    console.close()
+
+
+def test_stop_leaves_what_moves_nothing_and_what_writes_its_report_alone() -> None:
+    console = Served().console
+    del console.verbs.start
+    for verb, is_under_way in (("plan", False), ("reset", False), ("run", True)):
+        console.verbs.start(verb, ["--help"])
+        console.verbs.is_under_way = is_under_way
+        assert console.stop() == "nothing moves"
+        process = console.verbs._process
+        assert process is not None
+        assert process.wait() == 0
+        console.verbs.update()
+    console.close()
+
+
+def test_a_failure_of_the_computer_is_answered_and_later_commands_are_executed(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_args: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with served.page() as page:
+        command(page, "take_control")
+        monkeypatch.setattr(served.console.verbs, "start", full)
+        refused = command(page, "jog_begin")
+        assert (refused["ok"], "No space left" in refused["what"]) == (False, True)
+        monkeypatch.setattr(served.console, "update", full)
+        assert command(page, "give_control")["ok"]
+        monkeypatch.undo()
+        before = state(page)["seq"]
+        while state(page)["seq"] <= before + 1:
+            pass
 
 
 def test_messages_are_not_compressed(served: Served) -> None:
@@ -620,6 +676,48 @@ def test_nothing_runs_that_was_not_seen_to_pass(served: Served) -> None:
         verb, arguments = served.started[-1]
         assert (verb, arguments[0]) == ("run", "short.json")
         assert "--yes" in arguments
+        assert "--plan-hash" in arguments
+
+
+def test_a_plan_that_was_replaced_after_it_was_shown_does_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    console = Served().console
+    plan = write_short_plan(tmp_path / "plan.json")
+    console.plan.load(Path("plan.json"))
+    scene = free_scene(START_MM, [GOAL_MM[0], GOAL_MM[1], GOAL_MM[2] - 10.0])
+    save_plan(straight_plan(load_rig(RIG), scene, [START_MM, scene.goal.position * 1e3]), plan)
+    answer = call("run", plan, "--fast", "--no-camera", "--plan-hash", console.plan.hash)
+    assert answer.code == 2
+    assert "replaced after it was shown" in answer.err
+    console.plan.load(Path("plan.json"))
+    answer = call("run", plan, "--fast", "--no-camera", "--plan-hash", console.plan.hash)
+    assert answer.code == 0, answer
+    console.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_closed_terminal_ends_the_console_as_any_end_does(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    said = tmp_path / "ended"
+    program = (
+        "import sys; from pathlib import Path; from cdpr.cli import main;"
+        " from cdpr.console.session import Console; end = Console.close;"
+        f" Console.close = lambda self: (end(self), Path({str(said)!r}).touch());"
+        f" sys.argv = ['cdpr', 'console', {str(RIG)!r}, '--port', '0']; main()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], cwd=tmp_path, stdout=subprocess.PIPE, text=True
+    ) as console:
+        assert console.stdout is not None
+        address = console.stdout.readline().partition("http://")[2].strip()
+        with urllib.request.urlopen(f"http://{address}", timeout=60) as page:
+            assert page.status == 200
+        console.send_signal(number)
+        console.wait()
+    assert said.exists()
 
 
 SMALL = st.recursive(

@@ -79,6 +79,10 @@ def run(
             "--no-clearance-stop", help="do not stop when the measured clearance is too small"
         ),
     ] = False,
+    plan_hash: Annotated[
+        str | None,
+        typer.Option(help="refuse another plan than that of this `hash`, as the console does"),
+    ] = None,
     as_json: SummaryJsonOption = False,
 ) -> None:
     """Run a plan: check it, compute set-points, arm the drives, move, measure, report.
@@ -95,6 +99,12 @@ def run(
       cdpr run plan.json --rig rig.yaml -o runs/third --camera front=0 --camera side=1
     """
     the_plan = load_plan(plan)
+    if plan_hash not in (None, the_plan.document.hash):
+        raise BadInput(
+            "the plan's file was replaced after it was shown",
+            where=str(plan),
+            next_step="load it again, look at it, then run it",
+        )
     if rig is None:
         the_rig = calibrated_rig(_simulated(the_plan.rig, interface, channel), calibration)
     else:

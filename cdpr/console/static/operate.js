@@ -205,8 +205,15 @@ export class Operate {
   }
 
   async #home() {
-    const lines = ["All winches wind in slowly until every cable is taut; the platform may move a little.", "The present homing reference is deleted first."];
-    if (await this.#confirmed("home", { title: "Home the drives?", lines, confirm: "Home: winches move" })) this.#page.command("home");
+    const { homes_by: camera, home_mm: home } = this.#page.situation().state;
+    const onJig = `The platform must be held by the jig at the rig’s home pose, ${home.map((v) => known(v, 0)).join(", ")} mm. It is not measured: this position is stored, wherever the platform is.`;
+    const lines = [
+      make("p", { class: "cause" }, camera === null ? onJig : `Camera ${camera} measures where the platform is.`),
+      "All winches wind in slowly until every cable is taut; the platform may move a little.",
+      "The present homing reference is deleted first.",
+    ];
+    const confirm = camera === null ? "On the jig: winches move" : "Home: winches move";
+    if (await this.#confirmed("home", { title: "Home the drives?", lines, confirm })) this.#page.command("home");
   }
 
   async #reset() {
