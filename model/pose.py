@@ -134,7 +134,7 @@ class Pose:
             raise BadInput(
                 f"a pose of shapes {self.position.shape} and {self.rotation.shape}",
                 where="Pose(position, rotation)",
-                next_step="pass a position of shape (3,) in m and a rotation matrix of shape (3, 3)",
+                next_step="pass a position of shape (3,) [m] and a rotation of shape (3, 3)",
             )
         if not _is_rotation(self.rotation):
             raise BadInput(

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.factory import stop_alone
 from executor.control.cycle import Cycle, CycleResult, Feed, targets_at
@@ -29,6 +30,8 @@ from model.errors import CdprError, Refused
 HOLD_TIMEOUT = 3.0
 #: Cycles at rest before and after the motion.
 SETTLING = 10
+#: Failures of the bus in a row after which it is given up while drives stop.
+GONE = 10
 
 
 class Loop:
@@ -63,8 +66,8 @@ class Loop:
         self._requests, self._on_cycle, self._on_event = requests, on_cycle, on_event
         self._sender = Cycle(checked, master, slack_counts=self.slack_counts)
         self._feed = Feed(len(checked), checked.cycle, checked.rig.motion)
-        self._cycle = 0
-        self._taken_over = False
+        self._cycle = self._bus_faults = 0
+        self._taken_over = self._held_before = False
         self._reported: set[tuple[str, str]] = set()
         self._listener_error = ""
         self._held = _HELD if self._group.capabilities.holds_on_quick_stop else _BRAKED
@@ -88,7 +91,7 @@ class Loop:
         """
         require_capabilities(self._group.capabilities, self._checked.cycle)
         require_unchanged(self._checked)
-        self._master.read_positions()
+        self._held_before = self._master.read_positions().holding
         self._take_positions()
         require(self.positions)
         self._require_at_start()
@@ -241,7 +244,7 @@ class Loop:
     def _record(self, done: CycleResult) -> None:
         if done.status is None:
             return
-        self.holding = done.status.holding or not self._taken_over
+        self.holding = done.status.holding or self._held_nothing
         record = CycleRecord(
             cycle=self._cycle,
             at=self._clock.time,
@@ -260,6 +263,11 @@ class Loop:
         )
         self._cycle += 1
         self._call_listener(lambda: self._on_cycle(record))
+
+    @property
+    def _held_nothing(self) -> bool:
+        """Whether no drive can let go of its cable, as none held it, before or in this motion."""
+        return not (self._taken_over or self._held_before)
 
     def _index(self) -> float:
         """Progress of the motion, for the record."""
@@ -370,16 +378,27 @@ class Loop:
             return
         if before is None or left.holding:
             return
-        self.holding = not self._taken_over
+        self.holding = self._held_nothing
         rig = self._checked.rig
         held = np.array(stop_alone(rig, before.status_words.tolist())) & ~before.missing
         if otherwise := changed_states(rig, before, left, np.flatnonzero(~held).tolist()):
             self._report("not_held", otherwise)
 
     def _one_more_latched(self) -> bool:
-        """Sends a cycle after a fault; false when the gate denies it, as it then always will."""
+        """Sends a cycle after a fault; false when the gate denies it, as it then always will.
+
+        A bus that disturbs single cycles still carries SYNC, whose end some drives take for a loss
+        of the master and let go: it is given up only after `GONE` failures in a row.
+        """
         targets = self._sender.resting_targets
-        done = self._sender.cycle(Purpose.HOLD, targets, at_rest=True)
+        try:
+            done = self._sender.cycle(Purpose.HOLD, targets, at_rest=True)
+        except BusFault:
+            self._bus_faults += 1
+            if self._bus_faults >= GONE:
+                raise
+            return True
+        self._bus_faults = 0
         if done.verdict.allowed:
             self._record(done)
             self._report_reasons(done.alarms)

@@ -19,7 +19,7 @@ from model.errors import Fault, Refused
 from simulation.drives.cia402 import SimulatedDrive
 from tests.cli.program import call
 from tests.scenarios.stage import Stage, at, staged
-from tests.scenarios.test_bus_faults import PASSIVE
+from tests.scenarios.test_bus_faults import LOST_BY_CONTROLLER, PASSIVE, PROTOCOL_ERROR
 from tests.scenarios.test_real_time import drives_on
 
 CRUISING = 150
@@ -82,6 +82,51 @@ def test_a_drive_that_releases_after_a_fault_is_reported_besides_its_cause(
     assert events[-1].code == "not_held"
     assert "cable 6 (drive 6) went from quick stop active to fault" in events[-1].text
     assert "cable 4" not in events[-1].text
+
+
+def test_a_disturbed_bus_still_ends_in_order_so_that_no_drive_misses_its_master(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """After the first fault of the bus others follow, each a new one, in a bus that still works."""
+
+    def fault(stage: Stage) -> None:
+        if stage.cycle >= CRUISING:
+            PROTOCOL_ERROR(stage)
+        if stage.cycle == CRUISING:
+            PASSIVE(stage)
+        if stage.cycle == CRUISING + 14:
+            LOST_BY_CONTROLLER(stage)
+
+    with staged(prepared, tmp_path / "run", fault) as stage:
+        for drive in stage.drives:
+            drive.behaviour = replace(drive.behaviour, heartbeat_loss_is_fault=True)
+        outcome = stage.run()
+        stage.rehearsal.advance(0.5)
+        stage.rehearsal.pump()
+        states = {drive.state for drive in stage.drives}
+        codes = [event.code for event in stage.events()]
+    assert "error-passive" in outcome.cause
+    assert "bus_lost" not in codes
+    assert states == {DriveState.QUICK_STOP_ACTIVE}
+
+
+def test_a_drive_that_held_and_lets_go_while_all_are_enabled_is_no_longer_held(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """The usual start: all drives hold since the last run."""
+
+    def fault(stage: Stage) -> None:
+        if stage.cycle == 1:
+            stage.drives[SIXTH].fail(0x2310)
+
+    for held in (True, False):
+        with staged(prepared, tmp_path / str(held), fault) as stage:
+            for drive in stage.drives:
+                drive.state = DriveState.QUICK_STOP_ACTIVE if held else drive.state
+            outcome = stage.run()
+        assert "drive 6" in outcome.cause
+        assert "enabled" not in [event.code for event in stage.events()]
+        assert outcome.holding is not held
 
 
 def test_a_second_drive_that_releases_after_a_fault_is_reported_although_the_first_does_not_hold(
