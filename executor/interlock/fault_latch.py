@@ -16,13 +16,13 @@ import json
 import os
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from drivers.can_bus import BusSettings
-from executor.interlock.locks import locked_within, open_state_file, read_state_file, state_file
+from executor.interlock.locks import locked_within, open_lock, read_state_file, state_files
 from executor.state_machine import State
 from model.errors import CdprError, Refused
 from model.files.documents import write_atomic
@@ -30,6 +30,7 @@ from model.files.documents import write_atomic
 #: Readers of the lock release it within this time, [s].
 LOCK_TIMEOUT = 0.5
 
+_UNKNOWN = "unknown"
 _CUT_SHORT = "a run did not finish: its program was killed, or the computer stopped"
 
 
@@ -60,20 +61,27 @@ class FaultLatch:
     def __init__(self, settings: BusSettings) -> None:
         """Reads nothing yet."""
         self._bus = str(settings)
-        self.path = state_file("latched", settings)
+        self.path, *earlier = state_files("latched", settings)
+        self._earlier = [path for path in earlier if os.access(path.parent, os.R_OK | os.X_OK)]
         self._lock = self.path.with_suffix(".lock")
         self._held: weakref.finalize[[int], FaultLatch] | None = None
 
     def read(self) -> LatchedFault | None:
         """The latched fault, or None. A file that cannot be read counts as engaged."""
+        for path in (self.path, *self._earlier):
+            with suppress(FileNotFoundError):
+                return self._read(path)
+        return None
+
+    def _read(self, path: Path) -> LatchedFault:
         try:
-            return LatchedFault(**json.loads(read_state_file(self.path)))
+            return LatchedFault(**json.loads(read_state_file(path)))
         except FileNotFoundError:
-            return None
+            raise
         except (OSError, ValueError, TypeError, RecursionError, Refused) as error:
             why = f"{error.where}: {error.what}" if isinstance(error, Refused) else error
             cause = f"the latch file cannot be read: {why}"
-            return LatchedFault(self._bus, "unknown", cause, "unknown", "unknown", 0)
+            return LatchedFault(self._bus, _UNKNOWN, cause, _UNKNOWN, _UNKNOWN, 0)
 
     def require_disengaged(self) -> None:
         """Requires the latch to be disengaged.
@@ -106,8 +114,16 @@ class FaultLatch:
             shown: The fault that the operator confirmed.
 
         Raises:
-            Refused: Another fault is latched now.
+            Refused: Another fault is latched now, or one of another rig on this bus.
         """
+        if shown is not None and shown.rig not in (rig, _UNKNOWN):
+            raise Refused(
+                f"the fault is of rig {shown.rig!r}, not of {rig!r}",
+                where=f"bus {self._bus}",
+                why="its drives are not all known here, and would not be looked at",
+                next_step=f"run `cdpr reset` with the rig file of {shown.rig!r}; if it was"
+                " renamed, write its former name there for the reset",
+            )
         if shown is None:
             self.engage(rig, self.path.parent, "a reset did not finish")
         else:
@@ -163,7 +179,8 @@ class FaultLatch:
     def disengage(self) -> None:
         """Disengages the latch: drives may be moved again."""
         try:
-            self.path.unlink(missing_ok=True)
+            for path in (*self._earlier, self.path):
+                path.unlink(missing_ok=True)
         except OSError as error:
             raise self._not_kept(error.strerror) from None
         self._release()
@@ -177,12 +194,15 @@ class FaultLatch:
         if self._held is not None:
             return
         try:
-            lock = open_state_file(self._lock, create=True)
+            lock = open_lock(self._lock, create=True)
         except OSError as error:
             raise self._not_kept(error.strerror) from None
-        if not locked_within(lock, LOCK_TIMEOUT):
+        try:
+            if not locked_within(lock, LOCK_TIMEOUT):
+                raise self._refusal(self.read())
+        except BaseException:
             os.close(lock)
-            raise self._refusal(self.read())
+            raise
         self._held = weakref.finalize(self, os.close, lock)
 
     def _release(self) -> None:
@@ -195,18 +215,15 @@ class FaultLatch:
         if self._held is not None:
             return False
         try:
-            lock = open_state_file(self._lock)
+            lock = open_lock(self._lock)
         except FileNotFoundError:
             return False
         except OSError as error:
             raise self._not_kept(error.strerror) from None
         try:
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
+            return not locked_within(lock, 0.0, fcntl.LOCK_SH)
         finally:
             os.close(lock)
-        return False
 
     def _latched(self, rig: str, cause: str, folder: Path) -> LatchedFault:
         now = datetime.now(UTC).isoformat(timespec="seconds")

@@ -33,25 +33,28 @@ _KINDS = {
 }
 
 
-def state_folder() -> Path:
-    """The state folder, which may not exist yet."""
-    if SHARED.is_dir():
-        return SHARED
+def state_folders() -> tuple[Path, ...]:
+    """The state folder, which may not exist yet; then the user's own, where it was before."""
     base = os.environ.get("XDG_STATE_HOME")
-    return (Path(base) if base else Path.home() / ".local" / "state") / "cdpr"
+    own = (Path(base) if base else Path.home() / ".local" / "state") / "cdpr"
+    return (SHARED, own) if SHARED.is_dir() else (own,)
+
+
+def state_files(kind: str, settings: BusSettings) -> tuple[Path, ...]:
+    """The file of a kind, such as ``latched``, for a bus; then where it was before."""
+    name = re.sub(r"[^A-Za-z0-9.]+", "-", settings.canonical)
+    return tuple(folder / f"{kind}-{name}.json" for folder in state_folders())
 
 
 def state_file(kind: str, settings: BusSettings) -> Path:
-    """The file of a kind, such as ``latched``, for a bus."""
-    name = re.sub(r"[^A-Za-z0-9.]+", "-", settings.canonical)
-    return state_folder() / f"{kind}-{name}.json"
+    """The file of a kind for a bus."""
+    return state_files(kind, settings)[0]
 
 
-def open_state_file(path: Path, *, create: bool = False) -> int:
-    """Opens a file of the state folder for reading; the caller closes it.
+def open_lock(path: Path, *, create: bool = False) -> int:
+    """Opens a lock file, which all operators of a shared folder may lock; the caller closes it.
 
-    The folder may be shared: any user with write access could put a link to another file there, or
-    a FIFO that blocks forever. Links are not followed, and FIFOs do not block.
+    It is opened for writing where that is allowed, as network file systems require it.
 
     Args:
         path: The file.
@@ -61,9 +64,32 @@ def open_state_file(path: Path, *, create: bool = False) -> int:
         Refused: It is not a regular file.
         OSError: It cannot be opened.
     """
-    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
-        handle = os.open(path, flags | (os.O_CREAT if create else 0), 0o644)
+        lock = open_state_file(path, os.O_RDWR | (os.O_CREAT if create else 0))
+    except PermissionError:  # another user's, of an earlier version
+        return open_state_file(path)
+    if create and os.fstat(lock).st_uid == os.geteuid():
+        os.fchmod(lock, 0o664)  # whatever the umask
+    return lock
+
+
+def open_state_file(path: Path, access: int = os.O_RDONLY) -> int:
+    """Opens a file of the state folder; the caller closes it.
+
+    The folder may be shared: any user with write access could put a link to another file there, or
+    a FIFO that blocks forever. Links are not followed, and FIFOs do not block.
+
+    Args:
+        path: The file.
+        access: Flags of `os.open`.
+
+    Raises:
+        Refused: It is not a regular file.
+        OSError: It cannot be opened.
+    """
+    flags = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        handle = os.open(path, flags | access, 0o664)
     except FileNotFoundError:
         raise
     except OSError:
@@ -114,16 +140,29 @@ def _refusal(path: Path, what: str) -> Refused:
 _POLL_INTERVAL = 0.01
 
 
-def locked_within(handle: int, seconds: float) -> bool:
-    """Locks an open file exclusively; waits up to a time [s]; returns whether it succeeded."""
+def locked_within(handle: int, seconds: float, operation: int = fcntl.LOCK_EX) -> bool:
+    """Locks an open file; waits up to a time [s]; returns whether it succeeded.
+
+    Raises:
+        Refused: The file system has no locks.
+    """
     until = time.monotonic() + seconds
     while True:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, operation | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() >= until:
                 return False
             time.sleep(_POLL_INTERVAL)
+        except OSError as error:
+            raise Refused(
+                "files of the state folder cannot be locked, so that another program could move"
+                " the same drives",
+                where=str(state_folders()[0]),
+                why=error.strerror or str(error),
+                next_step="create /var/lib/cdpr on a local disk (docs/commissioning.md), or set"
+                " XDG_STATE_HOME to a folder of one; nothing was moved",
+            ) from None
         else:
             return True
 
@@ -158,7 +197,7 @@ class SetUpLock:
             return
         try:
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            lock = open_state_file(self._path, create=True)
+            lock = open_lock(self._path, create=True)
         except OSError as error:
             raise Refused(
                 "exclusive access to the drives cannot be ensured",
@@ -186,7 +225,7 @@ class SetUpLock:
             Refused: The lock is not a regular file.
         """
         try:
-            lock = open_state_file(self._path)
+            lock = open_lock(self._path)
         except OSError:  # no program on this computer has used these drives
             yield True
             return

@@ -194,7 +194,7 @@ def test_nothing_moves_when_the_lock_or_its_folder_cannot_be_made(
             mine.engage("a rig", folder)
     folder.mkdir()
     with monkeypatch.context() as patched:
-        patched.setattr(fault_latch, "open_state_file", fails)
+        patched.setattr(fault_latch, "open_lock", fails)
         with pytest.raises(Refused, match="Read-only file system"):
             mine.engage("a rig", folder)
     assert mine.read() is None
@@ -229,7 +229,7 @@ def test_reads_and_refusals_leave_no_file_open(
     mine, other = two()
     mine.engage("a rig", folder)
     opened, closed = [], []
-    really_open, really_close = fault_latch.open_state_file, os.close
+    really_open, really_close = fault_latch.open_lock, os.close
 
     def opens(path: Path, *, create: bool = False) -> int:
         opened.append(really_open(path, create=create))
@@ -239,7 +239,7 @@ def test_reads_and_refusals_leave_no_file_open(
         closed.append(handle)
         really_close(handle)
 
-    monkeypatch.setattr(fault_latch, "open_state_file", opens)
+    monkeypatch.setattr(fault_latch, "open_lock", opens)
     monkeypatch.setattr(os, "close", closes)
     for _ in range(3):
         assert other.held_by_another()

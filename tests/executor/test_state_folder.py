@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import signal
 import socket
@@ -164,3 +166,70 @@ def test_files_left_open_do_not_pile_up(strange: str) -> None:
         with pytest.raises(Refused):
             read_state_file(_latched())
     assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_latch_outlives_the_change_to_a_folder_for_all_users(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `docs/commissioning.md` advises it, maybe between a fault and its reset."""
+    FaultLatch(BUS).engage("rig", tmp_path, "cable 4 is slack")
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    monkeypatch.setattr(state_folder, "SHARED", shared)
+    later = FaultLatch(BUS)
+    with pytest.raises(Refused, match="cable 4 is slack"):
+        later.engage("rig", tmp_path)
+    with later.held_for_reset("rig", later.read()):
+        pass
+    later.engage("rig", tmp_path)
+    later.disengage()
+    monkeypatch.setattr(state_folder, "SHARED", tmp_path / "absent")
+    assert FaultLatch(BUS).read() is None
+
+
+def test_a_fault_is_not_reset_with_the_file_of_another_rig(tmp_path: Path) -> None:
+    """Of fewer drives, say: the one in fault would not be looked at."""
+    latch = FaultLatch(BUS)
+    latch.engage("eight cables", tmp_path, "drive 8 is in fault")
+    with (
+        pytest.raises(Refused, match="of rig 'eight cables', not of 'four cables'"),
+        latch.held_for_reset("four cables", latch.read()),
+    ):
+        pytest.fail("it would be reset")
+    assert latch.read() is not None
+
+
+def test_locks_may_be_used_by_every_operator_whatever_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        FaultLatch(BUS).engage("rig", tmp_path)
+        with SetUpLock(BUS).held():
+            pass
+    finally:
+        os.umask(before)
+    for lock in (_latched().with_suffix(".lock"), _set_up()):
+        assert lock.stat().st_mode & 0o777 == 0o664
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EBADF])
+def test_a_file_system_without_locks_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def no_lock(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", no_lock)
+    with pytest.raises(Refused, match="cannot be locked"):
+        FaultLatch(BUS).engage("rig", tmp_path)
+    with pytest.raises(Refused, match="cannot be locked"), SetUpLock(BUS).held():
+        pytest.fail("it was not locked")
+    assert FaultLatch(BUS).read() is None
+
+
+def test_a_serial_adapter_is_the_same_bus_by_each_of_its_names(tmp_path: Path) -> None:
+    device, by_id = tmp_path / "ttyACM0", tmp_path / "usb-adapter"
+    device.touch()
+    by_id.symlink_to(device)
+    for speed in ("", "@115200"):
+        names = {BusSettings("slcan", f"{name}{speed}").canonical for name in (device, by_id)}
+        assert names == {f"slcan {device}{speed}"}

@@ -182,7 +182,7 @@ def test_without_a_folder_for_the_latch_nothing_moves(
 
 def test_a_latched_bus_is_refused_by_the_program(short_plan: Path, tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41999")
-    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41999")).engage("rig", tmp_path)
+    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41999")).engage("gachon_8_6", tmp_path)
     run = tmp_path / "run"
     answer = call("run", short_plan, "--rig", RIG, "-o", run, *bus, "--no-camera", "--yes")
     assert answer.code == 3
@@ -192,7 +192,7 @@ def test_a_latched_bus_is_refused_by_the_program(short_plan: Path, tmp_path: Pat
 
 def test_reset_asks_and_a_no_leaves_it_engaged(tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41998")
-    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41998")).engage("rig", tmp_path)
+    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41998")).engage("gachon_8_6", tmp_path)
     latch = FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41998"))
     for answers, code in (("n\n", 130), ("", 2)):
         assert call("reset", RIG, *bus, answers=answers).code == code
@@ -202,7 +202,7 @@ def test_reset_asks_and_a_no_leaves_it_engaged(tmp_path: Path) -> None:
 
 def test_reset_of_drives_that_do_not_answer_leaves_it_engaged(tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41997")
-    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41997")).engage("rig", tmp_path)
+    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41997")).engage("gachon_8_6", tmp_path)
     latch = FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41997"))
     assert call("reset", RIG, *bus, "--yes").code == 4
     assert latch.read() is not None
@@ -215,7 +215,7 @@ def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
 ) -> None:
     channel = f"239.74.163.23:{20000 + (os.getpid() * 11) % 20000}"
     bus = ("--interface", "udp_multicast", "--channel", channel)
-    FaultLatch(BusSettings("udp_multicast", channel)).engage("rig", tmp_path)
+    FaultLatch(BusSettings("udp_multicast", channel)).engage("gachon_8_6", tmp_path)
     latch = FaultLatch(BusSettings("udp_multicast", channel))
     with drives_on(channel, slow_run) as rehearsal:
         stood = [drive.motor.position for drive in rehearsal.drives]
@@ -237,7 +237,7 @@ def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:
     channel = f"239.74.163.23:{20000 + (os.getpid() * 17) % 20000}"
-    FaultLatch(BusSettings("udp_multicast", channel)).engage("rig", tmp_path)
+    FaultLatch(BusSettings("udp_multicast", channel)).engage("gachon_8_6", tmp_path)
     latch = FaultLatch(BusSettings("udp_multicast", channel))
     with drives_on(channel, slow_run) as rehearsal:
         answered = rehearsal.drives[4].on_sync
