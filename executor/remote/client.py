@@ -177,8 +177,8 @@ def no_run(verb: str) -> Fault:
     return Fault(
         "no active run found for this user",
         where=f"cdpr {verb}",
-        why="it has ended, is still being prepared (Ctrl-C there ends it), or another user"
-        " started it",
+        why="it has ended, is still being prepared (Ctrl-C there ends it), has another TMPDIR, or"
+        " another user started it",
         next_step="press the emergency stop if the robot moves; a run of another user is"
         f" stopped by that user, or with `sudo cdpr {verb}`",
     )

@@ -203,7 +203,7 @@ def answer_to(
         if isinstance(command, JogCommand):
             _jog(command, presses)
         else:
-            _request(command, board)
+            _request(command, board, presses)
         return status_answer(status)
     except InvalidCommand as error:
         return _line({"ok": False, "what": f"not a command: {error}"})
@@ -221,7 +221,14 @@ def _line(answer: dict[str, Any]) -> bytes:
     return json.dumps(answer, allow_nan=False).encode() + b"\n"
 
 
-def _request(command: RunCommand | FeedCommand, board: RequestBoard) -> None:
+def _request(
+    command: RunCommand | FeedCommand, board: RequestBoard, presses: Presses | None
+) -> None:
+    if presses is not None and command.command not in ("status", "stop"):
+        raise InvalidCommand(
+            f"a session of jogs has no path, so `{command.command}` would do nothing;"
+            " it moves only while a control is held, and `cdpr stop` ends it"
+        )
     if isinstance(command, FeedCommand):
         board.ask_speed(command.percent)
     elif command.command == "stop":

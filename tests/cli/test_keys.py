@@ -8,15 +8,18 @@ import sys
 import termios
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdpr.cli.operate import monitor
+from cdpr.cli.operate import jog, monitor
 from cdpr.cli.operate.jog import JogKeys
 from cdpr.cli.operate.supervision import NAMES, Keys, SignalSupervisor, names_of
 from executor.hold_to_run.line import JogProver
@@ -27,9 +30,10 @@ from executor.remote.client import StopResult, follow_run
 from executor.remote.command_socket import RunConnection, advertised, serving
 from executor.remote.protocol import make_line, parse_command
 from executor.remote.status import WinchStatus
-from executor.state_machine import CycleRecord
+from executor.state_machine import CycleRecord, State
 from executor.supervision import LocalRequests
 from model.errors import BadInput, StoppedByOperator
+from model.pose import Pose
 from model.rig import load_rig
 from tests.cli.plans import RIG
 from tests.cli.program import call
@@ -144,6 +148,23 @@ def test_any_other_key_ends_the_press(key: str) -> None:
     seen = jogged([(1.0, 1.3, "right"), (1.3, 1.4, key), (3.0, 9.0, "q")])
     held = jogged([(1.0, 1.4, "right"), (3.0, 9.0, "q")])
     assert seen[-1][1][0] < held[-1][1][0]
+
+
+def test_a_key_that_waited_while_the_program_paused_begins_no_press(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It may have been released meanwhile: a terminal does not tell."""
+    clock, held = [0.0], Mock()
+    monkeypatch.setattr(jog, "time", SimpleNamespace(monotonic=lambda: clock[0], time_ns=lambda: 0))
+    record: Any = SimpleNamespace(state=State.MOVING, at=0.0)
+    prover: Any = SimpleNamespace(pose=Pose.level([0.0, 0.0, 0.4]), limit="")
+    with JogKeys(Typed([(0.0, 9.0, "right")]), 20.0) as keys:  # type: ignore[arg-type]
+        counts = []
+        for pause in (0.0, 0.01, TIMEOUT + 0.05, 0.01):
+            clock[0] += pause
+            keys.take_cycle(record, held, prover)
+            counts.append(held.hold.call_count)
+    assert [counts[0] > 0, *(b > a for a, b in pairwise(counts))] == [True, True, False, True]
 
 
 def test_space_stops_the_session_while_it_moves() -> None:

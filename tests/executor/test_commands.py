@@ -331,6 +331,16 @@ def test_a_session_of_jogs_takes_what_is_reported_of_presses() -> None:
     assert "over" in _said(presses, command="held", press=9, direction=[1, 0, 0])["what"]
 
 
+@pytest.mark.parametrize("word", [{"command": "hold"}, {"command": "speed", "percent": 10}])
+def test_a_session_of_jogs_refuses_what_it_would_ignore(word: dict[str, Any]) -> None:
+    """Else somebody who asks for a hold would believe that it holds."""
+    answer = _said(_Presses(), **word)
+    assert not answer["ok"]
+    assert "cdpr stop" in answer["what"]
+    assert _said(_Presses(), command="stop")["ok"]
+    assert _said(None, **word)["ok"]
+
+
 @pytest.mark.parametrize(
     "wrong",
     [

@@ -41,7 +41,7 @@ from cdpr.cli.output import Terminal, err, out, show_json, show_line
 from executor import jogging
 from executor.drives import is_simulated, require_own_time
 from executor.hold_to_run.line import JogProver
-from executor.hold_to_run.presses import PressBoard
+from executor.hold_to_run.presses import TIMEOUT, PressBoard
 from executor.hold_to_run.session import cable_session, jog_session
 from executor.jogging import FASTEST, SPEED
 from executor.proposals import Proposal
@@ -327,6 +327,7 @@ class JogKeys:
         self._percent, self._in_platform = 100, False
         self._key, self._number = "", 0
         self._shown_at = float("-inf")
+        self._read_at = float("inf")
         self._live = Live(console=err, auto_refresh=False, transient=True)
         self._stack = ExitStack()
         self._is_ready = False
@@ -348,8 +349,12 @@ class JogKeys:
             self._stack.enter_context(self._keys)
             if err.is_terminal:
                 self._stack.enter_context(self._live)
+        now = time.monotonic()
+        # After a pause of this program a key that waited may not be held any more.
+        waited, self._read_at = now - self._read_at > TIMEOUT, now
         for key in self._keys.pressed():
-            self._take(key, presses)
+            if not (waited and key in DIRECTIONS):
+                self._take(key, presses)
         if record.at - self._shown_at >= SHOWN_EVERY:
             self._shown_at = record.at
             self._show(prover)
