@@ -87,7 +87,7 @@ class Attack:
     def _held(self, value: float) -> dict[str, Any]:
         said: dict[str, Any] = {
             "kind": "held", "hold": 1, "direction": [0.0, 0.0, 1.0], "frame": "world",
-            "step_mm": None, "speed_mm_s": 5.0, "seq": 1,
+            "step_mm": None, "speed_mm_s": 5.0, "seq": 1, "state": 1,
         }  # fmt: skip
         key = self._random.choice(["hold", "direction", "frame", "step_mm", "speed_mm_s"])
         said[key] = [value] * 3 if key == "direction" else value

@@ -145,7 +145,10 @@ class ForgetCommand(_Command):
 
 
 class Held(_Incoming):
-    """A jog control is held: for the platform with a direction, for a cable with a sense."""
+    """A jog control is held: for the platform with a direction, for a cable with a sense.
+
+    `state` is the number of the newest state that the page has received.
+    """
 
     kind: Literal["held"]
     hold: Number
@@ -156,6 +159,7 @@ class Held(_Incoming):
     step_mm: float | None
     speed_mm_s: Annotated[float, Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
     seq: Number
+    state: Number
 
     @model_validator(mode="after")
     def _possible(self) -> Held:

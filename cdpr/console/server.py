@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import secrets
 import signal
 import socket
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
@@ -35,6 +37,8 @@ RATE = 20.0
 PATIENCE = 2.0
 #: Largest number of open pages; STOP by `POST /stop` works without one.
 MOST_PAGES = 64
+#: A page whose newest state was followed by another this long ago cannot jog, [s].
+BEHIND = 0.3
 STOPS_AT_ONCE = 4
 PRESSES_AT_ONCE = 4
 _POLICY = (
@@ -75,6 +79,7 @@ class ConsoleServer:
         self._state: dict[str, Any] = {}
         self._news = asyncio.Condition()
         self._seq = 0
+        self._made_at: deque[float] = deque(maxlen=round(2.0 * RATE))  # times of the newest states
         self._stops = ThreadPoolExecutor(STOPS_AT_ONCE, "cdpr-stop")
         self._presses = ThreadPoolExecutor(PRESSES_AT_ONCE, "cdpr-press")
         self._stopping: set[asyncio.Task[None]] = set()
@@ -121,6 +126,7 @@ class ConsoleServer:
                 self._state = await run_in_threadpool(self._console.update)
                 async with self._news:
                     self._seq += 1
+                    self._made_at.append(loop.time())
                     self._news.notify_all()
             await asyncio.sleep(max(0.005, began + 1.0 / RATE - loop.time()))
 
@@ -271,7 +277,12 @@ class ConsoleServer:
             inbox.refuse(0, str(error))
             return
         if isinstance(message, Held):
-            inbox.hold(self._console.held(number, message), message)
+            if (behind := self._behind(message.state)) <= BEHIND:
+                inbox.hold(self._console.held(number, message), message)
+                return
+            released = LetGo(kind="let_go", hold=message.hold)
+            inbox.let_go(self._console.let_go(number, released))
+            inbox.refuse(0, f"the connection is too slow to jog: {behind:.1f} s behind")
         elif isinstance(message, LetGo):
             inbox.let_go(self._console.let_go(number, message))
         elif message.command == "stop":
@@ -282,6 +293,17 @@ class ConsoleServer:
             inbox.refuse(message.id, "earlier commands of this page are not finished yet")
         else:
             inbox.commands.put_nowait(message)
+
+    def _behind(self, newest: int) -> float:
+        """How long ago the state was made that follows the newest one of a page, [s]; 0 if none.
+
+        By this computer's clock alone: it bounds the delay of the connection, there and back.
+        """
+        missed = self._seq - newest
+        if missed <= 0:  # or a state of another server
+            return 0.0 if missed == 0 else math.inf
+        oldest = max(-missed, -len(self._made_at))
+        return asyncio.get_running_loop().time() - self._made_at[oldest]
 
     async def _stop_and_answer(self, page: WebSocket, number: int, message: Message) -> None:
         why_not = await _run_in(self._stops, self._console.command, number, message)

@@ -71,7 +71,7 @@ class SimulatedPage:
 
     def message(self) -> str:
         """The last of these messages."""
-        message = {"kind": "held", "hold": self.hold, "seq": self.seq} | self.motion
+        message = {"kind": "held", "hold": self.hold, "seq": self.seq, "state": 1} | self.motion
         return json.dumps(message | {"step_mm": self.step, "speed_mm_s": self.speed})
 
 

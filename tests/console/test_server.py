@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import itertools
 import json
+import math
 import os
 import signal
 import socket
@@ -27,6 +28,7 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from cdpr.console import server
 from cdpr.console.commands import MOST_WAITING, Held, LetGo, parse_message
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
 from cdpr.console.session import Console, ConsoleFiles
@@ -132,6 +134,13 @@ def own_announcements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
+
+
+@pytest.fixture(autouse=True)
+def slow_connections_count(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only where a test is about them: the others' reports name any state."""
+    if "slow" not in request.node.name:
+        monkeypatch.setattr(server, "BEHIND", math.inf)
 
 
 @pytest.fixture
@@ -258,7 +267,7 @@ def test_messages_are_not_compressed(served: Served) -> None:
 REPORTS = itertools.count(1)
 
 
-def held(hold: int) -> str:
+def held(hold: int, newest: int = 1) -> str:
     return json.dumps(
         {
             "kind": "held",
@@ -268,6 +277,7 @@ def held(hold: int) -> str:
             "step_mm": None,
             "speed_mm_s": 5.0,
             "seq": next(REPORTS),
+            "state": newest,
         }
     )
 
@@ -539,7 +549,29 @@ def test_release_and_stop_wait_for_no_report_of_a_press(
 
 def held_cable(hold: int, **changes: object) -> str:
     word = {"kind": "held", "hold": hold, "cable": 3, "sense": "wind_in", "step_mm": None}
-    return json.dumps(word | {"speed_mm_s": 5.0, "seq": next(REPORTS)} | changes)
+    return json.dumps(word | {"speed_mm_s": 5.0, "seq": next(REPORTS), "state": 1} | changes)
+
+
+def test_a_press_over_a_slow_connection_is_ended_and_the_page_is_told(served: Served) -> None:
+    """What arrives is old, however regularly it arrives: the newest state that it names tells."""
+    with served.something_moves(), served.page() as page, served.page() as other:
+        command(page, "take_control")
+        old = state(page)["seq"]
+        while state(other)["seq"] < old + 10:  # half a second
+            pass
+        page.send(held(1, newest=old))
+        while (answer := json.loads(page.recv(timeout=10)))["kind"] != "answer":
+            newest = answer["seq"]
+        assert "too slow to jog" in answer["what"]
+        assert served.said == []
+        while (newest := state(page)["seq"]) < state(other)["seq"]:
+            pass
+        page.send(held(2, newest=newest))
+        assert said(served, page, ["held"])
+        page.send(held(2, newest=old))
+        assert said(served, page, ["held", "let_go"])
+        page.send(held(3, newest=newest + 10**6))
+        assert said(served, page, ["held", "let_go", "let_go"]), "no state of this server"
 
 
 def test_a_cable_is_moved_by_a_page_in_service_mode_only(served: Served) -> None:

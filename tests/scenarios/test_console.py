@@ -99,6 +99,7 @@ class Operator:
         word = {"kind": "held", "hold": self._press, "direction": direction, "frame": "world"}
         self._reports += 1
         word |= {"step_mm": None, "speed_mm_s": 20.0, "seq": self._reports}
+        word["state"] = self.state["seq"]
         self._page.send(json.dumps(word))
 
     def winds_in(self, cable: int, state: dict[str, Any]) -> float:
@@ -109,6 +110,7 @@ class Operator:
             self.press()
         word = {"kind": "held", "hold": self._press, "cable": cable, "sense": "wind_in"}
         word |= {"step_mm": None, "speed_mm_s": 2.0, "seq": self._reports}
+        word["state"] = self.state["seq"]
         self._page.send(json.dumps(word))
         return float(jog["press_mm"]) if jog["cable"] == cable else 0.0
 

@@ -1,6 +1,7 @@
 /* The connection to the server and the age of its data, on the page's monotonic clock.
 
-Nothing is queued: a message that cannot be sent now is never sent, and no motion continues after a reconnection.
+No message waits here: one that cannot be sent now is never sent, and no motion continues after a reconnection. The
+server ends the press of a page whose connection is slow, by the newest state that its reports name.
 Events: "state" (a new one), "age" (every 50 ms), "stale" (data became too old), "closed", "refused" (a message that
 the server rejected; `detail` gives the reason). */
 

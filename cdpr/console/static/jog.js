@@ -48,7 +48,7 @@ const panelOf = (motion) => (motion.direction ? "jog" : "cable");
  */
 export function bindJog(connection, situation, command) {
   const hold = new Hold({
-    send: (message) => connection.send(message),
+    send: (message) => connection.send(message.kind === "held" ? { ...message, state: connection.state.seq } : message),
     whyNot: (motion) => (document.hasFocus() && !document.hidden ? whyNot(panelOf(motion), situation()) : "this page does not have the focus"),
     settings: (motion) => {
       const panel = panelOf(motion);

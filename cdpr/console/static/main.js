@@ -104,7 +104,10 @@ function showAge() {
 }
 
 let waiting = false;
-connection.addEventListener("refused", ({ detail }) => say(detail, true));
+connection.addEventListener("refused", ({ detail }) => {
+  jog.end(detail);
+  say(detail, true);
+});
 connection.addEventListener("age", showAge);
 connection.addEventListener("state", () => {
   if (waiting) return;
