@@ -11,6 +11,7 @@ import pytest
 
 from drivers.cia402.state_machine import DriveState
 from executor.control.path_runs import Outcome
+from executor.recording import recorder
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
 from tests.scenarios.stage import Stage, path_indices, staged
@@ -174,3 +175,17 @@ def test_the_status_tells_what_happens(prepared: PreparedRun, tmp_path: Path) ->
     assert holding["wished"] == {"stop": False, "hold": True, "speed_percent": 100}
     assert 0.0 < moving["path_mm"] < holding["path_mm"] < holding["path_length_mm"]
     assert [event["code"] for event in holding["events"]] == ["enabled", "moving", "hold"]
+
+
+def test_parts_of_a_record_are_those_of_the_whole_and_an_hour_is_small(
+    prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever is allocated at a time; a rig may be held overnight."""
+    monkeypatch.setattr(recorder, "_CHUNK", 7)
+    (tmp_path / "run").mkdir()
+    log = run(prepared, tmp_path / "run")[1].log
+    whole = log.table().csv_rows(0).splitlines()
+    for first in (0, 1, 6, 7, 8, len(log) - 1, len(log)):
+        for end in {min(first + count, len(log)) for count in (0, 1, 7, 20)}:
+            assert log.table(first, end).csv_rows(first).splitlines() == whole[first:end]
+    assert sum(chunk.nbytes for chunk in log._chunks) / len(log) < 300.0
