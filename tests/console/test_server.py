@@ -226,6 +226,19 @@ def test_stop_ends_a_verb_that_is_still_being_prepared(verb: str) -> None:
     console.close()
 
 
+def test_a_session_of_jogs_that_is_still_being_prepared_ends_with_the_console() -> None:
+    console = Served().console
+    del console.verbs.start
+    console.watch.send = lambda *_, **__: "nothing moves"  # type: ignore[method-assign]
+    console.verbs.start("jog", ["--help"])
+    process = console.verbs._process
+    assert process is not None
+    os.kill(process.pid, signal.SIGSTOP)
+    console.close()
+    os.kill(process.pid, signal.SIGCONT)
+    assert process.wait() == -signal.SIGTERM
+
+
 def test_stop_leaves_what_moves_nothing_and_what_writes_its_report_alone() -> None:
     console = Served().console
     del console.verbs.start
