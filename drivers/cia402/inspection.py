@@ -105,11 +105,13 @@ class Examined:
         nodes: The drives that answered.
         silent: The drives that did not answer.
         rows: One per object.
+        stopped: The silent drives that are in NMT *stopped*, by their heartbeats.
     """
 
     nodes: tuple[int, ...]
     silent: tuple[int, ...]
     rows: tuple[ObjectRow, ...]
+    stopped: tuple[int, ...] = ()
 
     @property
     def good(self) -> bool:
@@ -121,6 +123,7 @@ class Examined:
         return {
             "answered": list(self.nodes),
             "silent": list(self.silent),
+            "stopped": list(self.stopped),
             "objects": [
                 {
                     "object": row.object,
@@ -175,7 +178,8 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         reader.at_position_range(settings)
         for_unused_pdos(profile, reader.at_unused)
     answered = tuple(node for node in all_nodes if node not in silent)
-    return Examined(answered, tuple(silent), tuple(rows.values()))
+    stopped = tuple(filter(network.is_stopped, silent))
+    return Examined(answered, tuple(silent), tuple(rows.values()), stopped)
 
 
 def _last_of_each(settings: Iterable[Setting]) -> list[Setting]:
@@ -410,13 +414,15 @@ def _how_without(index: int, sub: int) -> str:
 # Reads the state of CiA 402 drives by SDO without changing anything.
 
 
-def read_states(rig: Rig, bus: can.BusABC, pump: Pump | None) -> DriveSnapshot:
+def read_states(
+    rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: bool = False
+) -> DriveSnapshot:
     """Status word, position and torque of every drive; see `drivers.factory.read_drives`."""
     nodes = [winch.node_id for winch in rig.winches]
     timeout = profile_of(rig).sdo_timeout_ms / 1000.0
     network = SetupNetwork(bus, pump, nodes, timeout=timeout)
     network.discard_waiting()
-    require_answers(network, nodes)
+    require_answers(network, nodes, revive=to_reset)
     winch_map = WinchMap(rig)
 
     def read(index: int, name: str, size: int) -> list[int]:

@@ -434,6 +434,7 @@ def test_doctor_names_silent_drives_and_reads_the_others(rig: Rig) -> None:
     del bus.drives[2]
     found = examined(rig, bus)
     assert (found.silent, len(found.nodes), found.good) == ((2,), 7, False)
+    assert found.stopped == ()
 
 
 @pytest.mark.parametrize(("name", "millimetres"), [("cia402", 0.7), ("epos4", 2.1)])
