@@ -566,6 +566,69 @@ def test_while_one_drive_is_slow_to_enable_the_others_hold_and_do_not_sag(
     assert [d.state for d in bench.drives[:7]] == [HOLDING] * 7
 
 
+def without_power(drive: SimulatedDrive) -> None:
+    """Its mains is off, or safe torque off is active."""
+    drive.state = DriveState.SWITCH_ON_DISABLED
+    drive._command_shutdown = lambda: None  # type: ignore[method-assign]
+    drive.objects.measured(0x6041, 0, lambda: drive.status_word & ~0x10)
+
+
+def holding_but_one_without_power(bench: Bench) -> None:
+    """Seven drives hold as after a run, the eighth cannot be enabled."""
+    bench.group.configure()
+    for drive in bench.drives[:7]:
+        drive.state = HOLDING
+    without_power(bench.drives[7])
+    bench.group.read_positions()
+
+
+def test_a_drive_without_power_alone_is_named_where_the_others_wait_for_it(bench: Bench) -> None:
+    holding_but_one_without_power(bench)
+    bench.group.command(GroupCommand.ENABLE)
+    bench.until(GroupState.FAULT, limit=150)
+    assert bench.status is not None
+    ((node, text),) = bench.status.faults
+    assert node == 8
+    assert "voltage enabled" in text
+    assert 0x0F not in bench.control_words()
+
+
+@pytest.mark.parametrize("powered", [True, False])
+def test_a_drive_without_torque_does_not_keep_the_others_from_their_release(
+    bench: Bench, powered: bool
+) -> None:
+    """It gets none, and they lose theirs together."""
+    holding_but_one_without_power(bench)
+    last = bench.drives[7]
+    if powered:
+        del last._command_shutdown
+        last.objects.measured(0x6041, 0, lambda: last.status_word)
+    stood = [drive.motor.position for drive in bench.drives]
+    bench.group.command(GroupCommand.RELEASE)
+    for _ in range(30):
+        if bench.group.state is GroupState.RELEASED:
+            break
+        bench.cycle()
+        assert not last.torque_on
+        assert len({drive.torque_on for drive in bench.drives[:7]}) == 1
+    assert bench.group.state is GroupState.RELEASED
+    assert bench.status is not None
+    assert bench.status.faults == ()
+    assert [drive.motor.position for drive in bench.drives] == pytest.approx(stood, abs=1)
+
+
+def test_no_drive_is_enabled_for_a_release_while_the_state_of_one_is_unknown(bench: Bench) -> None:
+    holding_but_one_without_power(bench)
+    bench.drives[7].objects.measured(0x6041, 0, lambda: 0x0200)
+    bench.cycle()
+    bench.group.command(GroupCommand.RELEASE)
+    bench.until(GroupState.FAULT, limit=250)
+    assert bench.status is not None
+    assert [node for node, _ in bench.status.faults] == [8]
+    assert set(bench.control_words()) == {0x02, 0x06}
+    assert all(drive.state is HOLDING for drive in bench.drives[:7])
+
+
 def test_the_heartbeat_comes_from_the_loop(bench: Bench) -> None:
     """With it drives stay enabled; it is counted in cycles, so that a stuck loop sends none."""
     bench.enable()
