@@ -15,12 +15,9 @@ from drivers.can_errors import (
 )
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
-    BEFORE,
     MODE_DISPLAY,
     count_heartbeats,
-    expected_by,
-    identifiers,
-    identity,
+    expectations,
     number_text,
     require_absent,
     require_expected,
@@ -118,7 +115,7 @@ def configure_drives(
     refusals = Refusals()
     entries: list[int] = []
     for drive, node in enumerate(nodes):
-        for expected in (*BEFORE, *identifiers(node), *identity(rig), *expected_by(profile)):
+        for expected in expectations(rig, profile, node):
             refusals.note(require_expected, network, node, expected)
         refusals.note(require_idle, network, node, to_reset)
         for setting in settings[drive]:

@@ -37,13 +37,16 @@ class Expectation:
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
-#: Requirements of a drive before anything is written to it.
-BEFORE = (
+SUPPORTED_MODES = 0x6502
+_UNLISTED = "for a drive that has it unlisted, set csp_unlisted: true in its profile"
+
+_CSP_LISTED = Expectation(
+    *(SUPPORTED_MODES, 0, 0x80, 0x80, "supported drive modes"),
+    "bit 7 is cyclic synchronous position (CSP); Technosoft iPOS and Pilz PRBT do not have it;"
+    f" {_UNLISTED}",
+)
+_BEFORE = (
     Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are supported"),
-    Expectation(
-        *(0x6502, 0, 0x80, 0x80, "supported drive modes"),
-        "cyclic synchronous position (CSP), bit 7; Technosoft iPOS and Pilz PRBT do not have it",
-    ),
     Expectation(
         *(0x607E, 0, 0x80, 0, "polarity"),
         "bit 7 inverts positions but not torques; `direction` of the winch inverts both",
@@ -57,7 +60,7 @@ BEFORE = (
 )
 
 
-def identifiers(node: int) -> tuple[Expectation, ...]:
+def _identifiers(node: int) -> tuple[Expectation, ...]:
     """Identifiers on which a drive receives SYNC and sends emergencies; CiA 301, 7.5.2.
 
     Bit 30 of 1005h makes the drive send SYNC, bit 29 selects 29-bit identifiers.
@@ -73,7 +76,7 @@ def identifiers(node: int) -> tuple[Expectation, ...]:
     )
 
 
-def identity(rig: Rig) -> tuple[Expectation, ...]:
+def _identity(rig: Rig) -> tuple[Expectation, ...]:
     """Vendor and product that the rig file requires, if any (1018h)."""
     drives = rig.document.drives
     if not isinstance(drives, Cia402Document):
@@ -93,7 +96,13 @@ MODE_DISPLAY = Expectation(
 """Required mode after the configuration, or once enabled (`ProfileDocument`)."""
 
 
-def expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
+def expectations(rig: Rig, profile: ProfileDocument, node: int) -> tuple[Expectation, ...]:
+    """Requirements of a drive before anything is written to it."""
+    listed = () if profile.csp_unlisted else (_CSP_LISTED,)
+    return (*_BEFORE, *listed, *_identifiers(node), *_identity(rig), *_expected_by(profile))
+
+
+def _expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
     """Values that the profile requires and the program does not write, such as units."""
     return tuple(
         Expectation(*object_key(each.object), 0xFFFFFFFF, each.value, each.name, each.why)
@@ -103,16 +112,17 @@ def expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
 
 def how_to_set(expected: Expectation) -> str:
     """The next step for a wrong value."""
-    if expected.index == 0x6502:
-        return (
-            "none: a drive without cyclic synchronous position (CSP) cannot be used; Technosoft"
-            " iPOS and Pilz PRBT do not have it"
-        )
+    if expected.index == SUPPORTED_MODES:
+        return HOW_WITHOUT_CSP
     if expected.index in (0x1000, 0x1018):
         return "check the node id, and vendor_id and product_code of the rig file"
     return BY_MAKERS_TOOL
 
 
+HOW_WITHOUT_CSP = (
+    "use another drive if it has no cyclic synchronous position (CSP), as Technosoft iPOS and Pilz"
+    f" PRBT; {_UNLISTED}"
+)
 BY_MAKERS_TOOL = "set it with the manufacturer's tool and store it"
 
 
@@ -130,6 +140,7 @@ def require_expected(network: SetupNetwork, node: int, expected: Expectation) ->
     except Refused as error:
         if expected.optional and error.values.get("abort_code") not in (None, *NOT_NOW):
             return
+        error.why = error.why or f"required because: {expected.why}"
         raise
     value = int.from_bytes(data, "little")
     if value & expected.mask != expected.expected:

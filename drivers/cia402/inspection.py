@@ -13,17 +13,16 @@ import numpy as np
 from drivers.cia402.configure import is_still_set_up, require_answers
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
-    BEFORE,
     BY_MAKERS_TOOL,
+    HOW_WITHOUT_CSP,
     MODE_DISPLAY,
     NO_WRAP,
     POSITION_RANGE,
+    SUPPORTED_MODES,
     Expectation,
-    expected_by,
+    expectations,
     holds_limits,
     how_to_set,
-    identifiers,
-    identity,
     position_range,
 )
 from drivers.cia402.object_dictionary import (
@@ -163,7 +162,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         if node in silent:
             continue
         reader = _Reader(network, node, rows)
-        for expected in (*BEFORE, *identifiers(node), *identity(rig), *expected_by(profile)):
+        for expected in expectations(rig, profile, node):
             reader.at_expected(expected)
         reader.at_state()
         for index, form, name, why in _PROCESS_DATA:
@@ -402,6 +401,8 @@ _BESIDE = {
 
 def _how_without(index: int, sub: int) -> str:
     """The next step for a required object that is missing."""
+    if index == SUPPORTED_MODES:
+        return HOW_WITHOUT_CSP
     name = "1016h:01" if index == HEARTBEAT_CONSUMERS else object_name(index, sub)
     if name not in OBJECTS or name in NEEDED:
         return "use another drive or firmware: no profile can replace it"

@@ -168,6 +168,11 @@ class ProfileDocument(Document):
         default=[],
         description="EMCY codes of warnings with which the drive stays enabled; x is any digit",
     )
+    csp_unlisted: bool = Field(
+        default=False,
+        description="the drive has cyclic synchronous position, although 6502h is absent or its"
+        " bit 7 is 0; 6061h = 8 shows it",
+    )
     mode_display_when_enabled: bool = Field(
         default=False, description="6061h shows the mode only once the drive is enabled"
     )

@@ -271,6 +271,45 @@ def test_drives_without_csp_are_refused_with_the_reason(rig: Rig) -> None:
     assert not downloads(bus)
 
 
+def modes_of_a_real_epos4(bus: ScriptedBus) -> None:
+    """SDO trace in github.com/ros-industrial/ros2_canopen issue 236."""
+    for drive in bus.drives.values():
+        drive.values[0x6502, 0] = 0x225
+
+
+def no_modes(bus: ScriptedBus) -> None:
+    for drive in bus.drives.values():
+        drive.aborts[0x6502, 0] = 0x06020000
+
+
+@pytest.mark.parametrize("unlisted", [modes_of_a_real_epos4, no_modes])
+def test_a_drive_that_runs_csp_without_listing_it_needs_a_key_of_its_profile(
+    rig: Rig, unlisted: Callable[[ScriptedBus], None]
+) -> None:
+    bus = eight_of("cia402")
+    unlisted(bus)
+    (row,) = (row for row in examined(rig, bus).rows if row.verdict == "wrong")
+    assert "csp_unlisted" in row.change
+    with pytest.raises(Refused, match="csp_unlisted") as caught:
+        set_up(rig, bus)
+    assert "6502h" in str(caught.value)
+    assert not downloads(bus)
+    theirs = with_profile(rig, "epos4")
+    bus = eight_of("epos4")
+    unlisted(bus)
+    assert examined(theirs, bus).good
+    set_up(theirs, bus)
+
+
+def test_a_drive_said_to_run_csp_must_show_it(rig: Rig) -> None:
+    bus = eight_of("epos4")
+    bus.drives[6].mode_late = 1000  # 6061h stays 0
+    with pytest.raises(Refused, match="drive has 0h; 8h is required"):
+        set_up(with_profile(rig, "epos4"), bus)
+    starts = [m for m in bus.sent if m.arbitration_id == 0 and m.data[0] == 0x01]
+    assert not starts, "no drive is started"
+
+
 @pytest.mark.parametrize("late", [0, 1, 9])
 def test_a_mode_that_shows_late_is_waited_for(rig: Rig, late: int) -> None:
     bus = eight_of("cia402")
@@ -346,7 +385,7 @@ def test_doctor_reports_all_objects_of_all_drives_and_writes_nothing(rig: Rig) -
     assert wrong["1006h:00"].found == {"absent": list(range(1, 9))}
     assert wrong["1006h:00"].change.endswith("epos4")
     assert (
-        wrong["6502h:00"].found_text(found.nodes) == "drive 1, 2, 3, 4, 5, 6, 8: 3A5h; drive 7: 65h"
+        wrong["6502h:00"].found_text(found.nodes) == "drive 1, 2, 3, 4, 5, 6, 8: 225h; drive 7: 65h"
     )
     assert not downloads(bus)
     assert not [m for m in bus.sent if m.arbitration_id < 0x600], "no NMT, no SYNC, no heartbeat"
