@@ -37,7 +37,7 @@ from drivers.cia402.object_dictionary import (
 )
 from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.profile import for_unused_pdos, profile_of, used_pdos
-from drivers.cia402.sdo import NOT_NOW, SetupNetwork, silent
+from drivers.cia402.sdo import NOT_NOW, SetupNetwork, means_absent, silent
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.drive_group import OnRestarted, Pump
 from model.errors import HardwareMissing, Refused
@@ -381,9 +381,9 @@ def _identifier_if_there(
     try:
         return int.from_bytes(network.client(node).read(index, 1, "PDO identifier"), "little")
     except Refused as error:
-        code = error.values.get("abort_code")
-        if code is None or code in NOT_NOW:
+        if not means_absent(error):
             raise
+        code = error.values["abort_code"]
         if code not in OBJECT_DOES_NOT_EXIST:
             remarks.append(
                 f"the drive refuses {index:04X}h:01 PDO identifier ({abort_text(int(code))}):"

@@ -10,8 +10,8 @@ import can
 
 from drivers.can_errors import in_fault, moved_by_another, wrong_setting
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
-from drivers.cia402.sdo import NOT_NOW, SetupNetwork
-from drivers.cia402.sdo_jobs import CSP_MODE, OBJECT_DOES_NOT_EXIST
+from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent
+from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
 from drivers.drive_group import Pump
 from model.errors import CdprError, Refused
@@ -138,7 +138,7 @@ def require_expected(network: SetupNetwork, node: int, expected: Expectation) ->
     try:
         data = network.client(node).read(expected.index, expected.sub, expected.name)
     except Refused as error:
-        if expected.optional and error.values.get("abort_code") not in (None, *NOT_NOW):
+        if expected.optional and means_absent(error):
             return
         error.why = error.why or f"required because: {expected.why}"
         raise
@@ -207,7 +207,8 @@ def require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
     try:
         network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
     except Refused as error:
-        if error.values.get("abort_code") in OBJECT_DOES_NOT_EXIST:
+        # The others would be noticed only when limits have been changed.
+        if error.values.get("abort_code") not in (WRITE_ONLY, *NOT_NOW):
             raise
 
 
@@ -220,7 +221,7 @@ def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
     try:
         data = network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
     except Refused as error:
-        if error.values.get("abort_code") in (None, *NOT_NOW):
+        if not means_absent(error):
             raise
         return
     if not setting.is_kept(data):

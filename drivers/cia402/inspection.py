@@ -32,7 +32,7 @@ from drivers.cia402.object_dictionary import (
     stated_absent,
 )
 from drivers.cia402.profile import for_unused_pdos, load_profile, profile_names, profile_of
-from drivers.cia402.sdo import SetupNetwork
+from drivers.cia402.sdo import WRITE_ONLY, SetupNetwork
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power
 from drivers.drive_group import DriveSnapshot, Pump
@@ -44,7 +44,6 @@ from model.winches import WinchMap
 
 Verdict = Literal["ok", "remark", "wrong"]
 
-WRITE_ONLY = 0x06010001
 MOST_VALUES = 3
 """Largest number of distinct values listed per object."""
 
@@ -295,7 +294,9 @@ class _Reader:
         except Refused as error:
             if "abort_code" not in error.values:
                 raise
-            found = None
+            text = f"refused: {abort_text(int(error.values['abort_code']))}"
+            row.note(self._node, text, "wrong", "see the drive's manual")
+            return
         good = holds_limits(found, settings)
         change = "" if good else BY_MAKERS_TOOL
         row.note(self._node, str(found or "none"), "ok" if good else "wrong", change)

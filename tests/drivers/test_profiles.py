@@ -343,6 +343,43 @@ def test_an_optional_object_that_is_refused_is_a_remark(rig: Rig, code: int) -> 
     assert len(remarks) == len(OPTIONAL)
 
 
+@pytest.mark.parametrize("code", ABORTS, ids=hex)
+def test_a_drive_without_a_position_range_has_none_whatever_code_says_so(
+    rig: Rig, code: int
+) -> None:
+    bus = eight_of("cia402")
+    bus.drives[3].aborts |= {(0x607B, 1): code, (0x607B, 2): code}
+    assert examined(rig, bus).good
+    assert set_up(rig, bus) == ()
+
+
+@pytest.mark.parametrize("code", [0x05040000, *sorted(NOT_NOW)], ids=hex)
+def test_a_position_range_that_cannot_be_read_now_is_not_taken_for_none(
+    rig: Rig, code: int
+) -> None:
+    bus = eight_of("cia402")
+    bus.drives[3].aborts[0x607B, 2] = code
+    assert [row.object[:5] for row in examined(rig, bus).rows if row.verdict == "wrong"] == [
+        "607Bh"
+    ]
+    with pytest.raises(Refused, match="607Bh"):
+        set_up(rig, bus)
+    assert not downloads(bus)
+
+
+@pytest.mark.parametrize("key", [(0x6065, 0), (0x607D, 1)], ids=str)
+@pytest.mark.parametrize("code", ABORTS, ids=hex)
+def test_a_required_object_that_is_missing_is_refused_before_anything_is_written(
+    rig: Rig, key: tuple[int, int], code: int
+) -> None:
+    bus = eight_of("cia402")
+    bus.drives[3].aborts[key] = code
+    assert not examined(rig, bus).good
+    with pytest.raises(Refused, match=f"drive 3, object {key[0]:04X}h"):
+        set_up(rig, bus)
+    assert not downloads(bus)
+
+
 @pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
 @pytest.mark.parametrize("code", ABORTS, ids=hex)
 def test_a_pdo_that_is_not_used_may_be_refused_with_any_code(
