@@ -19,7 +19,7 @@ import can
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 
-from drivers.can_errors import bus_fault
+from drivers.can_errors import bus_fault, bus_name
 from model.errors import BadInput, HardwareMissing
 from model.rig import Rig
 
@@ -316,11 +316,6 @@ def receive_frame(bus: can.BusABC, timeout: float) -> can.Message | None:
         return bus.recv(timeout)
     except Exception as error:  # back ends raise errors of their own libraries
         raise bus_fault("the bus cannot be read", bus_name(bus), error) from error
-
-
-def bus_name(bus: can.BusABC) -> str:
-    """Name of the bus for messages."""
-    return f"bus {bus.channel_info}"
 
 
 # Distinguishes this master's frames from those of another master. No bus.

@@ -17,7 +17,7 @@ from math import ceil
 
 import can
 
-from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, receive_frame, transmit
+from drivers.can_bus import EchoFilter, echoes_own_frames, receive_frame, transmit
 from drivers.can_errors import SETTING_UP, ForeignMaster, error_frame_fault
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import (
@@ -181,7 +181,9 @@ class SetupNetwork:
         if message is None:
             return False
         if message.is_error_frame:
-            self._judge_error(message)
+            fault = error_frame_fault(self._bus, message)
+            if fault is not None:
+                raise fault
         elif not (message.is_remote_frame or message.is_extended_id):
             self._refuse_foreign(message.arbitration_id)
             node = message.arbitration_id - HEARTBEAT_BASE
@@ -198,12 +200,6 @@ class SetupNetwork:
         while (left := deadline - self.clock()) > 0.0:
             if not self.process_frame(left) and self._pump is not None:
                 return
-
-    def _judge_error(self, message: can.Message) -> None:
-        where = bus_name(self._bus)
-        fault = error_frame_fault(message.arbitration_id, message.data, where)
-        if fault is not None:
-            raise fault
 
     def _refuse_foreign(self, can_id: int) -> None:
         if self._own.is_foreign(can_id):

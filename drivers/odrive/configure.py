@@ -12,7 +12,6 @@ import can
 from drivers.can_bus import (
     EchoFilter,
     SentFrame,
-    bus_name,
     echoes_own_frames,
     receive_frame,
     transmit,
@@ -21,6 +20,7 @@ from drivers.can_errors import (
     SETTING_UP,
     ForeignMaster,
     answers_twice,
+    bus_name,
     error_frame_fault,
     in_fault,
     moved_by_another,
@@ -128,9 +128,7 @@ class SetupLink:
         for left in self._waits(timeout):
             while (message := receive_frame(self._bus, left)) is not None:
                 if message.is_error_frame:
-                    fault = error_frame_fault(
-                        message.arbitration_id, message.data, bus_name(self._bus)
-                    )
+                    fault = error_frame_fault(self._bus, message)
                     if fault is not None:
                         raise fault
                 elif not (message.is_extended_id or message.is_remote_frame):
