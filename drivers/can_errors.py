@@ -241,7 +241,7 @@ def in_fault(node: int, what: str, where: str, why: str) -> Refused:
 
 
 def wrong_setting(
-    node: int, setting: str, found: str, wanted: str, why: str, manual: str
+    node: int, setting: str, found: str, wanted: str, why: str, next_step: str
 ) -> Refused:
     """A drive holds a wrong value of a setting.
 
@@ -251,19 +251,24 @@ def wrong_setting(
         found: Value in the drive.
         wanted: Required value.
         why: Reason for the required value.
-        manual: Document that describes the setting.
+        next_step: What the user can do now.
     """
     return Refused(
         f"the drive has {found}; {wanted} is required",
         where=f"drive {node}, {setting}",
         why=f"required because: {why}",
-        next_step=f"see {manual}; the drives were not changed",
+        next_step=next_step,
         values={"node": node, "object": setting, "found": found, "wanted": wanted},
     )
 
 
-def combined_refusal(refusals: Sequence[Refused]) -> Refused:
-    """One refusal that lists all others, with equal ones of several drives merged."""
+def combined_refusal(refusals: Sequence[Refused], left: str) -> Refused:
+    """One refusal that lists all others, with equal ones of several drives merged.
+
+    Args:
+        refusals: Of the drives; at least one.
+        left: The state that the drives are left in.
+    """
     nodes: dict[str, list[str]] = {}
     for each in refusals:
         node = str(each.values.get("node", ""))
@@ -274,6 +279,7 @@ def combined_refusal(refusals: Sequence[Refused]) -> Refused:
             listed.append(node)
     drives = {node for each in nodes.values() for node in each}
     if len(nodes) == len(drives) == 1:
+        refusals[0].next_step = f"{refusals[0].next_step}; {left}"
         return refusals[0]
     found = "".join(f"\n  drive {', '.join(each)}, {text}" for text, each in nodes.items())
     return Refused(
@@ -281,6 +287,6 @@ def combined_refusal(refusals: Sequence[Refused]) -> Refused:
         f" drive{'s' if len(drives) > 1 else ''} have unsuitable values:{found}",
         where=SETTING_UP,
         next_step="compare with the drive's manual; `cdpr doctor RIG --drives` lists every object,"
-        " and drives.profile of the rig file describes the drives",
+        f" and drives.profile of the rig file describes the drives; {left}",
         values={"nodes": ", ".join(sorted(drives)), "count": len(nodes)},
     )

@@ -58,6 +58,12 @@ MODE_ASKED = 10
 READ_ONLY = frozenset({0x06010000, 0x06010002})
 """Abort codes of a read-only object, whose fixed value may be the required one."""
 
+UNCHANGED = "the drives were not changed"
+UNFINISHED = (
+    "the set-up was not finished: the drives are in NMT pre-operational with part of their"
+    " settings, and none is enabled"
+)
+
 PDO_OBJECTS = 0xF9FF
 """Mask that maps a PDO's parameters (1400h, 1800h) and mapping (1600h, 1A00h) to one index."""
 
@@ -124,7 +130,7 @@ def configure_drives(
             refusals.note(require_absent, network, node, setting)
         refusals.note(require_no_wrap, network, node, settings[drive])
         refusals.note(count_heartbeats, network, node, profile, entries)
-    refusals.raise_any()
+    refusals.raise_any(UNCHANGED)
     _refuse_duplicates(network)
     on_restarted(
         tuple(n for n, s in zip(nodes, settings, strict=True) if not is_still_set_up(network, n, s))
@@ -139,11 +145,11 @@ def configure_drives(
         _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), refusals)
         for remark in refused:
             absent.setdefault(remark, []).append(node)
-    refusals.raise_any()  # before waiting for a mode that was refused
+    refusals.raise_any(UNFINISHED)  # before waiting for a mode that was refused
     if not profile.mode_display_when_enabled:
         for node in nodes:
             refusals.note(_await_mode, network, node)
-    refusals.raise_any()
+    refusals.raise_any(UNFINISHED)
     for node in nodes:
         network.command(NmtCommand.START, node)
     network.process_waiting()
@@ -176,14 +182,17 @@ class Refusals:
             return False
         return True
 
-    def raise_any(self) -> None:
+    def raise_any(self, left: str) -> None:
         """Raises if a refusal was recorded.
+
+        Args:
+            left: The state that the drives are left in.
 
         Raises:
             Refused: With all recorded refusals.
         """
         if self._found:
-            raise combined_refusal(self._found)
+            raise combined_refusal(self._found, left)
 
 
 def is_still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> bool:

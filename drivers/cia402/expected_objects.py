@@ -91,7 +91,9 @@ def _identity(rig: Rig) -> tuple[Expectation, ...]:
 
 
 MODE_DISPLAY = Expectation(
-    0x6061, 0, 0xFF, CSP_MODE, "mode of operation display", "the mode must be active"
+    *(0x6061, 0, 0xFF, CSP_MODE, "mode of operation display"),
+    "the mode must be active; for a drive that shows it only once enabled, set"
+    " mode_display_when_enabled: true in its profile",
 )
 """Required mode after the configuration, or once enabled (`ProfileDocument`)."""
 
@@ -280,7 +282,7 @@ def number_text(data: bytes, form: str) -> str:
 
 def wrong_value(node: int, name: str, found: str, wanted: str, why: str) -> Refused:
     """An object of a drive holds a wrong value."""
-    return wrong_setting(node, f"object {name}", found, wanted, why, "the drive's manual")
+    return wrong_setting(node, f"object {name}", found, wanted, why, "see the drive's manual")
 
 
 # Whether drives identify themselves as simulated.

@@ -54,7 +54,7 @@ _PROCESS_DATA = (
     (0x607A, "<i", "target position", "set-points"),
     (0x6064, "<i", "position actual value", "replies"),
     (0x6077, "<h", "torque actual value", "tension of the cable"),
-    (MODE_DISPLAY.index, "<b", MODE_DISPLAY.name, MODE_DISPLAY.why),
+    (MODE_DISPLAY.index, "<b", MODE_DISPLAY.name, "the mode must be active"),
 )
 
 

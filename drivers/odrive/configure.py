@@ -349,7 +349,8 @@ def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wante
             f"{endpoint.from_raw(int(reported)):g}",
             f"{wanted.value:g}",
             wanted.why,
-            "ODrive's API reference",
+            "see ODrive's API reference; the set-up was not finished: the axes are idle, with part"
+            " of their settings",
         )
     raise HardwareMissing(
         f"drive {node} does not report {endpoint.name}",

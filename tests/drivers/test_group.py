@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import can
 import numpy as np
@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.cia402.object_dictionary import PDO_NO_RTR, Setting, settings_for
+from drivers.cia402.pdo import NmtState
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import GroupCommand, GroupState
@@ -240,6 +241,44 @@ def test_every_object_that_is_not_kept_refuses_to_arm(bench: Bench) -> None:
         assert f"drive 6, object {key[0]:04X}h:{key[1]:02X}" in caught.value.where
         assert "is required" in caught.value.what
         assert bench.group.state is GroupState.OFFLINE
+
+
+def stuck_mode(drive: SimulatedDrive) -> None:
+    drive.objects.measured(0x6061, 0, lambda: 0)
+
+
+def clamped_ramp(drive: SimulatedDrive) -> None:
+    write = drive.objects.changed
+
+    def clamp(key: tuple[int, int], value: int) -> None:
+        if key == (0x6085, 0):
+            drive.objects.note(key, min(value, 1000))
+        write(key, value)
+
+    drive.objects.changed = clamp
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [(stuck_mode, "mode_display_when_enabled"), (clamped_ramp, "the drive has 1000")],
+)
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_refusal_says_whether_the_drives_were_changed(
+    bench: Bench, wrong: Callable[[SimulatedDrive], None], said: str, count: int
+) -> None:
+    bench.drives[7].objects[0x607C, 0] = 1  # refused before anything is written
+    with pytest.raises(Refused) as caught:
+        bench.group.configure()
+    assert "the drives were not changed" in caught.value.next_step
+    bench.drives[7].objects[0x607C, 0] = 0
+    for drive in bench.drives[:count]:
+        wrong(drive)
+    with pytest.raises(Refused) as caught:
+        bench.group.configure()
+    assert said in str(caught.value)
+    assert "not changed" not in str(caught.value)
+    assert "not finished: the drives are in NMT pre-operational" in caught.value.next_step
+    assert {drive.nmt for drive in bench.drives} == {NmtState.PRE_OPERATIONAL}
 
 
 def test_every_object_that_is_refused_refuses_to_arm(bench: Bench) -> None:
