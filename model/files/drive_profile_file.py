@@ -142,8 +142,8 @@ class ProfileDocument(Document):
     )
     monitoring: Literal["sync", "heartbeat"] = Field(
         default="sync",
-        description="what stops a drive whose master is gone; heartbeat: it has no 1006h, or must"
-        " not use it, since it removes torque without SYNC",
+        description="what stops a drive whose master is gone; heartbeat: it has no 1006h, does not"
+        " detect missing SYNC by it, or removes torque without SYNC",
     )
     sync_timeout_periods: Annotated[float, Field(ge=1.1, le=10.0)] = Field(
         default=3.0,

@@ -513,12 +513,16 @@ def test_doctor_names_silent_drives_and_reads_the_others(rig: Rig) -> None:
     assert found.stopped == ()
 
 
-@pytest.mark.parametrize(("name", "millimetres"), [("cia402", 0.7), ("epos4", 2.1)])
+@pytest.mark.parametrize(
+    ("name", "noticed_by", "millimetres"),
+    [("cia402", "SYNC", 0.7), *((make, "heartbeat", 2.1) for make in MAKERS)],
+)
 def test_without_sync_monitoring_the_platform_goes_further(
-    rig: Rig, name: str, millimetres: float
+    rig: Rig, name: str, noticed_by: str, millimetres: float
 ) -> None:
     """Heartbeat 100 ms, SYNC 30 ms, both with a ramp of one cycle, at 20 mm/s."""
     theirs = with_profile(rig, name)
+    assert lost_master(theirs).noticed_by == noticed_by
     distance = lost_master(theirs).distance
     assert distance == pytest.approx(millimetres / 1000.0)
     require_stopping_room(theirs, distance)
