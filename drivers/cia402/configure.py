@@ -142,9 +142,10 @@ def configure_drives(
         refused: list[str] = []  # switched off before another PDO takes its identifier
         refusals.note(_switch_off_unused, network, node, profile, refused)
         refused += _write_all(network, node, settings[drive], refusals)
-        _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), refusals)
         for remark in refused:
             absent.setdefault(remark, []).append(node)
+    for drive, node in enumerate(nodes):  # last: by now all peers send at their new period
+        _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), refusals)
     refusals.raise_any(UNFINISHED)  # before waiting for a mode that was refused
     if not profile.mode_display_when_enabled:
         for node in nodes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import can
 import numpy as np
@@ -21,6 +22,7 @@ from drivers.factory import make_drive_group
 from model.errors import Fault, HardwareMissing, Refused
 from model.files.rig_file import RigDocument
 from model.rig import rig_from_document
+from simulation.drives.behaviour import STRICT
 from simulation.drives.cia402 import SimulatedDrive
 from tests.drivers.drive_bench import Bench
 
@@ -105,6 +107,21 @@ def test_drives_that_were_listed_in_another_order_are_set_up_again(bench: Bench)
     make_drive_group(other, bench.group._bus, bench.rehearsal.pump).configure()
     assert bench.drives[0].objects[0x1016, 2] >> 16 == 6
     assert before >> 16 == 2
+
+
+def test_heartbeats_are_watched_only_once_all_drives_send_them_in_time(bench: Bench) -> None:
+    """Peers that still sent one per second were missed, EMCY 8130h, while they were set up."""
+    bench.rehearsal.behaviour = slow = replace(STRICT, sdo_delay=0.02)
+    sent: list[int] = []
+    for drive in bench.drives:
+        drive.behaviour = slow
+        drive.power_on()
+        drive.objects[0x1017, 0] = 1000
+        send = drive._bus_send
+        drive._bus_send = lambda i, d, send=send: (sent.append(i), send(i, d))
+    bench.group.configure()
+    assert not [identifier for identifier in sent if 0x80 < identifier < 0x100]
+    assert {drive.objects[0x1016, 8] & 0xFFFF for drive in bench.drives} == {100}
 
 
 def test_a_drive_may_need_some_time_until_it_answers_sync(bench: Bench) -> None:
