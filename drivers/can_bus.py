@@ -131,10 +131,18 @@ def open_bus(settings: BusSettings) -> can.BusABC:
     """Opens a bus; the caller shuts it down.
 
     Raises:
-        BadInput: python-can has no such interface, or the channel is not one of its channels.
+        BadInput: python-can has no such interface, it cannot be used, or the channel is not one
+            of its channels.
         HardwareMissing: It cannot be opened.
     """
-    known = sorted(can.VALID_INTERFACES)
+    known = sorted(set(can.VALID_INTERFACES) - {"gs_usb"})
+    if settings.interface == "gs_usb":
+        raise BadInput(
+            "the CAN interface 'gs_usb' cannot be used",
+            where="bus.interface",
+            why="python-can's back end gives a sender its own frames and hides failures of reading",
+            next_step="use the kernel driver of the same name: interface: socketcan, channel: can0",
+        )
     if settings.interface not in known:
         raise BadInput(
             f"unknown CAN interface {settings.interface!r}",
