@@ -19,7 +19,7 @@ import can
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 
-from drivers.can_errors import bus_fault
+from drivers.can_errors import bus_fault, bus_name
 from model.errors import BadInput, HardwareMissing
 from model.rig import Rig
 
@@ -134,10 +134,18 @@ def open_bus(settings: BusSettings) -> can.BusABC:
     """Opens a bus; the caller shuts it down.
 
     Raises:
-        BadInput: python-can has no such interface, or the channel is not one of its channels.
+        BadInput: python-can has no such interface, it cannot be used, or the channel is not one
+            of its channels.
         HardwareMissing: It cannot be opened.
     """
-    known = sorted(can.VALID_INTERFACES)
+    known = sorted(set(can.VALID_INTERFACES) - {"gs_usb"})
+    if settings.interface == "gs_usb":
+        raise BadInput(
+            "the CAN interface 'gs_usb' cannot be used",
+            where="bus.interface",
+            why="python-can's back end gives a sender its own frames and hides failures of reading",
+            next_step="use the kernel driver of the same name: interface: socketcan, channel: can0",
+        )
     if settings.interface not in known:
         raise BadInput(
             f"unknown CAN interface {settings.interface!r}",
@@ -319,11 +327,6 @@ def receive_frame(bus: can.BusABC, timeout: float) -> can.Message | None:
         return bus.recv(timeout)
     except Exception as error:  # back ends raise errors of their own libraries
         raise bus_fault("the bus cannot be read", bus_name(bus), error) from error
-
-
-def bus_name(bus: can.BusABC) -> str:
-    """Name of the bus for messages."""
-    return f"bus {bus.channel_info}"
 
 
 # Distinguishes this master's frames from those of another master. No bus.

@@ -7,6 +7,11 @@ from collections.abc import Sequence
 from enum import IntFlag
 from typing import ClassVar
 
+import can
+from can.interfaces.socketcan import SocketcanBus
+from can.interfaces.udp_multicast import UdpMulticastBus
+from can.interfaces.virtual import VirtualBus
+
 from model.errors import Fault, Refused
 
 
@@ -87,6 +92,11 @@ class ForeignMaster(BusFault):
     remedy = "end the other program, or wait for its run to finish"
 
 
+def bus_name(bus: can.BusABC) -> str:
+    """Name of the bus for messages."""
+    return f"bus {bus.channel_info}"
+
+
 SOCKET_FULL = "Transmit buffer full"
 """python-can's message, without an error number, for a full socket."""
 
@@ -115,9 +125,11 @@ def bus_fault(what: str, where: str, error: Exception) -> BusFault:
 
 # Error frames of CAN controllers: meaning, and when they end a run. Pure.
 #
-# Source: Linux, include/uapi/linux/can/error.h. Other back ends of python-can give error frames
-# without a class; these count as errors on the bus.
+# Source: Linux, include/uapi/linux/can/error.h. Other back ends of python-can give error frames the
+# codes of their makers, such as 4 for a stuff error (PCAN-Basic); these count as errors on the bus.
 
+WITH_CLASSES = (SocketcanBus, UdpMulticastBus, VirtualBus)
+"""SocketCAN, and the buses between programs, which carry its frames."""
 
 ERROR_CYCLES = 10
 """Consecutive cycles with error frames that end a run: retransmissions would delay a stop."""
@@ -138,14 +150,16 @@ class ControllerState(IntFlag):
     TRANSMIT_PASSIVE = 0x20
 
 
-def error_frame_fault(identifier: int, data: bytes | bytearray, where: str) -> BusFault | None:
+def error_frame_fault(bus: can.BusABC, frame: can.Message) -> BusFault | None:
     """The fault reported by an error frame; None if the controller recovers on its own.
 
     Args:
-        identifier: Of the error frame, without its flags.
-        data: Eight bytes, or empty.
-        where: The bus.
+        bus: That gave the frame.
+        frame: The error frame, with eight data bytes or none.
     """
+    if not isinstance(bus, WITH_CLASSES):
+        return None
+    identifier, data, where = frame.arbitration_id, frame.data, bus_name(bus)
     if identifier & ErrorClass.BUS_OFF:
         return BusOff("the controller went bus-off", where)
     if not identifier & ErrorClass.CONTROLLER or len(data) < 2:
@@ -164,18 +178,18 @@ class ErrorFrames:
         total: Number of all error frames.
     """
 
-    def __init__(self, where: str) -> None:
-        """Takes the name of the bus for messages."""
+    def __init__(self, bus: can.BusABC) -> None:
+        """Takes the bus."""
         self.total = 0
-        self._where = where
+        self._bus = bus
         self._now = 0
         self._in_a_row = 0
 
-    def take(self, identifier: int, data: bytes | bytearray) -> BusFault | None:
+    def take(self, frame: can.Message) -> BusFault | None:
         """Counts an error frame; returns the fault it reports, if any."""
         self.total += 1
         self._now += 1
-        return error_frame_fault(identifier, data, self._where)
+        return error_frame_fault(self._bus, frame)
 
     def end_cycle(self) -> BusFault | None:
         """Ends a cycle; returns a fault if errors persist."""
@@ -184,7 +198,7 @@ class ErrorFrames:
         if self._in_a_row < ERROR_CYCLES:
             return None
         what = f"error frames in {self._in_a_row} cycles in a row, {self.total} in all"
-        return BusErrors(what, self._where, {"error_frames": self.total})
+        return BusErrors(what, bus_name(self._bus), {"error_frames": self.total})
 
 
 # Refusals of the configuration, independent of the protocol.
@@ -227,7 +241,7 @@ def in_fault(node: int, what: str, where: str, why: str) -> Refused:
 
 
 def wrong_setting(
-    node: int, setting: str, found: str, wanted: str, why: str, manual: str
+    node: int, setting: str, found: str, wanted: str, why: str, next_step: str
 ) -> Refused:
     """A drive holds a wrong value of a setting.
 
@@ -237,19 +251,24 @@ def wrong_setting(
         found: Value in the drive.
         wanted: Required value.
         why: Reason for the required value.
-        manual: Document that describes the setting.
+        next_step: What the user can do now.
     """
     return Refused(
         f"the drive has {found}; {wanted} is required",
         where=f"drive {node}, {setting}",
         why=f"required because: {why}",
-        next_step=f"see {manual}; the drives were not changed",
+        next_step=next_step,
         values={"node": node, "object": setting, "found": found, "wanted": wanted},
     )
 
 
-def combined_refusal(refusals: Sequence[Refused]) -> Refused:
-    """One refusal that lists all others, with equal ones of several drives merged."""
+def combined_refusal(refusals: Sequence[Refused], left: str) -> Refused:
+    """One refusal that lists all others, with equal ones of several drives merged.
+
+    Args:
+        refusals: Of the drives; at least one.
+        left: The state that the drives are left in.
+    """
     nodes: dict[str, list[str]] = {}
     for each in refusals:
         node = str(each.values.get("node", ""))
@@ -260,6 +279,7 @@ def combined_refusal(refusals: Sequence[Refused]) -> Refused:
             listed.append(node)
     drives = {node for each in nodes.values() for node in each}
     if len(nodes) == len(drives) == 1:
+        refusals[0].next_step = f"{refusals[0].next_step}; {left}"
         return refusals[0]
     found = "".join(f"\n  drive {', '.join(each)}, {text}" for text, each in nodes.items())
     return Refused(
@@ -267,6 +287,6 @@ def combined_refusal(refusals: Sequence[Refused]) -> Refused:
         f" drive{'s' if len(drives) > 1 else ''} have unsuitable values:{found}",
         where=SETTING_UP,
         next_step="compare with the drive's manual; `cdpr doctor RIG --drives` lists every object,"
-        " and drives.profile of the rig file describes the drives",
+        f" and drives.profile of the rig file describes the drives; {left}",
         values={"nodes": ", ".join(sorted(drives)), "count": len(nodes)},
     )

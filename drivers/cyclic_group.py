@@ -11,13 +11,19 @@ import can
 
 from drivers.can_bus import (
     EchoFilter,
-    bus_name,
     echoes_own_frames,
     lost_frames,
     receive_frame,
     transmit,
 )
-from drivers.can_errors import SETTING_UP, BusFault, ErrorFrames, ForeignMaster, ReceiveOverflow
+from drivers.can_errors import (
+    SETTING_UP,
+    BusFault,
+    ErrorFrames,
+    ForeignMaster,
+    ReceiveOverflow,
+    bus_name,
+)
 from drivers.can_load import check_bus_load
 from drivers.drive_group import WHOLE_BUS, CycleStatus, GroupState, Pump
 from drivers.plausibility import largest_steps
@@ -67,7 +73,7 @@ class CyclicBus:
         self._bus, self._where = bus, bus_name(bus)
         self._own = EchoFilter(commanding, echoes_own_frames=echoes_own_frames(bus))
         self._foreign_master_message = foreign_master_message
-        self._errors = ErrorFrames(self._where)
+        self._errors = ErrorFrames(bus)
         self._lost = lost_frames(bus)
         self._found: list[BusFault] = []
         self._raised: set[str] = set()
@@ -163,7 +169,7 @@ class CyclicBus:
 
     def _process(self, message: can.Message, listener: ReplyListener, *, stale: bool) -> None:
         if message.is_error_frame:
-            self._find(self._errors.take(message.arbitration_id, message.data))
+            self._find(self._errors.take(message))
         elif message.is_extended_id or message.is_remote_frame:
             return
         elif self._own.is_foreign(message.arbitration_id):

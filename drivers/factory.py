@@ -40,17 +40,20 @@ def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
     return tuple(state_of(word) is DriveState.QUICK_STOP_ACTIVE for word in status_words)
 
 
-def read_drives(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveSnapshot:
+def read_drives(
+    rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, to_reset: bool = False
+) -> DriveSnapshot:
     """Reads the state of drives at rest; changes nothing, not even their configuration.
 
     Args:
         rig: The robot; its winches name the nodes.
         bus: An open bus, owned by the caller.
         pump: As for `make_drive_group`.
+        to_reset: Takes drives in NMT *stopped*, which answer nothing, to *pre-operational*.
 
     Raises:
         HardwareMissing: A drive does not answer.
-        Refused: A drive refuses to answer.
+        Refused: A drive refuses to answer, or is in NMT *stopped* without ``to_reset``.
         Fault: The bus failed.
     """
     document = rig.document.drives
@@ -60,7 +63,7 @@ def read_drives(rig: Rig, bus: can.BusABC, pump: Pump | None = None) -> DriveSna
         return read_axes(rig, document, bus, pump)
     from drivers.cia402.inspection import read_states
 
-    return read_states(rig, bus, pump)
+    return read_states(rig, bus, pump, to_reset=to_reset)
 
 
 def make_drive_group(

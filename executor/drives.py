@@ -176,7 +176,7 @@ def open_drives(
         rig: The robot and its bus.
         simulated_start: Pose of the platform if the drives are simulated here.
         load: Its load then.
-        to_reset: Also accepts drives in fault, to be reset.
+        to_reset: Also accepts drives in fault, to be reset, and in NMT *stopped*.
         lost_power: Effect of a power loss on drives simulated here.
         configure_as: For unreferenced drives: takes their state before any change, returns the rig
             as they count and the largest tension [N] for their torque limit.
@@ -196,7 +196,8 @@ def open_drives(
 
     with _locked_bus(rig, simulated_start, load, lost_power, listener) as reached:
         if configure_as is not None:
-            counted, max_tension = configure_as(read_drives(rig, reached.bus, reached.pump))
+            snapshot = read_drives(rig, reached.bus, reached.pump, to_reset=to_reset)
+            counted, max_tension = configure_as(snapshot)
         group = make_drive_group(counted, reached.bus, reached.pump, max_tension=max_tension)
         try:
             remarks = group.configure(to_reset=to_reset, on_restarted=note_restarted)
@@ -263,7 +264,7 @@ def resting_drives_of(
 
     Args:
         document: The rig file.
-        to_reset: Also accepts drives in fault, to be reset.
+        to_reset: As for `open_drives`.
     """
     rig = rig_from_document(document)
     load = empty_scene(rig).load

@@ -96,9 +96,14 @@ def _show_table(found: Examined, rig: Rig) -> None:
                 table.add_row(marks[verdict], *cells)
     if found.rows:
         out.print(table)
-    if found.silent:
-        names = ", ".join(map(str, found.silent))
-        out.print(f"[red]no answer[/] from drive {names}: check power, wiring and node id")
+    unexplained = [node for node in found.silent if node not in found.stopped]
+    for nodes, step in (
+        (found.stopped, "in NMT state 'stopped', by its heartbeat: run `cdpr reset RIG`"),
+        (unexplained, "check power, wiring and node id"),
+    ):
+        if nodes:
+            names = ", ".join(map(str, nodes))
+            out.print(f"[red]no answer[/] from drive {names}: {step}")
     wrong = sum(row.verdict == "wrong" for row in found.rows)
     out.print(
         f"{len(found.rows)} objects of {len(found.nodes)} drives read, nothing written;"

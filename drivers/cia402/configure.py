@@ -15,12 +15,9 @@ from drivers.can_errors import (
 )
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
-    BEFORE,
     MODE_DISPLAY,
     count_heartbeats,
-    expected_by,
-    identifiers,
-    identity,
+    expectations,
     number_text,
     require_absent,
     require_expected,
@@ -40,7 +37,7 @@ from drivers.cia402.object_dictionary import (
 )
 from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.profile import for_unused_pdos, profile_of, used_pdos
-from drivers.cia402.sdo import NOT_NOW, SetupNetwork, silent
+from drivers.cia402.sdo import NOT_NOW, SetupNetwork, means_absent, silent
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.drive_group import OnRestarted, Pump
 from model.errors import HardwareMissing, Refused
@@ -60,6 +57,12 @@ MODE_ASKED = 10
 
 READ_ONLY = frozenset({0x06010000, 0x06010002})
 """Abort codes of a read-only object, whose fixed value may be the required one."""
+
+UNCHANGED = "the drives were not changed"
+UNFINISHED = (
+    "the set-up was not finished: the drives are in NMT pre-operational with part of their"
+    " settings, and none is enabled"
+)
 
 PDO_OBJECTS = 0xF9FF
 """Mask that maps a PDO's parameters (1400h, 1800h) and mapping (1600h, 1A00h) to one index."""
@@ -118,7 +121,7 @@ def configure_drives(
     refusals = Refusals()
     entries: list[int] = []
     for drive, node in enumerate(nodes):
-        for expected in (*BEFORE, *identifiers(node), *identity(rig), *expected_by(profile)):
+        for expected in expectations(rig, profile, node):
             refusals.note(require_expected, network, node, expected)
         refusals.note(require_idle, network, node, to_reset)
         for setting in settings[drive]:
@@ -127,7 +130,7 @@ def configure_drives(
             refusals.note(require_absent, network, node, setting)
         refusals.note(require_no_wrap, network, node, settings[drive])
         refusals.note(count_heartbeats, network, node, profile, entries)
-    refusals.raise_any()
+    refusals.raise_any(UNCHANGED)
     _refuse_duplicates(network)
     on_restarted(
         tuple(n for n, s in zip(nodes, settings, strict=True) if not is_still_set_up(network, n, s))
@@ -139,14 +142,15 @@ def configure_drives(
         refused: list[str] = []  # switched off before another PDO takes its identifier
         refusals.note(_switch_off_unused, network, node, profile, refused)
         refused += _write_all(network, node, settings[drive], refusals)
-        _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), refusals)
         for remark in refused:
             absent.setdefault(remark, []).append(node)
-    refusals.raise_any()  # before waiting for a mode that was refused
+    for drive, node in enumerate(nodes):  # last: by now all peers send at their new period
+        _write_all(network, node, heartbeat_consumers(rig, drive, entries[drive]), refusals)
+    refusals.raise_any(UNFINISHED)  # before waiting for a mode that was refused
     if not profile.mode_display_when_enabled:
         for node in nodes:
             refusals.note(_await_mode, network, node)
-    refusals.raise_any()
+    refusals.raise_any(UNFINISHED)
     for node in nodes:
         network.command(NmtCommand.START, node)
     network.process_waiting()
@@ -179,14 +183,17 @@ class Refusals:
             return False
         return True
 
-    def raise_any(self) -> None:
+    def raise_any(self, left: str) -> None:
         """Raises if a refusal was recorded.
+
+        Args:
+            left: The state that the drives are left in.
 
         Raises:
             Refused: With all recorded refusals.
         """
         if self._found:
-            raise combined_refusal(self._found)
+            raise combined_refusal(self._found, left)
 
 
 def is_still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> bool:
@@ -384,9 +391,9 @@ def _identifier_if_there(
     try:
         return int.from_bytes(network.client(node).read(index, 1, "PDO identifier"), "little")
     except Refused as error:
-        code = error.values.get("abort_code")
-        if code is None or code in NOT_NOW:
+        if not means_absent(error):
             raise
+        code = error.values["abort_code"]
         if code not in OBJECT_DOES_NOT_EXIST:
             remarks.append(
                 f"the drive refuses {index:04X}h:01 PDO identifier ({abort_text(int(code))}):"

@@ -10,8 +10,8 @@ import can
 
 from drivers.can_errors import in_fault, moved_by_another, wrong_setting
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
-from drivers.cia402.sdo import NOT_NOW, SetupNetwork
-from drivers.cia402.sdo_jobs import CSP_MODE, OBJECT_DOES_NOT_EXIST
+from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent
+from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
 from drivers.drive_group import Pump
 from model.errors import CdprError, Refused
@@ -37,13 +37,16 @@ class Expectation:
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
-#: Requirements of a drive before anything is written to it.
-BEFORE = (
+SUPPORTED_MODES = 0x6502
+_UNLISTED = "for a drive that has it unlisted, set csp_unlisted: true in its profile"
+
+_CSP_LISTED = Expectation(
+    *(SUPPORTED_MODES, 0, 0x80, 0x80, "supported drive modes"),
+    "bit 7 is cyclic synchronous position (CSP); Technosoft iPOS and Pilz PRBT do not have it;"
+    f" {_UNLISTED}",
+)
+_BEFORE = (
     Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are supported"),
-    Expectation(
-        *(0x6502, 0, 0x80, 0x80, "supported drive modes"),
-        "cyclic synchronous position (CSP), bit 7; Technosoft iPOS and Pilz PRBT do not have it",
-    ),
     Expectation(
         *(0x607E, 0, 0x80, 0, "polarity"),
         "bit 7 inverts positions but not torques; `direction` of the winch inverts both",
@@ -57,7 +60,7 @@ BEFORE = (
 )
 
 
-def identifiers(node: int) -> tuple[Expectation, ...]:
+def _identifiers(node: int) -> tuple[Expectation, ...]:
     """Identifiers on which a drive receives SYNC and sends emergencies; CiA 301, 7.5.2.
 
     Bit 30 of 1005h makes the drive send SYNC, bit 29 selects 29-bit identifiers.
@@ -73,7 +76,7 @@ def identifiers(node: int) -> tuple[Expectation, ...]:
     )
 
 
-def identity(rig: Rig) -> tuple[Expectation, ...]:
+def _identity(rig: Rig) -> tuple[Expectation, ...]:
     """Vendor and product that the rig file requires, if any (1018h)."""
     drives = rig.document.drives
     if not isinstance(drives, Cia402Document):
@@ -88,12 +91,20 @@ def identity(rig: Rig) -> tuple[Expectation, ...]:
 
 
 MODE_DISPLAY = Expectation(
-    0x6061, 0, 0xFF, CSP_MODE, "mode of operation display", "the mode must be active"
+    *(0x6061, 0, 0xFF, CSP_MODE, "mode of operation display"),
+    "the mode must be active; for a drive that shows it only once enabled, set"
+    " mode_display_when_enabled: true in its profile",
 )
 """Required mode after the configuration, or once enabled (`ProfileDocument`)."""
 
 
-def expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
+def expectations(rig: Rig, profile: ProfileDocument, node: int) -> tuple[Expectation, ...]:
+    """Requirements of a drive before anything is written to it."""
+    listed = () if profile.csp_unlisted else (_CSP_LISTED,)
+    return (*_BEFORE, *listed, *_identifiers(node), *_identity(rig), *_expected_by(profile))
+
+
+def _expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
     """Values that the profile requires and the program does not write, such as units."""
     return tuple(
         Expectation(*object_key(each.object), 0xFFFFFFFF, each.value, each.name, each.why)
@@ -103,16 +114,17 @@ def expected_by(profile: ProfileDocument) -> tuple[Expectation, ...]:
 
 def how_to_set(expected: Expectation) -> str:
     """The next step for a wrong value."""
-    if expected.index == 0x6502:
-        return (
-            "none: a drive without cyclic synchronous position (CSP) cannot be used; Technosoft"
-            " iPOS and Pilz PRBT do not have it"
-        )
+    if expected.index == SUPPORTED_MODES:
+        return HOW_WITHOUT_CSP
     if expected.index in (0x1000, 0x1018):
         return "check the node id, and vendor_id and product_code of the rig file"
     return BY_MAKERS_TOOL
 
 
+HOW_WITHOUT_CSP = (
+    "use another drive if it has no cyclic synchronous position (CSP), as Technosoft iPOS and Pilz"
+    f" PRBT; {_UNLISTED}"
+)
 BY_MAKERS_TOOL = "set it with the manufacturer's tool and store it"
 
 
@@ -128,8 +140,9 @@ def require_expected(network: SetupNetwork, node: int, expected: Expectation) ->
     try:
         data = network.client(node).read(expected.index, expected.sub, expected.name)
     except Refused as error:
-        if expected.optional and error.values.get("abort_code") not in (None, *NOT_NOW):
+        if expected.optional and means_absent(error):
             return
+        error.why = error.why or f"required because: {expected.why}"
         raise
     value = int.from_bytes(data, "little")
     if value & expected.mask != expected.expected:
@@ -196,7 +209,8 @@ def require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
     try:
         network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
     except Refused as error:
-        if error.values.get("abort_code") in OBJECT_DOES_NOT_EXIST:
+        # The others would be noticed only when limits have been changed.
+        if error.values.get("abort_code") not in (WRITE_ONLY, *NOT_NOW):
             raise
 
 
@@ -209,7 +223,7 @@ def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
     try:
         data = network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
     except Refused as error:
-        if error.values.get("abort_code") in (None, *NOT_NOW):
+        if not means_absent(error):
             raise
         return
     if not setting.is_kept(data):
@@ -268,7 +282,7 @@ def number_text(data: bytes, form: str) -> str:
 
 def wrong_value(node: int, name: str, found: str, wanted: str, why: str) -> Refused:
     """An object of a drive holds a wrong value."""
-    return wrong_setting(node, f"object {name}", found, wanted, why, "the drive's manual")
+    return wrong_setting(node, f"object {name}", found, wanted, why, "see the drive's manual")
 
 
 # Whether drives identify themselves as simulated.

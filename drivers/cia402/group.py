@@ -29,6 +29,7 @@ from drivers.cia402.sdo_jobs import (
 from drivers.cia402.state_machine import (
     FAULTED,
     HOLDS,
+    WITHOUT_TORQUE,
     ControlWord,
     DriveState,
     Goal,
@@ -60,7 +61,6 @@ FIRST_READING_WITHIN = 2.0
 FIRST_READINGS = 2
 #: Time-out per attempt, [s]; a drive just started may miss the first SYNC.
 FIRST_READING_TIMEOUT = 0.1
-_WITHOUT_TORQUE = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON)
 
 
 class Cia402Group(CyclicGroup):
@@ -359,12 +359,12 @@ class Cia402Group(CyclicGroup):
             if all(state is DriveState.OPERATION_ENABLED for state in states) and not idle:
                 self._check_modes()
             elif self._cycles_to_goal > self._patience:
-                self._latch(self._late((DriveState.OPERATION_ENABLED,), self._patience) or idle)
+                self._latch(self._late(self._patience) or idle)
         elif self._goal is Goal.RELEASE:
-            if all(state in _WITHOUT_TORQUE for state in states):
+            if all(state in WITHOUT_TORQUE for state in states):
                 self._goal, self._state = Goal.IDLE, GroupState.RELEASED
             elif self._cycles_to_goal > 2 * self._patience:  # it enables the drives first
-                self._latch(self._late(_WITHOUT_TORQUE, 2 * self._patience))
+                self._latch(self._late(2 * self._patience))
 
     def _check_modes(self) -> None:
         """Enters ENABLED once every drive shows CSP; most profiles check it when configuring."""
@@ -387,9 +387,9 @@ class Cia402Group(CyclicGroup):
         seconds = self._patience * self._cycle_s
         return ignoring_drives(self._rig.drive_names, self._watch.status_words, seconds)
 
-    def _late(self, wanted: tuple[DriveState, ...], cycles: int) -> list[tuple[int, str]]:
+    def _late(self, cycles: int) -> list[tuple[int, str]]:
         words, seconds = self._watch.status_words, cycles * self._cycle_s
-        return late_drives(self._rig.drive_names, words, wanted, seconds)
+        return late_drives(self._rig.drive_names, words, self._words, self._goal, seconds)
 
     def _status(self) -> CycleStatus:
         watch = self._watch

@@ -13,17 +13,16 @@ import numpy as np
 from drivers.cia402.configure import is_still_set_up, require_answers
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
-    BEFORE,
     BY_MAKERS_TOOL,
+    HOW_WITHOUT_CSP,
     MODE_DISPLAY,
     NO_WRAP,
     POSITION_RANGE,
+    SUPPORTED_MODES,
     Expectation,
-    expected_by,
+    expectations,
     holds_limits,
     how_to_set,
-    identifiers,
-    identity,
     position_range,
 )
 from drivers.cia402.object_dictionary import (
@@ -33,7 +32,7 @@ from drivers.cia402.object_dictionary import (
     stated_absent,
 )
 from drivers.cia402.profile import for_unused_pdos, load_profile, profile_names, profile_of
-from drivers.cia402.sdo import SetupNetwork
+from drivers.cia402.sdo import WRITE_ONLY, SetupNetwork
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power
 from drivers.drive_group import DriveSnapshot, Pump
@@ -45,7 +44,6 @@ from model.winches import WinchMap
 
 Verdict = Literal["ok", "remark", "wrong"]
 
-WRITE_ONLY = 0x06010001
 MOST_VALUES = 3
 """Largest number of distinct values listed per object."""
 
@@ -56,7 +54,7 @@ _PROCESS_DATA = (
     (0x607A, "<i", "target position", "set-points"),
     (0x6064, "<i", "position actual value", "replies"),
     (0x6077, "<h", "torque actual value", "tension of the cable"),
-    (MODE_DISPLAY.index, "<b", MODE_DISPLAY.name, MODE_DISPLAY.why),
+    (MODE_DISPLAY.index, "<b", MODE_DISPLAY.name, "the mode must be active"),
 )
 
 
@@ -105,11 +103,13 @@ class Examined:
         nodes: The drives that answered.
         silent: The drives that did not answer.
         rows: One per object.
+        stopped: The silent drives that are in NMT *stopped*, by their heartbeats.
     """
 
     nodes: tuple[int, ...]
     silent: tuple[int, ...]
     rows: tuple[ObjectRow, ...]
+    stopped: tuple[int, ...] = ()
 
     @property
     def good(self) -> bool:
@@ -121,6 +121,7 @@ class Examined:
         return {
             "answered": list(self.nodes),
             "silent": list(self.silent),
+            "stopped": list(self.stopped),
             "objects": [
                 {
                     "object": row.object,
@@ -160,7 +161,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         if node in silent:
             continue
         reader = _Reader(network, node, rows)
-        for expected in (*BEFORE, *identifiers(node), *identity(rig), *expected_by(profile)):
+        for expected in expectations(rig, profile, node):
             reader.at_expected(expected)
         reader.at_state()
         for index, form, name, why in _PROCESS_DATA:
@@ -175,7 +176,8 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         reader.at_position_range(settings)
         for_unused_pdos(profile, reader.at_unused)
     answered = tuple(node for node in all_nodes if node not in silent)
-    return Examined(answered, tuple(silent), tuple(rows.values()))
+    stopped = tuple(filter(network.is_stopped, silent))
+    return Examined(answered, tuple(silent), tuple(rows.values()), stopped)
 
 
 def _last_of_each(settings: Iterable[Setting]) -> list[Setting]:
@@ -292,7 +294,9 @@ class _Reader:
         except Refused as error:
             if "abort_code" not in error.values:
                 raise
-            found = None
+            text = f"refused: {abort_text(int(error.values['abort_code']))}"
+            row.note(self._node, text, "wrong", "see the drive's manual")
+            return
         good = holds_limits(found, settings)
         change = "" if good else BY_MAKERS_TOOL
         row.note(self._node, str(found or "none"), "ok" if good else "wrong", change)
@@ -398,6 +402,8 @@ _BESIDE = {
 
 def _how_without(index: int, sub: int) -> str:
     """The next step for a required object that is missing."""
+    if index == SUPPORTED_MODES:
+        return HOW_WITHOUT_CSP
     name = "1016h:01" if index == HEARTBEAT_CONSUMERS else object_name(index, sub)
     if name not in OBJECTS or name in NEEDED:
         return "use another drive or firmware: no profile can replace it"
@@ -410,13 +416,15 @@ def _how_without(index: int, sub: int) -> str:
 # Reads the state of CiA 402 drives by SDO without changing anything.
 
 
-def read_states(rig: Rig, bus: can.BusABC, pump: Pump | None) -> DriveSnapshot:
+def read_states(
+    rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: bool = False
+) -> DriveSnapshot:
     """Status word, position and torque of every drive; see `drivers.factory.read_drives`."""
     nodes = [winch.node_id for winch in rig.winches]
     timeout = profile_of(rig).sdo_timeout_ms / 1000.0
     network = SetupNetwork(bus, pump, nodes, timeout=timeout)
     network.discard_waiting()
-    require_answers(network, nodes)
+    require_answers(network, nodes, revive=to_reset)
     winch_map = WinchMap(rig)
 
     def read(index: int, name: str, size: int) -> list[int]:

@@ -315,7 +315,7 @@ def _mapped(parameters: int, identifier: int, objects: tuple[int, ...]) -> tuple
 
 def _supervision(cycle: float, sync: bool, produced_ms: int) -> tuple[Setting, ...]:
     period_us = round(1e6 * cycle) if sync else 0
-    why = "the cycle of the rig" if sync else "a missed SYNC would remove the torque"
+    why = "the cycle of the rig" if sync else "unused: the heartbeat stops the drive"
     return (
         Setting(0x1006, 0, "<I", period_us, "communication cycle period", why),
         Setting(

@@ -17,7 +17,7 @@ from math import ceil
 
 import can
 
-from drivers.can_bus import EchoFilter, bus_name, echoes_own_frames, receive_frame, transmit
+from drivers.can_bus import EchoFilter, echoes_own_frames, receive_frame, transmit
 from drivers.can_errors import SETTING_UP, ForeignMaster, error_frame_fault
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import (
@@ -33,7 +33,6 @@ from drivers.cia402.pdo import (
     parse_heartbeat,
     set_up_ids,
 )
-from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.drive_group import Pump
 from model.errors import CdprError, Fault, HardwareMissing, Refused
 
@@ -51,6 +50,9 @@ ECHO_WAIT = 0.05
 
 NOT_NOW = frozenset({0x08000020, 0x08000021, 0x08000022})
 """Abort codes of an object that exists but cannot be transferred in the present state."""
+
+TIMED_OUT, WRITE_ONLY = 0x05040000, 0x06010001
+"""Abort codes: SDO protocol timed out; attempt to read a write-only object."""
 
 Key = tuple[int, int, int]
 """Kind of an answer, index and sub-index."""
@@ -179,7 +181,9 @@ class SetupNetwork:
         if message is None:
             return False
         if message.is_error_frame:
-            self._judge_error(message)
+            fault = error_frame_fault(self._bus, message)
+            if fault is not None:
+                raise fault
         elif not (message.is_remote_frame or message.is_extended_id):
             self._refuse_foreign(message.arbitration_id)
             node = message.arbitration_id - HEARTBEAT_BASE
@@ -196,12 +200,6 @@ class SetupNetwork:
         while (left := deadline - self.clock()) > 0.0:
             if not self.process_frame(left) and self._pump is not None:
                 return
-
-    def _judge_error(self, message: can.Message) -> None:
-        where = bus_name(self._bus)
-        fault = error_frame_fault(message.arbitration_id, message.data, where)
-        if fault is not None:
-            raise fault
 
     def _refuse_foreign(self, can_id: int) -> None:
         if self._own.is_foreign(can_id):
@@ -287,16 +285,16 @@ class Client:
         return self._attempt(lambda: self._read(index, sub, size), target)
 
     def read_if_there(self, index: int, sub: int, name: str, size: int = 4) -> bytes | None:
-        """Reads an optional object as `read`; None if it does not exist.
+        """Reads an optional object as `read`; None if the drive lacks it (`means_absent`).
 
         Raises:
             HardwareMissing: The drive does not answer.
-            Refused: It has the object, and aborts the transfer.
+            Refused: It may have the object, and aborts the transfer.
         """
         try:
             return self.read(index, sub, name, size)
         except Refused as error:
-            if error.values.get("abort_code") in OBJECT_DOES_NOT_EXIST:
+            if means_absent(error):
                 return None
             raise
 
@@ -395,6 +393,15 @@ def _answers(wanted: Key, command: int, index: int, sub: int) -> bool:
     if kind in _SEGMENTS:
         return command & (_KIND | 0x10) == kind
     return command & _KIND == kind and (index, sub) == (wanted_index, wanted_sub)
+
+
+def means_absent(error: Refused) -> bool:
+    """Whether the refusal of a read means that the drive lacks the object.
+
+    Drives use many abort codes for that; only these say nothing about it: a time-out, and those
+    of the present state. Without a code something else answered.
+    """
+    return error.values.get("abort_code") not in (None, TIMED_OUT, *NOT_NOW)
 
 
 def silent(node: int, where: str) -> HardwareMissing:

@@ -1,13 +1,14 @@
 """Next control word of each drive, so that all change state in the same cycle.
 
 Pure: from goal and states to words. Every word has bit 1 set, so that none is "disable voltage";
-all drives are enabled together or none.
+all drives are enabled together or none, for a release all that are under torque.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from enum import Enum, IntEnum, auto
+from itertools import compress
 
 # The CiA 402 state machine as tables: states by status word, and the control words in use.
 #
@@ -68,6 +69,9 @@ HOLDS = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE})
 
 FAULTED = frozenset({DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT})
 
+WITHOUT_TORQUE = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON})
+"""States at the end of a release."""
+
 
 def _decoded(status_word: int) -> DriveState:
     for mask, value, state in STATE_CODES:
@@ -105,22 +109,30 @@ _STAYS_STOPPED = (
 def late_drives(
     names: Mapping[int, str],
     status_words: Sequence[int],
-    wanted: Sequence[DriveState],
+    commanded: Sequence[ControlWord],
+    goal: Goal,
     seconds: float,
 ) -> list[tuple[int, str]]:
-    """Drives that did not reach a state in time, by node, with the likely reason.
+    """Drives that keep the group from its goal, by node, with the likely reason.
+
+    Drives that only wait for these are not among them.
 
     Args:
         names: By node id.
         status_words: Of each of them, as last reported.
-        wanted: Accepted states; the last one was commanded.
+        commanded: Last control word of each of them.
+        goal: ENABLE or RELEASE.
         seconds: Time that they had, [s].
     """
-    late = f"instead of {wanted[-1].value} after {seconds:g} s (enable_timeout_ms of its profile)"
+    wanted = DriveState.OPERATION_ENABLED if goal is Goal.ENABLE else DriveState.READY_TO_SWITCH_ON
+    late = f"instead of {wanted.value} after {seconds:g} s (enable_timeout_ms of its profile)"
+    states = [state_of(word) for word in status_words]
+    behind = next((step for step in _STEPS[goal] if step.intersection(states)), frozenset())
+    rows = zip(names.items(), states, status_words, commanded, strict=True)
     return [
-        (node, f"{name} is in {state_of(word).value} {late}{_reason_for(word)}")
-        for (node, name), word in zip(names.items(), status_words, strict=True)
-        if state_of(word) not in wanted
+        (node, f"{name} is in {state.value} {late}{_reason_for(state, status_word, control_word)}")
+        for (node, name), state, status_word, control_word in rows
+        if state in behind
     ]
 
 
@@ -142,12 +154,11 @@ def ignoring_drives(
     ]
 
 
-def _reason_for(status_word: int) -> str:
+def _reason_for(state: DriveState, status_word: int, control_word: ControlWord) -> str:
     """Why a drive stays in its state, as far as its status word shows."""
-    state = state_of(status_word)
-    if state is DriveState.QUICK_STOP_ACTIVE:
+    if state is DriveState.QUICK_STOP_ACTIVE and control_word is ControlWord.ENABLE_OPERATION:
         return f"; {_STAYS_STOPPED}"
-    if state not in (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON):
+    if state not in WITHOUT_TORQUE:
         return ""
     return f"; {' and '.join(without_power(status_word)) or _INTERLOCKED}"
 
@@ -181,6 +192,20 @@ _RANKS = {
     DriveState.OPERATION_ENABLED: 3,
 }
 """Progress towards OPERATION ENABLED; a drive in quick stop waits for the others."""
+
+_STEPS = {
+    Goal.ENABLE: tuple(
+        frozenset(state for state in DriveState if _RANKS.get(state, 0) == rank)
+        for rank in range(_RANKS[DriveState.OPERATION_ENABLED])
+    ),
+    Goal.RELEASE: (
+        FAULTED | {DriveState.NOT_READY},
+        frozenset({DriveState.QUICK_STOP_ACTIVE}),
+        frozenset({DriveState.OPERATION_ENABLED}),
+        frozenset({DriveState.SWITCHED_ON}),
+    ),
+}
+"""States short of a goal: drives in a later one wait for those in an earlier one."""
 
 _NEXT_WORD = (
     ControlWord.SHUTDOWN,
@@ -243,12 +268,19 @@ def _release(
     """Disables operation of all drives, which closes brakes, then shuts them down.
 
     Without "disable voltage", QUICK STOP ACTIVE can only be left through OPERATION ENABLED, by
-    all drives together and with targets at the actual positions.
+    all drives under torque together and with targets at the actual positions. The others stay
+    without it, as one that has no power could not join them: those under torque hold their
+    positions, as before, and lose their torque together.
     """
     if any(state in FAULTED for state in states):
         return (ControlWord.QUICK_STOP,) * len(states)
     if DriveState.QUICK_STOP_ACTIVE in states:
-        return _enable(states, stop_commanded)
+        holding = [state in _MAY_HOLD for state in states]
+        words = iter(_enable([*compress(states, holding)], [*compress(stop_commanded, holding)]))
+        return tuple(next(words) if holds else ControlWord.SHUTDOWN for holds in holding)
     if DriveState.OPERATION_ENABLED in states:
-        return (ControlWord.SWITCH_ON,) * len(states)
+        return tuple(
+            ControlWord.SHUTDOWN if state in WITHOUT_TORQUE else ControlWord.SWITCH_ON
+            for state in states
+        )
     return (ControlWord.SHUTDOWN,) * len(states)

@@ -12,7 +12,6 @@ import can
 from drivers.can_bus import (
     EchoFilter,
     SentFrame,
-    bus_name,
     echoes_own_frames,
     receive_frame,
     transmit,
@@ -21,6 +20,7 @@ from drivers.can_errors import (
     SETTING_UP,
     ForeignMaster,
     answers_twice,
+    bus_name,
     error_frame_fault,
     in_fault,
     moved_by_another,
@@ -128,9 +128,7 @@ class SetupLink:
         for left in self._waits(timeout):
             while (message := receive_frame(self._bus, left)) is not None:
                 if message.is_error_frame:
-                    fault = error_frame_fault(
-                        message.arbitration_id, message.data, bus_name(self._bus)
-                    )
+                    fault = error_frame_fault(self._bus, message)
                     if fault is not None:
                         raise fault
                 elif not (message.is_extended_id or message.is_remote_frame):
@@ -351,7 +349,8 @@ def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wante
             f"{endpoint.from_raw(int(reported)):g}",
             f"{wanted.value:g}",
             wanted.why,
-            "ODrive's API reference",
+            "see ODrive's API reference; the set-up was not finished: the axes are idle, with part"
+            " of their settings",
         )
     raise HardwareMissing(
         f"drive {node} does not report {endpoint.name}",

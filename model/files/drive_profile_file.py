@@ -142,8 +142,8 @@ class ProfileDocument(Document):
     )
     monitoring: Literal["sync", "heartbeat"] = Field(
         default="sync",
-        description="what stops a drive whose master is gone; heartbeat: it has no 1006h, or must"
-        " not use it, since it removes torque without SYNC",
+        description="what stops a drive whose master is gone; heartbeat: it has no 1006h, does not"
+        " detect missing SYNC by it, or removes torque without SYNC",
     )
     sync_timeout_periods: Annotated[float, Field(ge=1.1, le=10.0)] = Field(
         default=3.0,
@@ -167,6 +167,11 @@ class ProfileDocument(Document):
     warnings: list[CodePattern] = Field(
         default=[],
         description="EMCY codes of warnings with which the drive stays enabled; x is any digit",
+    )
+    csp_unlisted: bool = Field(
+        default=False,
+        description="the drive has cyclic synchronous position, although 6502h is absent or its"
+        " bit 7 is 0; 6061h = 8 shows it",
     )
     mode_display_when_enabled: bool = Field(
         default=False, description="6061h shows the mode only once the drive is enabled"

@@ -289,7 +289,7 @@ class SimulatedDrive(PowerStage):
             return self._pdos.refused(key, value, may_map=may_map)
         if index == 0x1016 and self._is_consumed_already(sub, value):
             return NO_DUPLICATE_CONSUMER
-        if key == MODE and not self._has_mode(value):
+        if key == MODE and not self.objects.has_mode(value):
             return OUT_OF_RANGE
         if index in (POSITION_UNIT, VELOCITY_UNIT, ACCELERATION_UNIT):
             known = counts_in(value, self._counts_per_turn)

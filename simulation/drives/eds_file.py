@@ -72,11 +72,14 @@ class Eds:
         path: Of the file.
         objects: By index and sub-index.
         dummies: Data types that may fill gaps in an RPDO (``DummyUsage``).
+        unlisted_modes: Modes of operation that the drive has although 6502h does not list them:
+            ``UnlistedModes`` of ``[6060]``, which is not in CiA 306.
     """
 
     path: Path
     objects: Mapping[Key, ObjectDescription]
     dummies: frozenset[int]
+    unlisted_modes: frozenset[int] = frozenset()
 
 
 def profile_path(profile: str) -> Path:
@@ -143,7 +146,9 @@ def read_eds(path: Path) -> Eds:
         for name, value in used.items()
         if value.strip() == "1" and re.fullmatch(r"dummy[0-9a-f]{4}", name, re.IGNORECASE)
     }
-    return Eds(path, objects, frozenset(dummies))
+    modes = parser.get("6060", "unlistedmodes", fallback="")
+    unlisted = frozenset(_number(mode, f"{path}: [6060]")[0] or 0 for mode in modes.split())
+    return Eds(path, objects, frozenset(dummies), unlisted)
 
 
 def _text(path: Path) -> str:

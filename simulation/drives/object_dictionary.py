@@ -120,6 +120,12 @@ class DriveObjects:
         """Whether a data type may fill gaps of an RPDO."""
         return index in self._eds.dummies
 
+    def has_mode(self, mode: int) -> bool:
+        """Whether 6502h or the EDS file lists a mode; bit 0 is mode 1, mode 0 means none."""
+        modes = self.get((0x6502, 0), 0xFFFFFFFF)
+        listed = 0 < mode <= 32 and bool(modes >> (mode - 1) & 1)
+        return mode <= 0 or listed or mode in self._eds.unlisted_modes
+
     def measured(self, index: int, sub: int, read: Callable[[], int]) -> None:
         """Makes an object return a live value."""
         self._readers[index, sub] = read

@@ -271,11 +271,6 @@ class PowerStage(ABC):
         else:
             self._power_off(DriveState.FAULT)
 
-    def _has_mode(self, mode: int) -> bool:
-        """Whether 6502h lists a mode; bit 0 is mode 1, mode 0 means none."""
-        modes = self.objects.get((0x6502, 0), 0xFFFFFFFF)
-        return mode <= 0 or (mode <= 32 and bool(modes >> (mode - 1) & 1))
-
     def _position_shown(self) -> int:
         position = self.motor.position
         if self.behaviour.position_noise:
@@ -332,7 +327,7 @@ class PowerStage(ABC):
 
     def _take_mode(self, mode: int) -> None:
         """6060h: at once, late, or only while enabled, according to the behaviour."""
-        if not self._has_mode(mode):
+        if not self.objects.has_mode(mode):
             return
         self._wanted_mode = mode
         if self.behaviour.mode_when_enabled and self.state is not DriveState.OPERATION_ENABLED:

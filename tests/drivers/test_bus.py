@@ -21,6 +21,17 @@ def with_bus(rig: Rig, **changes: object) -> Rig:
     return rig_from_document(RigDocument.model_validate(document))
 
 
+def test_gs_usb_is_refused_in_favour_of_the_kernel_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It took the channel's text for a number, and its own frames for another master's."""
+    monkeypatch.setattr(can, "Bus", lambda **_options: pytest.fail("it was opened"))
+    with pytest.raises(BadInput) as caught:
+        open_bus(BusSettings("gs_usb", "0"))
+    assert "interface: socketcan" in caught.value.next_step
+    with pytest.raises(BadInput) as caught:
+        open_bus(BusSettings("gs-usb", "0"))
+    assert "gs_usb" not in caught.value.next_step
+
+
 def test_an_unknown_interface_lists_those_there_are() -> None:
     with pytest.raises(BadInput) as caught:
         open_bus(BusSettings("sockectan", "can0"))

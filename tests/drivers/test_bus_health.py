@@ -9,12 +9,17 @@ from collections.abc import Callable
 
 import can
 import pytest
+from can.interfaces.pcan import PcanBus
+from can.interfaces.socketcan import SocketcanBus
+from can.interfaces.udp_multicast import UdpMulticastBus
+from can.interfaces.virtual import VirtualBus
 from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.can_bus import BusSettings, EchoFilter, lost_frames, open_bus
 from drivers.can_errors import (
     ERROR_CYCLES,
+    WITH_CLASSES,
     BusDown,
     BusErrors,
     BusFault,
@@ -31,6 +36,7 @@ from drivers.can_errors import (
 from drivers.cia402.pdo import commanding_ids
 from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import WHOLE_BUS, GroupCommand, GroupState
+from drivers.factory import make_drive_group
 from drivers.plausibility import ReplyCheck
 from model.errors import Fault, HardwareMissing, Refused
 from tests.drivers.drive_bench import Bench, free_udp_channel
@@ -87,20 +93,72 @@ def test_every_bus_fault_has_a_code_of_its_own() -> None:
 def test_which_error_frames_end_a_run(
     identifier: int, data: bytes, kind: type[BusFault] | None
 ) -> None:
-    fault = error_frame_fault(identifier, data, "bus can0")
+    with open_bus(BusSettings("virtual", "classes")) as bus:
+        fault = error_frame_fault(bus, error_frame(identifier, data))
     assert (type(fault) if fault else None) is kind
 
 
+@pytest.mark.parametrize("kind", [SocketcanBus, VirtualBus, UdpMulticastBus])
+def test_linux_classes_are_those_of_these_buses(kind: type[can.BusABC]) -> None:
+    assert issubclass(kind, WITH_CLASSES)
+    assert not issubclass(PcanBus, WITH_CLASSES)
+
+
+def error_frame(identifier: int, data: bytes) -> can.Message:
+    return can.Message(
+        arbitration_id=identifier, data=data, is_extended_id=False, is_error_frame=True
+    )
+
+
+class Adapter(can.BusABC):
+    """A back end of a maker, whose error frames have the maker's codes."""
+
+    channel_info = "adapter"
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._inner = bus
+        self.errors: list[can.Message] = []
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self._inner.send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        return self.errors.pop() if self.errors else self._inner.recv(timeout)
+
+    def shutdown(self) -> None:
+        """The wrapped bus stays open."""
+
+
+#: ID 4 is a stuff error; DATA[1] the code of the segment. Source: PCAN-Basic, Error Frames.
+STUFF_ERROR = error_frame(0x004, b"\0\x0a\0\0")
+
+
+def test_error_frames_of_other_back_ends_are_only_counted(bench: Bench) -> None:
+    """A stuff error was taken for a receive overflow, which ended the run."""
+    adapter = Adapter(bench.group._bus)
+    bench.group = make_drive_group(bench.rig, adapter, bench.rehearsal.pump)
+    adapter.errors.append(STUFF_ERROR)
+    bench.enable()
+    for count in range(1, ERROR_CYCLES):
+        adapter.errors.append(STUFF_ERROR)
+        assert bench.cycle().error_frames == count
+    assert bench.group.state is GroupState.ENABLED
+    adapter.errors.append(STUFF_ERROR)
+    with pytest.raises(BusErrors):
+        bench.cycle()
+
+
 def test_errors_that_do_not_cease_end_a_run_too() -> None:
-    errors = ErrorFrames("bus can0")
+    with open_bus(BusSettings("virtual", "errors")) as bus:
+        errors, frame = ErrorFrames(bus), error_frame(0x008, bytes(8))
     for _ in range(ERROR_CYCLES - 1):
-        assert errors.take(0x008, bytes(8)) is None
+        assert errors.take(frame) is None
         assert errors.end_cycle() is None
     assert errors.end_cycle() is None  # a good cycle: counted from the beginning
     for _ in range(ERROR_CYCLES - 1):
-        errors.take(0x008, bytes(8))
+        errors.take(frame)
         assert errors.end_cycle() is None
-    errors.take(0x008, bytes(8))
+    errors.take(frame)
     fault = errors.end_cycle()
     assert isinstance(fault, BusErrors)
     assert errors.total == fault.values["error_frames"] == 2 * ERROR_CYCLES - 1

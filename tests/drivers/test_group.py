@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import can
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.cia402.object_dictionary import PDO_NO_RTR, Setting, settings_for
+from drivers.cia402.pdo import NmtState
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import GroupCommand, GroupState
@@ -20,6 +22,7 @@ from drivers.factory import make_drive_group
 from model.errors import Fault, HardwareMissing, Refused
 from model.files.rig_file import RigDocument
 from model.rig import rig_from_document
+from simulation.drives.behaviour import STRICT
 from simulation.drives.cia402 import SimulatedDrive
 from tests.drivers.drive_bench import Bench
 
@@ -104,6 +107,21 @@ def test_drives_that_were_listed_in_another_order_are_set_up_again(bench: Bench)
     make_drive_group(other, bench.group._bus, bench.rehearsal.pump).configure()
     assert bench.drives[0].objects[0x1016, 2] >> 16 == 6
     assert before >> 16 == 2
+
+
+def test_heartbeats_are_watched_only_once_all_drives_send_them_in_time(bench: Bench) -> None:
+    """Peers that still sent one per second were missed, EMCY 8130h, while they were set up."""
+    bench.rehearsal.behaviour = slow = replace(STRICT, sdo_delay=0.02)
+    sent: list[int] = []
+    for drive in bench.drives:
+        drive.behaviour = slow
+        drive.power_on()
+        drive.objects[0x1017, 0] = 1000
+        send = drive._bus_send
+        drive._bus_send = lambda i, d, send=send: (sent.append(i), send(i, d))
+    bench.group.configure()
+    assert not [identifier for identifier in sent if 0x80 < identifier < 0x100]
+    assert {drive.objects[0x1016, 8] & 0xFFFF for drive in bench.drives} == {100}
 
 
 def test_a_drive_may_need_some_time_until_it_answers_sync(bench: Bench) -> None:
@@ -240,6 +258,44 @@ def test_every_object_that_is_not_kept_refuses_to_arm(bench: Bench) -> None:
         assert f"drive 6, object {key[0]:04X}h:{key[1]:02X}" in caught.value.where
         assert "is required" in caught.value.what
         assert bench.group.state is GroupState.OFFLINE
+
+
+def stuck_mode(drive: SimulatedDrive) -> None:
+    drive.objects.measured(0x6061, 0, lambda: 0)
+
+
+def clamped_ramp(drive: SimulatedDrive) -> None:
+    write = drive.objects.changed
+
+    def clamp(key: tuple[int, int], value: int) -> None:
+        if key == (0x6085, 0):
+            drive.objects.note(key, min(value, 1000))
+        write(key, value)
+
+    drive.objects.changed = clamp
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [(stuck_mode, "mode_display_when_enabled"), (clamped_ramp, "the drive has 1000")],
+)
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_refusal_says_whether_the_drives_were_changed(
+    bench: Bench, wrong: Callable[[SimulatedDrive], None], said: str, count: int
+) -> None:
+    bench.drives[7].objects[0x607C, 0] = 1  # refused before anything is written
+    with pytest.raises(Refused) as caught:
+        bench.group.configure()
+    assert "the drives were not changed" in caught.value.next_step
+    bench.drives[7].objects[0x607C, 0] = 0
+    for drive in bench.drives[:count]:
+        wrong(drive)
+    with pytest.raises(Refused) as caught:
+        bench.group.configure()
+    assert said in str(caught.value)
+    assert "not changed" not in str(caught.value)
+    assert "not finished: the drives are in NMT pre-operational" in caught.value.next_step
+    assert {drive.nmt for drive in bench.drives} == {NmtState.PRE_OPERATIONAL}
 
 
 def test_every_object_that_is_refused_refuses_to_arm(bench: Bench) -> None:
@@ -564,6 +620,69 @@ def test_while_one_drive_is_slow_to_enable_the_others_hold_and_do_not_sag(
     assert "instead of operation enabled" in bench.status.faults[0][1]
     bench.cycle()
     assert [d.state for d in bench.drives[:7]] == [HOLDING] * 7
+
+
+def without_power(drive: SimulatedDrive) -> None:
+    """Its mains is off, or safe torque off is active."""
+    drive.state = DriveState.SWITCH_ON_DISABLED
+    drive._command_shutdown = lambda: None  # type: ignore[method-assign]
+    drive.objects.measured(0x6041, 0, lambda: drive.status_word & ~0x10)
+
+
+def holding_but_one_without_power(bench: Bench) -> None:
+    """Seven drives hold as after a run, the eighth cannot be enabled."""
+    bench.group.configure()
+    for drive in bench.drives[:7]:
+        drive.state = HOLDING
+    without_power(bench.drives[7])
+    bench.group.read_positions()
+
+
+def test_a_drive_without_power_alone_is_named_where_the_others_wait_for_it(bench: Bench) -> None:
+    holding_but_one_without_power(bench)
+    bench.group.command(GroupCommand.ENABLE)
+    bench.until(GroupState.FAULT, limit=150)
+    assert bench.status is not None
+    ((node, text),) = bench.status.faults
+    assert node == 8
+    assert "voltage enabled" in text
+    assert 0x0F not in bench.control_words()
+
+
+@pytest.mark.parametrize("powered", [True, False])
+def test_a_drive_without_torque_does_not_keep_the_others_from_their_release(
+    bench: Bench, powered: bool
+) -> None:
+    """It gets none, and they lose theirs together."""
+    holding_but_one_without_power(bench)
+    last = bench.drives[7]
+    if powered:
+        del last._command_shutdown
+        last.objects.measured(0x6041, 0, lambda: last.status_word)
+    stood = [drive.motor.position for drive in bench.drives]
+    bench.group.command(GroupCommand.RELEASE)
+    for _ in range(30):
+        if bench.group.state is GroupState.RELEASED:
+            break
+        bench.cycle()
+        assert not last.torque_on
+        assert len({drive.torque_on for drive in bench.drives[:7]}) == 1
+    assert bench.group.state is GroupState.RELEASED
+    assert bench.status is not None
+    assert bench.status.faults == ()
+    assert [drive.motor.position for drive in bench.drives] == pytest.approx(stood, abs=1)
+
+
+def test_no_drive_is_enabled_for_a_release_while_the_state_of_one_is_unknown(bench: Bench) -> None:
+    holding_but_one_without_power(bench)
+    bench.drives[7].objects.measured(0x6041, 0, lambda: 0x0200)
+    bench.cycle()
+    bench.group.command(GroupCommand.RELEASE)
+    bench.until(GroupState.FAULT, limit=250)
+    assert bench.status is not None
+    assert [node for node, _ in bench.status.faults] == [8]
+    assert set(bench.control_words()) == {0x02, 0x06}
+    assert all(drive.state is HOLDING for drive in bench.drives[:7])
 
 
 def test_the_heartbeat_comes_from_the_loop(bench: Bench) -> None:

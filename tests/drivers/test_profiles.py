@@ -271,6 +271,45 @@ def test_drives_without_csp_are_refused_with_the_reason(rig: Rig) -> None:
     assert not downloads(bus)
 
 
+def modes_of_a_real_epos4(bus: ScriptedBus) -> None:
+    """SDO trace in github.com/ros-industrial/ros2_canopen issue 236."""
+    for drive in bus.drives.values():
+        drive.values[0x6502, 0] = 0x225
+
+
+def no_modes(bus: ScriptedBus) -> None:
+    for drive in bus.drives.values():
+        drive.aborts[0x6502, 0] = 0x06020000
+
+
+@pytest.mark.parametrize("unlisted", [modes_of_a_real_epos4, no_modes])
+def test_a_drive_that_runs_csp_without_listing_it_needs_a_key_of_its_profile(
+    rig: Rig, unlisted: Callable[[ScriptedBus], None]
+) -> None:
+    bus = eight_of("cia402")
+    unlisted(bus)
+    (row,) = (row for row in examined(rig, bus).rows if row.verdict == "wrong")
+    assert "csp_unlisted" in row.change
+    with pytest.raises(Refused, match="csp_unlisted") as caught:
+        set_up(rig, bus)
+    assert "6502h" in str(caught.value)
+    assert not downloads(bus)
+    theirs = with_profile(rig, "epos4")
+    bus = eight_of("epos4")
+    unlisted(bus)
+    assert examined(theirs, bus).good
+    set_up(theirs, bus)
+
+
+def test_a_drive_said_to_run_csp_must_show_it(rig: Rig) -> None:
+    bus = eight_of("epos4")
+    bus.drives[6].mode_late = 1000  # 6061h stays 0
+    with pytest.raises(Refused, match="drive has 0h; 8h is required"):
+        set_up(with_profile(rig, "epos4"), bus)
+    starts = [m for m in bus.sent if m.arbitration_id == 0 and m.data[0] == 0x01]
+    assert not starts, "no drive is started"
+
+
 @pytest.mark.parametrize("late", [0, 1, 9])
 def test_a_mode_that_shows_late_is_waited_for(rig: Rig, late: int) -> None:
     bus = eight_of("cia402")
@@ -302,6 +341,43 @@ def test_an_optional_object_that_is_refused_is_a_remark(rig: Rig, code: int) -> 
         assert f"{index:04X}h:{sub:02X}" in remark
         assert (f"{code:08X}h" in remark) == (code not in NOT_THERE)
     assert len(remarks) == len(OPTIONAL)
+
+
+@pytest.mark.parametrize("code", ABORTS, ids=hex)
+def test_a_drive_without_a_position_range_has_none_whatever_code_says_so(
+    rig: Rig, code: int
+) -> None:
+    bus = eight_of("cia402")
+    bus.drives[3].aborts |= {(0x607B, 1): code, (0x607B, 2): code}
+    assert examined(rig, bus).good
+    assert set_up(rig, bus) == ()
+
+
+@pytest.mark.parametrize("code", [0x05040000, *sorted(NOT_NOW)], ids=hex)
+def test_a_position_range_that_cannot_be_read_now_is_not_taken_for_none(
+    rig: Rig, code: int
+) -> None:
+    bus = eight_of("cia402")
+    bus.drives[3].aborts[0x607B, 2] = code
+    assert [row.object[:5] for row in examined(rig, bus).rows if row.verdict == "wrong"] == [
+        "607Bh"
+    ]
+    with pytest.raises(Refused, match="607Bh"):
+        set_up(rig, bus)
+    assert not downloads(bus)
+
+
+@pytest.mark.parametrize("key", [(0x6065, 0), (0x607D, 1)], ids=str)
+@pytest.mark.parametrize("code", ABORTS, ids=hex)
+def test_a_required_object_that_is_missing_is_refused_before_anything_is_written(
+    rig: Rig, key: tuple[int, int], code: int
+) -> None:
+    bus = eight_of("cia402")
+    bus.drives[3].aborts[key] = code
+    assert not examined(rig, bus).good
+    with pytest.raises(Refused, match=f"drive 3, object {key[0]:04X}h"):
+        set_up(rig, bus)
+    assert not downloads(bus)
 
 
 @pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
@@ -346,7 +422,7 @@ def test_doctor_reports_all_objects_of_all_drives_and_writes_nothing(rig: Rig) -
     assert wrong["1006h:00"].found == {"absent": list(range(1, 9))}
     assert wrong["1006h:00"].change.endswith("epos4")
     assert (
-        wrong["6502h:00"].found_text(found.nodes) == "drive 1, 2, 3, 4, 5, 6, 8: 3A5h; drive 7: 65h"
+        wrong["6502h:00"].found_text(found.nodes) == "drive 1, 2, 3, 4, 5, 6, 8: 225h; drive 7: 65h"
     )
     assert not downloads(bus)
     assert not [m for m in bus.sent if m.arbitration_id < 0x600], "no NMT, no SYNC, no heartbeat"
@@ -434,14 +510,19 @@ def test_doctor_names_silent_drives_and_reads_the_others(rig: Rig) -> None:
     del bus.drives[2]
     found = examined(rig, bus)
     assert (found.silent, len(found.nodes), found.good) == ((2,), 7, False)
+    assert found.stopped == ()
 
 
-@pytest.mark.parametrize(("name", "millimetres"), [("cia402", 0.7), ("epos4", 2.1)])
+@pytest.mark.parametrize(
+    ("name", "noticed_by", "millimetres"),
+    [("cia402", "SYNC", 0.7), *((make, "heartbeat", 2.1) for make in MAKERS)],
+)
 def test_without_sync_monitoring_the_platform_goes_further(
-    rig: Rig, name: str, millimetres: float
+    rig: Rig, name: str, noticed_by: str, millimetres: float
 ) -> None:
     """Heartbeat 100 ms, SYNC 30 ms, both with a ramp of one cycle, at 20 mm/s."""
     theirs = with_profile(rig, name)
+    assert lost_master(theirs).noticed_by == noticed_by
     distance = lost_master(theirs).distance
     assert distance == pytest.approx(millimetres / 1000.0)
     require_stopping_room(theirs, distance)

@@ -95,13 +95,61 @@ def test_no_control_word_is_disable_voltage() -> None:
     ],
 )
 def test_a_drive_that_is_not_enabled_in_time_says_what_keeps_it(word: int, said: str) -> None:
-    wanted = (DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED)
-    (found,) = late_drives({4: "cable 1", 5: "cable 2"}, (word, 0x0237), wanted, 1.0)
+    commanded = (ControlWord.ENABLE_OPERATION,) * 2
+    names = {4: "cable 1", 5: "cable 2"}
+    (found,) = late_drives(names, (word, 0x0237), commanded, Goal.ENABLE, 1.0)
     assert found[0] == 4
     assert found[1].startswith(f"cable 1 is in {state_of(word).value} instead of operation")
     assert said in found[1]
     assert (";" in found[1]) == bool(said)
     assert ("bit 9" in found[1]) == (said == "remote")
+
+
+QUICK_STOPPED, NO_POWER, READY, ON, ENABLED = 0x0217, 0x0240, 0x0231, 0x0233, 0x0237
+
+
+@pytest.mark.parametrize(
+    ("goal", "healthy", "late", "said"),
+    [
+        (Goal.ENABLE, QUICK_STOPPED, NO_POWER, "voltage enabled"),
+        (Goal.ENABLE, READY, NO_POWER, "voltage enabled"),
+        (Goal.ENABLE, ON, 0x0221, "voltage enabled"),
+        (Goal.ENABLE, ENABLED, QUICK_STOPPED, "transition 16"),
+        (Goal.RELEASE, NO_POWER, QUICK_STOPPED, "transition 16"),
+        (Goal.RELEASE, ENABLED, QUICK_STOPPED, "transition 16"),
+        (Goal.RELEASE, ON, ENABLED, "instead of ready to switch on"),
+        (Goal.RELEASE, READY, ON, "instead of ready to switch on"),
+    ],
+)
+def test_drives_that_wait_for_a_late_one_are_not_named(
+    goal: Goal, healthy: int, late: int, said: str
+) -> None:
+    """Seven that stopped were said to need a power cycle because the eighth had no power."""
+    names = {node: f"cable {node}" for node in range(1, 9)}
+    words = (healthy,) * 7 + (late,)
+    states = [state_of(word) for word in words]
+    commanded = next_words(goal, states, [True] * 8)
+    ((node, text),) = late_drives(names, words, commanded, goal, 1.0)
+    assert node == 8
+    assert said in text
+
+
+@given(
+    goal=st.sampled_from([Goal.ENABLE, Goal.RELEASE]),
+    words=st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=8),
+)
+def test_a_group_short_of_its_goal_has_a_late_drive(goal: Goal, words: list[int]) -> None:
+    states = [state_of(word) for word in words]
+    commanded = next_words(goal, states, [True] * len(words))
+    found = late_drives({n: f"drive {n}" for n in range(len(words))}, words, commanded, goal, 1.0)
+    reached = {
+        Goal.ENABLE: {DriveState.OPERATION_ENABLED},
+        Goal.RELEASE: {DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON},
+    }[goal]
+    assert bool(found) == (not set(states) <= reached)
+    assert not any(states[node] in reached for node, _ in found)
+    for node, text in found:
+        assert commanded[node] is ControlWord.ENABLE_OPERATION or "0Fh" not in text
 
 
 def test_only_a_drive_with_torque_and_no_fault_holds() -> None:

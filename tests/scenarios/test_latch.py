@@ -8,16 +8,23 @@ import os
 import signal
 from pathlib import Path
 
+import can
 import pytest
 
-from drivers.can_bus import BusSettings
+from cdpr.cli.options import rig_on_bus
+from drivers.can_bus import BusSettings, open_bus
+from drivers.cia402.pdo import NmtState
 from drivers.cia402.state_machine import DriveState
+from executor.doctor import examine
+from executor.drives import read_snapshot, resting_drives_of
 from executor.interlock.fault_latch import FaultLatch
 from executor.remote.client import ask_all
 from executor.remote.command_socket import find_runs
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
 from model.errors import Refused
+from model.rig import rig_from_document
+from model.scene import empty_scene
 from tests.cli.plans import RIG
 from tests.cli.program import call
 from tests.scenarios.test_real_time import (
@@ -252,6 +259,37 @@ def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
     assert answer.code == 4, answer
     assert "(drive 5) stopped answering" in answer.err
     assert latch.read() is not None
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_reset_takes_a_drive_in_nmt_stopped_back(
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
+) -> None:
+    """It answers nothing, but its heartbeat names the state; only a reset changes it."""
+    profile = tmp_path / "lab.yaml"  # a shorter time-out of silent drives
+    profile.write_text("name: Ours\nsources: [a test]\nsdo_timeout_ms: 600\n")
+    channel = f"239.74.163.35:{20000 + (os.getpid() * 17) % 20000}"
+    document = rig_on_bus(slow_rig, "udp_multicast", channel).document
+    drives = document.drives.model_copy(update={"profile": str(profile)})
+    document = document.model_copy(update={"drives": drives})
+    rig = rig_from_document(document)
+    with drives_on(channel, slow_run) as rehearsal:
+        with resting_drives_of(document, to_reset=True):
+            pass  # from now on the drives send heartbeats
+        with open_bus(BusSettings.of(rig)) as bus:
+            bus.send(can.Message(arbitration_id=0, data=(0x02, 5), is_extended_id=False))
+            while rehearsal.drives[4].nmt is not NmtState.STOPPED:
+                signal.sigtimedwait([], 0.01)
+        found = examine(rig)
+        assert (found.silent, found.stopped) == ((5,), (5,))
+        with pytest.raises(Refused, match="drive 5: in the NMT state 'stopped'") as caught:
+            read_snapshot(rig, rig.home, empty_scene(rig).load)
+        assert "`cdpr reset RIG`" in caught.value.next_step
+        assert rehearsal.drives[4].nmt is NmtState.STOPPED
+        with resting_drives_of(document, to_reset=True) as ready:
+            assert ready.restarted == ()
+            assert rehearsal.drives[4].nmt is NmtState.OPERATIONAL
 
 
 @pytest.mark.slow

@@ -89,6 +89,16 @@ def test_all_lose_their_torque_where_they_are() -> None:
         assert [drive.motor.position for drive in bench.drives] == pytest.approx(stood, abs=1)
 
 
+def test_a_drive_that_cannot_be_enabled_does_not_prevent_the_release() -> None:
+    with held() as bench:
+        last = bench.drives[7]
+        last.state = DriveState.SWITCH_ON_DISABLED
+        last._command_shutdown = lambda: None  # type: ignore[method-assign]
+        bench.do(Release)
+        assert bench.ended is State.FINISHED
+        assert bench.states == {DriveState.READY_TO_SWITCH_ON, DriveState.SWITCH_ON_DISABLED}
+
+
 @pytest.mark.parametrize("kind", [Release, FaultReset])
 def test_nobody_is_watched_any_more_when_the_program_leaves(kind: type[Standstill]) -> None:
     with held() as bench:

@@ -113,6 +113,17 @@ def test_a_drive_of_every_profile_answers(path: Path) -> None:
     line.drive.on_sync()
 
 
+def test_an_epos4_runs_csp_without_listing_it() -> None:
+    line = Line(eds=read_eds(profile_path("epos4")))
+    assert line.read(0x6502, 0) == 0x225
+    assert line.abort(0x6060, 0, "<b", 8) == 0
+    assert line.read(0x6061, 0) == 8
+    assert line.abort(0x6060, 0, "<b", 4) == 0x06090030  # neither in 6502h nor in the file
+    other = Line(eds=read_eds(EDS))
+    other.drive.objects[0x6502, 0] = 0x225
+    assert other.abort(0x6060, 0, "<b", 8) == 0x06090030
+
+
 def test_a_makers_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
     path = tmp_path / "maker.eds"
     path.write_bytes(b"\xef\xbb\xbf" + MAKERS.replace("\n", "\r\n").encode())
