@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 import cdpr
 from cdpr.operation import set_speed
 from executor.recording.run_folder import RunFolder
+from model.scene import empty_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -94,6 +95,20 @@ def test_a_plan_continues_a_run_and_passes_poses(run: cdpr.RunResult) -> None:
         cdpr.plan(rig, scene, start=end, from_run=run.folder)
     with pytest.raises(cdpr.BadInput, match="nothing remains"):
         cdpr.plan(rig, scene, goal=end, from_run=run.folder)
+
+
+def test_a_run_that_ends_on_a_corner_of_the_workspace_is_continued(tmp_path: Path) -> None:
+    """Rounded counts put the platform up to a micrometre outside."""
+    rig = cdpr.load_rig(CONFIGS / "gachon_8_6.yaml")
+    goal = cdpr.Pose.level(rig.workspace_upper)
+    inside = cdpr.Pose.level(np.subtract(rig.workspace_upper, 0.005))
+    scene = empty_scene(rig).changed(start=inside, goal=goal)
+    plan = cdpr.plan(rig, scene, rounds=2)
+    run = cdpr.run(plan, rig, folder=tmp_path / "run", cameras=[], realtime=False)
+    assert run.passed
+    back = cdpr.plan(rig, scene, goal=inside, from_run=run.folder, rounds=2)
+    assert back.waypoints[0].distance_to(goal) < 5e-5
+    assert cdpr.check(back, rig)
 
 
 def messages(path: Path) -> dict[str, int]:
