@@ -13,6 +13,10 @@ from planner.check import AXIS_RADII, SPACING, axis_distances
 from planner.costs import capacity_margins
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
+SAME_ROTATION = 1e-7
+"""Angle up to which two orientations are the same, [rad]: files round quaternions to nine digits.
+The path keeps the start's, and its check allows ten times this."""
+
 
 def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) -> None:
     """Refuses a start, stop or goal at which no path can begin or end.
@@ -31,7 +35,7 @@ def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) 
     model = ClearanceModel(rig, scene)
     for leg in legs_of(scene):
         if not free_rotation:
-            _require_same_orientation(leg)
+            _require_same_orientation(scene, leg)
         for name, pose in ((leg.begin, leg.scene.start), (leg.end, leg.scene.goal)):
             _require_in_workspace(rig, name, pose)
             _require_off_pulley_axes(rig, name, pose)
@@ -57,11 +61,11 @@ def require_feasible_length(scene: Scene, longest: float) -> None:
     )
 
 
-def _require_same_orientation(leg: Leg) -> None:
-    angle = leg.scene.start.angle_to(leg.scene.goal)
-    if angle > 1e-9:
+def _require_same_orientation(scene: Scene, leg: Leg) -> None:
+    angle = scene.start.angle_to(leg.scene.goal)
+    if angle > SAME_ROTATION:
         raise BadInput(
-            f"{leg.begin} and {leg.end} differ in orientation by {np.degrees(angle):.3g} deg",
+            f"start and {leg.end} differ in orientation by {np.degrees(angle):.3g} deg",
             where=f"scene {leg.scene.name}",
             why="without --free-rotation the search keeps the platform's orientation",
             next_step=f"plan with --free-rotation (the scene then needs rotation_limits), or give"

@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 import cdpr
 from cdpr.operation import set_speed
 from executor.recording.run_folder import RunFolder
+from model.pose import matrix_from_rotation_vector, quaternion_from_matrix
 from model.scene import empty_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -108,6 +109,33 @@ def test_a_run_that_ends_on_a_corner_of_the_workspace_is_continued(tmp_path: Pat
     assert run.passed
     back = cdpr.plan(rig, scene, goal=inside, from_run=run.folder, rounds=2)
     assert back.waypoints[0].distance_to(goal) < 5e-5
+    assert cdpr.check(back, rig)
+
+
+@pytest.mark.parametrize(("turn_deg", "tilt_deg"), [(45.0, 0.0), (30.0, 10.0)])
+def test_a_run_with_a_constant_orientation_is_continued_with_it(
+    tmp_path: Path, turn_deg: float, tilt_deg: float
+) -> None:
+    """The paper's robot in a platform frame that is rotated: tables round its quaternion."""
+    turn, tilt = np.radians([turn_deg, tilt_deg])
+    rotation = matrix_from_rotation_vector([0.0, 0.0, turn]) @ matrix_from_rotation_vector(
+        [tilt, 0.0, 0.0]
+    )
+    document = yaml.safe_load((CONFIGS / "gachon_8_6.yaml").read_text())
+    document["anchors_mm"] = (np.array(document["anchors_mm"]) @ rotation).tolist()
+    platform = document["platform"]
+    platform["home"] |= {"rotation_wxyz": quaternion_from_matrix(rotation).tolist()}
+    platform["size_mm"] = [40, 40, 40]
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(document))
+    rig = cdpr.load_rig(tmp_path / "rig.yaml")
+    goal = cdpr.Pose(np.add(rig.home.position, (0.005, 0.0, 0.0)), rotation)
+    scene = empty_scene(rig).changed(goal=goal)
+    run = cdpr.run(
+        cdpr.plan(rig, scene, rounds=2), rig, folder=tmp_path / "run", cameras=[], realtime=False
+    )
+    assert run.passed
+    back = cdpr.plan(rig, scene, goal=rig.home, from_run=run.folder, rounds=2)
+    assert back.waypoints[-1].distance_to(rig.home) < 1e-8
     assert cdpr.check(back, rig)
 
 
