@@ -16,6 +16,8 @@ from mcap.reader import make_reader
 import cdpr
 from cdpr.operation import set_speed
 from executor.recording.run_folder import RunFolder
+from model.files.documents import PoseDocument
+from model.files.scene_file import StopDocument
 from model.pose import matrix_from_rotation_vector, quaternion_from_matrix
 from model.scene import empty_scene
 
@@ -137,6 +139,30 @@ def test_a_run_with_a_constant_orientation_is_continued_with_it(
     back = cdpr.plan(rig, scene, goal=rig.home, from_run=run.folder, rounds=2)
     assert back.waypoints[-1].distance_to(rig.home) < 1e-8
     assert cdpr.check(back, rig)
+
+
+@pytest.mark.parametrize("stops", [(0, 1), (1, 1), (0, 0), (1, 2), (2, 2)])
+def test_stops_that_share_a_waypoint_are_saved_run_and_reported(
+    tmp_path: Path, stops: tuple[int, int]
+) -> None:
+    rig, scene = ready()
+    waypoints = [
+        cdpr.Pose.level(np.add(scene.start.position, (0.0, 0.0, 0.005 * i))) for i in range(3)
+    ]
+    named = [
+        StopDocument(
+            name=f"stop {i}", dwell_s=0.1 * i, **PoseDocument.of(waypoints[k]).model_dump()
+        )
+        for i, k in enumerate(stops)
+    ]
+    scene = scene.changed(goal=waypoints[-1], stops=named)
+    plan = cdpr.plan_from_waypoints(rig, scene, waypoints, stops=stops)
+    again = cdpr.load_plan(plan.save(tmp_path / "plan.json"))
+    assert again.stops == stops
+    run = cdpr.run(again, rig, folder=tmp_path / "run", cameras=[], realtime=False)
+    assert run.passed
+    assert run.report.exists()
+    assert [stop["reached_s"] is not None for stop in run.summary["stops"]] == [True, True]
 
 
 def messages(path: Path) -> dict[str, int]:
