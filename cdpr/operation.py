@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from executor.evaluation import rewrite_report
 from executor.recording.resume import passing, require_room, scene_after
 from executor.recording.run_folder import RunFolder
@@ -88,7 +90,7 @@ def plan(
     """
     if from_run is not None and start is not None:
         raise BadInput("from_run and start contradict each other", next_step="leave out one")
-    of_legs = [rounds] if isinstance(rounds, int) else list(rounds or ())
+    of_legs: list[int] = [] if rounds is None else np.atleast_1d(rounds).tolist()
     settings = settings_from_options(
         PlanningOptions(
             planner=planner,
@@ -213,6 +215,8 @@ def set_speed(percent: int, process: int | None = None) -> dict[str, Any]:
     Raises:
         BadInput: It is not a whole number from 1 to 100, or as for `hold`.
     """
+    if isinstance(percent, np.integer):
+        percent = int(percent)
     if type(percent) is not int or not SLOWEST <= percent <= FASTEST:
         raise BadInput(
             f"the speed must be a whole number of percent from {SLOWEST} to {FASTEST}, it is"

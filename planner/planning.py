@@ -35,6 +35,7 @@ from planner.settings import (
     PlannerSettings,
     Settings,
     TurningSettings,
+    whole_number,
 )
 from planner.space import PoseSpace, Space, TranslationSpace
 
@@ -332,6 +333,7 @@ def plan_from_waypoints(
             where=f"plan for {rig.name} in {scene.name}",
             next_step="start at scene.start and end at scene.goal",
         )
+    stops = [whole_number("the waypoint of a stop", index) for index in stops]
     report = check_path(rig, scene, waypoints, stops)
     if not report.passed:
         raise PlanRejected(

@@ -258,15 +258,16 @@ def measurement_poses(
         listener: Receives the progress.
 
     Raises:
+        BadInput: The seed is out of range.
         NoSolution: Too few poses are feasible and free, or there is no path between two.
     """
+    settings = TurningSettings(weights=OBJECTIVES["length"], seed=seed, rounds=ROUNDS)
     room = RESERVE_SHARE * (rig.max_tension - rig.min_tension) if reserve is None else reserve
     of_poses = (0.3e-3,) * 3 + (radians(0.05),) * 3
     requirements = PoseRequirements(count, tilt, turn, candidates, room, 0.1e-3, of_poses)
     with listener.waiting("choosing poses"):
         parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
-        chosen = choose_poses(rig, scene, requirements, parameters, seed)
-    settings = TurningSettings(weights=OBJECTIVES["length"], seed=seed, rounds=ROUNDS)
+        chosen = choose_poses(rig, scene, requirements, parameters, settings.seed)
     document = plan_path(rig, _with_stops(scene, chosen, dwell), settings, listener)
     return MeasurementPlan(tuple(chosen), document)
 

@@ -229,6 +229,11 @@ def test_a_speed_that_cannot_be_is_refused_before_it_is_sent(percent: object) ->
         set_speed(percent)  # type: ignore[arg-type]
 
 
+def test_a_speed_is_an_integer_of_any_type() -> None:
+    with pytest.raises(cdpr.Fault, match="no active run"):
+        set_speed(np.int64(50))
+
+
 def test_a_figure_shows_error_tensions_and_clearance(run: cdpr.RunResult) -> None:
     mpl.use("Agg")
     import matplotlib.pyplot as plt

@@ -14,9 +14,10 @@ from calibration.geometry.pose_selection import (
     _d_optimal,
     _short_tour,
     choose_poses,
+    measurement_poses,
 )
 from model.clearance import ClearanceModel
-from model.errors import NoSolution
+from model.errors import BadInput, NoSolution
 from model.pose import Pose
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene
@@ -96,3 +97,9 @@ def test_a_scene_without_room_is_refused(rig: Rig, scene: Scene) -> None:
         choose_poses(
             rig, narrow, replace(WISH, candidates=15), Parameters.of(rig, {"offsets": 1e-3}), 0
         )
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_a_seed_that_no_plan_can_have_is_refused_at_once(rig: Rig, scene: Scene, seed: int) -> None:
+    with pytest.raises(BadInput, match="seed must be a whole number"):
+        measurement_poses(rig, scene, seed=seed)
