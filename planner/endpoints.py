@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from model.clearance import ClearanceModel, Nearest
+from model.clearance import PLATFORM, ClearanceModel, Nearest, SelfModel
 from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig
@@ -29,9 +29,11 @@ def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) 
         free_rotation: Whether they may differ in orientation.
 
     Raises:
-        BadInput: One of them is outside the workspace box, violates an obstacle or self clearance,
-            or cannot be held; or they differ in orientation.
+        BadInput: An anchor is too deep inside the platform's box; one of them is outside the
+            workspace box, violates an obstacle or self clearance, or cannot be held; or they
+            differ in orientation.
     """
+    _require_outer_anchors(rig, scene)
     model = ClearanceModel(rig, scene)
     for leg in legs_of(scene):
         if not free_rotation:
@@ -58,6 +60,32 @@ def require_feasible_length(scene: Scene, longest: float) -> None:
         where=f"scene {scene.name}",
         next_step="allow a longer path with --longest-mm, or leave it out",
         values={"longest_mm": longest * 1e3, "straight_mm": straight * 1e3},
+    )
+
+
+def _require_outer_anchors(rig: Rig, scene: Scene) -> None:
+    """Refuses anchors so deep in the platform's box that no pose keeps the self clearance.
+
+    A cable is compared with the box from a stub's length off its anchor on. Whatever its direction,
+    it is there no farther outside than the stub is longer than the anchor is deep.
+    """
+    stub, needed = SelfModel(rig).stub, scene.self_clearance + CLEARANCE_RESERVE
+    depths = np.min(rig.half_size - np.abs(rig.anchors), axis=1)
+    cable = int(np.argmax(depths))
+    depth, most = float(depths[cable]), stub - rig.cable_radius - needed
+    if depth < 0.0 or depth <= most:
+        return
+    where = f"{depth * 1e3:.1f} mm inside the platform's box" if depth else "on the platform's box"
+    deep = f"move the anchor to at most {most * 1e3:.2f} mm inside the box, correct the box"
+    raise BadInput(
+        f"at no pose does cable {cable + 1} keep {needed * 1e3:.2f} mm from the platform: its"
+        f" anchor is {where}",
+        where=f"rig {rig.name}",
+        why=f"only the first {stub * 1e3:.1f} mm of a cable, a quarter of the shortest side of the"
+        " box, may be nearer",
+        next_step=f"{deep if most >= 0.0 else 'declare a thicker box'}, or reduce clearance.self_mm"
+        " in the scene",
+        values={"cable": cable + 1, "depth_mm": depth * 1e3, "required_mm": needed * 1e3},
     )
 
 
@@ -130,11 +158,14 @@ def _clearance_error(name: str, near: Nearest, needed: float, key: str) -> BadIn
             f"at the {name} {near.first} is {distance:.2f} mm from {near.second},"
             f" less than the required {limit:.2f} mm"
         )
+    hint = " or the obstacle"
+    if key == "self_mm" and near.second == PLATFORM:
+        hint = ", correct the anchor or the platform's box in the rig file"
     return BadInput(
         what,
         where=f"scene {name}",
         why=f"the scene's clearance.{key} plus 0.05 mm that the planner keeps in reserve",
-        next_step=f"move the {name} or the obstacle, or reduce the clearance",
+        next_step=f"move the {name}{hint}, or reduce the clearance",
         values={"distance_mm": distance, "required_mm": limit, "pair": _pair(near)},
     )
 
