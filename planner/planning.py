@@ -185,7 +185,7 @@ def make_plan(
 ) -> PlanDocument:
     """Plans a path from the scene's start through its stops to its goal.
 
-    The same rig, scene and settings give the same path on every machine with the same libraries.
+    The same rig, scene and settings give the same path with the same libraries and processor type.
     The clock only fills the statistics; but settings without a number of rounds continue until the
     budget is spent, and the plan then states the rounds that reproduce its path.
 
