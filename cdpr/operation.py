@@ -72,7 +72,7 @@ def plan(
         free_rotation: The platform may rotate, within the scene's limits.
         start: Overrides the scene's start, ``world_from_platform``.
         goal: Overrides the scene's goal, ``world_from_platform``.
-        via: Poses to pass before the scene's stops; short rests there are joined where possible.
+        via: Poses to pass before the scene's stops; the platform comes to rest at each.
         from_run: Folder of a run that ended early: the plan starts there and visits the remaining
             stops.
         clearance: Overrides the scene's obstacle clearance, [m].
