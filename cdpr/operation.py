@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from executor.evaluation import rewrite_report
 from executor.recording.resume import passing, require_room, scene_after
 from executor.recording.run_folder import RunFolder
@@ -70,7 +72,7 @@ def plan(
         free_rotation: The platform may rotate, within the scene's limits.
         start: Overrides the scene's start, ``world_from_platform``.
         goal: Overrides the scene's goal, ``world_from_platform``.
-        via: Poses to pass before the scene's stops; short rests there are joined where possible.
+        via: Poses to pass before the scene's stops; the platform comes to rest at each.
         from_run: Folder of a run that ended early: the plan starts there and visits the remaining
             stops.
         clearance: Overrides the scene's obstacle clearance, [m].
@@ -88,7 +90,7 @@ def plan(
     """
     if from_run is not None and start is not None:
         raise BadInput("from_run and start contradict each other", next_step="leave out one")
-    of_legs = [rounds] if isinstance(rounds, int) else list(rounds or ())
+    of_legs: list[int] = [] if rounds is None else np.atleast_1d(rounds).tolist()
     settings = settings_from_options(
         PlanningOptions(
             planner=planner,
@@ -213,6 +215,8 @@ def set_speed(percent: int, process: int | None = None) -> dict[str, Any]:
     Raises:
         BadInput: It is not a whole number from 1 to 100, or as for `hold`.
     """
+    if isinstance(percent, np.integer):
+        percent = int(percent)
     if type(percent) is not int or not SLOWEST <= percent <= FASTEST:
         raise BadInput(
             f"the speed must be a whole number of percent from {SLOWEST} to {FASTEST}, it is"

@@ -2,7 +2,8 @@
 
     python examples/compare_objectives.py
 
-With a fixed number of rounds and a seed the paths are the same on every computer.
+With a fixed number of rounds and a seed the paths are the same each time, with the same libraries
+on processors of the same type.
 """
 
 from pathlib import Path

@@ -2,7 +2,8 @@
 
     python examples/run_simulated.py
 
-Drives, platform and cameras are simulated in this process. Writes the folder `runs/simulated`.
+Drives, platform and cameras are simulated in this process. The run folder, named by date and
+time, is in `runs`.
 """
 
 from pathlib import Path
@@ -21,7 +22,7 @@ def main() -> None:
     scene = scene.changed(goal=goal)  # 28 mm: a few seconds at 20 mm/s
 
     plan = cdpr.plan(rig, scene)
-    run = cdpr.run(plan, rig, folder="runs/simulated", realtime=False, on_event=print)
+    run = cdpr.run(plan, rig, realtime=False, on_event=print)
     print(run.verdict, "-", run.sentence)
 
     error = run.cycles["following_error_mm"]

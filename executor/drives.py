@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from can import BusABC
 
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
@@ -283,6 +282,9 @@ _SETTLED, _ROUNDS = 1e-8, 200
 def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
     """The pose whose planned drive positions are these, ``world_from_platform``.
 
+    On a face of the workspace box, rounded counts give a position up to micrometres outside: within
+    the start tolerance, the nearest one of the box is meant.
+
     Args:
         rig: The robot; its drives are referenced.
         counts: Positions of the drives, shape (m,), [counts].
@@ -310,10 +312,10 @@ def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
             why="the solver did not converge",
             next_step="report this with the rig file and the positions; nothing has moved",
         )
-    position = found.pose.position
-    inside = np.all((rig.workspace_lower <= position) & (position <= rig.workspace_upper))
-    if not (inside and found.worst <= rig.motion.start_tolerance):
-        x, y, z = position * 1000.0
+    pose = rig.clipped(found.pose)
+    off = max(found.worst, pose.distance_to(found.pose))
+    if not off <= rig.motion.start_tolerance:
+        x, y, z = found.pose.position * 1000.0
         raise Refused(
             f"the drive positions fit no pose in the workspace: the nearest is {x:.1f}, {y:.1f},"
             f" {z:.1f} mm, with a cable {found.worst * 1000:.1f} mm off",
@@ -322,4 +324,4 @@ def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
             next_step="home the drives at a known pose (home_counts in the rig file);"
             " nothing was moved",
         )
-    return found.pose
+    return pose

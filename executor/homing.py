@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from executor.cameras.client import static_pose
 from executor.cameras.open import measure_at_rest
 from executor.cameras.sources import choose_one_camera, require_synthetic_images
@@ -114,7 +116,7 @@ def home(
     """
     in_process = is_simulated(rig)
     require_own_time(rig, realtime)
-    given = [camera] if isinstance(camera, str | int) else camera or []
+    given = [camera] if isinstance(camera, str | int | np.integer) else camera or []
     sources = [str(source) for source in given]
     require_one_pose(at_home, pose, sources)
     _require_slow(reach, speed, pictures)

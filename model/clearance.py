@@ -227,7 +227,8 @@ class ClearanceModel:
 
     It caches the separating planes of the last pose: a plane bounds the distance from below at the
     next pose too, so most bodies are ruled out without computing their distance. The bounds are
-    exact; the cache changes the time, not the result.
+    exact; the cache changes the time, not the result. Each thread needs a model of its own: a bound
+    read while another thread stores a plane may be wrong.
     """
 
     def __init__(self, rig: Rig, scene: Scene) -> None:

@@ -149,7 +149,7 @@ def _check_stops(plan: Plan, path: Path) -> None:
     indices = [mark.waypoint for mark in marks]
     if [mark.name for mark in marks] != [stop.name for stop in stops]:
         what = f"marks the stops {[m.name for m in marks]}; its scene has {[s.name for s in stops]}"
-    elif indices != sorted(set(indices)) or not all(0 < p < len(plan.waypoints) for p in indices):
+    elif indices != sorted(indices) or not all(p < len(plan.waypoints) for p in indices):
         what = f"marks the waypoints {indices} of {len(plan.waypoints)} as stops, out of order"
     else:
         away = [plan.waypoints[p].distance_to(s.pose) for p, s in zip(indices, stops, strict=True)]

@@ -222,6 +222,11 @@ class Rig:
         """
         return posed_rig(self, pose, load)
 
+    def clipped(self, pose: Pose) -> Pose:
+        """The pose with its origin moved to the nearest point of the workspace box."""
+        position = np.clip(pose.position, self.workspace_lower, self.workspace_upper)
+        return Pose(position, pose.rotation)
+
     def camera(self, name: str | None = None) -> Camera:
         """The camera of a name; the first when no name is given.
 

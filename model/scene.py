@@ -101,8 +101,8 @@ class Scene:
         goal: ``world_from_platform`` at the goal.
         load: What the cables carry from the start on.
         stops: Intermediate stops in order; `legs_of` gives the loads between them.
-        rotation_limits: Limits of the platform's tilt and turn; None where the scene has none, and
-            the platform then keeps its orientation.
+        rotation_limits: Limits of the platform's tilt and turn, checked on every path; None for no
+            limits. Planning with free rotation requires some.
     """
 
     document: SceneDocument

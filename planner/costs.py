@@ -157,8 +157,13 @@ class KinematicCost:
             return condition, 1.0 / force_volume(matrices, rig.max_tension - rig.min_tension)
 
     def _scaled(self, condition: Array, inverse: Array) -> Array:
+        """An index better than the best of the lattice counts as 0, as in the search."""
         scaled = [
-            np.where(np.isfinite(v), (v - low) / (high - low if high > low else 1.0), 1.0)
+            np.where(
+                np.isfinite(v),
+                np.maximum((v - low) / (high - low if high > low else 1.0), 0.0),
+                1.0,
+            )
             for v, (low, high) in zip((condition, inverse), self.extremes, strict=True)
         ]
         total: Array = scaled[0] + scaled[1]

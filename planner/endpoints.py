@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from model.clearance import ClearanceModel, Nearest
+from model.clearance import PLATFORM, ClearanceModel, Nearest, SelfModel
 from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig
@@ -12,6 +12,10 @@ from model.scene import Leg, Scene, legs_of
 from planner.check import AXIS_RADII, SPACING, axis_distances
 from planner.costs import capacity_margins
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
+
+SAME_ROTATION = 1e-7
+"""Angle up to which two orientations are the same, [rad]: files round quaternions to nine digits.
+The path keeps the start's, and its check allows ten times this."""
 
 
 def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) -> None:
@@ -25,13 +29,15 @@ def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) 
         free_rotation: Whether they may differ in orientation.
 
     Raises:
-        BadInput: One of them is outside the workspace box, violates an obstacle or self clearance,
-            or cannot be held; or they differ in orientation.
+        BadInput: An anchor is too deep inside the platform's box; one of them is outside the
+            workspace box, violates an obstacle or self clearance, or cannot be held; or they
+            differ in orientation.
     """
+    _require_outer_anchors(rig, scene)
     model = ClearanceModel(rig, scene)
     for leg in legs_of(scene):
         if not free_rotation:
-            _require_same_orientation(leg)
+            _require_same_orientation(scene, leg)
         for name, pose in ((leg.begin, leg.scene.start), (leg.end, leg.scene.goal)):
             _require_in_workspace(rig, name, pose)
             _require_off_pulley_axes(rig, name, pose)
@@ -57,11 +63,37 @@ def require_feasible_length(scene: Scene, longest: float) -> None:
     )
 
 
-def _require_same_orientation(leg: Leg) -> None:
-    angle = leg.scene.start.angle_to(leg.scene.goal)
-    if angle > 1e-9:
+def _require_outer_anchors(rig: Rig, scene: Scene) -> None:
+    """Refuses anchors so deep in the platform's box that no pose keeps the self clearance.
+
+    A cable is compared with the box from a stub's length off its anchor on. Whatever its direction,
+    it is there no farther outside than the stub is longer than the anchor is deep.
+    """
+    stub, needed = SelfModel(rig).stub, scene.self_clearance + CLEARANCE_RESERVE
+    depths = np.min(rig.half_size - np.abs(rig.anchors), axis=1)
+    cable = int(np.argmax(depths))
+    depth, most = float(depths[cable]), stub - rig.cable_radius - needed
+    if depth < 0.0 or depth <= most:
+        return
+    where = f"{depth * 1e3:.1f} mm inside the platform's box" if depth else "on the platform's box"
+    deep = f"move the anchor to at most {most * 1e3:.2f} mm inside the box, correct the box"
+    raise BadInput(
+        f"at no pose does cable {cable + 1} keep {needed * 1e3:.2f} mm from the platform: its"
+        f" anchor is {where}",
+        where=f"rig {rig.name}",
+        why=f"only the first {stub * 1e3:.1f} mm of a cable, a quarter of the shortest side of the"
+        " box, may be nearer",
+        next_step=f"{deep if most >= 0.0 else 'declare a thicker box'}, or reduce clearance.self_mm"
+        " in the scene",
+        values={"cable": cable + 1, "depth_mm": depth * 1e3, "required_mm": needed * 1e3},
+    )
+
+
+def _require_same_orientation(scene: Scene, leg: Leg) -> None:
+    angle = scene.start.angle_to(leg.scene.goal)
+    if angle > SAME_ROTATION:
         raise BadInput(
-            f"{leg.begin} and {leg.end} differ in orientation by {np.degrees(angle):.3g} deg",
+            f"start and {leg.end} differ in orientation by {np.degrees(angle):.3g} deg",
             where=f"scene {leg.scene.name}",
             why="without --free-rotation the search keeps the platform's orientation",
             next_step=f"plan with --free-rotation (the scene then needs rotation_limits), or give"
@@ -126,11 +158,14 @@ def _clearance_error(name: str, near: Nearest, needed: float, key: str) -> BadIn
             f"at the {name} {near.first} is {distance:.2f} mm from {near.second},"
             f" less than the required {limit:.2f} mm"
         )
+    hint = " or the obstacle"
+    if key == "self_mm" and near.second == PLATFORM:
+        hint = ", correct the anchor or the platform's box in the rig file"
     return BadInput(
         what,
         where=f"scene {name}",
         why=f"the scene's clearance.{key} plus 0.05 mm that the planner keeps in reserve",
-        next_step=f"move the {name} or the obstacle, or reduce the clearance",
+        next_step=f"move the {name}{hint}, or reduce the clearance",
         values={"distance_mm": distance, "required_mm": limit, "pair": _pair(near)},
     )
 

@@ -35,6 +35,7 @@ from planner.settings import (
     PlannerSettings,
     Settings,
     TurningSettings,
+    whole_number,
 )
 from planner.space import PoseSpace, Space, TranslationSpace
 
@@ -184,7 +185,7 @@ def make_plan(
 ) -> PlanDocument:
     """Plans a path from the scene's start through its stops to its goal.
 
-    The same rig, scene and settings give the same path on every machine with the same libraries.
+    The same rig, scene and settings give the same path with the same libraries and processor type.
     The clock only fills the statistics; but settings without a number of rounds continue until the
     budget is spent, and the plan then states the rounds that reproduce its path.
 
@@ -332,6 +333,7 @@ def plan_from_waypoints(
             where=f"plan for {rig.name} in {scene.name}",
             next_step="start at scene.start and end at scene.goal",
         )
+    stops = [whole_number("the waypoint of a stop", index) for index in stops]
     report = check_path(rig, scene, waypoints, stops)
     if not report.passed:
         raise PlanRejected(

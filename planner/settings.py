@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
 from model.errors import BadInput, NoSolution
+from model.files.documents import SEED_LARGEST, WHOLE_LARGEST
 from planner.path import Progress
 from planner.rrt.variants import TEXT, AlgorithmVariant, ConeDraw, FailureRate, Focus, Steer
 
@@ -28,6 +30,27 @@ MARGIN_RESERVE = 0.002
 IMPROVING_ITERATIONS = 500
 """Iterations of the rewiring mode after its first path. Source: measured on the paper's scenes;
 twice as many made the paths 1 % cheaper, as post-processing does the rest."""
+
+
+def whole_number(name: str, value: int, least: int = 0, most: int = WHOLE_LARGEST) -> int:
+    """A Python integer from any integer type, such as NumPy's.
+
+    Args:
+        name: Of the value, for the message.
+        value: The number.
+        least: Smallest allowed.
+        most: Largest allowed.
+
+    Raises:
+        BadInput: It is not a whole number, or outside the limits.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or not least <= number <= most:
+        raise BadInput(f"{name} must be a whole number from {least} to {most}, it is {value}")
+    return number
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +83,7 @@ class PlannerSettings:
         """Refuses unusable settings.
 
         Raises:
-            BadInput: A name is unknown or a size is not positive.
+            BadInput: A name is unknown, a size is not positive, or a number is out of range.
         """
         known = {
             "sampler": ("adaptive", "goal-bias"),
@@ -71,11 +94,12 @@ class PlannerSettings:
             if getattr(self, name) not in choices:
                 what = f"unknown {name} {getattr(self, name)!r}"
                 raise BadInput(what, next_step=f"use one of: {', '.join(choices)}")
-        for name in ("step", "neighbour_radius", "goal_radius", "max_iterations"):
+        for name in ("step", "neighbour_radius", "goal_radius"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise BadInput(f"{name} must be above 0, it is {getattr(self, name)}")
-        if self.seed < 0:
-            raise BadInput(f"the seed must not be negative, it is {self.seed}")
+        most = whole_number("max_iterations", self.max_iterations, least=1)
+        object.__setattr__(self, "max_iterations", most)
+        object.__setattr__(self, "seed", whole_number("the seed", self.seed, most=SEED_LARGEST))
 
 
 # The objective of a search: a weighted sum of length, kinematic cost, clearance and margin.
@@ -166,14 +190,13 @@ class AnytimeSettings:
         """Refuses unusable settings.
 
         Raises:
-            BadInput: The seed is negative, or a limit is not positive.
+            BadInput: The seed or the rounds are out of range, or a limit is not positive.
         """
-        if self.seed < 0:
-            raise BadInput(f"the seed must not be negative, it is {self.seed}")
+        object.__setattr__(self, "seed", whole_number("the seed", self.seed, most=SEED_LARGEST))
         if not 0.0 < self.budget < math.inf:
             raise BadInput(f"the budget must be above 0 ms, it is {self.budget * 1e3:g} ms")
-        if self.rounds is not None and self.rounds < 1:
-            raise BadInput(f"rounds must be at least 1, not {self.rounds}")
+        if self.rounds is not None:
+            object.__setattr__(self, "rounds", whole_number("rounds", self.rounds, least=1))
         if not self.longest > 0.0:
             raise BadInput(f"the longest path must be above 0 mm, not {self.longest * 1e3:g} mm")
 

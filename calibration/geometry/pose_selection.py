@@ -21,7 +21,7 @@ from model.plan import Plan, plan_from_document
 from model.pose import Array, Pose, largest_rotations, matrix_from_rotation_vector
 from model.progress import SILENT, Listener
 from model.rig import Rig
-from model.scene import Scene, scene_from_document
+from model.scene import Load, Scene, scene_from_document
 from model.statics.gravity import working_tensions
 from model.statics.tension_distribution import TensionInfeasible
 from model.statics.wrench_sets import rms_anchor_radius
@@ -84,7 +84,8 @@ def choose_poses(
             next_step="use fewer poses, less --reserve-n, less clearance in the scene, or more"
             " --candidates",
         )
-    best = _d_optimal(_rows(rig, found, requirements, parameters), requirements.count)
+    rows = _rows(rig, scene.load, found, requirements, parameters)
+    best = _d_optimal(rows, requirements.count)
     reach = rms_anchor_radius(rig.anchors)
     return _short_tour([found[k] for k in best], scene.start, reach)
 
@@ -134,11 +135,15 @@ def _is_free(rig: Rig, scene: Scene, model: ClearanceModel, pose: Pose, room: fl
 
 
 def _rows(
-    rig: Rig, poses: Sequence[Pose], requirements: PoseRequirements, parameters: Parameters
+    rig: Rig,
+    load: Load,
+    poses: Sequence[Pose],
+    requirements: PoseRequirements,
+    parameters: Parameters,
 ) -> Array:
     """Whitened Jacobian of each pose, its pose error included, shape (k, m, p)."""
     winches = WinchMap(rig)
-    tensions = np.array([working_tensions(rig, pose).tensions for pose in poses])
+    tensions = np.array([working_tensions(rig, pose, load).tensions for pose in poses])
     lengths = np.array([cables_at(rig, pose).lengths for pose in poses])
     positions = np.array([pose.position for pose in poses])
     rotations = np.array([pose.rotation for pose in poses])
@@ -258,15 +263,16 @@ def measurement_poses(
         listener: Receives the progress.
 
     Raises:
+        BadInput: The seed is out of range.
         NoSolution: Too few poses are feasible and free, or there is no path between two.
     """
+    settings = TurningSettings(weights=OBJECTIVES["length"], seed=seed, rounds=ROUNDS)
     room = RESERVE_SHARE * (rig.max_tension - rig.min_tension) if reserve is None else reserve
     of_poses = (0.3e-3,) * 3 + (radians(0.05),) * 3
     requirements = PoseRequirements(count, tilt, turn, candidates, room, 0.1e-3, of_poses)
     with listener.waiting("choosing poses"):
         parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
-        chosen = choose_poses(rig, scene, requirements, parameters, seed)
-    settings = TurningSettings(weights=OBJECTIVES["length"], seed=seed, rounds=ROUNDS)
+        chosen = choose_poses(rig, scene, requirements, parameters, settings.seed)
     document = plan_path(rig, _with_stops(scene, chosen, dwell), settings, listener)
     return MeasurementPlan(tuple(chosen), document)
 

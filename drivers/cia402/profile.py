@@ -31,26 +31,32 @@ def profile_names() -> tuple[str, ...]:
 
 
 def load_profile(name: str) -> ProfileDocument:
-    """A shipped profile by name, or a profile file by path.
+    """A shipped profile by name, or a profile file by path, as it is now.
 
     Raises:
         BadInput: There is no such profile, or the file cannot be read.
         InvalidFile: With all errors of the file.
     """
-    return _loaded(name)
+    if name in profile_names():
+        return _loaded(FOLDER / f"{name}.yaml", ())
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        raise BadInput(
+            f"there is no drive profile {name!r}",
+            where="drives.profile",
+            next_step=f"use one of {', '.join(profile_names())}, or the path of your own YAML file",
+        )
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return load_yaml(path, ProfileDocument)  # refuses it with the reason
+    return _loaded(path.resolve(), (status.st_ino, status.st_mtime_ns, status.st_size))
 
 
 @lru_cache(maxsize=16)
-def _loaded(name: str) -> ProfileDocument:
-    if name in profile_names():
-        return load_yaml(FOLDER / f"{name}.yaml", ProfileDocument)
-    if name.endswith((".yaml", ".yml")):
-        return load_yaml(Path(name), ProfileDocument)
-    raise BadInput(
-        f"there is no drive profile {name!r}",
-        where="drives.profile",
-        next_step=f"use one of {', '.join(profile_names())}, or the path of your own YAML file",
-    )
+def _loaded(path: Path, _version: tuple[int, ...]) -> ProfileDocument:
+    """A profile file; an edited one is another version."""
+    return load_yaml(path, ProfileDocument)
 
 
 def profile_of(rig: Rig) -> ProfileDocument:

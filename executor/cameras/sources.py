@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from model.errors import BadInput
 from model.rig import Camera, Rig
 
@@ -108,7 +110,7 @@ def resolve_cameras(rig: Rig, wanted: CameraChoice, in_process: bool) -> dict[Ca
     """
     if wanted is None:
         return choose_cameras(rig, [], False, in_process)
-    if isinstance(wanted, str | int):
+    if isinstance(wanted, str | int | np.integer):
         return choose_cameras(rig, [str(wanted)], False, in_process)
     if isinstance(wanted, Mapping):
         wanted = [f"{name}={source}" for name, source in wanted.items()]

@@ -137,7 +137,7 @@ def _pose(rig: Rig, cycles: CycleTable, where: str) -> Pose:
             f" the limit is {allowed * 1e3:g} mm",
             where,
         )
-    pose = Pose(found.position, commanded.rotation)
+    pose = rig.clipped(Pose(found.position, commanded.rotation))  # counts are rounded
     off = np.abs(cable_lengths(rig, pose) - lengths)
     worst, allowed = int(np.argmax(off)), rig.motion.start_tolerance
     if not off[worst] <= allowed:

@@ -38,7 +38,8 @@ LARGEST, SMALLEST = 1e12, 1e-12
 them stay finite."""
 WHOLE_LARGEST = 2**31 - 1
 """Limit of drive positions and other whole numbers."""
-SEED_LARGEST = 2**63 - 1
+SEED_LARGEST = COUNT_LARGEST = 2**63 - 1
+"""Limit of seeds, and of what a search counts: half an hour checks more than 2**31 edges."""
 NAME_BYTES = 100
 """Longest name in UTF-8: it becomes part of file names."""
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from model.files.documents import (
+    COUNT_LARGEST,
     WHOLE_LARGEST,
     Document,
     NonNegative,
@@ -75,9 +76,9 @@ class WaypointsDocument(Document):
 class StatisticsDocument(Document):
     """Effort of the search."""
 
-    nodes: Annotated[int, Field(ge=1, le=WHOLE_LARGEST)]
-    iterations: Annotated[int, Field(ge=0, le=WHOLE_LARGEST)]
-    edge_checks: Annotated[int, Field(ge=0, le=WHOLE_LARGEST)]
+    nodes: Annotated[int, Field(ge=1, le=COUNT_LARGEST)]
+    iterations: Annotated[int, Field(ge=0, le=COUNT_LARGEST)]
+    edge_checks: Annotated[int, Field(ge=0, le=COUNT_LARGEST)]
     planning_time_s: NonNegative
     search_time_s: NonNegative | None = None
 

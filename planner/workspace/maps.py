@@ -218,5 +218,5 @@ def costs(values: Values, extremes: Extremes) -> Values:
 
 def _scaled(values: Array, low: float, high: float) -> Array:
     """From 0 to 1 within the workspace, and 1 where the platform is singular, as plans have it."""
-    scaled: Array = (values - low) / (high - low if high > low else 1.0)
+    scaled = np.maximum((values - low) / (high - low if high > low else 1.0), 0.0)
     return np.where(np.isinf(values), 1.0, scaled)

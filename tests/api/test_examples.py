@@ -44,7 +44,7 @@ def ran(name: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
     ("name", "said", "left"),
     [
         ("plan_path.py", "proved clearance: 10.", ["plan.json", "plan.png"]),
-        ("run_simulated.py", "PASSED - ", ["runs/simulated/report.html", "run.png"]),
+        ("run_simulated.py", "PASSED - ", ["runs/*/report.html", "run.png"]),
         ("track_images.py", "place_06.jpg:", []),
         ("compare_objectives.py", "capacity ", []),
         ("own_planner.py", "around passes: <Plan", ["own-plan.json"]),
@@ -60,7 +60,13 @@ def test_an_example_runs_and_leaves_what_it_says(
 ) -> None:
     ran(name, monkeypatch)
     assert said in capsys.readouterr().out
-    assert [file for file in left if not Path(file).is_file()] == []
+    assert [file for file in left if not any(Path().glob(file))] == []
+
+
+def test_the_example_of_a_run_can_be_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    for _ in range(2):
+        ran("run_simulated.py", monkeypatch)
+    assert len(list(Path("runs").iterdir())) == 2
 
 
 def test_the_example_for_a_bus_is_rehearsed_and_refuses_a_missing_one(

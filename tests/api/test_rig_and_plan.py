@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 import pytest
 
 import cdpr
+from model.files.documents import PoseDocument
+from model.files.scene_file import StopDocument
 from model.kinematics import cable_lengths
 from model.statics.gravity import weight_wrench
 
@@ -68,6 +71,63 @@ def test_the_same_rounds_and_seed_give_the_same_path(
 ) -> None:
     again = cdpr.plan(rig, scene, rounds=[12], seed=3)
     assert again.document.waypoints == plan.document.waypoints
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rounds": np.int64(12)},
+        {"rounds": np.array([12])},
+        {"rounds": [np.int32(12)]},
+        {"seed": np.int64(3)},
+        {"seed": np.uint8(3)},
+    ],
+)
+def test_integers_of_numpy_are_integers(
+    rig: cdpr.Rig, scene: cdpr.Scene, plan: cdpr.Plan, changes: dict[str, Any]
+) -> None:
+    again = cdpr.plan(rig, scene, **{"rounds": 12, "seed": 3, **changes})
+    assert again.document.waypoints == plan.document.waypoints
+    assert again.document.planner == plan.document.planner
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"seed": 2**63}, "seed"),
+        ({"seed": -1}, "seed"),
+        ({"seed": 1.5}, "seed"),
+        ({"rounds": 2.5}, "rounds"),
+        ({"rounds": 2**31}, "rounds"),
+        ({"rounds": ["12"]}, "rounds"),
+        ({"seed": 2**63, "planner": "adaptive"}, "seed"),
+        ({"max_iterations": 10.0, "planner": "adaptive"}, "max_iterations"),
+    ],
+)
+def test_numbers_that_are_not_whole_or_out_of_range_are_refused(
+    rig: cdpr.Rig, scene: cdpr.Scene, changes: dict[str, Any], word: str
+) -> None:
+    with pytest.raises(cdpr.BadInput, match=f"{word} must be a whole number"):
+        cdpr.plan(rig, scene, **changes)
+
+
+def test_the_largest_seed_is_written_to_the_plan_file(
+    rig: cdpr.Rig, scene: cdpr.Scene, tmp_path: Path
+) -> None:
+    plan = cdpr.plan(rig, scene, seed=2**63 - 1, rounds=1)
+    again = cdpr.load_plan(plan.save(tmp_path / "plan.json"))
+    assert again.document.planner.seed == 2**63 - 1
+
+
+def test_stops_of_a_path_are_integers_of_any_type(rig: cdpr.Rig, scene: cdpr.Scene) -> None:
+    over = cdpr.Pose.level(np.add(scene.start.position, (0.0, 0.0, 0.01)))
+    at = StopDocument(name="over", **PoseDocument.of(over).model_dump())
+    around = scene.changed(goal=scene.start, stops=[at])
+    poses = [scene.start, over, scene.start]
+    plan = cdpr.plan_from_waypoints(rig, around, poses, stops=np.flatnonzero([0, 1, 0]))
+    assert plan.stops == (1,)
+    with pytest.raises(cdpr.BadInput, match="whole number"):
+        cdpr.plan_from_waypoints(rig, around, poses, stops=[1.0])  # type: ignore[list-item]
 
 
 def test_arguments_that_contradict_each_other_are_refused(rig: cdpr.Rig, scene: cdpr.Scene) -> None:

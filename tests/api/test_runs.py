@@ -16,6 +16,10 @@ from mcap.reader import make_reader
 import cdpr
 from cdpr.operation import set_speed
 from executor.recording.run_folder import RunFolder
+from model.files.documents import PoseDocument
+from model.files.scene_file import StopDocument
+from model.pose import matrix_from_rotation_vector, quaternion_from_matrix
+from model.scene import empty_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -96,6 +100,71 @@ def test_a_plan_continues_a_run_and_passes_poses(run: cdpr.RunResult) -> None:
         cdpr.plan(rig, scene, goal=end, from_run=run.folder)
 
 
+def test_a_run_that_ends_on_a_corner_of_the_workspace_is_continued(tmp_path: Path) -> None:
+    """Rounded counts put the platform up to a micrometre outside."""
+    rig = cdpr.load_rig(CONFIGS / "gachon_8_6.yaml")
+    goal = cdpr.Pose.level(rig.workspace_upper)
+    inside = cdpr.Pose.level(np.subtract(rig.workspace_upper, 0.005))
+    scene = empty_scene(rig).changed(start=inside, goal=goal)
+    plan = cdpr.plan(rig, scene, rounds=2)
+    run = cdpr.run(plan, rig, folder=tmp_path / "run", cameras=[], realtime=False)
+    assert run.passed
+    back = cdpr.plan(rig, scene, goal=inside, from_run=run.folder, rounds=2)
+    assert back.waypoints[0].distance_to(goal) < 5e-5
+    assert cdpr.check(back, rig)
+
+
+@pytest.mark.parametrize(("turn_deg", "tilt_deg"), [(45.0, 0.0), (30.0, 10.0)])
+def test_a_run_with_a_constant_orientation_is_continued_with_it(
+    tmp_path: Path, turn_deg: float, tilt_deg: float
+) -> None:
+    """The paper's robot in a platform frame that is rotated: tables round its quaternion."""
+    turn, tilt = np.radians([turn_deg, tilt_deg])
+    rotation = matrix_from_rotation_vector([0.0, 0.0, turn]) @ matrix_from_rotation_vector(
+        [tilt, 0.0, 0.0]
+    )
+    document = yaml.safe_load((CONFIGS / "gachon_8_6.yaml").read_text())
+    document["anchors_mm"] = (np.array(document["anchors_mm"]) @ rotation).tolist()
+    platform = document["platform"]
+    platform["home"] |= {"rotation_wxyz": quaternion_from_matrix(rotation).tolist()}
+    platform["size_mm"] = [40, 40, 40]
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(document))
+    rig = cdpr.load_rig(tmp_path / "rig.yaml")
+    goal = cdpr.Pose(np.add(rig.home.position, (0.005, 0.0, 0.0)), rotation)
+    scene = empty_scene(rig).changed(goal=goal)
+    run = cdpr.run(
+        cdpr.plan(rig, scene, rounds=2), rig, folder=tmp_path / "run", cameras=[], realtime=False
+    )
+    assert run.passed
+    back = cdpr.plan(rig, scene, goal=rig.home, from_run=run.folder, rounds=2)
+    assert back.waypoints[-1].distance_to(rig.home) < 1e-8
+    assert cdpr.check(back, rig)
+
+
+@pytest.mark.parametrize("stops", [(0, 1), (1, 1), (0, 0), (1, 2), (2, 2)])
+def test_stops_that_share_a_waypoint_are_saved_run_and_reported(
+    tmp_path: Path, stops: tuple[int, int]
+) -> None:
+    rig, scene = ready()
+    waypoints = [
+        cdpr.Pose.level(np.add(scene.start.position, (0.0, 0.0, 0.005 * i))) for i in range(3)
+    ]
+    named = [
+        StopDocument(
+            name=f"stop {i}", dwell_s=0.1 * i, **PoseDocument.of(waypoints[k]).model_dump()
+        )
+        for i, k in enumerate(stops)
+    ]
+    scene = scene.changed(goal=waypoints[-1], stops=named)
+    plan = cdpr.plan_from_waypoints(rig, scene, waypoints, stops=stops)
+    again = cdpr.load_plan(plan.save(tmp_path / "plan.json"))
+    assert again.stops == stops
+    run = cdpr.run(again, rig, folder=tmp_path / "run", cameras=[], realtime=False)
+    assert run.passed
+    assert run.report.exists()
+    assert [stop["reached_s"] is not None for stop in run.summary["stops"]] == [True, True]
+
+
 def messages(path: Path) -> dict[str, int]:
     """Number of messages by topic."""
     with path.open("rb") as stream:
@@ -158,6 +227,11 @@ def test_a_run_without_obstacles_needs_no_stated_errors(tmp_path: Path) -> None:
 def test_a_speed_that_cannot_be_is_refused_before_it_is_sent(percent: object) -> None:
     with pytest.raises(cdpr.BadInput, match="whole number of percent"):
         set_speed(percent)  # type: ignore[arg-type]
+
+
+def test_a_speed_is_an_integer_of_any_type() -> None:
+    with pytest.raises(cdpr.Fault, match="no active run"):
+        set_speed(np.int64(50))
 
 
 def test_a_figure_shows_error_tensions_and_clearance(run: cdpr.RunResult) -> None:

@@ -14,13 +14,17 @@ from calibration.geometry.pose_selection import (
     _d_optimal,
     _short_tour,
     choose_poses,
+    measurement_poses,
 )
 from model.clearance import ClearanceModel
-from model.errors import NoSolution
+from model.errors import BadInput, NoSolution
+from model.files.rig_file import RigDocument
+from model.files.scene_file import Payload
 from model.pose import Pose
-from model.rig import Rig, load_rig
-from model.scene import Scene, load_scene
+from model.rig import Rig, load_rig, rig_from_document
+from model.scene import Scene, empty_scene, load_scene
 from model.statics.gravity import working_tensions
+from model.statics.tension_distribution import TensionInfeasible
 
 ROOT = Path(__file__).resolve().parents[2]
 WISH = PoseRequirements(
@@ -53,6 +57,23 @@ def test_every_pose_can_be_held_and_is_free(rig: Rig, scene: Scene, poses: list[
         assert near is not None
         assert near.distance > scene.obstacle_clearance
         assert model.self_clearance(pose).distance > scene.self_clearance
+
+
+def test_poses_that_only_the_payload_makes_possible_can_be_chosen(rig: Rig) -> None:
+    """Below the lower outlets all cables pull up: the platform's own weight is too small."""
+    box = {"lower_mm": [-150.0, -150.0, -60.0], "upper_mm": [150.0, 150.0, 450.0]}
+    low = rig_from_document(
+        RigDocument.model_validate(rig.document.model_dump() | {"workspace": box})
+    )
+    scene = empty_scene(low).changed(payload=Payload(4.0, (0.0, 0.0, 0.0)))
+    chosen = choose_poses(
+        low, scene, replace(WISH, reserve=0.5), Parameters.of(low, DEFAULT_DEVIATIONS), 1
+    )
+    heights = [pose.position[2] for pose in chosen]
+    assert min(heights) < 0.0 < max(heights)
+    lowest = chosen[int(np.argmin(heights))]
+    with pytest.raises(TensionInfeasible):
+        working_tensions(low, lowest)
 
 
 def test_the_platform_is_rotated_no_further_than_its_cables_allow(
@@ -96,3 +117,9 @@ def test_a_scene_without_room_is_refused(rig: Rig, scene: Scene) -> None:
         choose_poses(
             rig, narrow, replace(WISH, candidates=15), Parameters.of(rig, {"offsets": 1e-3}), 0
         )
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_a_seed_that_no_plan_can_have_is_refused_at_once(rig: Rig, scene: Scene, seed: int) -> None:
+    with pytest.raises(BadInput, match="seed must be a whole number"):
+        measurement_poses(rig, scene, seed=seed)

@@ -16,7 +16,13 @@ from drivers.cia402 import inspection as examine
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.inspection import Examined, examine_drives
 from drivers.cia402.object_dictionary import heartbeat_consumers, settings_for
-from drivers.cia402.profile import load_profile, profile_names, unused_pdos
+from drivers.cia402.profile import (
+    FOLDER,
+    load_profile,
+    profile_names,
+    profile_of,
+    unused_pdos,
+)
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork
 from drivers.cia402.sdo_jobs import monitoring_off
 from drivers.factory import make_drive_group
@@ -654,6 +660,20 @@ def test_a_profile_of_the_lab_is_used(tmp_path: Path, rig: Rig) -> None:
         (s.index, s.sub) for s in settings_for(with_profile(rig, str(path)), 0, WinchMap(rig))
     }
     assert (0x1400, 5) not in written
+
+
+def test_a_profile_of_the_lab_is_read_again_after_it_was_edited(tmp_path: Path, rig: Rig) -> None:
+    """Between two runs of one notebook; the real-time process reads it as well."""
+    path = tmp_path / "lab.yaml"
+    text = (FOLDER / "cia402.yaml").read_text(encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
+    before = profile_of(with_profile(rig, str(path)))
+    assert profile_of(with_profile(rig, str(path))) is before
+    path.write_text(f"{text}\nsdo_timeout_ms: {before.sdo_timeout_ms + 100}\n", encoding="utf-8")
+    assert profile_of(with_profile(rig, str(path))).sdo_timeout_ms == before.sdo_timeout_ms + 100
+    path.unlink()
+    with pytest.raises(BadInput, match=r"cannot be read|no such file"):
+        profile_of(with_profile(rig, str(path)))
 
 
 def lab_profile(tmp_path: Path, lines: str) -> str:

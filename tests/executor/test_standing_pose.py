@@ -59,6 +59,17 @@ def test_positions_of_a_drive_that_lost_its_reference_fit_no_pose(cable):
         current_pose(PAPER, counts, LOAD)
 
 
+@pytest.mark.parametrize("rig", [PAPER, HALL_RIG], ids=["paper", "hall"])
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("outside", [0.0, 5e-6])
+def test_on_a_face_of_the_workspace_rounded_counts_give_a_pose_of_it(rig, axis, outside):
+    position = rig.home.position.copy()
+    position[axis] = rig.workspace_upper[axis] + outside
+    found = current_pose(rig, planned_counts(rig, Pose(position, rig.home.rotation)), LOAD)
+    assert (found.position <= rig.workspace_upper).all()
+    assert np.linalg.norm(found.position - position) < 5e-5
+
+
 def test_a_pose_outside_the_workspace_is_refused():
     outside = Pose.level(PAPER.workspace_upper + np.array([0.005, 0.0, -0.1]))
     with pytest.raises(CdprError, match="fit no pose in the workspace"):

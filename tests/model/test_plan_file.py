@@ -99,6 +99,15 @@ def refused(text: str, tmp_path: Path) -> CdprError:
     return caught.value
 
 
+@pytest.mark.parametrize("key", ["nodes", "iterations", "edge_checks"])
+def test_the_counts_of_a_long_search_are_kept(key: str, tmp_path: Path) -> None:
+    """Half an hour checks more than 2**31 edges."""
+    fields = {k: v for k, v in DATA.items() if k != "hash"}
+    path = tmp_path / "plan.json"
+    save_plan(sealed({**fields, "statistics": DATA["statistics"] | {key: 2**31}}), path)
+    assert getattr(load_plan(path).document.statistics, key) == 2**31
+
+
 def test_a_plan_comes_back_as_it_was_written(tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
     save_plan(DOCUMENT, path)

@@ -153,7 +153,7 @@ def test_a_payload_that_does_not_fit_the_stops_is_refused() -> None:
     [
         ([], "marks the stops []; its scene has ['a']"),
         ([("b", 1)], "marks the stops ['b']; its scene has ['a']"),
-        ([("a", 0)], "marks the waypoints [0] of 3 as stops"),
+        ([("a", 0)], "misses a stop by"),
         ([("a", 3)], "marks the waypoints [3] of 3 as stops"),
         ([("a", 1)], "misses a stop by 1 mm"),
     ],

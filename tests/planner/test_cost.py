@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from model.errors import BadInput
+from model.files.documents import PoseDocument
 from model.files.rig_file import RigDocument
 from model.kinematics import structure_matrix
-from model.pose import Pose
+from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Rig, rig_from_document
 from model.statics.wrench_sets import condition_number, force_volume, rms_anchor_radius
 from planner.costs import KinematicCost, LengthCost
 from planner.kernels import jit as stored
-from planner.planning import make_plan
+from planner.planning import make_plan, plan_from_waypoints
 from planner.space import Lattice, corners_and_weights
 from tests.cli.plans import free_scene
 from tests.model.rig_builds import paper_rig_with_pulleys
@@ -108,6 +109,28 @@ def test_mean_cost_weighs_by_length(cost) -> None:
     assert cost.mean_along(path) == pytest.approx((parts[0] + 2 * parts[1]) / 3)
     point = path[:1]
     assert cost.mean_along(np.concatenate([point, point])) == pytest.approx(cost.at(point)[0])
+
+
+def test_an_index_better_than_anywhere_in_the_workspace_counts_as_zero(gachon, scene_with) -> None:
+    """Start tilted in a workspace of one lattice cell, then level."""
+    home = gachon.home.position
+    box = {"lower_mm": (home * 1e3 - 5.0).tolist(), "upper_mm": (home * 1e3 + 5.0).tolist()}
+    small = changed(gachon, workspace=box)
+    tilted, level, goal = (
+        Pose(
+            np.add(home, [0.0, y, 0.0]),
+            matrix_from_rotation_vector(np.radians([degrees, 0.0, 0.0])),
+        )
+        for degrees, y in ((-8.0, 0.0), (0.0, 0.0), (0.0, 0.004))
+    )
+    scene = scene_with(
+        start=PoseDocument.of(tilted).model_dump(),
+        goal=PoseDocument.of(goal).model_dump(),
+        rotation_limits={"tilt_deg": 9.0, "turn_deg": 9.0},
+        clearance={"obstacle_mm": 0.0, "self_mm": 0.0},
+    )
+    plan = plan_from_waypoints(small, scene, [scene.start, level, scene.goal])
+    assert 0.0 < plan.quality.mean_kinematic_cost < 1.0
 
 
 def test_length_cost_is_the_distance() -> None:

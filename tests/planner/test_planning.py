@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from model.clearance import ClearanceModel
 from model.errors import BadInput, NoSolution
+from model.files.rig_file import RigDocument
 from model.plan import plan_from_document
-from model.pose import Pose
+from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Rig, rig_from_document
+from model.scene import empty_scene
 from planner.check import verify
 from planner.endpoints import require_usable_ends
 from planner.planning import make_plan
-from planner.settings import PlannerSettings
+from planner.settings import CLEARANCE_RESERVE, PlannerSettings
 
 QUICK = PlannerSettings(mode="paper")
 
@@ -183,6 +192,53 @@ def test_start_and_goal_of_different_orientation_are_bad_input(gachon, scene_wit
     scene = scene_with(goal={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": rotated})
     with pytest.raises(BadInput, match=r"differ in orientation by 5\.73 deg"):
         make_plan(gachon, scene, QUICK)
+
+
+def with_anchors(rig: Rig, anchors_mm: Sequence[Sequence[float]]) -> Rig:
+    changes = {"anchors_mm": [list(anchor) for anchor in anchors_mm]}
+    return rig_from_document(RigDocument.model_validate(rig.document.model_dump() | changes))
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [
+        (0.4, ["at no pose does cable", "39.0 mm inside", "at most 27.45 mm"]),
+        (0.55, ["at no pose does cable", "mm inside", "at most 27.45 mm"]),
+        (0.6, ["at the start cable", "touches platform", "correct the anchor"]),
+    ],
+)
+def test_anchors_inside_the_platforms_box_are_named(gachon, scene_with, share, words) -> None:
+    rig = with_anchors(gachon, share * 1e3 * gachon.anchors)
+    with pytest.raises(BadInput) as refusal:
+        make_plan(rig, scene_with(goal={"position_mm": [5.0, 0.0, 445.0]}), QUICK)
+    assert all(word in str(refusal.value) for word in words)
+
+
+def test_anchors_a_little_inside_the_platforms_box_are_planned_with(gachon, scene_with) -> None:
+    rig = with_anchors(gachon, 0.97 * 1e3 * gachon.anchors)
+    proved(rig, scene_with(goal={"position_mm": [5.0, 0.0, 445.0]}), QUICK)
+
+
+@given(
+    share=st.floats(0.0, 1.0),
+    at=st.tuples(*[st.floats(0.0, 1.0)] * 3),
+    turn=st.tuples(*[st.floats(-0.5, 0.5)] * 3),
+    clearance_mm=st.floats(0.0, 20.0),
+)
+def test_no_pose_would_pass_where_anchors_are_refused(
+    gachon, share, at, turn, clearance_mm
+) -> None:
+    rig = with_anchors(gachon, share * 1e3 * gachon.anchors)
+    position = rig.workspace_lower + np.array(at) * (rig.workspace_upper - rig.workspace_lower)
+    pose = Pose(position, matrix_from_rotation_vector(turn))
+    scene = empty_scene(rig).changed(start=pose, goal=pose)
+    scene = replace(scene, self_clearance=clearance_mm * 1e-3)
+    try:
+        require_usable_ends(rig, scene)
+    except BadInput as refusal:
+        if refusal.what.startswith("at no pose"):
+            near = ClearanceModel(rig, scene).self_clearance(pose)
+            assert near.distance < scene.self_clearance + CLEARANCE_RESERVE
 
 
 @pytest.mark.parametrize("mode", ["paper", "rewire"])

@@ -20,7 +20,8 @@ from executor import evaluation as run_module
 from executor.cameras import client as camera_sight
 from executor.cameras import multi_camera as run_cameras
 from executor.cameras import process as camera_process
-from executor.cameras.sources import choose_cameras
+from executor.cameras.sources import choose_cameras, resolve_cameras
+from executor.homing import home
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import RunFolder
 from model.errors import BadInput
@@ -148,6 +149,14 @@ def test_cameras_are_chosen_as_they_are_named(
 ) -> None:
     eyes = choose_cameras(load_rig(rig_file), wanted, without=False, in_process=True)
     assert {camera.name: source for camera, source in eyes.items()} == chosen
+
+
+@pytest.mark.parametrize("wanted", [1, np.int64(1), [np.int64(1)], {"front": np.int64(1)}])
+def test_a_camera_is_named_by_an_integer_of_any_type(rig_file: Path, wanted: Any) -> None:
+    eyes = resolve_cameras(load_rig(rig_file), wanted, in_process=True)
+    assert {camera.name: source for camera, source in eyes.items()} == {"front": "1"}
+    with pytest.raises(BadInput, match="camera"):
+        home(load_rig(rig_file), at_home=True, camera=np.int64(1))
 
 
 @pytest.mark.parametrize(
