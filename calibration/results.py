@@ -162,17 +162,18 @@ class ResultDocument(Document, ABC):
             BadInput: The result is not about this rig.
         """
 
-    def require_basis(self, parts: object, what: str) -> None:
+    def require_basis(self, parts: object, what: str, *former: object) -> None:
         """Refuses a rig whose parts differ from those this result depends on.
 
         Args:
             parts: The JSON-like parts of the rig file that the result takes as known.
             what: Their names, for the message.
+            former: The same parts as former versions took them.
 
         Raises:
             BadInput: They differ.
         """
-        if content_hash(parts) != self.rests_on:
+        if self.rests_on not in map(content_hash, (parts, *former)):
             raise BadInput(
                 f"this result was made with {what} that differ from the rig's",
                 where=f"calibration {self.kind} {self.name}, {self.date}",

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from itertools import product
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -176,8 +177,11 @@ class ExtrinsicsResult(ResultDocument):
             BadInput: The rig has no such camera, or its tags or camera parameters differ.
         """
         camera = camera_named(rig, self.name)
+        latencies = (camera.latency_ms, 0.0)  # stated now, or not yet in a former version
         self.require_basis(
-            _basis(rig, self.name, self.by), f"parameters of the camera or {self.by}"
+            _basis(rig, self.name, self.by),
+            f"parameters of the camera or {self.by}",
+            *(_basis(rig, self.name, self.by, {"latency_ms": one}) for one in latencies),
         )
         keys = ("world_from_camera", "pose_covariance", "pose_by_lens")
         return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
@@ -185,7 +189,7 @@ class ExtrinsicsResult(ResultDocument):
 
 _NOT_OF_THE_LENS = (
     *("world_from_camera", "rate_hz", "pose_covariance", "error_mm", "readout_ms"),
-    *("lens_covariance", "pose_by_lens"),
+    *("latency_ms", "lens_covariance", "pose_by_lens"),
 )
 
 
@@ -241,10 +245,12 @@ def pose_rows(stated: Mapping[str, Interval]) -> list[tuple[str, str]]:
     ]
 
 
-def _basis(rig: RigDocument, name: str, by: str) -> dict[str, Any]:
-    """Parts of the rig file that the result takes as known."""
+def _basis(
+    rig: RigDocument, name: str, by: str, more: Mapping[str, float] = MappingProxyType({})
+) -> dict[str, Any]:
+    """Parts of the rig file that the result takes as known; ``more`` of the camera's keys."""
     camera = camera_named(rig, name).model_dump(mode="json")
-    of_camera = {k: v for k, v in camera.items() if k not in _NOT_OF_THE_LENS}
+    of_camera = {k: v for k, v in camera.items() if k not in _NOT_OF_THE_LENS} | dict(more)
     if of_camera["lens"] == "pinhole":  # as in results of versions without a choice
         del of_camera["lens"]
     tags = rig.tags.model_dump(mode="json") if rig.tags else {}
