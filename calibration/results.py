@@ -126,6 +126,11 @@ class ResultDocument(Document, ABC):
     hash: str = Field(default="", description="over the rest of the file")
 
     @property
+    def follows(self) -> str:
+        """Name of the result of its kind that is applied before, if given; empty for none."""
+        return ""
+
+    @property
     def file_name(self) -> str:
         """Name of its file."""
         return result_file_name(self.kind, self.name, self.date)
@@ -250,11 +255,6 @@ def write_result(folder: Path, result: ResultDocument) -> Path:
     return path
 
 
-def in_order(results: Sequence[ResultDocument]) -> list[ResultDocument]:
-    """Results in the order in which they are applied."""
-    return sorted(results, key=lambda result: result.order)
-
-
 # Hash of the measurements behind a result, in one form for all kinds.
 
 
@@ -298,6 +298,11 @@ class Calibration(Generic[Result, Found, Quality]):
     def order(self) -> int:
         """Its rank among applied results, as `Rig.with_calibration` needs it."""
         return self.result.order
+
+    @property
+    def follows(self) -> str:
+        """Name of the result of its kind that is applied before, if given; empty for none."""
+        return self.result.follows
 
     @property
     def kind(self) -> str:

@@ -176,6 +176,7 @@ def locate_by_pairs(
         unused=unused,
         issues=tuple(issues),
         data_hash=hash_of_data,
+        reference_camera=reference.name,
     )
 
 
