@@ -6,7 +6,7 @@ import os
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.live import Frame, Image, eight_bits, is_too_large
+from drivers.cameras.live import Frame, Image, eight_bits, is_too_large, stated_size
 from model.errors import AlreadyExists, BadInput, Fault
 from model.files.documents import write_bytes_atomic
 from model.files.reading import PICTURE_LIMIT, read_bytes
@@ -72,16 +72,16 @@ class ImageFolder:
         """
         self.unused.clear()
         wanted = (self._camera.width, self._camera.height)
-        none_read = True
-        upright = _have_one_orientation(self.files)
+        none_read, upright = True, _are_upright_by_headers(self.files, wanted)
         for number, path in enumerate(self.files):
-            image = read_picture(path, upright)
-            if none_read and image is not None and _size(image) != wanted:
-                other = read_picture(path, not upright)
-                if other is not None and _size(other) == wanted:
-                    image, upright = other, not upright
+            image = read_picture(path, upright is not False)
+            if upright is None and image is not None and _size(image) != wanted:
+                other = read_picture(path, upright=False)  # formats whose orientation is not parsed
+                if _size(other) == wanted:
+                    image, upright = other, False
             none_read &= image is None
             if image is not None and _size(image) == wanted:
+                upright = upright is not False
                 yield Frame(number / self._rate, image, path.name)
                 continue
             why = _NO_PICTURE if image is None else _other_size(_size(image), _CAMERA, wanted)
@@ -97,8 +97,9 @@ class ImageFolder:
 class OneCamerasPictures:
     """The images of a folder with one size, rotated according to their EXIF orientation.
 
-    If the images have one size only without this rotation, they are used as stored. Files that
-    cannot be used are listed in `unused`.
+    If more images have this size without the rotation, or their orientations differ, they are used
+    as stored. Files of another size do not count in this; those that cannot be used are listed in
+    `unused`.
 
     Args:
         folder: Folder of the images.
@@ -120,7 +121,7 @@ class OneCamerasPictures:
         files = picture_files(folder)
         self.unused: dict[str, str] = {}
         sizes: dict[Path, tuple[int, int]] = {}
-        orientations = set()
+        orientations: dict[Path, int] = {}
         for path in files:
             data = _data(path)
             image = _decoded(data)
@@ -128,21 +129,23 @@ class OneCamerasPictures:
                 self.unused[path.name] = _NO_PICTURE
             else:
                 sizes[path] = _size(image)
-                orientations.add(exif_orientation(data))
+                orientations[path] = exif_orientation(data)
         if not sizes:
             raise _no_picture(folder, len(files))
         self.upright = True
-        if len(orientations) > 1 or set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
-            as_stored = {path: _size(read_picture(path, upright=False)) for path in sizes}
-            if set(as_stored.values()) == {wanted or next(iter(as_stored.values()))}:
-                sizes, self.upright = as_stored, False
-        counted = Counter(sizes.values())
-        self.size = wanted or max(counted, key=lambda size: (counted[size], size))
+        mixed = len(set(orientations.values())) > 1
+        if mixed or set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
+            stored = {path: _size(read_picture(path, upright=False)) for path in sizes}
+            self.upright = _are_upright(
+                list(orientations.values()), list(sizes.values()), list(stored.values()), wanted
+            )
+            sizes = sizes if self.upright else stored
+        self.size = wanted or _most_frequent(sizes.values())
         for path, size in sizes.items():
             if size != self.size:
                 owner = _CAMERA if wanted else "most have"
                 self.unused[path.name] = _other_size(size, owner, self.size)
-        if self.size not in counted:
+        if self.size not in sizes.values():
             raise _wrong_sizes(folder, self.unused, self.size)
         self._files = [path for path in sizes if path.name not in self.unused]
         self.names = tuple(path.name for path in self._files)
@@ -191,12 +194,45 @@ def _data(path: Path) -> bytes:
         return b""
 
 
-def _have_one_orientation(files: Iterable[Path]) -> bool:
-    """Whether the EXIF orientation of all images is the same; unreadable files do not count."""
-    found = {path: exif_orientation(_head(path)) for path in files}
-    if len(set(found.values())) > 1:  # rare, so images are decoded only here
-        found = {path: value for path, value in found.items() if read_picture(path) is not None}
-    return len(set(found.values())) <= 1
+def _are_upright(
+    orientations: Sequence[int],
+    upright: Sequence[tuple[int, int]],
+    stored: Sequence[tuple[int, int]],
+    wanted: tuple[int, int] | None,
+) -> bool:
+    """Whether the EXIF orientation of a camera's images is applied.
+
+    Args:
+        orientations: Of each image.
+        upright: Width and height of each with its orientation applied, [px].
+        stored: The same without.
+        wanted: The camera's (default: the most frequent).
+    """
+    size, size_stored = wanted or _most_frequent(upright), wanted or _most_frequent(stored)
+    count, count_stored = upright.count(size), stored.count(size_stored)
+    if count != count_stored:
+        return count > count_stored
+    each = zip(orientations, upright, stored, strict=True)
+    return len({one for one, a, b in each if a == size or b == size_stored}) <= 1
+
+
+def _are_upright_by_headers(files: Sequence[Path], wanted: tuple[int, int]) -> bool | None:
+    """The same by the beginnings of files; None where none states a rotation."""
+    orientations = {path: exif_orientation(_head(path)) for path in files}
+    if set(orientations.values()) == {1}:
+        return None
+    stored = {path: stated_size(_head(path)) or _size(read_picture(path, False)) for path in files}
+    stored = {path: size for path, size in stored.items() if all(size)}
+    turned = [size[::-1] if orientations[path] > 4 else size for path, size in stored.items()]
+    return _are_upright(
+        [orientations[path] for path in stored], turned, list(stored.values()), wanted
+    )
+
+
+def _most_frequent(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    """The most frequent size, of two equally frequent ones the larger."""
+    counted = Counter(sizes)
+    return max(counted, key=lambda size: (counted[size], size))
 
 
 def _head(path: Path) -> bytes:

@@ -62,21 +62,30 @@ def test_a_broken_file_among_good_ones_is_named_and_skipped(
 
 @pytest.mark.parametrize("orientations", [(1, 1), (3, 3), (6, 6), (1, 3), (1, 6)])
 @pytest.mark.parametrize("stored", ["wide", "tall"])
+@pytest.mark.parametrize("stray", [None, "0.png", "z.png"])
 def test_a_measurement_sees_the_pixels_that_a_calibration_saw(
-    tmp_path: Path, camera: Camera, orientations: tuple[int, ...], stored: str
+    tmp_path: Path, camera: Camera, orientations: tuple[int, ...], stored: str, stray: str | None
 ) -> None:
-    """Whatever EXIF orientations the images of a camera have."""
+    """Whatever EXIF orientations the images of a camera have, and whatever else is there."""
+    if stray is not None:
+        cv2.imwrite(str(tmp_path / stray), np.zeros((30, 80), np.uint8))
     image = np.add.outer(np.arange(48), np.arange(64)).astype(np.uint8)
     pixels = image if stored == "wide" else image.T
     for name, orientation in zip("ab", orientations, strict=True):
         (tmp_path / f"{name}.jpg").write_bytes(jpeg(pixels, orientation))
     (tmp_path / "c.jpg").write_bytes(b"not an image")
     calibrated = OneCamerasPictures(tmp_path)
+    assert calibrated.names == ("a.jpg", "b.jpg")
+    # In the same position the pixels of two images differ only by the compression.
+    first, second = (image.astype(int) for _, image in calibrated)
+    assert np.abs(first - second).max() < 8
     camera = replace(camera, width=calibrated.size[0], height=calibrated.size[1])
     measured = ImageFolder(tmp_path, camera)
-    for frame, (name, expected) in zip(measured, calibrated, strict=True):
-        assert frame.name == name
+    again = OneCamerasPictures(tmp_path, calibrated.size)
+    for frame, (name, expected), other in zip(measured, calibrated, again, strict=True):
+        assert (frame.name, other[0]) == (name, name)
         np.testing.assert_array_equal(frame.image, expected)
+        np.testing.assert_array_equal(other[1], expected)
 
 
 def test_a_folder_of_broken_files_only_is_refused(tmp_path: Path, camera: Camera) -> None:
