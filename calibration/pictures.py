@@ -309,9 +309,12 @@ def _named_by_time(frames: Iterable[Frame]) -> Iterator[tuple[str, Image]]:
 
 
 def _sampled(video: VideoFile, most: int) -> ImageSet:
-    every = max(1, -(-len(video) // most))
-    frames = (frame for number, frame in enumerate(video) if number % every == 0)
-    return ImageSet(((f.name, f.image) for f in frames), -(-len(video) // every))
+    """Evenly spaced images of a video; they are counted if the file does not state how many."""
+    total = len(video) or sum(1 for _ in video)
+    count = min(most, total)
+    numbers = {k * total // count for k in range(count)}
+    frames = (frame for number, frame in enumerate(video) if number in numbers)
+    return ImageSet(((f.name, f.image) for f in frames), count)
 
 
 def _live(source: str, camera: Camera, most: int) -> Iterable[tuple[str, Image]]:

@@ -1,13 +1,16 @@
-"""Which images a live camera captures, and the instructions to the operator."""
+"""Which images a live camera captures, the instructions to the operator, and videos' samples."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from calibration.pictures import CaptureGuide
+from calibration.pictures import VIDEO_IMAGES, CaptureGuide, open_images
 from calibration.targets.boards import Chessboard, DetectedBoard
+from drivers.cameras.live import VideoFile
 from model.pose import Array, Pose, matrix_from_rotation_vector
 
 SIZE = (1280, 720)
@@ -133,3 +136,23 @@ def test_enough_is_said_when_all_parts_and_tilts_were_seen(shown) -> None:
     assert last.done
     assert last.text.endswith("enough")
     assert not show(CaptureGuide(shown, wanted=99), shown, None).done
+
+
+@pytest.mark.parametrize("length", [7, VIDEO_IMAGES, VIDEO_IMAGES + 1, 100, 3 * VIDEO_IMAGES])
+@pytest.mark.parametrize("states_length", [True, False])
+def test_as_many_images_of_a_video_as_wanted_are_spaced_evenly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int, states_length: bool
+) -> None:
+    path = tmp_path / "board.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48), False)
+    for _ in range(length):
+        writer.write(np.zeros((48, 64), np.uint8))
+    writer.release()
+    if not states_length:
+        monkeypatch.setattr(VideoFile, "__len__", lambda _: 0)
+    images = open_images(path)
+    numbers = [int(name.removeprefix("image ")) for name, _ in images.images]
+    assert images.count == len(numbers) == min(length, VIDEO_IMAGES)
+    gaps = np.diff([*numbers, length])
+    assert numbers[0] == 0
+    assert np.ptp(gaps) <= 1
