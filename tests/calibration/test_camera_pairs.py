@@ -30,7 +30,7 @@ from calibration.targets.grids import TagGrid
 from model.errors import BadInput
 from model.files.documents import PoseDocument, content_hash
 from model.pose import Pose, matrix_from_rotation_vector
-from model.rig import Rig, load_rig, rig_from_document
+from model.rig import Camera, Rig, load_rig, rig_from_document
 from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics
@@ -116,6 +116,7 @@ def test_mistakes_are_refused_in_one_message(folders: Path) -> None:
     verb = ("calibrate", "extrinsics", rig, side, "--camera", "side", "--beside")
     one_message(call(*verb, f"side={side}"), 2, "cannot be located relative to itself")
     one_message(call(*verb, f"top={side}"), 2, "'top'")
+    one_message(call(*verb, "front=1"), 2, "camera front: images of a live camera cannot be paired")
     board = ("--columns", 9, "--rows", 6, "--square-mm", 25)
     one_message(call(*verb, f"front={folders / 'front'}", *board), 2, "rotated by 180")
 
@@ -159,8 +160,38 @@ def test_pairs_that_agree_but_for_one_are_not_led_astray(two) -> None:
     found = locate_by_pairs(rig, rig.cameras[1], front, pairs, {}, "sha256:0")
     assert found.world_from_camera.distance_to(truth) < 1e-3
     few = dict(list(pairs.items())[:2])
-    with pytest.raises(BadInput, match="2 pairs"):
+    with pytest.raises(BadInput, match="2 of 4 required"):
         locate_by_pairs(rig, rig.cameras[1], front, few, {}, "sha256:0")
+
+
+def test_pairs_of_a_body_at_rest_count_once(two) -> None:
+    """Their errors are common: 20 of them would make the interval too narrow by 4.5."""
+    rig, truth = two
+    board = TagGrid(4, 3, 0.05, 0.02, "tag36h11")
+    points, rng = board.points_of(range(12)), np.random.default_rng(5)
+    cameras = (replace(rig.cameras[1], world_from_camera=truth), rig.cameras[0])
+
+    def seen(camera: Camera, pose: Pose) -> BodyObservation:
+        exact = pixels_of(camera, camera.world_from_camera.inverse().compose(pose).apply(points))
+        body = _board_pose(
+            DetectedBoard(points, exact + 0.02 * rng.standard_normal(exact.shape)), camera
+        )
+        assert body is not None
+        return body
+
+    poses = where_it_goes(rig, 5)
+    moving = {
+        f"{k}": tuple(seen(camera, pose) for camera in cameras) for k, pose in enumerate(poses)
+    }
+    resting = {f"rest {k}": tuple(seen(camera, poses[0]) for camera in cameras) for k in range(20)}
+    found = locate_by_pairs(rig, *cameras, moving | resting, {}, "sha256:0")
+    once = locate_by_pairs(rig, *cameras, moving, {}, "sha256:0")
+    assert found.pictures == 5
+    assert list(found.unused) == [f"side: rest {k}" for k in range(20)]
+    np.testing.assert_array_equal(found.half_widths, once.half_widths)
+    with pytest.raises(BadInput, match="1 of 4 required") as caught:
+        locate_by_pairs(rig, *cameras, resting, {}, "sha256:0")
+    assert "duplicates rest 0: nothing moved" in caught.value.why
 
 
 def by_exact_pairs(
