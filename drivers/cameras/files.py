@@ -6,7 +6,7 @@ import os
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -25,6 +25,7 @@ from model.rig import Camera
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
 #: An EXIF block begins within so many bytes and is no longer, [bytes].
 EXIF_WITHIN = 65536
+_GREY_LEVELS = (np.uint8, np.uint16)
 _NO_PICTURE, _CAMERA = "is not a readable image", "the camera has"
 
 
@@ -84,12 +85,12 @@ class ImageFolder:
                 upright = upright is not False
                 yield Frame(number / self._rate, image, path.name)
                 continue
-            why = _NO_PICTURE if image is None else _other_size(_size(image), _CAMERA, wanted)
+            why = _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
             self.unused[path.name] = why
             if self._on_unused is not None:
                 self._on_unused(path.name, why)
         if none_read:
-            raise _no_picture(self._folder, len(self.files))
+            raise _no_picture(self._folder, self.unused)
         if len(self.unused) == len(self.files):
             raise _wrong_sizes(self._folder, self.unused, wanted)
 
@@ -126,12 +127,12 @@ class OneCamerasPictures:
             data = _data(path)
             image = _decoded(data)
             if image is None:
-                self.unused[path.name] = _NO_PICTURE
+                self.unused[path.name] = _unreadable(path)
             else:
                 sizes[path] = _size(image)
                 orientations[path] = exif_orientation(data)
         if not sizes:
-            raise _no_picture(folder, len(files))
+            raise _no_picture(folder, self.unused)
         self.upright = True
         mixed = len(set(orientations.values())) > 1
         if mixed or set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
@@ -223,7 +224,7 @@ def _are_upright_by_headers(files: Sequence[Path], wanted: tuple[int, int]) -> b
         return None
     stored = {path: stated_size(_head(path)) or _size(read_picture(path, False)) for path in files}
     stored = {path: size for path, size in stored.items() if all(size)}
-    turned = [size[::-1] if orientations[path] > 4 else size for path, size in stored.items()]
+    turned = [size[::-1] if 4 < orientations[path] < 9 else size for path, size in stored.items()]
     return _are_upright(
         [orientations[path] for path in stored], turned, list(stored.values()), wanted
     )
@@ -245,6 +246,19 @@ def _head(path: Path) -> bytes:
 
 
 def _decoded(data: bytes, upright: bool = True) -> Image | None:
+    picture = _raw(data, upright)
+    return None if picture is None or picture.dtype not in _GREY_LEVELS else eight_bits(picture)
+
+
+def _unreadable(path: Path) -> str:
+    """Why a file is not used."""
+    picture = _raw(_data(path))
+    if picture is None:
+        return _NO_PICTURE
+    return f"has values of type {picture.dtype}; only integers of 8 to 16 bits can be used"
+
+
+def _raw(data: bytes, upright: bool = True) -> NDArray[np.generic] | None:
     if not data or is_too_large(data):
         return None
     flags = (
@@ -256,7 +270,7 @@ def _decoded(data: bytes, upright: bool = True) -> Image | None:
         picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error:
         return None
-    return None if picture is None else eight_bits(picture)
+    return None if picture is None else np.asarray(picture)
 
 
 def exif_orientation(data: bytes) -> int:
@@ -284,11 +298,12 @@ def _size(image: Image | None) -> tuple[int, int]:
     return (0, 0) if image is None else (image.shape[1], image.shape[0])
 
 
-def _no_picture(folder: Path, count: int) -> BadInput:
+def _no_picture(folder: Path, unused: Mapping[str, str]) -> BadInput:
     return BadInput(
-        f"none of the {count} files is a readable image",
+        f"none of the {len(unused)} files is a readable image",
         where=str(folder),
-        next_step="check that the files were copied completely",
+        why=_first(unused),
+        next_step="check that the files were copied completely, and hold integers of 8 to 16 bits",
     )
 
 
@@ -296,9 +311,13 @@ def _wrong_sizes(folder: Path, unused: dict[str, str], wanted: tuple[int, int]) 
     return BadInput(
         f"none of the {len(unused)} images has the camera's {wanted[0]} x {wanted[1]} px",
         where=str(folder),
-        why="; ".join(f"{name} {why}" for name, why in list(unused.items())[:4]),
+        why=_first(unused),
         next_step="use full-size images of this camera, or calibrate it at this size",
     )
+
+
+def _first(unused: Mapping[str, str]) -> str:
+    return "; ".join(f"{name} {why}" for name, why in list(unused.items())[:4])
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

@@ -291,6 +291,25 @@ def test_images_of_more_bits_keep_their_contrast(tmp_path: Path, camera: Camera,
     np.testing.assert_array_equal(frame.image, grey)
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_floating_point_images_are_refused_with_the_reason(
+    folder: Path, tmp_path: Path, camera: Camera, kind: type
+) -> None:
+    """Values from 0 to 1 would all become black."""
+    only = tmp_path / "only"
+    only.mkdir()
+    for path in (folder / "a.tiff", only / "a.tiff"):
+        cv2.imwrite(str(path), np.full((camera.height, camera.width), 0.5, kind))
+    reason = f"has values of type {kind.__name__}; only integers of 8 to 16 bits can be used"
+    source = ImageFolder(folder, camera)
+    assert len(list(source)) == len(TRUTH)
+    assert source.unused == OneCamerasPictures(folder).unused == {"a.tiff": reason}
+    for read in (lambda: OneCamerasPictures(only), lambda: list(ImageFolder(only, camera))):
+        with pytest.raises(BadInput, match="none of the 1 files is a readable image") as caught:
+            read()
+        assert caught.value.why == f"a.tiff {reason}"
+
+
 def test_reasons_that_differ_in_numbers_are_one() -> None:
     reasons = NoPoseReasons()
     for reason in ("error is 1.39 px", "no tag detected", "error is 0.5 px", "error is 12 px"):
