@@ -211,6 +211,10 @@ def _positive(matrix: Array) -> Array:
 # Check of the camera's pose against frame tags.
 
 
+PERHAPS_MOVED = "the camera moved"
+"""Part of the reason for a missing pose where the last check failed."""
+
+
 class CameraMoved(Fault):
     """The frame tags are not at their expected positions in the image."""
 

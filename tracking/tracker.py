@@ -28,7 +28,7 @@ from tracking.measurement import (
     predict,
 )
 from tracking.rolling_shutter import RecentMotion
-from tracking.shared_errors import CameraCheck, require_unmoved_camera
+from tracking.shared_errors import PERHAPS_MOVED, CameraCheck, require_unmoved_camera
 
 # Encoder prior: where to search for the platform.
 #
@@ -258,6 +258,6 @@ class Tracker:
     def _suspicion(self, failed: CameraCheck) -> str:
         return (
             f"frame tags {', '.join(map(str, failed.tags))} are {failed.error:.2f} px from their"
-            f" positions, limit {self._moved_px:.2f} px: the camera moved, or they are covered by"
+            f" positions, limit {self._moved_px:.2f} px: {PERHAPS_MOVED}, or they are covered by"
             " others; the next image that shows them decides"
         )
