@@ -6,7 +6,7 @@ or a tilt not covered yet, or a position far from all others.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import product
@@ -200,11 +200,15 @@ class ImageSet:
         images: Names and grey images.
         count: Number of images.
         unused: Reason for each file left out, by name.
+        video: The video of which they are a sample.
+        is_live: They are taken by a camera while they are read.
     """
 
     images: Iterable[tuple[str, Image]]
     count: int
     unused: Mapping[str, str] = field(default_factory=dict)
+    video: VideoFile | None = None
+    is_live: bool = False
 
     @contextmanager
     def reported(self, text: str, listener: Listener) -> Iterator[Iterator[tuple[str, Image]]]:
@@ -265,7 +269,7 @@ def open_source(source: str | Path, camera: Camera, wanted: int | None, usual: i
     if path.is_file():
         return _sampled(VideoFile(path, camera), most)
     require_camera_source(str(source))
-    return ImageSet(_live(str(source), camera, most), most)
+    return ImageSet(_live(str(source), camera, most), most, is_live=True)
 
 
 def open_image_source(pictures: ImageSource, camera: Camera, usual: int) -> ImageSet:
@@ -308,10 +312,27 @@ def _named_by_time(frames: Iterable[Frame]) -> Iterator[tuple[str, Image]]:
     return ((f"{frame.time:.6f} s {frame.name}", frame.image) for frame in frames)
 
 
-def _sampled(video: VideoFile, most: int) -> ImageSet:
-    every = max(1, -(-len(video) // most))
-    frames = (frame for number, frame in enumerate(video) if number % every == 0)
-    return ImageSet(((f.name, f.image) for f in frames), -(-len(video) // every))
+def same_images(sets: Sequence[ImageSet]) -> list[ImageSet]:
+    """The sets, but of videos samples with the same numbers, as far as the shortest one."""
+    videos = [one.video for one in sets if one.video is not None]
+    if len(videos) < len(sets):
+        return list(sets)
+    total, most = min(map(_length, videos)), min(one.count for one in sets)
+    return [_sampled(video, most, total) for video in videos]
+
+
+def _length(video: VideoFile) -> int:
+    """Number of its images, counted if the file does not state it."""
+    return len(video) or sum(1 for _ in video)
+
+
+def _sampled(video: VideoFile, most: int, total: int | None = None) -> ImageSet:
+    """Evenly spaced images of a video, of its first ``total`` (default: all)."""
+    total = _length(video) if total is None else total
+    count = min(most, total)
+    numbers = {k * total // count for k in range(count)}
+    frames = (frame for number, frame in enumerate(video) if number in numbers)
+    return ImageSet(((f.name, f.image) for f in frames), count, video=video)
 
 
 def _live(source: str, camera: Camera, most: int) -> Iterable[tuple[str, Image]]:

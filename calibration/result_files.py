@@ -13,12 +13,12 @@ from calibration.extrinsics.result import ExtrinsicsResult
 from calibration.geometry.result import RigResult
 from calibration.intrinsics.readout import ReadoutResult
 from calibration.intrinsics.result import CameraResult
-from calibration.results import ResultDocument, in_order
+from calibration.results import ResultDocument
 from calibration.statistics import Interval
 from calibration.tag_map.result import TagsResult
 from model.errors import BadInput
 from model.files.documents import load_yaml, read_yaml, write_atomic
-from model.rig import Rig
+from model.rig import Rig, in_order
 
 KINDS: dict[str, type[ResultDocument]] = {
     "camera": CameraResult,

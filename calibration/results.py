@@ -126,6 +126,11 @@ class ResultDocument(Document, ABC):
     hash: str = Field(default="", description="over the rest of the file")
 
     @property
+    def follows(self) -> str:
+        """Name of the result of its kind that is applied before, if given; empty for none."""
+        return ""
+
+    @property
     def file_name(self) -> str:
         """Name of its file."""
         return result_file_name(self.kind, self.name, self.date)
@@ -162,17 +167,18 @@ class ResultDocument(Document, ABC):
             BadInput: The result is not about this rig.
         """
 
-    def require_basis(self, parts: object, what: str) -> None:
+    def require_basis(self, parts: object, what: str, *former: object) -> None:
         """Refuses a rig whose parts differ from those this result depends on.
 
         Args:
             parts: The JSON-like parts of the rig file that the result takes as known.
             what: Their names, for the message.
+            former: The same parts as former versions took them.
 
         Raises:
             BadInput: They differ.
         """
-        if content_hash(parts) != self.rests_on:
+        if self.rests_on not in map(content_hash, (parts, *former)):
             raise BadInput(
                 f"this result was made with {what} that differ from the rig's",
                 where=f"calibration {self.kind} {self.name}, {self.date}",
@@ -249,11 +255,6 @@ def write_result(folder: Path, result: ResultDocument) -> Path:
     return path
 
 
-def in_order(results: Sequence[ResultDocument]) -> list[ResultDocument]:
-    """Results in the order in which they are applied."""
-    return sorted(results, key=lambda result: result.order)
-
-
 # Hash of the measurements behind a result, in one form for all kinds.
 
 
@@ -297,6 +298,11 @@ class Calibration(Generic[Result, Found, Quality]):
     def order(self) -> int:
         """Its rank among applied results, as `Rig.with_calibration` needs it."""
         return self.result.order
+
+    @property
+    def follows(self) -> str:
+        """Name of the result of its kind that is applied before, if given; empty for none."""
+        return self.result.follows
 
     @property
     def kind(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice, takewhile
 from pathlib import Path
 
@@ -316,7 +316,12 @@ def _opened(
         video = VideoFile(path, camera)
         return video, len(video)
     require_camera_source(source)
-    return LiveCamera(source, camera), None
+    return _exposed(LiveCamera(source, camera), camera.latency), None
+
+
+def _exposed(frames: Iterable[Frame], latency: float) -> Iterator[Frame]:
+    """Images of a live camera with the times of their exposure instead of their arrival, [s]."""
+    return (replace(frame, time=frame.time - latency) for frame in frames)
 
 
 def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Pose]]:

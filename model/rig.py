@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +32,7 @@ __all__ = [
     "Rig",
     "Tag",
     "Winch",
+    "in_order",
     "load_rig",
     "rig_from_document",
 ]
@@ -101,6 +103,11 @@ class CalibrationResult(Protocol):
     @property
     def name(self) -> str:
         """Which of its kind, such as the camera's name."""
+        ...
+
+    @property
+    def follows(self) -> str:
+        """Name of the result of its kind that is applied before, if given; empty for none."""
         ...
 
     @property
@@ -280,7 +287,7 @@ class Rig:
                 )
             seen[what] = result.date
         document = self.document
-        for result in sorted(results, key=lambda result: result.order):
+        for result in in_order(results):
             document = result.corrected(document)
         return rig_from_document(document)
 
@@ -307,6 +314,20 @@ class Rig:
             ("cameras", cameras or "none"),
         ]
         return html_table(f"Rig {self.name}", rows)
+
+
+Result = TypeVar("Result", bound=CalibrationResult)
+
+
+def in_order(results: Iterable[Result]) -> list[Result]:
+    """Calibration results in the order in which they are applied."""
+    waiting = sorted(results, key=lambda one: one.order)
+    ordered = []
+    while waiting:
+        left = {(one.kind, one.name) for one in waiting}
+        free = (k for k, one in enumerate(waiting) if (one.kind, one.follows) not in left)
+        ordered.append(waiting.pop(next(free, 0)))  # in a circle, one is refused by its basis
+    return ordered
 
 
 def load_rig(path: str | Path) -> Rig:

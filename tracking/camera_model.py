@@ -24,7 +24,11 @@ _CONVERGES = 5
 _NEWTON_STEPS, _LONGEST_STEP, _AT_ONCE = 30, 0.3, 100_000
 """For rays of other lenses: iterations, largest step, and rays per batch."""
 WIDEST = 1.5
-"""Rays farther off the axis are clamped to this angle, below 90°, [rad]."""
+"""Rays of a fisheye farther off the axis are clamped to this angle, below 90°, [rad], or to the one
+from which on the radius increases with the angle by less than `_LEAST_SLOPE`."""
+_LEAST_SLOPE = 1e-3
+_ANGLES, _ANGLE_STEPS = np.linspace(0.0, WIDEST, 1000), 5
+"""Angles at which Newton's method for rays of a fisheye starts, [rad], and number of its steps."""
 
 
 def undistort_pixels(camera: Camera, pixels: Array) -> Array:
@@ -52,9 +56,7 @@ def rays_of(lens: str, matrix: Array, distortion: Array, pixels: Array) -> Array
     """
     flat = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
     if lens == FISHEYE:
-        inside = _clamped_pixels(matrix, distortion, flat)
-        near = cv2.fisheye.undistortPoints(inside, matrix, distortion, criteria=_CRITERIA)
-        return np.asarray(near, dtype=np.float64).reshape(-1, 2)
+        return _fisheye_rays(matrix, distortion, flat.reshape(-1, 2))
     near = cv2.undistortPoints(flat, matrix, distortion, criteria=_CRITERIA)
     rays: Array = np.asarray(near, dtype=np.float64)
     if np.size(distortion) > _CONVERGES:
@@ -64,14 +66,23 @@ def rays_of(lens: str, matrix: Array, distortion: Array, pixels: Array) -> Array
     return rays.reshape(-1, 2)
 
 
-def _clamped_pixels(matrix: Array, distortion: Array, pixels: Array) -> Array:
-    """Pixels of a fisheye, with rays beyond `WIDEST` clamped to it."""
-    turns = WIDEST ** np.arange(2, 10, 2)
-    widest = WIDEST * (1.0 + float(np.ravel(distortion)[:4] @ turns))
-    scale, middle = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2]
-    away = (pixels - middle) / scale
-    radius = np.linalg.norm(away, axis=-1, keepdims=True)
-    return np.asarray(middle + away * scale * np.minimum(1.0, widest / np.maximum(radius, 1e-12)))
+def _fisheye_rays(matrix: Array, distortion: Array, pixels: Array) -> Array:
+    """Rays through pixels of a fisheye, on the branch where the radius increases from 0.
+
+    OpenCV's iteration may leave that branch: it begins at the radius, not at an angle of it.
+    """
+    coefficients = np.zeros(10)
+    coefficients[1::2] = 1.0, *np.ravel(distortion)[:4]
+    radius_by_angle = np.polynomial.Polynomial(coefficients)
+    slope = radius_by_angle.deriv()
+    angles = _ANGLES[np.logical_and.accumulate(slope(_ANGLES) > _LEAST_SLOPE)]
+    away = (pixels - matrix[:2, 2]) / [matrix[0, 0], matrix[1, 1]]
+    radius = np.linalg.norm(away, axis=1)
+    angle = np.interp(radius, radius_by_angle(angles), angles)
+    for _ in range(_ANGLE_STEPS):
+        step = (radius_by_angle(angle) - radius) / np.maximum(slope(angle), _LEAST_SLOPE)
+        angle = np.clip(angle - step, 0.0, angles[-1])
+    return np.asarray(away * (np.tan(angle) / np.maximum(radius, 1e-12))[:, None])
 
 
 def _refined_rays(matrix: Array, distortion: Array, pixels: Array, rays: Array) -> Array:

@@ -26,7 +26,7 @@ from tracking.estimator import UNCERTAIN, UNSHARP
 from tracking.fusion import MultiCameraFusion, synchronize_frames
 from tracking.measurement import Observation, PoseMeasurement, rates
 from tracking.pose_log import LoggedPicture
-from tracking.shared_errors import require_stated_errors
+from tracking.shared_errors import PERHAPS_MOVED, require_stated_errors
 from tracking.tracker import Tracker
 
 
@@ -154,6 +154,8 @@ def _nothing_seen(
     soft = edge_width(last.image) > SOFT
     if UNCERTAIN in reason and not soft:
         next_step = "focus the camera, bring it nearer, or make more tags of the platform visible"
+    elif PERHAPS_MOVED in reason:
+        next_step = "take more images; if the camera moved, restore it or calibrate its pose again"
     elif UNSHARP in reason or soft:
         next_step = "focus the camera on the platform, and add light to shorten the exposure"
     elif len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:

@@ -28,7 +28,7 @@ from tracking.measurement import (
     predict,
 )
 from tracking.rolling_shutter import RecentMotion
-from tracking.shared_errors import CameraCheck, require_unmoved_camera
+from tracking.shared_errors import PERHAPS_MOVED, CameraCheck, require_unmoved_camera
 
 # Encoder prior: where to search for the platform.
 #
@@ -136,8 +136,11 @@ class Tracker:
         self._last: PoseMeasurement | None = None
         self._before: PoseMeasurement | None = None
         self._prior = EncoderPrior()
-        self._stated_px = _stated_error_px(rig, camera)
+        limit, stated = self.settings.camera_moved_px, _stated_error_px(rig, camera)
+        self._moved_px = math.hypot(limit, stated)
         self._pictures = 0
+        self._failed: tuple[int, CameraCheck] | None = None
+        """Number of the image, and check, until one passes."""
 
     @property
     def expected_tags(self) -> tuple[int, ...]:
@@ -159,7 +162,8 @@ class Tracker:
 
         Raises:
             BadInput: The image is not grey, or not of the camera's size.
-            CameraMoved: The frame tags are not at their expected positions.
+            CameraMoved: In two images, the frame tags are at the same wrong positions. The first of
+                them, and all until a check passes, give no pose.
         """
         require_image_format(image, self.camera, self.rig.name)
         self._pictures += 1
@@ -172,10 +176,12 @@ class Tracker:
             result = self._search_around(image, time, self._last)
         if result is None:
             result = self._search(image, time)
-        elif self._pictures % self.settings.camera_check_period == 0:
+        elif self._failed or self._pictures % self.settings.camera_check_period == 0:
             self._check_camera(
                 image, detect_expected(self.camera, self._frame, self._detector, image)
             )
+        if self._failed is not None:
+            result = NoPose(time, self._suspicion(self._failed[1]))
         self._before, self._last = self._last, None
         if isinstance(result, PoseMeasurement):
             self._last = result
@@ -242,6 +248,16 @@ class Tracker:
         views = self._estimator.views(
             image, nearest_to_expected(self.camera, self._frame, detections), self._frame
         )
-        limit = math.hypot(self.settings.camera_moved_px, self._stated_px)
-        check = require_unmoved_camera(self.camera, views, limit)
-        self.camera_check = check or self.camera_check
+        number, before = self._failed or (0, None)
+        in_other_image = before if number != self._pictures else None
+        check = require_unmoved_camera(self.camera, views, self._moved_px, in_other_image)
+        if check is not None:
+            self.camera_check = check
+            self._failed = (self._pictures, check) if check.error > self._moved_px else None
+
+    def _suspicion(self, failed: CameraCheck) -> str:
+        return (
+            f"frame tags {', '.join(map(str, failed.tags))} are {failed.error:.2f} px from their"
+            f" positions, limit {self._moved_px:.2f} px: {PERHAPS_MOVED}, or they are covered by"
+            " others; the next image that shows them decides"
+        )

@@ -7,8 +7,8 @@ Errors of the other camera's pose carry over to this one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -26,9 +26,16 @@ from calibration.extrinsics.result import (
     workspace_corners,
 )
 from calibration.intrinsics.calibrate import NOT_FOUND
-from calibration.pictures import DEFAULT_IMAGES, ImageSource, open_image_source
+from calibration.pictures import (
+    DEFAULT_IMAGES,
+    ImageSet,
+    ImageSource,
+    open_image_source,
+    same_images,
+)
 from calibration.procedures import ExtrinsicsOutcome
 from calibration.results import Calibration, Destination, Issue, data_hash
+from calibration.statistics import duplicate_reason, is_duplicate_view
 from calibration.tag_map.bundle_adjustment import require_tags
 from calibration.tag_map.observations import TagObservations, observe_tags, platform_pose
 from calibration.targets.boards import Board, Charuco, DetectedBoard
@@ -58,11 +65,21 @@ class BodyObservation:
         camera_from_body: Its pose in the camera frame.
         covariance: Of position and rotation vector along the camera's axes, shape (6, 6), [m, rad].
         error: RMS of its corners, [px].
+        corners: Of each tag or point of it, shape (4, 2) or (2,), [px].
     """
 
     camera_from_body: Pose
     covariance: Array
     error: float
+    corners: Mapping[Hashable, Array] = field(default_factory=dict)
+
+    def duplicates(self, before: BodyObservation) -> bool:
+        """Whether what is seen of the body in both images did not move."""
+        both = self.corners.keys() & before.corners.keys()
+        if not both:
+            return False
+        now, earlier = (np.array([one.corners[k] for k in both]) for one in (self, before))
+        return is_duplicate_view(now, earlier)
 
 
 def observe_platform(
@@ -73,7 +90,12 @@ def observe_platform(
         n: platform_pose(rig, camera, squares) for n, squares in observations.squares.items()
     }
     return {
-        name: BodyObservation(bundle.camera_from_body, bundle.covariance, bundle.reprojection)
+        name: BodyObservation(
+            bundle.camera_from_body,
+            bundle.covariance,
+            bundle.reprojection,
+            {number: square.corners for number, square in observations.squares[name].items()},
+        )
         for name, bundle in bundles.items()
         if bundle is not None
     }
@@ -112,7 +134,9 @@ def _board_pose(seen: DetectedBoard, camera: Camera) -> BodyObservation | None:
     freedom = max(errors.size - 6, 1)
     scatter = max(float(np.sum(errors**2)) / freedom, _LEAST_SCATTER**2)
     error = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
-    return BodyObservation(pose, np.asarray(scatter * np.linalg.inv(slopes.T @ slopes)), error)
+    covariance = np.asarray(scatter * np.linalg.inv(slopes.T @ slopes))
+    corners = zip(map(tuple, seen.points.tolist()), seen.corners, strict=True)
+    return BodyObservation(pose, covariance, error, dict(corners))
 
 
 def locate_by_pairs(
@@ -125,6 +149,8 @@ def locate_by_pairs(
 ) -> ExtrinsicCalibration:
     """Finds a camera's pose from that of another.
 
+    Pairs of a body at rest have errors in common, so only the first of them counts.
+
     Args:
         rig: Its workspace is where errors are assessed.
         camera: Its matrix and distortion are taken as known; its pose in the rig file is not used.
@@ -136,13 +162,16 @@ def locate_by_pairs(
     Raises:
         BadInput: Too few pairs.
     """
+    pairs, duplicates = _without_duplicates(pairs)
+    unused = {**{f"{camera.name}: {name}": why for name, why in duplicates.items()}, **unused}
     if len(pairs) < LEAST_PAIRS:
         raise BadInput(
-            f"{len(pairs)} pairs of images show the same body; {LEAST_PAIRS} are required",
+            f"too few pairs of images show the same body: {len(pairs)} of {LEAST_PAIRS} required",
             where=f"cameras {camera.name} and {reference.name}",
             why="; ".join(f"{name} {why}" for name, why in list(unused.items())[:4])
             or "images taken at the same time need the same name in both folders",
-            next_step="take images at the same times, of tags that both cameras see",
+            next_step="take images at the same times, of tags that both cameras see, at other poses"
+            " each time",
         )
     observed = list(pairs.values())
     between, information, scores = _fit(observed)
@@ -176,7 +205,24 @@ def locate_by_pairs(
         unused=unused,
         issues=tuple(issues),
         data_hash=hash_of_data,
+        reference_camera=reference.name,
     )
+
+
+def _without_duplicates(
+    pairs: Mapping[str, tuple[BodyObservation, BodyObservation]],
+) -> tuple[dict[str, tuple[BodyObservation, BodyObservation]], dict[str, str]]:
+    """The pairs between which the body moved for both cameras, and why others are left out."""
+    kept: dict[str, tuple[BodyObservation, BodyObservation]] = {}
+    unused = {}
+    for name, (near, far) in pairs.items():
+        alike = (n for n, (a, b) in kept.items() if near.duplicates(a) or far.duplicates(b))
+        first = next(alike, None)
+        if first is None:
+            kept[name] = (near, far)
+        else:
+            unused[name] = duplicate_reason(first)
+    return kept, unused
 
 
 def _reference_covariance(reference: Camera, world_from_camera: Pose) -> Array:
@@ -249,14 +295,16 @@ def locate_camera_by_another(
         rig: The robot.
         camera: Its matrix and distortion are taken as known.
         reference: Another camera of the rig; its pose is taken as known as well.
-        sources: Images of this and of the other camera; simultaneous ones have the same name.
+        sources: Images of this and of the other camera; simultaneous ones have the same name, in
+            videos the same number.
         board: The board that both see; the tags of the platform when left out.
         wanted: Required error in the work space, 95 %, [m].
         output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives the progress.
 
     Raises:
-        BadInput: Both are one camera, the board has no unique orientation, or too few pairs.
+        BadInput: Both are one camera, the board has no unique orientation, a source is a live
+            camera, or too few pairs.
     """
     if camera.name == reference.name:
         raise BadInput(
@@ -272,8 +320,14 @@ def locate_camera_by_another(
     ready_to_measure(listener)
     seen: list[dict[str, BodyObservation]] = []
     unused: dict[str, str] = {}
-    for one, source in zip((camera, reference), sources, strict=True):
-        found_by_one, left_out = _observations(rig, one, source, board, listener)
+    both = (camera, reference)
+    opened = [
+        open_image_source(source, one, DEFAULT_IMAGES)
+        for one, source in zip(both, sources, strict=True)
+    ]
+    _require_recorded(both, opened)
+    for one, pictures in zip(both, same_images(opened), strict=True):
+        found_by_one, left_out = _observations(rig, one, pictures, board, listener)
         seen.append(found_by_one)
         unused |= {f"{one.name}: {name}": why for name, why in left_out.items()}
     own, others = seen
@@ -282,8 +336,8 @@ def locate_camera_by_another(
     pairs = {name: (body, others[name]) for name, body in own.items() if name in others}
     numbers = (
         name.encode() + np.round(body.camera_from_body.matrix(), 9).tobytes()
-        for name, both in pairs.items()
-        for body in both
+        for name, pair in pairs.items()
+        for body in pair
     )
     found = locate_by_pairs(rig, camera, reference, pairs, unused, data_hash(numbers))
     verdict = judge_extrinsics(found, wanted)
@@ -293,11 +347,24 @@ def locate_camera_by_another(
     return Calibration(result, page, found, verdict, facts).saved_in(to.folder)
 
 
+def _require_recorded(cameras: Sequence[Camera], opened: Sequence[ImageSet]) -> None:
+    """Refuses live cameras: all images of the first would be older than those of the second."""
+    for camera, pictures in zip(cameras, opened, strict=True):
+        if pictures.is_live:
+            raise BadInput(
+                "images of a live camera cannot be paired with those of another",
+                where=f"camera {camera.name}",
+                why="the cameras would take their images one after the other, not at the same"
+                " times",
+                next_step="save images of both while nothing moves, with the same name for each"
+                " pair, and pass the two folders",
+            )
+
+
 def _observations(
-    rig: Rig, camera: Camera, source: ImageSource, board: Board | None, listener: Listener
+    rig: Rig, camera: Camera, pictures: ImageSet, board: Board | None, listener: Listener
 ) -> tuple[dict[str, BodyObservation], dict[str, str]]:
     """Observations of a camera by image, and why other images are not used."""
-    pictures = open_image_source(source, camera, DEFAULT_IMAGES)
     found: dict[str, BodyObservation] = {}
     unused = dict(pictures.unused)
     with pictures.reported(f"camera {camera.name}", listener) as images:

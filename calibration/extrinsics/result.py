@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from itertools import product
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -41,6 +42,7 @@ class ExtrinsicCalibration:
         unused: Why each other image is not used, by name.
         issues: Issues beside precision.
         data_hash: Of the observations.
+        reference_camera: The other camera, where the pose was found by one.
     """
 
     camera: Camera
@@ -54,6 +56,7 @@ class ExtrinsicCalibration:
     unused: Mapping[str, str]
     issues: tuple[Issue, ...]
     data_hash: str
+    reference_camera: str | None = None
 
     @property
     def world_from_camera(self) -> Pose:
@@ -134,7 +137,7 @@ class ExtrinsicsResult(ResultDocument):
     """A camera's pose, in the keys of the rig file's ``cameras`` section."""
 
     order: ClassVar[int] = 2
-    added: ClassVar[tuple[str, ...]] = ("pose_covariance", "pose_by_lens")
+    added: ClassVar[tuple[str, ...]] = ("pose_covariance", "pose_by_lens", "reference_camera")
 
     kind: Literal["extrinsics"] = "extrinsics"
     by: Literal["frame tags", "rig motion", "another camera"]
@@ -150,6 +153,14 @@ class ExtrinsicsResult(ResultDocument):
     pose_by_lens: PoseSlopes | None = Field(
         default=None, description="how errors of the lens move it: a column for each of its numbers"
     )
+    reference_camera: str | None = Field(
+        default=None, description="the other camera, whose lens and pose were taken as known"
+    )
+
+    @property
+    def follows(self) -> str:
+        """The other camera: its pose is applied before."""
+        return self.reference_camera or ""
 
     def in_words(self) -> list[tuple[str, str]]:
         """As for every result; rotations are relative to the stated one: uncertainty only."""
@@ -173,11 +184,18 @@ class ExtrinsicsResult(ResultDocument):
         """The rig file's content with the camera at this pose.
 
         Raises:
-            BadInput: The rig has no such camera, or its tags or camera parameters differ.
+            BadInput: The rig has no such camera, or its tags, the camera's parameters, or the other
+                camera's differ.
         """
         camera = camera_named(rig, self.name)
+        latencies = (camera.latency_ms, 0.0)  # stated now, or not yet in a former version
         self.require_basis(
-            _basis(rig, self.name, self.by), f"parameters of the camera or {self.by}"
+            _basis(rig, self.name, self.by, self.reference_camera),
+            f"parameters of the camera or {self.by}",
+            *(
+                _basis(rig, self.name, self.by, self.reference_camera, {"latency_ms": one})
+                for one in latencies
+            ),
         )
         keys = ("world_from_camera", "pose_covariance", "pose_by_lens")
         return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
@@ -185,7 +203,7 @@ class ExtrinsicsResult(ResultDocument):
 
 _NOT_OF_THE_LENS = (
     *("world_from_camera", "rate_hz", "pose_covariance", "error_mm", "readout_ms"),
-    *("lens_covariance", "pose_by_lens"),
+    *("latency_ms", "lens_covariance", "pose_by_lens"),
 )
 
 
@@ -209,11 +227,12 @@ def extrinsics_result(
             pose_intervals(result),
             verdict,
             result.unused,
-            _basis(rig, name, result.by),
+            _basis(rig, name, result.by, result.reference_camera),
         ),
         by=result.by,
         world_from_camera=PoseDocument.of(result.world_from_camera),
         points_mm=[[float(x) * 1e3 for x in point] for point in result.points],
+        reference_camera=result.reference_camera,
         tag_errors_px={str(k): float(v) for k, v in result.tag_errors.items()},
         pictures=result.pictures,
         pose_covariance=(result.stated_covariance * np.outer(SCALES, SCALES)).tolist(),
@@ -241,17 +260,35 @@ def pose_rows(stated: Mapping[str, Interval]) -> list[tuple[str, str]]:
     ]
 
 
-def _basis(rig: RigDocument, name: str, by: str) -> dict[str, Any]:
-    """Parts of the rig file that the result takes as known."""
+def _basis(
+    rig: RigDocument,
+    name: str,
+    by: str,
+    reference: str | None,
+    more: Mapping[str, float] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Parts of the rig file that the result takes as known.
+
+    Args:
+        rig: The rig file's content.
+        name: The camera.
+        by: See `ExtrinsicCalibration`.
+        reference: The other camera; None in former versions, whose results took all as known.
+        more: More of the camera's keys.
+    """
     camera = camera_named(rig, name).model_dump(mode="json")
-    of_camera = {k: v for k, v in camera.items() if k not in _NOT_OF_THE_LENS}
+    of_camera = {k: v for k, v in camera.items() if k not in _NOT_OF_THE_LENS} | dict(more)
     if of_camera["lens"] == "pinhole":  # as in results of versions without a choice
         del of_camera["lens"]
     tags = rig.tags.model_dump(mode="json") if rig.tags else {}
     if by == "another camera":
+        keys: tuple[str, ...]
         keys = ("name", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "world_from_camera")
-        others = [one.model_dump(mode="json") for one in rig.cameras if one.name != name]
-        return {"camera": of_camera, "others": [{k: one[k] for k in keys} for one in others]}
+        others = [one for one in rig.cameras if one.name != name]
+        if reference is not None:
+            keys, others = (*keys, "lens"), [camera_named(rig, reference)]
+        plain = [one.model_dump(mode="json") for one in others]
+        return {"camera": of_camera, "others": [{k: one[k] for k in keys} for one in plain]}
     which = "frame" if by == "frame tags" else "platform"
     return {"camera": of_camera, "family": tags.get("family"), "tags": tags.get(which)}
 

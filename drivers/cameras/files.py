@@ -6,7 +6,7 @@ import os
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.live import Frame, Image, eight_bits, is_too_large
+from drivers.cameras.live import Frame, Image, eight_bits, is_too_large, stated_size
 from model.errors import AlreadyExists, BadInput, Fault
 from model.files.documents import write_bytes_atomic
 from model.files.reading import PICTURE_LIMIT, read_bytes
@@ -25,6 +25,7 @@ from model.rig import Camera
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
 #: An EXIF block begins within so many bytes and is no longer, [bytes].
 EXIF_WITHIN = 65536
+_GREY_LEVELS = (np.uint8, np.uint16)
 _NO_PICTURE, _CAMERA = "is not a readable image", "the camera has"
 
 
@@ -72,24 +73,24 @@ class ImageFolder:
         """
         self.unused.clear()
         wanted = (self._camera.width, self._camera.height)
-        none_read = True
-        upright = _have_one_orientation(self.files)
+        none_read, upright = True, _are_upright_by_headers(self.files, wanted)
         for number, path in enumerate(self.files):
-            image = read_picture(path, upright)
-            if none_read and image is not None and _size(image) != wanted:
-                other = read_picture(path, not upright)
-                if other is not None and _size(other) == wanted:
-                    image, upright = other, not upright
+            image = read_picture(path, upright is not False)
+            if upright is None and image is not None and _size(image) != wanted:
+                other = read_picture(path, upright=False)  # formats whose orientation is not parsed
+                if _size(other) == wanted:
+                    image, upright = other, False
             none_read &= image is None
             if image is not None and _size(image) == wanted:
+                upright = upright is not False
                 yield Frame(number / self._rate, image, path.name)
                 continue
-            why = _NO_PICTURE if image is None else _other_size(_size(image), _CAMERA, wanted)
+            why = _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
             self.unused[path.name] = why
             if self._on_unused is not None:
                 self._on_unused(path.name, why)
         if none_read:
-            raise _no_picture(self._folder, len(self.files))
+            raise _no_picture(self._folder, self.unused)
         if len(self.unused) == len(self.files):
             raise _wrong_sizes(self._folder, self.unused, wanted)
 
@@ -97,8 +98,9 @@ class ImageFolder:
 class OneCamerasPictures:
     """The images of a folder with one size, rotated according to their EXIF orientation.
 
-    If the images have one size only without this rotation, they are used as stored. Files that
-    cannot be used are listed in `unused`.
+    If more images have this size without the rotation, or their orientations differ, they are used
+    as stored. Files of another size do not count in this; those that cannot be used are listed in
+    `unused`.
 
     Args:
         folder: Folder of the images.
@@ -120,29 +122,31 @@ class OneCamerasPictures:
         files = picture_files(folder)
         self.unused: dict[str, str] = {}
         sizes: dict[Path, tuple[int, int]] = {}
-        orientations = set()
+        orientations: dict[Path, int] = {}
         for path in files:
             data = _data(path)
             image = _decoded(data)
             if image is None:
-                self.unused[path.name] = _NO_PICTURE
+                self.unused[path.name] = _unreadable(path)
             else:
                 sizes[path] = _size(image)
-                orientations.add(exif_orientation(data))
+                orientations[path] = exif_orientation(data)
         if not sizes:
-            raise _no_picture(folder, len(files))
+            raise _no_picture(folder, self.unused)
         self.upright = True
-        if len(orientations) > 1 or set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
-            as_stored = {path: _size(read_picture(path, upright=False)) for path in sizes}
-            if set(as_stored.values()) == {wanted or next(iter(as_stored.values()))}:
-                sizes, self.upright = as_stored, False
-        counted = Counter(sizes.values())
-        self.size = wanted or max(counted, key=lambda size: (counted[size], size))
+        mixed = len(set(orientations.values())) > 1
+        if mixed or set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
+            stored = {path: _size(read_picture(path, upright=False)) for path in sizes}
+            self.upright = _are_upright(
+                list(orientations.values()), list(sizes.values()), list(stored.values()), wanted
+            )
+            sizes = sizes if self.upright else stored
+        self.size = wanted or _most_frequent(sizes.values())
         for path, size in sizes.items():
             if size != self.size:
                 owner = _CAMERA if wanted else "most have"
                 self.unused[path.name] = _other_size(size, owner, self.size)
-        if self.size not in counted:
+        if self.size not in sizes.values():
             raise _wrong_sizes(folder, self.unused, self.size)
         self._files = [path for path in sizes if path.name not in self.unused]
         self.names = tuple(path.name for path in self._files)
@@ -191,12 +195,45 @@ def _data(path: Path) -> bytes:
         return b""
 
 
-def _have_one_orientation(files: Iterable[Path]) -> bool:
-    """Whether the EXIF orientation of all images is the same; unreadable files do not count."""
-    found = {path: exif_orientation(_head(path)) for path in files}
-    if len(set(found.values())) > 1:  # rare, so images are decoded only here
-        found = {path: value for path, value in found.items() if read_picture(path) is not None}
-    return len(set(found.values())) <= 1
+def _are_upright(
+    orientations: Sequence[int],
+    upright: Sequence[tuple[int, int]],
+    stored: Sequence[tuple[int, int]],
+    wanted: tuple[int, int] | None,
+) -> bool:
+    """Whether the EXIF orientation of a camera's images is applied.
+
+    Args:
+        orientations: Of each image.
+        upright: Width and height of each with its orientation applied, [px].
+        stored: The same without.
+        wanted: The camera's (default: the most frequent).
+    """
+    size, size_stored = wanted or _most_frequent(upright), wanted or _most_frequent(stored)
+    count, count_stored = upright.count(size), stored.count(size_stored)
+    if count != count_stored:
+        return count > count_stored
+    each = zip(orientations, upright, stored, strict=True)
+    return len({one for one, a, b in each if a == size or b == size_stored}) <= 1
+
+
+def _are_upright_by_headers(files: Sequence[Path], wanted: tuple[int, int]) -> bool | None:
+    """The same by the beginnings of files; None where none states a rotation."""
+    orientations = {path: exif_orientation(_head(path)) for path in files}
+    if set(orientations.values()) == {1}:
+        return None
+    stored = {path: stated_size(_head(path)) or _size(read_picture(path, False)) for path in files}
+    stored = {path: size for path, size in stored.items() if all(size)}
+    turned = [size[::-1] if 4 < orientations[path] < 9 else size for path, size in stored.items()]
+    return _are_upright(
+        [orientations[path] for path in stored], turned, list(stored.values()), wanted
+    )
+
+
+def _most_frequent(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    """The most frequent size, of two equally frequent ones the larger."""
+    counted = Counter(sizes)
+    return max(counted, key=lambda size: (counted[size], size))
 
 
 def _head(path: Path) -> bytes:
@@ -209,6 +246,19 @@ def _head(path: Path) -> bytes:
 
 
 def _decoded(data: bytes, upright: bool = True) -> Image | None:
+    picture = _raw(data, upright)
+    return None if picture is None or picture.dtype not in _GREY_LEVELS else eight_bits(picture)
+
+
+def _unreadable(path: Path) -> str:
+    """Why a file is not used."""
+    picture = _raw(_data(path))
+    if picture is None:
+        return _NO_PICTURE
+    return f"has values of type {picture.dtype}; only integers of 8 to 16 bits can be used"
+
+
+def _raw(data: bytes, upright: bool = True) -> NDArray[np.generic] | None:
     if not data or is_too_large(data):
         return None
     flags = (
@@ -220,7 +270,7 @@ def _decoded(data: bytes, upright: bool = True) -> Image | None:
         picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error:
         return None
-    return None if picture is None else eight_bits(picture)
+    return None if picture is None else np.asarray(picture)
 
 
 def exif_orientation(data: bytes) -> int:
@@ -248,11 +298,12 @@ def _size(image: Image | None) -> tuple[int, int]:
     return (0, 0) if image is None else (image.shape[1], image.shape[0])
 
 
-def _no_picture(folder: Path, count: int) -> BadInput:
+def _no_picture(folder: Path, unused: Mapping[str, str]) -> BadInput:
     return BadInput(
-        f"none of the {count} files is a readable image",
+        f"none of the {len(unused)} files is a readable image",
         where=str(folder),
-        next_step="check that the files were copied completely",
+        why=_first(unused),
+        next_step="check that the files were copied completely, and hold integers of 8 to 16 bits",
     )
 
 
@@ -260,9 +311,13 @@ def _wrong_sizes(folder: Path, unused: dict[str, str], wanted: tuple[int, int]) 
     return BadInput(
         f"none of the {len(unused)} images has the camera's {wanted[0]} x {wanted[1]} px",
         where=str(folder),
-        why="; ".join(f"{name} {why}" for name, why in list(unused.items())[:4]),
+        why=_first(unused),
         next_step="use full-size images of this camera, or calibrate it at this size",
     )
+
+
+def _first(unused: Mapping[str, str]) -> str:
+    return "; ".join(f"{name} {why}" for name, why in list(unused.items())[:4])
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

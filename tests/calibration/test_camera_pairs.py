@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import date
+from itertools import permutations
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,12 +20,17 @@ from calibration.extrinsics.camera_pairs import (
     locate_by_pairs,
     require_oriented,
 )
+from calibration.extrinsics.result import (
+    ExtrinsicsResult,
+    extrinsics_result,
+    judge_extrinsics,
+)
 from calibration.targets.boards import Chessboard, DetectedBoard
 from calibration.targets.grids import TagGrid
 from model.errors import BadInput
-from model.files.documents import PoseDocument
+from model.files.documents import PoseDocument, content_hash
 from model.pose import Pose, matrix_from_rotation_vector
-from model.rig import Rig, load_rig, rig_from_document
+from model.rig import Camera, Rig, load_rig, rig_from_document
 from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics
@@ -108,6 +116,7 @@ def test_mistakes_are_refused_in_one_message(folders: Path) -> None:
     verb = ("calibrate", "extrinsics", rig, side, "--camera", "side", "--beside")
     one_message(call(*verb, f"side={side}"), 2, "cannot be located relative to itself")
     one_message(call(*verb, f"top={side}"), 2, "'top'")
+    one_message(call(*verb, "front=1"), 2, "camera front: images of a live camera cannot be paired")
     board = ("--columns", 9, "--rows", 6, "--square-mm", 25)
     one_message(call(*verb, f"front={folders / 'front'}", *board), 2, "rotated by 180")
 
@@ -151,5 +160,109 @@ def test_pairs_that_agree_but_for_one_are_not_led_astray(two) -> None:
     found = locate_by_pairs(rig, rig.cameras[1], front, pairs, {}, "sha256:0")
     assert found.world_from_camera.distance_to(truth) < 1e-3
     few = dict(list(pairs.items())[:2])
-    with pytest.raises(BadInput, match="2 pairs"):
+    with pytest.raises(BadInput, match="2 of 4 required"):
         locate_by_pairs(rig, rig.cameras[1], front, few, {}, "sha256:0")
+
+
+def test_pairs_of_a_body_at_rest_count_once(two) -> None:
+    """Their errors are common: 20 of them would make the interval too narrow by 4.5."""
+    rig, truth = two
+    board = TagGrid(4, 3, 0.05, 0.02, "tag36h11")
+    points, rng = board.points_of(range(12)), np.random.default_rng(5)
+    cameras = (replace(rig.cameras[1], world_from_camera=truth), rig.cameras[0])
+
+    def seen(camera: Camera, pose: Pose) -> BodyObservation:
+        exact = pixels_of(camera, camera.world_from_camera.inverse().compose(pose).apply(points))
+        body = _board_pose(
+            DetectedBoard(points, exact + 0.02 * rng.standard_normal(exact.shape)), camera
+        )
+        assert body is not None
+        return body
+
+    poses = where_it_goes(rig, 5)
+    moving = {
+        f"{k}": tuple(seen(camera, pose) for camera in cameras) for k, pose in enumerate(poses)
+    }
+    resting = {f"rest {k}": tuple(seen(camera, poses[0]) for camera in cameras) for k in range(20)}
+    found = locate_by_pairs(rig, *cameras, moving | resting, {}, "sha256:0")
+    once = locate_by_pairs(rig, *cameras, moving, {}, "sha256:0")
+    assert found.pictures == 5
+    assert list(found.unused) == [f"side: rest {k}" for k in range(20)]
+    np.testing.assert_array_equal(found.half_widths, once.half_widths)
+    with pytest.raises(BadInput, match="1 of 4 required") as caught:
+        locate_by_pairs(rig, *cameras, resting, {}, "sha256:0")
+    assert "duplicates rest 0: nothing moved" in caught.value.why
+
+
+def by_exact_pairs(
+    rig: Rig, camera: str, other: str, truths: dict[str, Pose], **changed: Any
+) -> ExtrinsicsResult:
+    """The result of a camera at its true pose, located by another at its pose in the rig."""
+    covariance = 1e-8 * np.eye(6)
+    reference = rig.camera(other)
+    there = (truths[camera], reference.world_from_camera)
+    pairs = {
+        str(k): tuple(
+            BodyObservation(one.inverse().compose(pose), covariance, 0.1) for one in there
+        )
+        for k, pose in enumerate(where_it_goes(rig, 12))
+    }
+    found = locate_by_pairs(rig, rig.camera(camera), reference, pairs, {}, "sha256:0")
+    found = replace(found, **changed)
+    verdict = judge_extrinsics(found, 1e-3)
+    return extrinsics_result(found, verdict, rig.document, date(2026, 3, 2))
+
+
+@pytest.mark.parametrize("rights_reference", ["front", "left"])
+def test_results_of_three_cameras_can_be_applied_together_in_any_order(
+    two, rights_reference: str
+) -> None:
+    """The front camera's own result, to which the others' belong, is among them."""
+    first = two[0].document.cameras[0]
+    cameras = [first.model_copy(update={"name": name}) for name in ("front", "left", "right")]
+    rig = rig_from_document(two[0].document.model_copy(update={"cameras": cameras}))
+    truths = {
+        name: rotated_about_home(rig, degrees)
+        for name, degrees in (("front", 1.0), ("left", 25.0), ("right", -25.0))
+    }
+    alone = {"by": "frame tags", "reference_camera": None}
+    front = by_exact_pairs(rig, "front", "right", truths, **alone)
+    located = rig.with_calibration(front)
+    left = by_exact_pairs(located, "left", "front", truths)
+    if rights_reference == "left":
+        located = located.with_calibration(left)
+    right = by_exact_pairs(located, "right", rights_reference, truths)
+    for results in permutations((front, left, right)):
+        together = rig.with_calibration(*results)
+        for name, truth in truths.items():
+            assert together.camera(name).world_from_camera.distance_to(truth) < 1e-6
+    for one in (left, right):
+        with pytest.raises(BadInput, match="was made with"):
+            rig.with_calibration(one)
+
+
+def test_cameras_located_by_each_other_are_refused(two) -> None:
+    rig, truth = two
+    truths = {"side": truth, "front": rotated_about_home(rig, 1.0)}
+    results = [
+        by_exact_pairs(rig, *names, truths) for names in (("side", "front"), ("front", "side"))
+    ]
+    for both in permutations(results):
+        with pytest.raises(BadInput, match="was made with"):
+            rig.with_calibration(*both)
+
+
+def test_a_former_result_rests_on_all_other_cameras(two) -> None:
+    """Its file does not name the other camera."""
+    rig, truth = two
+    made = by_exact_pairs(rig, "side", "front", {"side": truth})
+    front, side = (one.model_dump(mode="json") for one in rig.document.cameras)
+    of_others = ("name", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "world_from_camera")
+    lens = ("name", "width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion")
+    basis = {
+        "camera": {k: side[k] for k in (*lens, "latency_ms", "gamma")},
+        "others": [{k: front[k] for k in of_others}],
+    }
+    former = {"rests_on": content_hash(basis), "reference_camera": None}
+    applied = rig.with_calibration(made.model_copy(update=former))
+    assert applied.camera("side").world_from_camera.distance_to(truth) < 1e-6

@@ -1,13 +1,16 @@
-"""Which images a live camera captures, and the instructions to the operator."""
+"""Which images a live camera captures, the instructions to the operator, and videos' samples."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from calibration.pictures import CaptureGuide
-from calibration.targets.boards import Chessboard, DetectedBoard
+from calibration.pictures import VIDEO_IMAGES, CaptureGuide, open_images, open_source, same_images
+from calibration.targets.boards import Chessboard, DetectedBoard, generic_camera
+from drivers.cameras.live import VideoFile
 from model.pose import Array, Pose, matrix_from_rotation_vector
 
 SIZE = (1280, 720)
@@ -133,3 +136,39 @@ def test_enough_is_said_when_all_parts_and_tilts_were_seen(shown) -> None:
     assert last.done
     assert last.text.endswith("enough")
     assert not show(CaptureGuide(shown, wanted=99), shown, None).done
+
+
+def video_of(path: Path, length: int) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48), False)
+    for _ in range(length):
+        writer.write(np.zeros((48, 64), np.uint8))
+    writer.release()
+    return path
+
+
+@pytest.mark.parametrize("length", [7, VIDEO_IMAGES, VIDEO_IMAGES + 1, 100, 3 * VIDEO_IMAGES])
+@pytest.mark.parametrize("states_length", [True, False])
+def test_as_many_images_of_a_video_as_wanted_are_spaced_evenly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int, states_length: bool
+) -> None:
+    path = video_of(tmp_path / "board.avi", length)
+    if not states_length:
+        monkeypatch.setattr(VideoFile, "__len__", lambda _: 0)
+    images = open_images(path)
+    numbers = [int(name.removeprefix("image ")) for name, _ in images.images]
+    assert images.count == len(numbers) == min(length, VIDEO_IMAGES)
+    gaps = np.diff([*numbers, length])
+    assert numbers[0] == 0
+    assert np.ptp(gaps) <= 1
+
+
+@pytest.mark.parametrize("lengths", [(60, 62), (300, 310), (310, 12)])
+def test_of_two_videos_images_with_the_same_numbers_are_used(
+    tmp_path: Path, lengths: tuple[int, int]
+) -> None:
+    camera = generic_camera((64, 48))
+    videos = [video_of(tmp_path / f"{k}.avi", length) for k, length in enumerate(lengths)]
+    samples = same_images([open_source(video, camera, None, 20) for video in videos])
+    first, second = ([name for name, _ in one.images] for one in samples)
+    assert first == second
+    assert len(first) == samples[0].count == samples[1].count == min(20, *lengths)

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
@@ -39,6 +39,7 @@ from tracking.camera_model import (
     distort_pixels,
     pixels_of,
     project,
+    ray_slopes,
     rays_of,
     undistort_pixels,
 )
@@ -220,6 +221,42 @@ def test_rays_beside_and_behind_a_fisheye_are_put_at_its_rim() -> None:
     np.testing.assert_allclose(np.arctan(reach), WIDEST, atol=1e-3)
 
 
+TURNING = [0.3660, 1.1433, -3.0081, -3.1187]
+"""Coefficients of a camera of 640 x 480 px by Kalibr: the radius decreases from 37° on."""
+GRID = np.stack(np.meshgrid(np.linspace(0, 639, 21), np.linspace(0, 479, 16)), axis=-1)
+
+
+def small_fisheye(lens: list[float]) -> Camera:
+    m = np.array([[633.0, 0.0, 320.0], [0.0, 633.0, 240.0], [0.0, 0.0, 1.0]])
+    return Camera("c", 640, 480, m, read_only(lens), Pose.level([0.0, 0.0, 0.0]), 10.0, "fisheye")
+
+
+@given(st.tuples(*(st.floats(-limit, limit) for limit in (1, 2, 4, 4))).map(list))
+@example(TURNING)
+@settings(max_examples=100, deadline=None)
+def test_all_pixels_of_a_fisheye_come_back_wherever_its_radius_ends(lens: list[float]) -> None:
+    """The radius increases over the image, and does beyond it whatever it likes."""
+    angles = np.linspace(0.0, 1.49, 1000)
+    radii = angles * (1.0 + sum(k * angles ** (2 * n + 2) for n, k in enumerate(lens)))
+    slopes = np.diff(radii) / np.diff(angles)
+    to_corner = np.argmax(radii > np.hypot(320, 240) / 633.0)
+    assume(to_corner and (slopes[: to_corner + 1] > 0.05).all())
+    camera = small_fisheye(lens)
+    ideal = undistort_pixels(camera, GRID)
+    np.testing.assert_allclose(distort_pixels(camera, ideal), GRID, atol=1e-6)
+    assert ((ideal - [320, 240]) * (GRID - [320, 240]) >= 0.0).all()
+
+
+def test_pixels_where_no_ray_of_a_fisheye_arrives_are_put_at_its_rim() -> None:
+    camera = small_fisheye(TURNING)
+    beyond = np.array([320.0, 240.0]) + 633.0 * np.array([[0.7, 0.0], [0.0, 2.0], [-3.0, 0.0]])
+    away = undistort_pixels(camera, beyond) - [320.0, 240.0]
+    angles = np.arctan(np.linalg.norm(away, axis=1) / 633.0)
+    np.testing.assert_allclose(angles, 0.6501, atol=2e-3)
+    assert (away * (beyond - [320.0, 240.0]) >= 0.0).all()
+    assert np.isfinite(ray_slopes(camera, away / 633.0)).all()
+
+
 @given(
     angle=st.floats(0.05, 1.3),
     around=st.floats(0.0, 6.28),
@@ -254,8 +291,9 @@ def test_a_synthetic_camera_of_any_lens_is_tracked_to_a_millimetre(name: str) ->
     found = Tracker(bent, camera).observe(picture, 0.0)
     assert isinstance(found, PoseMeasurement)
     assert np.linalg.norm(found.pose.position - truth.position) < 1e-3
-    with pytest.raises(CameraMoved):  # without the lens
-        Tracker(rig, plain).observe(picture, 0.0)
+    without_lens = Tracker(rig, plain)
+    with pytest.raises(CameraMoved):
+        list(without_lens.observe(picture, 0.1 * k) for k in range(2))
 
 
 @pytest.fixture(scope="module")

@@ -62,21 +62,30 @@ def test_a_broken_file_among_good_ones_is_named_and_skipped(
 
 @pytest.mark.parametrize("orientations", [(1, 1), (3, 3), (6, 6), (1, 3), (1, 6)])
 @pytest.mark.parametrize("stored", ["wide", "tall"])
+@pytest.mark.parametrize("stray", [None, "0.png", "z.png"])
 def test_a_measurement_sees_the_pixels_that_a_calibration_saw(
-    tmp_path: Path, camera: Camera, orientations: tuple[int, ...], stored: str
+    tmp_path: Path, camera: Camera, orientations: tuple[int, ...], stored: str, stray: str | None
 ) -> None:
-    """Whatever EXIF orientations the images of a camera have."""
+    """Whatever EXIF orientations the images of a camera have, and whatever else is there."""
+    if stray is not None:
+        cv2.imwrite(str(tmp_path / stray), np.zeros((30, 80), np.uint8))
     image = np.add.outer(np.arange(48), np.arange(64)).astype(np.uint8)
     pixels = image if stored == "wide" else image.T
     for name, orientation in zip("ab", orientations, strict=True):
         (tmp_path / f"{name}.jpg").write_bytes(jpeg(pixels, orientation))
     (tmp_path / "c.jpg").write_bytes(b"not an image")
     calibrated = OneCamerasPictures(tmp_path)
+    assert calibrated.names == ("a.jpg", "b.jpg")
+    # In the same position the pixels of two images differ only by the compression.
+    first, second = (image.astype(int) for _, image in calibrated)
+    assert np.abs(first - second).max() < 8
     camera = replace(camera, width=calibrated.size[0], height=calibrated.size[1])
     measured = ImageFolder(tmp_path, camera)
-    for frame, (name, expected) in zip(measured, calibrated, strict=True):
-        assert frame.name == name
+    again = OneCamerasPictures(tmp_path, calibrated.size)
+    for frame, (name, expected), other in zip(measured, calibrated, again, strict=True):
+        assert (frame.name, other[0]) == (name, name)
         np.testing.assert_array_equal(frame.image, expected)
+        np.testing.assert_array_equal(other[1], expected)
 
 
 def test_a_folder_of_broken_files_only_is_refused(tmp_path: Path, camera: Camera) -> None:
@@ -280,6 +289,25 @@ def test_images_of_more_bits_keep_their_contrast(tmp_path: Path, camera: Camera,
     cv2.imwrite(str(tmp_path / "a.png"), wide)
     (frame,) = ImageFolder(tmp_path, camera)
     np.testing.assert_array_equal(frame.image, grey)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_floating_point_images_are_refused_with_the_reason(
+    folder: Path, tmp_path: Path, camera: Camera, kind: type
+) -> None:
+    """Values from 0 to 1 would all become black."""
+    only = tmp_path / "only"
+    only.mkdir()
+    for path in (folder / "a.tiff", only / "a.tiff"):
+        cv2.imwrite(str(path), np.full((camera.height, camera.width), 0.5, kind))
+    reason = f"has values of type {kind.__name__}; only integers of 8 to 16 bits can be used"
+    source = ImageFolder(folder, camera)
+    assert len(list(source)) == len(TRUTH)
+    assert source.unused == OneCamerasPictures(folder).unused == {"a.tiff": reason}
+    for read in (lambda: OneCamerasPictures(only), lambda: list(ImageFolder(only, camera))):
+        with pytest.raises(BadInput, match="none of the 1 files is a readable image") as caught:
+            read()
+        assert caught.value.why == f"a.tiff {reason}"
 
 
 def test_reasons_that_differ_in_numbers_are_one() -> None:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
+from drivers.cameras.live import Frame
 from executor.track import track_sources
 from model.errors import BadInput
 from model.pose import Pose
-from model.rig import Rig
+from model.rig import Camera, Rig
+from model.scene import Scene
 from simulation.camera.camera import SyntheticCamera
+from tests.tracking.test_cameras_together import other_side
 from tracking.pose_log import POSE_COLUMNS
 
 TRUTH = [Pose.level([0.10 - 0.01 * k, 0.1, 0.4]) for k in range(3)]
@@ -54,3 +60,31 @@ def test_a_source_that_is_none_and_a_camera_without_a_path_are_refused(rig: Rig)
         track_sources(rig, {camera: "nowhere"})
     with pytest.raises(BadInput, match="needs a path to render"):
         track_sources(rig, {camera: "synthetic"})
+
+
+def test_live_cameras_with_different_latencies_measure_the_platform_where_it_was(
+    rig: Rig, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It moves at 0.3 m/s; the images of both are exposed at the same times."""
+
+    def pose_at(time: float) -> Pose:
+        return Pose.level([0.3 * (time - 5.2), 0.05, 0.4])
+
+    class Live:
+        def __init__(self, _source: str, camera: Camera) -> None:
+            self._eye = SyntheticCamera(rig, replace(scene, obstacles=()), camera, seed=4)
+            self._delay = camera.latency
+
+        def __iter__(self) -> Iterator[Frame]:
+            for k, time in enumerate(np.arange(5.0, 5.5, 0.1).tolist()):
+                yield Frame(time + self._delay, self._eye.render(pose_at(time), k), f"image {k}")
+
+    monkeypatch.setattr("executor.track.LiveCamera", Live)
+    front = replace(rig.cameras[0], latency=0.02)
+    side = replace(other_side(front), latency=0.12)
+    result = track_sources(replace(rig, cameras=(front, side)), {front: "0", side: "1"})
+    assert result.together is not None
+    assert result.together.without_partner == 0
+    assert len(result.poses) == 5
+    for found in result.poses:
+        assert found.pose.distance_to(pose_at(found.time)) < 1e-3

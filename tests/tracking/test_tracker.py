@@ -20,6 +20,7 @@ from model.pose import (
 from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
+from tracking.camera_model import Image, pixels_of
 from tracking.estimator import TrackerSettings
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.shared_errors import CameraMoved
@@ -137,8 +138,11 @@ def test_a_moved_camera_is_reported_with_the_distance(
     moved = Pose(here.position + np.array([0.006, 0.0, 0.0]), turn @ here.rotation)
     real = SyntheticCamera(rig, scene, replace(camera, world_from_camera=moved), seed=1)
     tracker = Tracker(rig, camera)
+    first = tracker.observe(real.render(Pose.level([0.0, 0.0, 0.445]), 0), 0.0)
+    assert isinstance(first, NoPose)
+    assert "the camera moved" in first.reason
     with pytest.raises(CameraMoved) as caught:
-        tracker.observe(real.render(Pose.level([0.0, 0.0, 0.445]), 0), 0.0)
+        tracker.observe(real.render(Pose.level([0.0, 0.0, 0.445]), 1), 0.1)
     assert caught.value.exit_code == 1
     assert float(caught.value.values["moved_mm"]) == pytest.approx(6.0, abs=1.0)
     assert float(caught.value.values["turned_deg"]) == pytest.approx(0.5, abs=0.05)
@@ -157,6 +161,32 @@ def test_a_camera_moved_during_a_run_is_noticed(
     assert isinstance(tracker.observe(synthetic.render(truth, 0), 0.0), PoseMeasurement)
     with pytest.raises(CameraMoved):
         list(tracker.observe(later.render(truth, frame), frame * 0.1) for frame in range(1, 4))
+
+
+def test_another_print_of_a_covered_frame_tag_costs_one_pose_and_not_the_camera(
+    rig: Rig, camera: Camera, scene: Scene
+) -> None:
+    """The rig has one frame tag; what the camera sees of it lies elsewhere in some images."""
+    tag, truth = rig.frame_tags[0], Pose.level([0.0, 0.0, 0.445])
+    rig = replace(rig, frame_tags=(tag,))
+
+    def seen_with_it_at(shift: float, number: int) -> Image:
+        pose = replace(tag.pose, position=tag.pose.position + shift * np.eye(3)[1])
+        real = replace(rig, frame_tags=(replace(tag, pose=pose),))
+        return SyntheticCamera(real, scene, camera, seed=1).render(truth, number)
+
+    shifts = [0.0, 0.05, 0.0, 0.0, 0.05, 0.1, 0.0, 0.05]
+    tracker = Tracker(rig, camera, TrackerSettings(camera_check_period=1))
+    for number, shift in enumerate(shifts):
+        found = tracker.observe(seen_with_it_at(shift, number), 0.1 * number, truth)
+        assert isinstance(found, NoPose if shift else PoseMeasurement)
+    covered = seen_with_it_at(0.0, 8)
+    centre = np.round(pixels_of(camera, camera.world_from_camera.inverse().apply(
+        tag.pose.position[None]))[0]).astype(int)  # fmt: skip
+    covered[centre[1] - 40 : centre[1] + 40, centre[0] - 40 : centre[0] + 40] = 128
+    assert isinstance(tracker.observe(covered, 0.8, truth), NoPose)
+    with pytest.raises(CameraMoved):
+        tracker.observe(seen_with_it_at(0.05, 9), 0.9, truth)
 
 
 def test_a_single_tag_that_allows_two_poses_gives_none(
