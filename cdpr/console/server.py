@@ -24,7 +24,8 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 
 from cdpr.console.commands import Held, Inbox, LetGo, Message, NotAMessage, parse_message
-from cdpr.console.session import MADE, Console
+from cdpr.console.session import Console
+from cdpr.console.state import plans_and_scenes
 from cdpr.console.view import scene_of
 from executor.realtime.scheduling import prompt_threads, take_short_turns
 from executor.recording.record_files import RUNS
@@ -180,7 +181,7 @@ class ConsoleServer:
         return JSONResponse(data)
 
     async def _files(self) -> Response:
-        return JSONResponse(await run_in_threadpool(_plans_and_scenes))
+        return JSONResponse(await run_in_threadpool(plans_and_scenes))
 
     async def _preview(self) -> Response:
         if self._console.plan.preview is None:
@@ -373,24 +374,6 @@ async def _help(code: str) -> Response:
     if code not in fault_codes():
         raise HTTPException(404)
     return Response(page_text(code), media_type=_KINDS[".md"])
-
-
-def _plans_and_scenes() -> dict[str, list[str]]:
-    """Files to choose from, in the console's working folder."""
-    here = Path()
-    plans = sorted({*here.glob("*.json"), *here.glob("plans/*.json"), *MADE.glob("*.plan.json")})
-    folders = (here, here / "scenes", here / "configs")
-    scenes = sorted({path for folder in folders for path in folder.glob("*.yaml")})
-    return {
-        "plans": [str(path) for path in plans if _contains(path, '"kind": "cdpr-plan"')],
-        "scenes": [str(path) for path in scenes if _contains(path, "\ngoal:")],
-    }
-
-
-def _contains(path: Path, text: str) -> bool:
-    with suppress(OSError), path.open(encoding="utf-8", errors="replace") as stream:
-        return text in stream.read(100_000)
-    return False
 
 
 def run_server(console: Console, host: str, port: int, on_ready: Callable[[str], None]) -> None:

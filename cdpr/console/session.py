@@ -30,7 +30,7 @@ from cdpr.console.commands import (
     TakeCommand,
 )
 from cdpr.console.state import (
-    LoadedPlan,
+    MADE,
     StartedVerb,
     StoredState,
     cable_state,
@@ -43,7 +43,14 @@ from cdpr.console.state import (
     stored_state,
 )
 from cdpr.console.teach import TaughtPoses, scene_text
-from cdpr.console.view import RobotNow, RobotView, nearest_data, pose_data
+from cdpr.console.view import (
+    LoadedPlan,
+    RobotNow,
+    RobotView,
+    nearest_data,
+    pose_data,
+    shown_tensions,
+)
 from cdpr.console.watch import CameraPictures, RunWatch
 from executor.drives import is_simulated
 from executor.jogging import FASTEST
@@ -59,8 +66,6 @@ from model.scene import empty_scene, load_scene
 
 #: Shortest period of reading the fault latch and the reference, [s].
 STORED_EVERY = 0.5
-#: Folder of the plans and scenes that the console writes.
-MADE = Path("console")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,7 +197,7 @@ class Console:
             "outcome": outcome_state(self.verbs.outcome),
             "motion": None if status is None else {**status, "age_s": round(age, 3)},
             "platform": None if robot is None else pose_data(rig, robot.pose, "drives"),
-            "tensions_n": _tensions(status, robot),
+            "tensions_n": shown_tensions(status, robot),
             "tension_limits_n": [rig.min_tension, rig.max_tension],
             "clearance_mm": near and nearest_data(near, self.view.required_clearance),
             "measured": measured_state(status, age),
@@ -216,13 +221,8 @@ class Console:
     # Commands.
 
     def stop(self) -> str:
-        """Stops every run of this user, and a verb that is still being prepared.
-
-        Returns:
-            Why not, or an empty text.
-        """
-        result = stop_runs()
-        ended = self.verbs.stop_before_motion()
+        """Stops every run of this user, and a verb in preparation; returns why not, or nothing."""
+        result, ended = stop_runs(), self.verbs.stop_before_motion()
         if result.silent:
             return "a run does not answer: press the emergency stop"
         return "" if result.stopped or ended else "nothing moves"
@@ -325,9 +325,8 @@ class Console:
         cameras = [text for source in self.files.cameras for text in ("--camera", source)]
         if not (cameras or is_simulated(self.rig)):
             cameras = ["--no-camera"]
-        rig = ["--rig", str(self.files.rig_file)]
-        seen = ["--plan-hash", self.plan.hash]
-        return self._start_verb("run", [self.plan.preview["name"], *rig, *cameras, *seen])
+        rig = ["--rig", str(self.files.rig_file), "--plan-hash", self.plan.hash]
+        return self._start_verb("run", [self.plan.preview["name"], *rig, *cameras])
 
     def _jog_begin(self) -> str:
         scene = self.files.scene_file
@@ -340,9 +339,8 @@ class Console:
     def _cable_begin(self) -> str:
         if not self.control.is_service:
             return "enter service mode first"
-        speed = ["--speed-mm-s", f"{1e3 * FASTEST:g}"]
-        rig = str(self.files.rig_file)
-        return self._start_verb("jog", [rig, "--hold-to-run", "--one-cable", *speed])
+        how = ["--hold-to-run", "--one-cable", "--speed-mm-s", f"{1e3 * FASTEST:g}"]
+        return self._start_verb("jog", [str(self.files.rig_file), *how])
 
     def _service(self, *, on: bool) -> str:
         """Enters or leaves service mode, the only mode that jogs single cables."""
@@ -450,11 +448,3 @@ class Console:
         """Reports to the run that a press is over."""
         if press is not None:
             self.watch.send("let_go", press=press)
-
-
-def _tensions(status: dict[str, Any] | None, robot: RobotNow | None) -> list[float] | None:
-    """Tensions [N] of the run, even where no pose fits; else those last seen."""
-    drives = [] if status is None else status["drives"]
-    if drives:
-        return [drive["tension_n"] for drive in drives]
-    return None if robot is None else [round(t, 2) for t in robot.tensions]

@@ -10,27 +10,19 @@ import sys
 import tempfile
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from cdpr.console.view import measured_data, scene_figure
+from cdpr.console.view import measured_data
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.jogging import FASTEST
 from executor.recording.record_files import RUNS
-from executor.report.page import plan_labels
-from executor.runner import prepare_plan
-from executor.trajectory.setpoints import PreparedRun
-from model.clearance import ClearanceModel
 from model.errors import BadInput, CdprError, Refused
-from model.kinematics import cable_lengths, cables_at
-from model.pages.scene import Moment, Stroke, scene_data
-from model.plan import Plan, load_plan, require_same_rig
 from model.pose import Pose
 from model.rig import Rig
 
@@ -39,6 +31,8 @@ SHOWN = 4000
 #: Exit code of a verb that the operator stopped.
 STOPPED = 130
 BEFORE_MOTION = "Stopped during the preparation: nothing was moved."
+#: Folder of the plans and scenes that the console writes.
+MADE = Path("console")
 #: Verbs after which drives move, or let go.
 MOVING = frozenset({"home", "jog", "release", "run"})
 _REPORT = re.compile(r"(\S+/report\.html)")
@@ -181,6 +175,24 @@ def local_file(name: str) -> Path:
     return path
 
 
+def plans_and_scenes() -> dict[str, list[str]]:
+    """Files to choose from, in the console's working folder."""
+    here = Path()
+    plans = sorted({*here.glob("*.json"), *here.glob("plans/*.json"), *MADE.glob("*.plan.json")})
+    folders = (here, here / "scenes", here / "configs")
+    scenes = sorted({path for folder in folders for path in folder.glob("*.yaml")})
+    return {
+        "plans": [str(path) for path in plans if _contains(path, '"kind": "cdpr-plan"')],
+        "scenes": [str(path) for path in scenes if _contains(path, "\ngoal:")],
+    }
+
+
+def _contains(path: Path, text: str) -> bool:
+    with suppress(OSError), path.open(encoding="utf-8", errors="replace") as stream:
+        return text in stream.read(100_000)
+    return False
+
+
 @dataclass(frozen=True, slots=True)
 class StoredState:
     """Stored state of a bus.
@@ -302,148 +314,3 @@ def measured_state(status: dict[str, Any] | None, age: float) -> dict[str, Any] 
     if status is None or measured is None or status["elapsed_s"] is None:
         return None
     return measured_data(measured, max(0.0, status["elapsed_s"] - measured["time_s"]) + age)
-
-
-# Preview of a plan: path, checks, clearance and tensions along it.
-#: Number of poses that are drawn, and at which clearance is computed.
-POSES = 200
-
-
-class LoadedPlan:
-    """The plan that a run would follow, and another to compare it with."""
-
-    def __init__(self, rig: Rig) -> None:
-        """Before any plan."""
-        self._rig = rig
-        self.preview: dict[str, Any] | None = None
-        self.compared: dict[str, Any] | None = None
-        self.start: Pose | None = None
-        self.hash = ""
-        """Of the plan: its file may be replaced before a run."""
-
-    def load(self, path: Path) -> None:
-        """Loads a plan for preview.
-
-        Raises:
-            BadInput: It cannot be read, or is for another rig.
-        """
-        self.forget()
-        plan = self._read(path)
-        self.preview, self.start = preview(path, plan, self._rig), plan.waypoints[0]
-        self.hash = plan.document.hash
-
-    def forget(self) -> None:
-        """No plan is loaded; another takes its place."""
-        self.preview = self.start = None
-
-    def compare(self, path: Path | None) -> None:
-        """Shows another plan beside the loaded one; None ends the comparison.
-
-        Raises:
-            BadInput: It cannot be read, or is for another rig.
-        """
-        self.compared = None if path is None else preview(path, self._read(path), self._rig)
-
-    def _read(self, path: Path) -> Plan:
-        plan = load_plan(path)
-        require_same_rig(plan, self._rig, path)
-        return plan
-
-    def off_mm(self, pose: Pose | None) -> float | None:
-        """Distance of a pose from the plan's start, [mm]; None if one is unknown."""
-        start = self.start
-        return None if start is None or pose is None else round(1e3 * pose.distance_to(start), 1)
-
-    def begins_elsewhere(self, pose: Pose) -> bool:
-        """Whether a cable has another length at a pose than at the plan's start."""
-        if self.start is None:
-            return False
-        off = cable_lengths(self._rig, pose) - cable_lengths(self._rig, self.start)
-        return bool(np.max(np.abs(off)) > self._rig.motion.start_tolerance)
-
-
-def preview(path: Path, plan: Plan, rig: Rig) -> dict[str, Any]:
-    """Preview data of a plan and its file; the verdict says why a plan does not pass."""
-    try:
-        prepared = prepare_plan(plan, rig)
-    except CdprError as error:
-        return {
-            "name": str(path),
-            "passed": False,
-            "verdict": error.what,
-            "checks": [],
-            "duration_s": None,
-            "length_mm": None,
-            "least_clearance_mm": None,
-            "largest_tension_n": None,
-            **_drawn(rig, plan, []),
-            "curves": None,
-        }
-    report = prepared.checked.report
-    rows = _rows(prepared)
-    table = prepared.checked.table
-    poses = [Pose(table.positions[row], table.rotations[row]) for row in rows]
-    times = [round(row * table.cycle, 3) for row in rows]
-    return {
-        "name": str(path),
-        "passed": True,
-        "verdict": "passed every check",
-        "checks": _checks(prepared),
-        "duration_s": round(prepared.duration, 1),
-        "length_mm": round(prepared.length * 1e3, 1),
-        "least_clearance_mm": _in_mm(report.proved_obstacle_clearance),
-        "largest_tension_n": round(report.max_tension, 1),
-        **_drawn(rig, plan, list(zip(times, poses, strict=True))),
-        "curves": {
-            "time_s": times,
-            "clearance_mm": _clearances(rig, plan, poses),
-            "required_mm": round(report.required_obstacle_clearance * 1e3, 2),
-            "tensions_n": np.round(table.tensions[rows].T, 2).tolist(),
-        },
-    }
-
-
-def _in_mm(distance: float) -> float | None:
-    """A distance [m] in mm for the page; None if infinite."""
-    return round(distance * 1e3, 1) if np.isfinite(distance) else None
-
-
-def _rows(prepared: PreparedRun) -> list[int]:
-    count = len(prepared.checked.table)
-    even = np.linspace(0, count - 1, min(count, POSES))
-    return sorted({round(float(row)) for row in even})
-
-
-def _checks(prepared: PreparedRun) -> list[str]:
-    report = prepared.checked.report
-    checks = []
-    if np.isfinite(report.proved_obstacle_clearance):
-        checks.append(
-            f"clearance to obstacles at least {report.proved_obstacle_clearance * 1e3:.1f} mm,"
-            f" required {report.required_obstacle_clearance * 1e3:.1f} mm"
-        )
-    checks.append(
-        f"clearance between cables and to the platform at least"
-        f" {report.proved_self_clearance * 1e3:.1f} mm,"
-        f" required {report.required_self_clearance * 1e3:.1f} mm"
-    )
-    checks.append(f"tensions {report.min_tension:.1f} to {report.max_tension:.1f} N")
-    return checks
-
-
-def _clearances(rig: Rig, plan: Plan, poses: list[Pose]) -> list[float | None] | None:
-    if not plan.scene.obstacles:
-        return None
-    model = ClearanceModel(rig, plan.scene)
-    near = [model.smallest(pose) for pose in poses]
-    return [None if one is None else round(one.distance * 1e3, 2) for one in near]
-
-
-def _drawn(rig: Rig, plan: Plan, moments: list[tuple[float, Pose]]) -> dict[str, Any]:
-    points = np.array([pose.position for pose in plan.waypoints])
-    figure = scene_figure(rig, plan.scene, Stroke.along("path", "ink", points, 4.5))
-    drawn = tuple(
-        Moment(time, pose.position, pose.rotation, cables_at(rig, pose).exits)
-        for time, pose in moments
-    )
-    return scene_data(replace(figure, labels=plan_labels(plan), moments=drawn))

@@ -1,10 +1,10 @@
-"""Pose, tensions and clearance of the robot from its drives, as data for the page."""
+"""Pose, tensions and clearance of the robot, and the preview of a plan, as data for the page."""
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,15 @@ import numpy as np
 
 from executor.interlock.interlock import MotionInterlock
 from executor.recording.run_folder import RunFolder
+from executor.report.page import plan_labels
+from executor.runner import prepare_plan
 from executor.service import StatusResult
+from executor.trajectory.setpoints import PreparedRun
 from model.clearance import ClearanceModel, Nearest
 from model.errors import CdprError
-from model.kinematics import cables_at, forward_kinematics
+from model.kinematics import cable_lengths, cables_at, forward_kinematics
 from model.pages.scene import (
+    Moment,
     SceneFigure,
     Stroke,
     frame_surface,
@@ -25,6 +29,7 @@ from model.pages.scene import (
     platform_surface,
     scene_data,
 )
+from model.plan import Plan, load_plan, require_same_rig
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, empty_scene
@@ -211,3 +216,156 @@ class RobotView:
         self._winches = WinchMap(rig)
         self._model = ClearanceModel(rig, self.scene)
         self._pose = rig.home
+
+
+def shown_tensions(status: dict[str, Any] | None, robot: RobotNow | None) -> list[float] | None:
+    """Tensions [N] of the run, even where no pose fits; else those last seen."""
+    drives = [] if status is None else status["drives"]
+    if drives:
+        return [drive["tension_n"] for drive in drives]
+    return None if robot is None else [round(t, 2) for t in robot.tensions]
+
+
+# Preview of a plan: path, checks, clearance and tensions along it.
+#: Number of poses that are drawn, and at which clearance is computed.
+POSES = 200
+
+
+class LoadedPlan:
+    """The plan that a run would follow, and another to compare it with."""
+
+    def __init__(self, rig: Rig) -> None:
+        """Before any plan."""
+        self._rig = rig
+        self.preview: dict[str, Any] | None = None
+        self.compared: dict[str, Any] | None = None
+        self.start: Pose | None = None
+        self.hash = ""
+        """Of the plan: its file may be replaced before a run."""
+
+    def load(self, path: Path) -> None:
+        """Loads a plan for preview.
+
+        Raises:
+            BadInput: It cannot be read, or is for another rig.
+        """
+        self.forget()
+        plan = self._read(path)
+        self.preview, self.start = preview(path, plan, self._rig), plan.waypoints[0]
+        self.hash = plan.document.hash
+
+    def forget(self) -> None:
+        """No plan is loaded; another takes its place."""
+        self.preview = self.start = None
+
+    def compare(self, path: Path | None) -> None:
+        """Shows another plan beside the loaded one; None ends the comparison.
+
+        Raises:
+            BadInput: It cannot be read, or is for another rig.
+        """
+        self.compared = None if path is None else preview(path, self._read(path), self._rig)
+
+    def _read(self, path: Path) -> Plan:
+        plan = load_plan(path)
+        require_same_rig(plan, self._rig, path)
+        return plan
+
+    def off_mm(self, pose: Pose | None) -> float | None:
+        """Distance of a pose from the plan's start, [mm]; None if one is unknown."""
+        start = self.start
+        return None if start is None or pose is None else round(1e3 * pose.distance_to(start), 1)
+
+    def begins_elsewhere(self, pose: Pose) -> bool:
+        """Whether a cable has another length at a pose than at the plan's start."""
+        if self.start is None:
+            return False
+        off = cable_lengths(self._rig, pose) - cable_lengths(self._rig, self.start)
+        return bool(np.max(np.abs(off)) > self._rig.motion.start_tolerance)
+
+
+def preview(path: Path, plan: Plan, rig: Rig) -> dict[str, Any]:
+    """Preview data of a plan and its file; the verdict says why a plan does not pass."""
+    try:
+        prepared = prepare_plan(plan, rig)
+    except CdprError as error:
+        return {
+            "name": str(path),
+            "passed": False,
+            "verdict": error.what,
+            "checks": [],
+            "duration_s": None,
+            "length_mm": None,
+            "least_clearance_mm": None,
+            "largest_tension_n": None,
+            **_drawn(rig, plan, []),
+            "curves": None,
+        }
+    report = prepared.checked.report
+    rows = _rows(prepared)
+    table = prepared.checked.table
+    poses = [Pose(table.positions[row], table.rotations[row]) for row in rows]
+    times = [round(row * table.cycle, 3) for row in rows]
+    return {
+        "name": str(path),
+        "passed": True,
+        "verdict": "passed every check",
+        "checks": _checks(prepared),
+        "duration_s": round(prepared.duration, 1),
+        "length_mm": round(prepared.length * 1e3, 1),
+        "least_clearance_mm": _in_mm(report.proved_obstacle_clearance),
+        "largest_tension_n": round(report.max_tension, 1),
+        **_drawn(rig, plan, list(zip(times, poses, strict=True))),
+        "curves": {
+            "time_s": times,
+            "clearance_mm": _clearances(rig, plan, poses),
+            "required_mm": round(report.required_obstacle_clearance * 1e3, 2),
+            "tensions_n": np.round(table.tensions[rows].T, 2).tolist(),
+        },
+    }
+
+
+def _in_mm(distance: float) -> float | None:
+    """A distance [m] in mm for the page; None if infinite."""
+    return round(distance * 1e3, 1) if np.isfinite(distance) else None
+
+
+def _rows(prepared: PreparedRun) -> list[int]:
+    count = len(prepared.checked.table)
+    even = np.linspace(0, count - 1, min(count, POSES))
+    return sorted({round(float(row)) for row in even})
+
+
+def _checks(prepared: PreparedRun) -> list[str]:
+    report = prepared.checked.report
+    checks = []
+    if np.isfinite(report.proved_obstacle_clearance):
+        checks.append(
+            f"clearance to obstacles at least {report.proved_obstacle_clearance * 1e3:.1f} mm,"
+            f" required {report.required_obstacle_clearance * 1e3:.1f} mm"
+        )
+    checks.append(
+        f"clearance between cables and to the platform at least"
+        f" {report.proved_self_clearance * 1e3:.1f} mm,"
+        f" required {report.required_self_clearance * 1e3:.1f} mm"
+    )
+    checks.append(f"tensions {report.min_tension:.1f} to {report.max_tension:.1f} N")
+    return checks
+
+
+def _clearances(rig: Rig, plan: Plan, poses: list[Pose]) -> list[float | None] | None:
+    if not plan.scene.obstacles:
+        return None
+    model = ClearanceModel(rig, plan.scene)
+    near = [model.smallest(pose) for pose in poses]
+    return [None if one is None else round(one.distance * 1e3, 2) for one in near]
+
+
+def _drawn(rig: Rig, plan: Plan, moments: list[tuple[float, Pose]]) -> dict[str, Any]:
+    points = np.array([pose.position for pose in plan.waypoints])
+    figure = scene_figure(rig, plan.scene, Stroke.along("path", "ink", points, 4.5))
+    drawn = tuple(
+        Moment(time, pose.position, pose.rotation, cables_at(rig, pose).exits)
+        for time, pose in moments
+    )
+    return scene_data(replace(figure, labels=plan_labels(plan), moments=drawn))
