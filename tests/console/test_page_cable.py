@@ -43,7 +43,7 @@ def test_what_a_held_message_says(desk: Visit) -> None:
     (one, *_) = desk.fake.received("held")
     expected = {"kind": "held", "cable": 6, "sense": "pay_out", "step_mm": 0.1, "speed_mm_s": 3}
     assert {k: one[k] for k in expected} == expected
-    assert set(one) == {*expected, "hold", "seq"}
+    assert set(one) == {*expected, "hold", "seq", "state"}
 
 
 def test_nothing_is_possible_outside_service_mode(desk: Visit) -> None:

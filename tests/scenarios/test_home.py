@@ -316,7 +316,7 @@ def test_a_bus_that_dies_at_once_is_reported(monkeypatch: pytest.MonkeyPatch) ->
         def broken(*_: object) -> None:
             raise BusDown("the interface is down", "can0")
 
-        there = SimpleNamespace(positions=np.array(bench.counts))
+        there = SimpleNamespace(positions=np.array(bench.counts), holding=False)
         monkeypatch.setattr(bench.group, "read_positions", lambda _pace: there)
         monkeypatch.setattr(bench.group, "send_cycle", broken)
         result = bench.take_up()
