@@ -11,6 +11,7 @@ import pytest
 
 from drivers.can_bus import BusSettings
 from drivers.cia402.state_machine import DriveState
+from executor.control.path_runs import Outcome
 from executor.interlock.fault_latch import FaultLatch
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State
@@ -24,6 +25,16 @@ from tests.scenarios.test_real_time import drives_on
 
 CRUISING = 150
 FIFTH, SIXTH = 4, 5
+
+
+def run_and_left_alone(stage: Stage) -> tuple[Outcome, set[DriveState]]:
+    """With drives that take the end of heartbeats as a fault, and their states later."""
+    for drive in stage.drives:
+        drive.behaviour = replace(drive.behaviour, heartbeat_loss_is_fault=True)
+    outcome = stage.run()
+    stage.rehearsal.advance(0.5)
+    stage.rehearsal.pump()
+    return outcome, {drive.state for drive in stage.drives}
 
 
 def fails_once_left(drive: SimulatedDrive) -> None:
@@ -98,12 +109,7 @@ def test_a_disturbed_bus_still_ends_in_order_so_that_no_drive_misses_its_master(
             LOST_BY_CONTROLLER(stage)
 
     with staged(prepared, tmp_path / "run", fault) as stage:
-        for drive in stage.drives:
-            drive.behaviour = replace(drive.behaviour, heartbeat_loss_is_fault=True)
-        outcome = stage.run()
-        stage.rehearsal.advance(0.5)
-        stage.rehearsal.pump()
-        states = {drive.state for drive in stage.drives}
+        outcome, states = run_and_left_alone(stage)
         codes = [event.code for event in stage.events()]
     assert "error-passive" in outcome.cause
     assert "bus_lost" not in codes
@@ -173,12 +179,7 @@ def test_a_cycle_without_replies_does_not_cut_the_end_short(
             drive.silent = len(ending) == later
 
     with staged(prepared, tmp_path / "run", deaf_once) as stage:
-        for drive in stage.drives:
-            drive.behaviour = replace(drive.behaviour, heartbeat_loss_is_fault=True)
-        outcome = stage.run()
-        stage.rehearsal.advance(0.5)
-        stage.rehearsal.pump()
-        states = {drive.state for drive in stage.drives}
+        outcome, states = run_and_left_alone(stage)
     assert len(ending) > later, "the end went on"
     assert outcome.state is State.FINISHED, outcome.cause
     assert states == {DriveState.QUICK_STOP_ACTIVE}
