@@ -65,7 +65,7 @@ test: install  ## Run the whole test suite on two cores
 	  -o "$(VENV)/turning-plan.json" --force --json >/dev/null && \
 	"$(BIN)/python" -c '$(COMPILE_REST)' && \
 	wait $$paper
-	"$(BIN)/python" -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+	"$(BIN)/python" -m pytest -n 5 --dist loadfile --no-loadscope-reorder
 
 mutation: install  ## Try small changes of the code that keeps people safe (PATHS=executor/safety, or CHANGED=BASE)
 	"$(BIN)/python" tools/mutation/run.py $(if $(CHANGED),--changed "$(CHANGED)") $(PATHS)
