@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -87,3 +88,12 @@ def test_a_program_beside_the_page_runs_until_its_end_and_then_gets_ctrl_c(
     )
     assert tool.run_pages([[page(tmp_path, text)]], fast=True) == 0
     assert (tmp_path / "interrupted").exists()
+
+
+def test_what_the_next_block_waits_for_is_printed_by_the_product() -> None:
+    """Blocks in real time do not run in every CI: a changed message would go unnoticed."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    waits = {t for page in pages for t in re.findall(r"ready at: (.+?) -->", page.read_text())}
+    assert waits
+    product = "".join(p.read_text() for f in ("cdpr", "executor") for p in (ROOT / f).rglob("*.py"))
+    assert [text for text in waits if text not in product] == []
