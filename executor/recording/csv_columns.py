@@ -211,7 +211,7 @@ class TableFile:
             raise self._bad(
                 f"the column {name!r} has a value that is not a number: {error}"
             ) from None
-        beyond = found[np.isfinite(found) & (np.abs(found) > LARGEST_RECORDED)]
+        beyond = found[np.abs(found) > LARGEST_RECORDED]  # NaN stands for unknown
         if len(beyond):
             raise self._bad(
                 f"the column {name!r} has a value beyond ±{LARGEST_RECORDED:g}: {beyond[0]:g}"

@@ -72,6 +72,12 @@ def test_a_print_is_named_as_what_it_is(tmp_path: Path) -> None:
     one_message(answer, 2, "the output must be a PDF file", "name it board.pdf")
 
 
+@pytest.mark.parametrize("folder", ["/", ".", ".."])
+def test_a_folder_is_no_print(folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    one_message(call("calibrate", "print", folder, *BOARD), 2, "this is a folder", "name a file")
+
+
 def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:
     (tmp_path / "board.pdf").write_text("mine")
     answer = call("calibrate", "print", tmp_path / "board.pdf", *BOARD)

@@ -82,7 +82,7 @@ def test_a_whole_number_past_64_bits_in_a_table_is_reported(tmp_path: Path) -> N
         TableFile(tmp_path / "a.csv").ints("n")
 
 
-@pytest.mark.parametrize("value", ["-1e308", "1.1e15"])
+@pytest.mark.parametrize("value", ["-1e308", "1.1e15", "1e400", "-inf"])
 def test_a_number_that_no_run_records_is_reported(tmp_path: Path, value: str) -> None:
     (tmp_path / "a.csv").write_text(f"x_mm,y_mm\n1,2\nnan,{value}\n")
     table = TableFile(tmp_path / "a.csv")

@@ -134,13 +134,13 @@ def print_(
 
       cdpr calibrate print tags.pdf --rig configs/gachon_8_6.yaml
     """
+    require_new_file(output, force)
     if output.suffix.lower() != ".pdf":
         raise BadInput(
             "the output must be a PDF file",
             where=str(output),
             next_step=f"name it {output.with_suffix('.pdf').name}",
         )
-    require_new_file(output, force)
     if rig is not None and printed != BoardOptions():
         raise BadInput(
             "--rig prints the rig's tags in the sizes of the rig file",
