@@ -157,23 +157,23 @@ class KinematicCost:
             return condition, 1.0 / force_volume(matrices, rig.max_tension - rig.min_tension)
 
     def _scaled(self, condition: Array, inverse: Array) -> Array:
-        """An index better than the best of the lattice counts as 0, as in the search."""
-        scaled = [
-            np.where(
-                np.isfinite(v),
-                np.maximum((v - low) / (high - low if high > low else 1.0), 0.0),
-                1.0,
-            )
-            for v, (low, high) in zip((condition, inverse), self.extremes, strict=True)
-        ]
-        total: Array = scaled[0] + scaled[1]
-        return total
+        of_condition, of_inverse = self.extremes
+        return scaled(condition, *of_condition) + scaled(inverse, *of_inverse)
 
 
 def finite_range(values: Array) -> tuple[float, float]:
     """The smallest and the largest finite value; 0 without any."""
     finite = values[np.isfinite(values)]
     return (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
+
+
+def scaled(values: Array, low: float, high: float) -> Array:
+    """An index as a cost: 0 at its best within the workspace or better, 1 at a singular pose.
+
+    An orientation other than the one of the extremes may be better than their best.
+    """
+    rising = np.maximum((values - low) / (high - low if high > low else 1.0), 0.0)
+    return np.where(np.isfinite(values), rising, 1.0)
 
 
 # Wrench feasibility: weight, payload and the box of disturbances, within the tension limits.

@@ -1,4 +1,4 @@
-"""Data sent to every page: started verbs, rig and jog session, preview of a plan."""
+"""Data sent to every page: started verbs, stored state, jog session, files to choose from."""
 
 from __future__ import annotations
 

@@ -299,8 +299,7 @@ class RunCameras:
         for frame_set in self._open:
             answered = frame_set.asked - gone <= frame_set.samples.keys()
             late = frame_set.trigger.frame < self._frame - 1
-            in_order = all(one.trigger.frame < self._frame - 1 for one in waiting)
-            if in_order and (answered or (late and frame_set.has_pose) or last):
+            if answered or (late and frame_set.has_pose) or last:
                 self._keep(self._fused(frame_set))
             else:
                 waiting.append(frame_set)

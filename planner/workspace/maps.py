@@ -24,7 +24,7 @@ from model.statics.wrench_sets import (
     force_volume,
     rms_anchor_radius,
 )
-from planner.costs import finite_range
+from planner.costs import finite_range, scaled
 from planner.space import Lattice
 
 Values = dict[str, Array]
@@ -217,6 +217,5 @@ def costs(values: Values, extremes: Extremes) -> Values:
 
 
 def _scaled(values: Array, low: float, high: float) -> Array:
-    """From 0 to 1 within the workspace, and 1 where the platform is singular, as plans have it."""
-    scaled = np.maximum((values - low) / (high - low if high > low else 1.0), 0.0)
-    return np.where(np.isinf(values), 1.0, scaled)
+    """As in plans; NaN where the platform cannot be."""
+    return np.where(np.isnan(values), np.nan, scaled(values, low, high))
