@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import json
 import os
@@ -63,15 +64,16 @@ class InProcessBus(VirtualBus):
     """
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Gives every other end a copy; copies of a `SentFrame` share its data."""
-        if not isinstance(msg, SentFrame) or self.receive_own_messages:
+        """Gives all other ends one copy, which nobody may change."""
+        if self.receive_own_messages:
             super().send(msg, timeout)
             return
         self._check_if_open()
-        now = time.time()
+        arrived = copy.copy(msg) if isinstance(msg, SentFrame) else copy.deepcopy(msg)
+        arrived.timestamp, arrived.channel, arrived.is_rx = time.time(), self.channel_id, True
         for inbox in self.channel:
             if inbox is not self.queue:
-                inbox.put(self._arrived(msg, now))
+                inbox.put(arrived)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next frame, or None if none arrives within the time [s]."""
@@ -81,16 +83,6 @@ class InProcessBus(VirtualBus):
         inbox = self.queue
         with inbox.mutex:
             return inbox.queue.popleft() if inbox.queue else None
-
-    def _arrived(self, frame: SentFrame, now: float) -> can.Message:
-        return can.Message(
-            timestamp=now,
-            arbitration_id=frame.arbitration_id,
-            is_extended_id=False,
-            channel=self.channel_id,
-            data=frame.data,
-            is_rx=True,
-        )
 
 
 @dataclass(frozen=True, slots=True)

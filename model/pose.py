@@ -30,7 +30,7 @@ def read_only(values: ArrayLike) -> Array:
 
 def skew(vector: ArrayLike) -> Array:
     """Matrix of the cross product: ``skew(a) @ b == a × b``; shape (3, 3)."""
-    x, y, z = np.asarray(vector, dtype=np.float64)
+    x, y, z = np.asarray(vector, dtype=np.float64).tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
@@ -59,45 +59,46 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
 
 def quaternion_from_matrix(matrix: ArrayLike) -> Array:
     """Unit quaternion (w ≥ 0) of a rotation matrix; stable for every angle (Shepperd)."""
-    m = np.asarray(matrix, dtype=np.float64)
-    trace = m[0, 0] + m[1, 1] + m[2, 2]
-    squares = np.array([trace, m[0, 0], m[1, 1], m[2, 2]])
-    largest = int(np.argmax(squares))
-    if largest == 0:
-        q = np.array([1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, dtype=np.float64).tolist()
+    trace = a + e + i
+    largest = max(trace, a, e, i)
+    if trace == largest:
+        q = (1.0 + trace, h - f, c - g, d - b)
+    elif a == largest:
+        q = (h - f, 1.0 + 2.0 * a - trace, d + b, g + c)
+    elif e == largest:
+        q = (c - g, b + d, 1.0 + 2.0 * e - trace, h + f)
     else:
-        i = largest - 1
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q = np.empty(4)
-        q[0] = m[k, j] - m[j, k]
-        q[1 + i] = 1 + 2 * m[i, i] - trace
-        q[1 + j] = m[j, i] + m[i, j]
-        q[1 + k] = m[k, i] + m[i, k]
-    q /= np.linalg.norm(q)
-    return q if q[0] >= 0 else -q
+        q = (d - b, c + g, f + h, 1.0 + 2.0 * i - trace)
+    length = math.hypot(*q)
+    return np.array(q) / (length if q[0] >= 0.0 else -length)
 
 
 def matrix_from_rotation_vector(vector: ArrayLike) -> Array:
     """Rotation matrix exp([vector]×), ``vector`` in rad; shape (3, 3)."""
-    v = np.asarray(vector, dtype=np.float64)
-    angle = float(np.linalg.norm(v))
-    s = skew(v)
+    x, y, z = np.asarray(vector, dtype=np.float64).tolist()
+    angle = math.hypot(x, y, z)
     if angle < 1e-6:  # series: the closed form loses digits near zero
         first, second = 1.0, 0.5
     else:
-        first, second = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2
-    matrix: Array = np.eye(3) + first * s + second * (s @ s)
-    return matrix
+        first, second = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    xy, xz, yz = second * x * y, second * x * z, second * y * z
+    xx, yy, zz = second * x * x, second * y * y, second * z * z
+    return np.array(
+        [
+            [1.0 - yy - zz, xy - first * z, xz + first * y],
+            [xy + first * z, 1.0 - xx - zz, yz - first * x],
+            [xz - first * y, yz + first * x, 1.0 - xx - yy],
+        ]
+    )
 
 
 def rotation_vector_from_matrix(matrix: ArrayLike) -> Array:
     """Rotation vector (axis times angle in [0, π]) of a rotation matrix; shape (3,), [rad]."""
-    q = quaternion_from_matrix(matrix)
-    sine = float(np.linalg.norm(q[1:]))
-    if sine < 1e-12:
-        return 2.0 * q[1:]
-    vector: Array = q[1:] * (2.0 * np.arctan2(sine, q[0]) / sine)
-    return vector
+    w, x, y, z = quaternion_from_matrix(matrix).tolist()
+    sine = math.hypot(x, y, z)
+    factor = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine
+    return np.array([factor * x, factor * y, factor * z])
 
 
 def _is_rotation(matrix: Array) -> bool:

@@ -251,7 +251,11 @@ class Client:
         if len(data) != 8:
             return
         command, index, sub = _HEAD.unpack_from(data)
-        known = [key for key in self._asked if _answers(key, command, index, sub)]
+        kind = command & _KIND
+        if kind in (_SEGMENT, _ABORT):
+            known = [key for key in self._asked if _answers(key, command, index, sub)]
+        else:
+            known = [key for key in [(kind, index, sub)] if key in self._asked]
         segments = [key for key in known if key[0] in _SEGMENTS]
         # A segment names no object: it counts for the open request, or else for any.
         own = [key for key in segments if key == self._wanted]
