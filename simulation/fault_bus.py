@@ -122,11 +122,14 @@ class FaultBus(can.BusABC):
     def _arbitrate(self) -> None:
         """Transmits waiting frames by priority until now."""
         while self.bitrate is not None and self._waiting:
-            begin = max(self._free_at, min(entry[2] for entry in self._waiting))
+            begin, entry = self._free_at, self._waiting[0]
+            if entry[2] > begin:  # the most urgent frame came later: another may go before it
+                begin = max(begin, min(waiting[2] for waiting in self._waiting))
+                entry = min(waiting for waiting in self._waiting if waiting[2] <= begin)
             if begin > self._now:
                 return
-            entry = min(entry for entry in self._waiting if entry[2] <= begin)
             self._waiting.remove(entry)
+            heapq.heapify(self._waiting)
             _, number, _, box, message = entry
             self._free_at = begin + frame_bits(len(message.data)) / self.bitrate
             heapq.heappush(box, (self._free_at, number, message))

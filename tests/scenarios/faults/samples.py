@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -120,16 +120,14 @@ class WatchedRehearsal(SimulatedCia402Rig):
 
     def _keep(self, at: float) -> None:
         drives = self.drives
-        sample = Sample(
-            at,
-            self.cycles,
+        state = (
             tuple(drive.state for drive in drives),
             tuple(drive._target for drive in drives),
             tuple(drive.motor.position for drive in drives),
         )
         last = self.samples[-1] if self.samples else None
-        if last is None or last != replace(sample, time=last.time, syncs=last.syncs):
-            self.samples.append(sample)
+        if last is None or state != (last.states, last.targets, last.positions):
+            self.samples.append(Sample(at, self.cycles, *state))
 
 
 @dataclass(frozen=True)
