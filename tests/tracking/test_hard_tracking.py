@@ -179,7 +179,7 @@ def test_a_smear_is_named_with_its_length(rig: Rig, camera: Camera, empty: Scene
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("blur", [0.3, 0.6, 1.0, 1.5])
+@pytest.mark.parametrize("blur", [0.3, 1.0, 1.5])
 def test_the_stated_covariance_is_that_of_the_errors(
     rig: Rig, camera: Camera, empty: Scene, blur: float
 ) -> None:
@@ -217,13 +217,13 @@ def test_two_tags_that_contradict_each_other_give_no_pose(
 def test_the_stated_error_of_tags_widens_the_limit_of_their_residuals(
     rig: Rig, scene: Scene
 ) -> None:
-    """As it does in pixels: in an image of three times as many pixels, three times as far."""
+    """As it does in pixels: in an image of twice as many pixels, twice as far."""
     draw = np.random.default_rng(2)
     camera = replace(
         rig.cameras[0],
-        width=3 * rig.cameras[0].width,
-        height=3 * rig.cameras[0].height,
-        matrix=rig.cameras[0].matrix * np.array([[3.0], [3.0], [1.0]]),
+        width=2 * rig.cameras[0].width,
+        height=2 * rig.cameras[0].height,
+        matrix=rig.cameras[0].matrix * np.array([[2.0], [2.0], [1.0]]),
     )
     off = tuple(
         replace(tag, pose=Pose(tag.pose.position + draw.normal(0.0, 1e-3, 3), tag.pose.rotation))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import combinations
 
 import coal
@@ -140,10 +141,13 @@ def _transform(pose: Pose):
 
 
 def _thread(start: Array, end: Array):
-    delta = end - start
-    length = float(np.linalg.norm(delta))
-    axis = delta / length
-    right = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    right /= np.linalg.norm(right)
-    middle = Pose((start + end) / 2.0, np.column_stack([right, np.cross(axis, right), axis]))
-    return coal.Capsule(1e-9, length), _transform(middle)
+    x, y, z = (end - start).tolist()
+    length = math.hypot(x, y, z)
+    x, y, z = x / length, y / length, z / length
+    # Axes at right angles to the thread (Duff et al., "Building an Orthonormal Basis", 2017).
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    right, up = (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+    turned = np.array([right, up, (x, y, z)]).T
+    return coal.Capsule(1e-9, length), coal.Transform3s(turned, (start + end) / 2.0)
