@@ -40,6 +40,15 @@ def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
     return tuple(state_of(word) is DriveState.QUICK_STOP_ACTIVE for word in status_words)
 
 
+def cycles_until_reported(rig: Rig) -> int:
+    """Cycles from the one that sends a set-point to the one that reports the position it commands.
+
+    CiA 402 drives apply a set-point at its SYNC, and answer with their position at that SYNC.
+    ODrives have no SYNC: they apply it on arrival, and report their position later in the cycle.
+    """
+    return 0 if rig.document.drives.type == "odrive" else 1
+
+
 def read_drives(
     rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, to_reset: bool = False
 ) -> DriveSnapshot:

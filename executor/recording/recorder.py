@@ -11,6 +11,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drivers.factory import cycles_until_reported
 from executor.recording.csv_columns import Integers
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.recording.tables import CycleTable, quaternions_of
@@ -40,6 +41,7 @@ class RunLog:
     def __init__(self, rig: Rig, scene: Scene, checked: CheckedTrajectory) -> None:
         """An empty log for a run of a checked table."""
         self._rig, self._scene, self._checked = rig, scene, checked
+        self._delay = cycles_until_reported(rig)
         per_drive = (rig.cable_count,)
         self._format = np.dtype(
             [
@@ -106,9 +108,7 @@ class RunLog:
         rig, planned = self._rig, self._checked.table
         cycles = self._cycles(first, self._count if end is None else end)
         began = self._chunks[0]["at"][0] if len(cycles) else 0.0
-        # A drive answers a SYNC with its position then: its target of the previous cycle.
-        before = self._cycles(first - 1, first)["index"] if first else [0.0]
-        index = np.concatenate([before, cycles["index"][:-1]])[: len(cycles)]
+        index = self._reported_index(cycles, first)
         rows = np.rint(index).astype(np.int64)
         lengths, tensions = self._lengths(cycles, rows)
         encoder, rotations = poses_near(
@@ -136,6 +136,13 @@ class RunLog:
             planned_tensions=between(planned.tensions, index),
             tensions=tensions,
         )
+
+    def _reported_index(self, cycles: Cycles, first: int) -> Array:
+        """Table index whose set-points the drives followed when they reported their positions."""
+        if not self._delay:
+            return np.asarray(cycles["index"], dtype=np.float64)
+        before = self._cycles(first - 1, first)["index"] if first else [0.0]
+        return np.concatenate([before, cycles["index"][:-1]])[: len(cycles)]
 
     def _lengths(self, cycles: Cycles, rows: Integers) -> tuple[Array, Array]:
         """Cable lengths [m] from the encoders, and tensions [N] where torques give them.

@@ -42,8 +42,9 @@ class CycleTable:
     Attributes:
         time: Since the start of the run, shape (n,), [s].
         state: State of the executor, n texts.
-        path_index: Row of the set-point table whose set-points the drives took over in this
-            cycle, at its SYNC; the set-points of the row after it are sent in it. Shape (n,).
+        path_index: Row of the set-point table whose set-points the drives followed when they
+            reported ``actual_counts``, shape (n,). CiA 402 drives took them over at the cycle's
+            SYNC, and those of the row after it are sent in it; ODrives got them in this cycle.
         leg: Number of the leg between stops, from 1, shape (n,); it ends when its stop is left.
         stop: Name of the stop at which the platform dwells, n texts; empty between stops.
         travelled: Length along the path, shape (n,), [m].

@@ -95,6 +95,22 @@ def test_a_plan_is_run_on_odrives_from_the_rig_file_alone(plan: Path, tmp_path: 
     assert "odrive, 1000 kbit/s" in (run / "report.html").read_text()
 
 
+def test_measurements_are_compared_with_the_plan_of_the_same_moment(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """A set-point of an ODrive acts on arrival: no cycle passes until its position is reported."""
+    with staged(prepared, tmp_path / "run", lambda _: None) as (stage, _):
+        log = stage.run().log
+    cycles = log.table()
+    moving = np.array(cycles.state) == State.MOVING.value
+    step = prepared.rig.motion.speed * prepared.rig.cycle
+    assert cycles.encoder_error[moving].max() < 0.1 * step
+    assert cycles.path_index[-1] == len(prepared.checked.table) - 1
+    part = log.table(100, 200)
+    np.testing.assert_array_equal(part.path_index, cycles.path_index[100:200])
+    np.testing.assert_array_equal(part.encoder, cycles.encoder[100:200])
+
+
 def test_targets_move_by_steps_of_the_path_and_all_axes_change_together(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
