@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from executor.recording.csv_columns import TableFile, numbers, texts, write_table
 from model.clearance import ClearanceModel, Nearest
@@ -86,7 +87,13 @@ class ClearanceTable:
 
     def of(self, source: str) -> ClearanceTable:
         """The rows of one source."""
-        rows = np.array([name == source for name in self.source], dtype=bool)
+        return self._chosen(np.array([name == source for name in self.source], dtype=bool))
+
+    def since(self, time: float) -> ClearanceTable:
+        """The rows from a time on, [s]."""
+        return self._chosen(self.time >= time)
+
+    def _chosen(self, rows: NDArray[np.bool_]) -> ClearanceTable:
         chosen = np.flatnonzero(rows)
         return ClearanceTable(
             time=self.time[rows],

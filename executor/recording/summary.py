@@ -6,10 +6,10 @@ Keys (``schema_version`` 1): ``verdict`` (PASSED, FAILED, STOPPED), ``passed``, 
 8601, UTC), ``duration_s``, ``cycles``, ``cycle_ms``, ``lost_replies``, ``rejected_frames``,
 ``error_frames``, ``path_length_mm``, ``travelled_mm``, ``stops`` [{``name``, ``kind``,
 ``reached_s``, ``left_s``}], ``following_error_mm`` {``max``, ``rms``, ``limit``},
-``encoder_error_mm`` {``max``, ``rms``}, ``tag_error_mm`` {``rms``, ``max``, ``frames``,
-``frames_without_pose``} or null without a camera, ``cameras`` [{``name``, ``source``, ``pictures``,
-``poses``, ``dropped``, ``measuring_ms`` (median), ``failed`` (why it gave no images any more, or
-nothing)}], ``clearance_mm`` {``required``, ``planned_min``, ``measured_min``,
+``encoder_error_mm`` {``max``, ``rms``} along the path, ``tag_error_mm`` {``rms``, ``max``,
+``frames``, ``frames_without_pose``} or null without a camera, ``cameras`` [{``name``, ``source``,
+``pictures``, ``poses``, ``dropped``, ``measuring_ms`` (median), ``failed`` (why it gave no images
+any more, or nothing)}], ``clearance_mm`` {``required``, ``planned_min``, ``measured_min``,
 ``measured_uncertainty``, ``measured_at_most``, ``pair``, ``at_s``, ``source``} or null without
 obstacles, ``tension_n`` {``min``, ``max``, ``planned_min``, ``planned_max``, ``lower_limit``,
 ``upper_limit``}, ``lateness_ms`` {``p50``, ``p99``, ``max``} or null in simulated time,
@@ -146,8 +146,8 @@ def summarize(
             **_size(cycles.following_error * 1e3),
             "limit": context.rig.motion.following_error * 1e3,
         },
-        "encoder_error_mm": _size(cycles.encoder_error * 1e3),
-        "tag_error_mm": _tag_error(poses),
+        "encoder_error_mm": _size(cycles.encoder_error[cycles.time >= cycles.path_began] * 1e3),
+        "tag_error_mm": _tag_error(poses, cycles.path_began),
         "cameras": [asdict(camera) for camera in context.cameras],
         "clearance_mm": _clearance(clearance, context.plan.scene.obstacle_clearance),
         "tension_n": _tension(cycles, context.rig),
@@ -184,11 +184,12 @@ def _size(values: Array) -> dict[str, float | None]:
     return {"max": _number(known.max()), "rms": _number(np.sqrt(np.mean(known**2)))}
 
 
-def _tag_error(poses: PoseTable) -> dict[str, float | int | None] | None:
+def _tag_error(poses: PoseTable, path_began: float) -> dict[str, float | int | None] | None:
+    """Distances from the plan since the motion along it began; numbers of all images."""
     if not len(poses):
         return None
     return {
-        **_size(poses.error[poses.ok] * 1e3),
+        **_size(poses.error[poses.ok & (poses.time >= path_began)] * 1e3),
         "frames": len(poses),
         "frames_without_pose": int(len(poses) - poses.ok.sum()),
     }

@@ -21,11 +21,13 @@ from executor.recording.csv_columns import (
     texts,
     write_table,
 )
+from executor.state_machine import ON_PATH
 from model.pose import Array, Pose, quaternion_from_matrix
 from tracking.fusion import Measured, fuse_with_encoders
 from tracking.pose_log import POSE_COLUMNS
 
 _MM, _MS = 1e3, 1e3
+_ON_PATH = [state.value for state in ON_PATH]
 _PER_CABLE = (
     "set_{}_counts",
     "actual_{}_counts",
@@ -96,6 +98,15 @@ class CycleTable:
     def cable_count(self) -> int:
         """Number of cables m."""
         return int(self.set_counts.shape[1])
+
+    @property
+    def path_began(self) -> float:
+        """Time of the first cycle along the path, [s]; infinite if there is none.
+
+        Before it the platform may be beside the start, by the tolerance.
+        """
+        on_path = np.isin(self.state, _ON_PATH)
+        return float(self.time[np.argmax(on_path)]) if on_path.any() else np.inf
 
     @property
     def encoder_error(self) -> Array:

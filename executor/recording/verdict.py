@@ -108,8 +108,8 @@ def judge(
         following(cycles, rig.motion.following_error),
         replies(cycles, simulated, silent),
         *tensions(cycles, rig),
-        *distances(clearance, scene.obstacle_clearance, cameras),
-        *camera(poses, cameras),
+        *distances(clearance, scene.obstacle_clearance, cameras, cycles.path_began),
+        *camera(poses, cameras, cycles.path_began),
         *(Check("record", False, f"{trouble}.") for trouble in troubles),
     ]
     failures = [check for check in measured if not check.passed]
@@ -250,19 +250,24 @@ def _where(
 
 
 def distances(
-    clearance: ClearanceTable, required: float, cameras: Sequence[CameraRecord] = ()
+    clearance: ClearanceTable,
+    required: float,
+    cameras: Sequence[CameraRecord] = (),
+    path_began: float = 0.0,
 ) -> list[Check]:
     """Checks of the clearance against the scene's and, for cameras, the planned one.
 
-    A distance fails only if it is too small by more than its uncertainty.
+    A distance fails only if it is too small by more than its uncertainty. Distances before the time
+    ``path_began`` [s] have no planned ones: the platform is beside the start, by the tolerance.
     """
     checks = []
     for source, source_name in (("tag", _camera_phrase(cameras)), ("encoder", "the encoders")):
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():
             checks.append(_against_required(rows, required, source_name))
-            if source == "tag":
-                checks.append(_against_plan(rows))
+            on_path = rows.since(path_began)
+            if source == "tag" and np.isfinite(on_path.distance).any():
+                checks.append(_against_plan(on_path))
     return checks
 
 
@@ -297,8 +302,13 @@ def _against_plan(rows: ClearanceTable) -> Check:
     return Check("clearance_plan", passed, text)
 
 
-def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
-    """Check that a camera gave poses and not all failed; empty without a camera."""
+def camera(
+    poses: PoseTable, cameras: Sequence[CameraRecord], path_began: float = 0.0
+) -> list[Check]:
+    """Check that a camera gave poses and not all failed; empty without a camera.
+
+    Its distance from the plan counts from the time ``path_began`` [s] on.
+    """
     failed = [one for one in cameras if one.failed]
     if failed and len(failed) == len(cameras):
         text = " ".join(f"Camera {one.name} failed: {one.failed}." for one in failed)
@@ -309,12 +319,12 @@ def camera(poses: PoseTable, cameras: Sequence[CameraRecord]) -> list[Check]:
     if not seen:
         text = f"None of {len(poses)} images gave a pose: {poses.status[0]}."
         return [Check("camera", False, text)]
-    error = poses.error[poses.ok] * 1e3
-    rms = float(np.sqrt(np.mean(error**2)))
-    text = (
-        f"{_camera_phrase(cameras).capitalize()} measured {seen} of {len(poses)} images,"
-        f" {rms:.2f} mm RMS from the plan (largest {error.max():.2f} mm)."
-    )
+    error = poses.error[poses.ok & (poses.time >= path_began)] * 1e3
+    text = f"{_camera_phrase(cameras).capitalize()} measured {seen} of {len(poses)} images"
+    if len(error):
+        rms, largest = float(np.sqrt(np.mean(error**2))), float(error.max())
+        text += f", {rms:.2f} mm RMS from the plan (largest {largest:.2f} mm)"
+    text += "."
     if len(cameras) > 1:
         text += f" Alone: {', '.join(map(_single_camera_phrase, cameras))}."
     return [Check("camera", True, text)]

@@ -214,6 +214,51 @@ def test_the_camera_is_also_held_against_the_plan(distance: float, passed: bool)
     assert planned.name == "clearance_plan"
 
 
+@pytest.mark.parametrize("on_path", [False, True])
+def test_only_along_the_path_is_the_platform_compared_with_the_plan(
+    run: fake_run.FakeRun, on_path: bool
+) -> None:
+    """Until the first second it approaches the start, from 3 mm beside it."""
+    cycles, poses, seen = run.cycles, run.poses, run.clearance
+    aside, early = np.array([0.0, 0.003, 0.0]), cycles.time < 1.0
+    state = "moving" if on_path else "approaching"
+    nearer = (seen.time < 1.0) * (np.array(seen.source) == "tag") * 0.003
+    made = replace(
+        run,
+        cycles=replace(
+            cycles,
+            state=tuple(state if k else "moving" for k in early),
+            encoder=cycles.encoder + early[:, None] * aside,
+        ),
+        poses=replace(poses, position=poses.position + (poses.time < 1.0)[:, None] * aside),
+        clearance=replace(seen, distance=seen.distance - nearer, at_most=seen.at_most - nearer),
+    ).summary
+    assert made["verdict"] == ("FAILED" if on_path else "PASSED")
+    assert (made["encoder_error_mm"]["max"] > 2.0) is on_path
+    assert (made["tag_error_mm"]["max"] > 2.0) is on_path
+    assert made["tag_error_mm"]["frames"] == len(poses)
+    text = next(check["text"] for check in made["checks"] if check["name"] == "camera")
+    assert ("largest 0." in text or "largest 1." in text) is not on_path
+
+
+@pytest.mark.parametrize("source", ["tag", "encoder"])
+def test_an_approach_too_near_to_an_obstacle_is_noticed(source: str) -> None:
+    checks = distances(rows(source, 9.0, 0.5, 12.0), 0.010, path_began=4.0)
+    assert [(check.name, check.passed) for check in checks] == [(f"clearance_{source}", False)]
+
+
+def test_a_platform_that_never_left_for_its_path_is_not_compared_with_it(
+    run: fake_run.FakeRun,
+) -> None:
+    waiting = replace(run.cycles, state=("enabling",) * len(run.cycles))
+    made = summary(replace(run, cycles=waiting), final_state="stopped")
+    assert made["encoder_error_mm"] == {"max": None, "rms": None}
+    assert made["tag_error_mm"]["rms"] is None
+    assert not [check for check in made["checks"] if check["name"] == "clearance_plan"]
+    text = next(check["text"] for check in made["checks"] if check["name"] == "camera")
+    assert text.endswith("images.")
+
+
 def test_one_bad_row_among_good_ones_is_found(run: fake_run.FakeRun) -> None:
     """The worst row is the one furthest beyond its own uncertainty, not the smallest distance."""
     good, bad = rows("tag", 9.5, 1.0, 9.5), rows("tag", 9.9, 0.05, 9.9)

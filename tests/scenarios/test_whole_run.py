@@ -143,7 +143,8 @@ def test_the_camera_measures_within_a_millimetre(
     poses = folder.poses()
     assert len(poses) == pytest.approx(summary["duration_s"] * 10.0, abs=2)
     assert poses.ok.all()
-    rms = float(np.sqrt(np.mean(poses.error**2)))
+    error = poses.error[poses.time >= folder.cycles().path_began]
+    rms = float(np.sqrt(np.mean(error**2)))
     assert rms < 1e-3
     assert summary["tag_error_mm"]["rms"] == pytest.approx(rms * 1000.0, rel=1e-3)
     assert summary["tag_error_mm"]["frames"] == len(poses)
