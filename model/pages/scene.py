@@ -246,15 +246,29 @@ def frame_surface(rig: Rig) -> SceneSurface:
     """The edges of the body that spans the outlets."""
     try:
         hull = convex_hull(rig.outlets)
-    except ValueError:  # all outlets at one height: the frame reaches down to the floor
-        hull = convex_hull(np.vstack([rig.outlets, rig.outlets * [1.0, 1.0, 0.0]]))
+    except ValueError:  # all outlets in one plane
+        hull = convex_hull(np.vstack([rig.outlets, rig.outlets + _depth(rig)]))
     solid = solid_of(Obstacle("frame", hull, Pose.level(np.zeros(3))))
     return SceneSurface("frame", "frame", solid.vertices, (), solid.edges)
 
 
+def _depth(rig: Rig) -> Array:
+    """From the plane of all outlets to the far end of workspace and floor, shape (3,), [m]."""
+    centre = rig.outlets.mean(axis=0)
+    normal = np.linalg.svd(rig.outlets - centre)[2][-1]
+    ends = np.vstack([_workspace_box(rig).vertices, centre * [1.0, 1.0, 0.0]])
+    depths = (ends - centre) @ normal
+    depth: Array = depths[np.argmax(np.abs(depths))] * normal
+    return depth
+
+
 def workspace_stroke(rig: Rig) -> Stroke:
     """The box that the platform's origin keeps within."""
-    centre = (rig.workspace_upper + rig.workspace_lower) / 2.0
-    box = box_solid((rig.workspace_upper - rig.workspace_lower) / 2.0, Pose.level(centre))
+    box = _workspace_box(rig)
     edges = box.vertices[np.array(box.edges)]
     return Stroke("workspace", "muted", edges, 1.0, 0.8, dash="4 4")
+
+
+def _workspace_box(rig: Rig) -> Solid:
+    centre = (rig.workspace_upper + rig.workspace_lower) / 2.0
+    return box_solid((rig.workspace_upper - rig.workspace_lower) / 2.0, Pose.level(centre))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from model.pages.charts import Chart, ChartLine, Span, charts, ticks
@@ -20,10 +21,12 @@ from model.pages.scene import (
     SceneSurface,
     Stroke,
     arrows,
+    frame_surface,
     grid_floor,
 )
 from model.pages.viewer import SCENE_SCRIPTS, page_data, still_image, viewer
-from model.pose import Array
+from model.pose import Array, matrix_from_rotation_vector
+from tests.model.rig_builds import paper_rig
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)> & \"'"
 
@@ -232,3 +235,19 @@ def test_on_paper_nothing_is_shown_that_only_a_screen_can_use() -> None:
     ]
     assert {"nav", ".viewer", ".scripted .viewer"} <= set(hidden)
     assert not {line for line in paper.splitlines() if len(line) > 40} & set(screen.splitlines())
+
+
+@given(
+    st.tuples(*[st.floats(-2.0, 2.0)] * 3),
+    st.sampled_from([(0.0, 0.0, 0.0), (np.pi / 2, 0.0, 0.0), (0.3, 1.0, 0.0)]),
+)
+@example((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))  # on the floor
+def test_a_frame_is_drawn_of_outlets_in_any_plane(
+    shift: tuple[float, ...], turn: tuple[float, ...]
+) -> None:
+    rig = paper_rig()
+    flat = rig.outlets * [1.0, 1.0, 0.0] @ matrix_from_rotation_vector(np.array(turn)).T + shift
+    frame = frame_surface(replace(rig, outlets=flat))
+    assert np.linalg.matrix_rank(frame.vertices - frame.vertices.mean(axis=0), tol=0.01) == 3
+    assert np.linalg.norm(flat[0] - frame.vertices, axis=1).min() < 1e-9
+    assert len(frame.edges) >= 9
