@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,8 +21,13 @@ from model.pages.page import html_table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+#: Why a file is missing where its disk, or the user's share of it, is full.
+_FULL = {os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT)}
+
 Columns = dict[str, NDArray[Any]]
-"""A table of a run folder: arrays of equal length by column name, which includes the unit."""
+"""A table of a run folder: read-only arrays of equal length by column name, with the unit in it.
+
+The type of an array depends on its name only: text, whole numbers or other numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +94,9 @@ class RunResult:
             names = [name for name, reason in self.missing.items() if reason == why]
             lines.append(f"  why: {', '.join(names)}: {why}")
         removed = "the folder was removed during the run, and its record with it"
-        again = f"free some disk space if it is full, then `cdpr report {self.folder}`"
-        then = f"{again} to write the missing files" if self.folder.is_dir() else removed
+        full = "free some disk space, then " if _FULL & {*self.missing.values()} else ""
+        again = f"{full}run `cdpr report {self.folder}` to write the missing files"
+        then = again if self.folder.is_dir() else removed
         lines.append(f"  next: the verdict and the exit code are valid; {then}")
         return "\n".join(lines)
 

@@ -18,6 +18,12 @@ from model.files.reading import CsvFile
 from model.pose import Array
 
 Integers = NDArray[np.int64]
+#: Columns of texts in the tables of a run.
+_TEXTS = frozenset({"state", "stop", "status", "tags", "picture", "source", "body", "obstacle"})
+#: Columns of whole numbers; those of neither kind hold other numbers.
+_INTEGERS = re.compile(
+    r"cycle|path_index|leg|missing|rejected_frames|error_frames|frame|(set|actual)_\d+_counts"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,13 +201,24 @@ class TableFile:
         return np.column_stack([self.ints(name) for name in names])
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """All columns by name: whole numbers, numbers or texts, each shape (n,).
+        """All columns by name, each shape (n,) and read-only; their types depend on the names only.
 
         Of columns with the same name the first is returned.
+
+        Raises:
+            BadInput: A value is not of its column's type, or beyond ±1e15.
         """
         found: dict[str, NDArray[Any]] = {}
-        for name, values in zip(self.names, self._columns, strict=True):
-            found.setdefault(name, _typed(values))
+        for name in dict.fromkeys(self.names):
+            values: NDArray[Any]
+            if name in _TEXTS:
+                values = np.array(self.texts(name), dtype=np.str_)
+            elif _INTEGERS.fullmatch(name):
+                values = self.ints(name)
+            else:
+                values = self.floats(name)
+            values.setflags(write=False)
+            found[name] = values
         return found
 
     def _numbers(self, name: str, values: Sequence[str]) -> Array:
@@ -225,13 +242,3 @@ class TableFile:
             why="the file was edited or truncated after the run",
             next_step="restore the file, or run the plan again into a new folder",
         )
-
-
-def _typed(values: Sequence[str]) -> NDArray[Any]:
-    """Texts as the narrowest of whole numbers, numbers and texts that holds them all."""
-    for kind in (np.int64, np.float64):
-        try:
-            return np.array(values, dtype=np.str_).astype(kind)
-        except (ValueError, OverflowError):
-            continue
-    return np.array(values, dtype=np.str_)

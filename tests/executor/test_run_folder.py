@@ -18,7 +18,14 @@ from hypothesis.extra.numpy import arrays
 
 from executor.recording.clearance import ClearanceTable, no_clearance
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
-from executor.recording.tables import CycleTable, PoseTable, no_poses, quaternions_of
+from executor.recording.tables import (
+    CycleTable,
+    PoseTable,
+    no_cycles,
+    no_poses,
+    quaternions_of,
+)
+from executor.run_result import RunResult
 from model.errors import BadInput
 from tests.executor import fake_run
 from tracking.pose_log import POSE_COLUMNS
@@ -333,3 +340,80 @@ def test_cycles_without_rows_round_trip(tmp_path: Path, run: fake_run.FakeRun) -
     none.write_csv(tmp_path / "cycles.csv")
     again = CycleTable.read_csv(tmp_path / "cycles.csv")
     assert (len(again), again.cable_count) == (0, 8)
+
+
+def table_kinds(result: RunResult) -> dict[str, str]:
+    """Kind of each column's type, by table and column."""
+    tables = {"cycles": result.cycles, "poses": result.poses, "clearance": result.clearance}
+    return {f"{t} {n}": v.dtype.kind for t, table in tables.items() for n, v in table.items()}
+
+
+def test_the_type_of_a_column_depends_on_its_name_only(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    """Not on tags that are one number, obstacles named by a number, or missing rows."""
+    full = RunResult(fake_run.write(run, tmp_path / "full", pictures=False).path, {})
+    count = len(run.clearance)
+    numbered = replace(
+        run,
+        poses=replace(run.poses, tags=("301",) * len(run.poses), status=("1",) * len(run.poses)),
+        clearance=replace(run.clearance, body=("1",) * count, obstacle=("2",) * count),
+        cycles=replace(
+            run.cycles, stop=("3",) * len(run.cycles), travelled=run.cycles.travelled * 0
+        ),
+    )
+    bare = RunFolder.create(tmp_path / "numbered")
+    bare.write_cycles(numbered.cycles)
+    bare.write_poses(numbered.poses)
+    bare.write_clearance(numbered.clearance)
+    empty = RunFolder.create(tmp_path / "empty")
+    empty.write_cycles(no_cycles(run.cycles.cable_count))
+    empty.write_poses(no_poses())
+    empty.write_clearance(no_clearance(run.clearance.obstacles))
+    kinds = table_kinds(full)
+    assert table_kinds(RunResult(bare.path, {})) == kinds
+    assert table_kinds(RunResult(empty.path, {})) == kinds
+    assert {name for name, kind in kinds.items() if kind == "U"} == {
+        *("cycles state", "cycles stop", "poses status", "poses tags", "poses picture"),
+        *("clearance source", "clearance body", "clearance obstacle"),
+    }
+    whole = [name for name, kind in kinds.items() if kind == "i"]
+    assert set(whole) == {
+        *(f"cycles {name}" for name in ("cycle", "path_index", "leg", "missing")),
+        *("cycles rejected_frames", "cycles error_frames", "poses frame"),
+        *(f"cycles {kind}_{k}_counts" for kind in ("set", "actual") for k in range(1, 9)),
+    }
+
+
+def test_no_reader_of_a_result_changes_it_for_the_others(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    result = RunResult(fake_run.write(run, tmp_path / "run", pictures=False).path, {})
+    for table in (result.cycles, result.poses, result.clearance):
+        for name, values in table.items():
+            with pytest.raises(ValueError, match="read-only"):
+                values[:1] = values[1:2]
+            assert not values.flags.writeable, name
+
+
+def test_a_column_that_was_edited_is_named(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    folder = fake_run.write(run, tmp_path / "run", pictures=False)
+    path = folder.path / "cycles.csv"
+    path.write_text(path.read_text().replace("moving,0,", "moving,a,", 1))
+    with pytest.raises(BadInput, match="path_index"):
+        _ = RunResult(folder.path, {}).cycles
+
+
+@pytest.mark.parametrize(
+    ("why", "full"),
+    [
+        ("ValueError: the points must span a volume", False),
+        ("No space left on device", True),
+        ("interrupted", False),
+    ],
+)
+def test_missing_files_have_a_next_step_that_helps(tmp_path: Path, why: str, full: bool) -> None:
+    text = RunResult(tmp_path, {}, missing={"report.html": why}).missing_text()
+    assert why in text
+    assert f"run `cdpr report {tmp_path}`" in text
+    assert ("disk space" in text) is full
