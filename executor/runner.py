@@ -33,7 +33,7 @@ from executor.proposals import MotionProposal, require_confirmed
 from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import RunCourse, dated_folder
-from executor.recording.recorder import Recorder
+from executor.recording.recorder import Recorder, require_readable_record
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
 from executor.remote.command_socket import advertised, serving
 from executor.remote.status import RunStatus
@@ -175,6 +175,7 @@ def run_prepared(
     Raises:
         CdprError: As for `run`.
     """
+    require_readable_record(prepared)
     proposal = MotionProposal(prepared, cameras, options.clearance_stop)
     require_confirmed(options.confirm, proposal)
     with options.listener.waiting("loading the report generator"):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from executor.recording.record_files import LARGEST_RECORDED
 from model.errors import BadInput
 from model.files.documents import write_atomic
-from model.files.reading import CsvFile
+from model.files.reading import TABLE_LIMIT, CsvFile, read_text
 from model.pose import Array
 
 Integers = NDArray[np.int64]
@@ -107,12 +107,13 @@ class TableFile:
         text: Its content, if already read.
 
     Raises:
-        BadInput: It cannot be read, or a row has more or fewer values than the header.
+        BadInput: It cannot be read, is larger than `TABLE_LIMIT`, or a row has more or fewer values
+            than the header.
     """
 
     def __init__(self, path: Path, text: str | None = None) -> None:
         self._path = path
-        file = CsvFile(path, text)
+        file = CsvFile(path, read_text(path, TABLE_LIMIT) if text is None else text)
         rows = file.rows
         if not rows:
             raise self._bad("the file is empty; the first line must name the columns")

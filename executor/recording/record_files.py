@@ -25,7 +25,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from model.errors import BadInput, InvalidFile
 from model.files.documents import keep_names, write_atomic
-from model.files.reading import parse_json, read_bytes, read_json, read_text
+from model.files.reading import TABLE_LIMIT, parse_json, read_bytes, read_json, read_text
 from model.files.validation import problems_of
 
 AGAIN = "restore the file, or run the plan again into a new folder"
@@ -294,11 +294,11 @@ def whole_lines(path: Path) -> list[str]:
     Raises:
         BadInput: It cannot be read, or is not text.
     """
-    data = read_bytes(path)
+    data = read_bytes(path, TABLE_LIMIT)
     try:
         return data[: data.rfind(b"\n") + 1].decode().split("\n")[:-1]
     except UnicodeDecodeError:
-        return read_text(path).split("\n")  # raises with the reason
+        return read_text(path, TABLE_LIMIT).split("\n")  # raises with the reason
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,8 @@ from executor.remote.status import RunStatus
 from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State
 from executor.trajectory.dwell import legs_at, stop_events
 from executor.trajectory.setpoints import CheckedTrajectory, PreparedRun
-from model.errors import CdprError, Fault
+from model.errors import BadInput, CdprError, Fault
+from model.files.reading import MEGABYTE, READING_NEEDS, TABLE_LIMIT
 from model.kinematics import forward_kinematics, poses_near
 from model.pose import Array, Pose
 from model.rig import Rig
@@ -33,6 +34,32 @@ _CHUNK = 4096
 _STATES = tuple(State)
 
 Cycles = NDArray[np.void]
+
+
+#: Size of a row of ``cycles.csv`` in a run of hours: of all cables together, and of each, [bytes].
+ROW, ROW_PER_CABLE = 230, 45
+
+
+def require_readable_record(prepared: PreparedRun) -> None:
+    """Refuses a run whose ``cycles.csv`` would be too large for this computer to read.
+
+    A run that is paused or slowed down takes longer, and may still exceed the limit.
+
+    Raises:
+        BadInput: With its size, and the longest run.
+    """
+    row = ROW + ROW_PER_CABLE * prepared.rig.cable_count
+    size = row * len(prepared.checked.table)
+    if size <= TABLE_LIMIT:
+        return
+    longest = TABLE_LIMIT / row * prepared.checked.table.cycle
+    raise BadInput(
+        f"the record of a run of {prepared.duration / 60.0:.0f} minutes would have"
+        f" {size / MEGABYTE:.0f} MB; at most {TABLE_LIMIT / MEGABYTE:.0f} MB are read",
+        where="cycles.csv of the run",
+        why=f"reading it takes {READING_NEEDS} times its size in memory",
+        next_step=f"split the plan into runs of at most {longest / 60.0:.0f} minutes",
+    )
 
 
 class RunLog:

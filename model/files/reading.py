@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import errno
-import io
 import json
 import os
 import stat
@@ -21,11 +20,30 @@ from model.errors import BadInput
 
 MEGABYTE = 1_000_000
 TEXT_LIMIT = 256 * MEGABYTE
-"""Largest text file, [bytes]: the cycles of a run of 80 minutes, at 10 ms and with 8 cables."""
+"""Largest text file that a user names, [bytes]."""
 YAML_LIMIT = 1 * MEGABYTE
 """Largest YAML file, [bytes]; its parser needs several seconds for that."""
 PICTURE_LIMIT = 256 * MEGABYTE
 """Largest image file, [bytes]."""
+
+
+READING_NEEDS = 10
+"""Memory for reading a table of a run, which is read whole, as a multiple of its size."""
+
+
+def table_limit(memory: int) -> int:
+    """Largest table of a run, [bytes]: as much as three quarters of the memory suffice to read.
+
+    It is at least `TEXT_LIMIT`.
+
+    Args:
+        memory: Of the computer, [bytes].
+    """
+    return max(TEXT_LIMIT, memory * 3 // (4 * READING_NEEDS))
+
+
+TABLE_LIMIT = table_limit(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+"""Largest table of a run that this computer reads, [bytes]."""
 
 
 def read_bytes(path: Path, limit: int = TEXT_LIMIT) -> bytes:
@@ -65,7 +83,7 @@ def _require_regular(path: Path, found: os.stat_result, limit: int) -> None:
             f"the file has {found.st_size / MEGABYTE:.1f} MB; at most {limit / MEGABYTE:.0f} MB"
             " are read",
             where=str(path),
-            why="larger files would not fit into the memory of a small computer",
+            why="a larger file may not fit into memory",
             next_step="check the path; for a longer run, split its plan",
         )
 
@@ -205,8 +223,17 @@ class CsvFile:
                 self.lines.append(line)
 
 
+def _lines(text: str) -> Iterator[str]:
+    """The lines of a text; `io.StringIO` would need four bytes of memory for every character."""
+    start = 0
+    while start < len(text):
+        end = text.find("\n", start) + 1 or len(text)
+        yield text[start:end]
+        start = end
+
+
 def _rows(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:
-    reader = csv.reader(io.StringIO(text))
+    reader = csv.reader(_lines(text))
     try:
         for row in reader:
             yield reader.line_num, row

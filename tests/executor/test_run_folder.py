@@ -16,7 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from executor.recording import csv_columns, record_files
 from executor.recording.clearance import ClearanceTable, no_clearance
+from executor.recording.recorder import ROW, ROW_PER_CABLE
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.recording.tables import (
     CycleTable,
@@ -340,6 +342,28 @@ def test_cycles_without_rows_round_trip(tmp_path: Path, run: fake_run.FakeRun) -
     none.write_csv(tmp_path / "cycles.csv")
     again = CycleTable.read_csv(tmp_path / "cycles.csv")
     assert (len(again), again.cable_count) == (0, 8)
+
+
+def test_only_the_limit_of_tables_ends_reading_a_record(
+    tmp_path: Path, run: fake_run.FakeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = fake_run.write(run, tmp_path / "run", pictures=False)
+    size = (folder.path / "cycles.csv").stat().st_size
+    for limit, is_read in ((size, True), (size - 1, False)):
+        monkeypatch.setattr(csv_columns, "TABLE_LIMIT", limit)
+        monkeypatch.setattr(record_files, "TABLE_LIMIT", limit)
+        for read in (folder.cycles, lambda: folder.cycles_cut_short(8)):
+            if is_read:
+                assert len(read()) == len(run.cycles)
+            else:
+                with pytest.raises(BadInput, match="at most"):
+                    read()
+
+
+def test_the_size_of_a_record_is_known_before_the_run(run: fake_run.FakeRun) -> None:
+    """Of its rows after two hours."""
+    row = len(run.cycles.csv_rows(720_000)) / len(run.cycles)
+    assert 0.8 < row / (ROW + 8 * ROW_PER_CABLE) < 1.0
 
 
 def table_kinds(result: RunResult) -> dict[str, str]:

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import os
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from calibration.geometry.measurements import read_rig_data
 from executor.recording.csv_columns import TableFile
 from model.errors import BadInput, InvalidFile
 from model.files.documents import load_yaml
-from model.files.reading import CsvFile, parse_json, read_bytes, read_text
+from model.files.reading import (
+    READING_NEEDS,
+    TEXT_LIMIT,
+    CsvFile,
+    parse_json,
+    read_bytes,
+    read_text,
+    table_limit,
+)
 from model.files.scene_file import SceneDocument
 from model.rig import load_rig
 from model.scene import load_scene
@@ -139,3 +151,24 @@ def test_a_hull_with_a_point_of_two_numbers_is_reported_with_its_position(tmp_pa
         load_yaml(scene, SceneDocument)
     assert "points_mm[1]" in str(caught.value)
     assert "needs 3 entries" in str(caught.value)
+
+
+@pytest.mark.parametrize("gigabytes", [1, 4, 16, 64])
+def test_a_table_is_as_large_as_memory_permits(gigabytes: int) -> None:
+    memory = gigabytes * 10**9
+    limit = table_limit(memory)
+    assert limit >= TEXT_LIMIT
+    assert limit * READING_NEEDS <= max(memory, TEXT_LIMIT * READING_NEEDS)
+
+
+@given(
+    st.lists(
+        st.lists(st.text(st.characters(exclude_characters="\r\0")), min_size=1, max_size=3),
+        max_size=4,
+    )
+)
+def test_a_csv_file_has_the_rows_that_were_written(rows: list[list[str]]) -> None:
+    """Whatever characters end lines elsewhere, and with line ends in quotes."""
+    stream = io.StringIO(newline="")
+    csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL).writerows(rows)
+    assert CsvFile(Path("x.csv"), stream.getvalue()).rows == rows

@@ -13,6 +13,7 @@ from executor import jogging, runner
 from executor.homing import home
 from executor.interlock.interlock import MotionInterlock
 from executor.proposals import MotionProposal
+from executor.recording import recorder
 from executor.recording.run_folder import RunEvent, RunFolder
 from model.errors import BadInput, StoppedByOperator
 from model.plan import Plan, load_plan
@@ -28,6 +29,24 @@ def rig() -> Rig:
 @pytest.fixture
 def plan(short_plan: Path) -> Plan:
     return load_plan(short_plan)
+
+
+def test_a_run_whose_record_could_not_be_read_does_not_begin(
+    plan: Plan, rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[MotionProposal] = []
+    monkeypatch.setattr(recorder, "TABLE_LIMIT", 100_000)
+    with pytest.raises(BadInput, match="split the plan") as caught:
+        runner.run(
+            *(plan, rig),
+            folder=tmp_path / "run",
+            cameras=(),
+            realtime=False,
+            confirm=lambda proposal: bool(asked.append(proposal)),
+        )
+    assert "MB are read" in caught.value.what
+    assert not asked
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_gives_its_verdict_its_tables_and_its_events(
