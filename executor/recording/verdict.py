@@ -18,6 +18,7 @@ from executor.recording.tables import CycleTable, PoseTable
 from executor.safety.limits import tension_limits
 from executor.state_machine import ON_PATH
 from model.errors import BadInput
+from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene
 from tracking.clearance import INTERVAL
@@ -28,8 +29,8 @@ NOT_ENDED = "not_ended"
 _ON_PATH = {state.value for state in ON_PATH}
 #: Tolerance for the rounding of the tables, [m].
 ROUNDING = 2e-9
-#: Distance of set-points from the goal at which the platform counts as there, [m].
-AT_GOAL = 1e-4
+#: Distance [m] and angle [rad] of set-points from the goal at which the platform counts as there.
+AT_GOAL, AT_GOAL_ANGLE = 1e-4, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,9 +136,12 @@ def judge(
 
 
 def _is_at_goal(cycles: CycleTable, scene: Scene) -> bool:
-    """Whether the last set-points were those of the goal."""
-    left = cycles.planned[-1:] - scene.goal.position
-    return bool(len(left)) and float(np.linalg.norm(left)) < AT_GOAL
+    """Whether the last set-points were those of the goal, at the end of the last leg."""
+    if not len(cycles) or cycles.leg[-1] <= len(scene.stops):  # the goal may be the start
+        return False
+    last = Pose.from_quaternion(cycles.planned[-1], cycles.planned_rotation[-1])
+    near, aligned = last.distance_to(scene.goal), last.angle_to(scene.goal)
+    return near < AT_GOAL and aligned < AT_GOAL_ANGLE
 
 
 _KILLED = (

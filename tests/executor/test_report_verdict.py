@@ -16,6 +16,7 @@ from executor.recording.summary import _clearance, summarize
 from executor.recording.tables import CycleTable, no_poses
 from executor.recording.verdict import distances, following, replies, tensions
 from executor.report.tiles import chips
+from model.files.scene_file import StopDocument
 from tests.executor import fake_run
 
 
@@ -102,6 +103,34 @@ def test_a_stopped_run_is_not_passed_and_not_a_fault(run: fake_run.FakeRun) -> N
     assert made["reasons"] == [
         "The run ended after 42.8 s and 854 mm, before the goal: The operator stopped the run."
     ]
+
+
+@pytest.mark.parametrize(
+    ("leg", "at", "turn_deg", "where"),
+    [
+        (1, "goal", 0.0, "before the goal"),
+        (2, "goal", 0.0, "at the goal"),
+        (2, "goal", 1.0, "before the goal"),
+        (2, "start", 0.0, "before the goal"),
+    ],
+)
+def test_a_run_ends_at_the_goal_only_at_the_end_of_its_last_leg(
+    run: fake_run.FakeRun, leg: int, at: str, turn_deg: float, where: str
+) -> None:
+    """A task may begin where it ends, pass there in between, or only rotate on its last leg."""
+    scene, count = run.context.plan.scene, len(run.cycles)
+    stop = StopDocument(name="shelf", position_mm=[0.0, 0.0, 400.0])
+    half = np.radians(turn_deg) / 2.0
+    cycles = replace(
+        run.cycles,
+        leg=np.full(count, leg),
+        planned=np.tile(getattr(scene, at).position, (count, 1)),
+        planned_rotation=np.tile([np.cos(half), 0.0, 0.0, np.sin(half)], (count, 1)),
+    )
+    plan = replace(run.context.plan, scene=scene.changed(stops=[stop]))
+    ended = replace(run, cycles=cycles, context=replace(run.context, plan=plan))
+    made = summary(ended, final_state="stopped")
+    assert made["sentence"] == f"The run was stopped {where}."
 
 
 def test_a_fault_is_failed_and_names_its_cause_even_when_notes_follow(
