@@ -89,6 +89,7 @@ def nearest_obstacles(clearance: ClearanceTable, most: int) -> list[int]:
 
 
 def _sources(clearance: ClearanceTable) -> list[ClearanceTable]:
+    """The rows of each source, the best first; the last one has rows of the whole run."""
     return [rows for rows in map(clearance.of, ("tag", "encoder")) if len(rows)]
 
 
@@ -98,9 +99,9 @@ def _smallest(run: RunData) -> Chart:
         source = rows.source[0]
         time, distance, low, high = with_gaps(rows.time, *_band(rows))
         lines.append(ChartLine(_NAMES[source], time, distance, source, band=(low, high)))
-    reference = _sources(run.clearance)[0]
-    planned = reference.planned_distance * 1e3
-    lines.append(_line("planned", reference.time, planned, "planned", dash=DASHED))
+    every = _sources(run.clearance)[-1]
+    planned = every.planned_distance * 1e3
+    lines.append(_line("planned", every.time, planned, "planned", dash=DASHED))
     lines.append(_required(run))
     return Chart(
         "Cables and platform to the nearest obstacle",
@@ -148,9 +149,9 @@ def _obstacle(run: RunData, index: int) -> Chart:
         width, opacity = (4.0, 0.5) if by_camera else (1.3, 1.0)
         name = "camera" if by_camera else "drives"
         lines.append(ChartLine(name, time, distance, rows.source[0], width, opacity=opacity))
-    reference = _sources(run.clearance)[0]
-    planned = reference.planned_distances[:, index] * 1e3
-    lines.append(_line("planned", reference.time, planned, "planned", SMALL_POINTS, dash=DASHED))
+    every = _sources(run.clearance)[-1]
+    planned = every.planned_distances[:, index] * 1e3
+    lines.append(_line("planned", every.time, planned, "planned", SMALL_POINTS, dash=DASHED))
     lines.append(_required(run))
     name = run.clearance.obstacles[index]
     text = f"Line chart of the clearance to {name}, planned at least {np.nanmin(planned):.1f} mm."

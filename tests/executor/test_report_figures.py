@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from executor.recording.run_folder import RunEvent
+from executor.report.figures import _obstacle, _smallest
 from executor.report.tiles import event_table
 from model.pages.charts import spread, thinned, with_gaps
 from model.pages.viewer import Eye
@@ -28,6 +30,7 @@ from model.shapes import (
     shape_points,
     solid_of,
 )
+from tests.executor import fake_run
 
 SHAPES: dict[str, Shape] = {
     "box": Box(np.array([0.1, 0.2, 0.3])),
@@ -64,6 +67,25 @@ def test_an_even_line_is_not_broken() -> None:
     at, value = with_gaps(time, time)
     np.testing.assert_array_equal(at, time)
     np.testing.assert_array_equal(value, time)
+
+
+def test_the_planned_clearance_is_drawn_where_no_camera_saw_the_platform() -> None:
+    run = fake_run.make(rate_hz=2.0, every=20)
+    plan = run.clearance.of("encoder")
+    least = int(np.argmin(plan.planned_distance))
+    blind = np.abs(run.clearance.time - plan.time[least]) < 5.0
+    seen = run.clearance._chosen(~blind | (np.array(run.clearance.source) == "encoder"))
+    assert seen.of("tag").planned_distance.min() > plan.planned_distance[least] + 5e-4
+    data: Any = SimpleNamespace(
+        cycles=run.cycles, clearance=seen, plan=run.context.plan, summary=run.summary
+    )
+    for chart, expected in (
+        (_smallest(data), plan.planned_distance),
+        (_obstacle(data, 0), plan.planned_distances[:, 0]),
+    ):
+        (line,) = (line for line in chart.lines if line.name == "planned")
+        assert np.nanmin(line.y) == pytest.approx(1e3 * expected.min())
+        assert np.diff(line.x).max() < 1.0
 
 
 @given(st.lists(st.floats(0.0, 10.0), min_size=1, max_size=12))
