@@ -215,10 +215,11 @@ _STRIP, _LIST = fox.LinePrimitiveLineType.LineStrip, fox.LinePrimitiveLineType.L
 
 
 def scene_messages(context: RunContext, start: int) -> Iterator[Message]:
-    """Obstacles, planned path and cameras, once."""
+    """Obstacles, planned path and the cameras used, once; all cameras if none is on record."""
     stamp = stamp_of(start, 0.0)
     yield "/scene", 0.0, scene_at(context.plan.scene.obstacles, context.plan.waypoints, stamp)
-    cameras = context.rig.cameras
+    used = {record.name for record in context.cameras}
+    cameras = [one for one in context.rig.cameras if one.name in used] or context.rig.cameras
     for camera in cameras:
         alone = camera.name if len(cameras) > 1 else ""
         mounting = camera.world_from_camera

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from executor.recording.mcap import write_mcap
 from executor.recording.mcap_channels import OWN, TYPED
+from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunFolder
 from executor.recording.tables import fused_table
 from model.errors import Fault
@@ -36,6 +38,10 @@ def folder(run: fake_run.FakeRun, tmp_path_factory: pytest.TempPathFactory) -> R
 
 @pytest.fixture(scope="module")
 def messages(folder: RunFolder) -> Messages:
+    return read(folder)
+
+
+def read(folder: RunFolder) -> Messages:
     found: Messages = defaultdict(list)
     decoders = DecoderFactory()
     with folder.mcap.open("rb") as stream:
@@ -128,6 +134,33 @@ def test_the_camera_is_in_the_tree_of_frames_with_its_lens(
         translation.y,
         translation.z,
     ] == camera.world_from_camera.position.tolist()
+
+
+@pytest.mark.parametrize("used", [("right",), ("left", "right")])
+def test_cameras_that_were_not_used_name_nothing(
+    run: fake_run.FakeRun, tmp_path: Path, used: tuple[str, ...]
+) -> None:
+    """Images, frames and calibrations belong together, also of one of a rig's cameras."""
+    (camera,) = run.context.rig.cameras
+    cameras = tuple(replace(camera, name=name) for name in ("left", "right", "spare"))
+    context = replace(
+        run.context,
+        rig=replace(run.context.rig, cameras=cameras),
+        cameras=tuple(CameraRecord(name, "0", 9, 9, 0, 2.0, "") for name in used),
+    )
+    folder = fake_run.write(replace(run, context=context), tmp_path / "run")
+    poses, fused = folder.poses(), fused_table(run.cycles, run.poses)
+    alone = dict.fromkeys(used, poses) if len(used) > 1 else {}
+    write_mcap(folder, context, run.cycles, poses, run.clearance, fused, alone)
+    found = read(folder)
+    of_images = {topic: rows[0][1].frame_id for topic, rows in found.items() if "pict" in topic}
+    of_lenses = {topic: rows[0][1].frame_id for topic, rows in found.items() if "calib" in topic}
+    frames = {m.transforms[0].child_frame_id for _, m in found["/tf"]} - {"platform"}
+    assert frames == set(of_images.values()) == set(of_lenses.values())
+    assert of_lenses == {
+        topic.replace("/pictures", "/camera_calibration"): name for topic, name in of_images.items()
+    }
+    assert len(of_images) == len(used)
 
 
 def test_cables_are_drawn_from_their_outlets_to_the_platform(
