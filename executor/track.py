@@ -338,4 +338,4 @@ def _rendered(
 ) -> Iterable[Picture]:
     film = ImageSequence(make_synthetic_camera(rig, scene, camera))
     for number, (at, pose) in enumerate(timed_poses):
-        yield Frame(at, film.picture(at, pose, number), f"rendered {number}")
+        yield Frame(at, film.picture(at, pose, number), f"rendered {number}", number)

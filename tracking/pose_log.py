@@ -57,17 +57,19 @@ class LoggedPicture:
         name: Of the image.
         observation: The pose, or the reason why there is none.
         clearance: At the pose, if the scene has obstacles.
+        frame: Number of the image in its source; with several cameras, of the frame set.
     """
 
     name: str
     observation: Observation
     clearance: MeasuredClearance | None = None
+    frame: int = 0
 
 
-def pose_row(frame: int, logged: LoggedPicture) -> tuple[str, ...]:
+def pose_row(logged: LoggedPicture) -> tuple[str, ...]:
     """Values of one row, in the order of `POSE_COLUMNS`; empty without a pose."""
     found = logged.observation
-    head = (str(frame), f"{found.time:.6f}")
+    head = (str(logged.frame), f"{found.time:.6f}")
     if isinstance(found, NoPose):
         nothing = ("",) * (len(POSE_COLUMNS) - 4)
         return (*head, found.reason, *nothing, logged.name)
@@ -100,8 +102,8 @@ def write_pose_log(
     """
     head = POSE_COLUMNS + (CLEARANCE_COLUMNS if with_clearance else ())
     rows = [
-        pose_row(frame, logged) + (_clearance_values(logged.clearance) if with_clearance else ())
-        for frame, logged in enumerate(pictures)
+        pose_row(logged) + (_clearance_values(logged.clearance) if with_clearance else ())
+        for logged in pictures
     ]
     lines = [",".join(_quoted(value) for value in row) for row in (head, *rows)]
     write_atomic(path, "\n".join(lines) + "\n")

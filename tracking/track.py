@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from time import monotonic
 from typing import Protocol
@@ -46,6 +46,11 @@ class Picture(Protocol):
     @property
     def name(self) -> str:
         """File name or number."""
+        ...
+
+    @property
+    def number(self) -> int:
+        """Number in the source, from 0."""
         ...
 
 
@@ -106,7 +111,7 @@ def track(
             reasons.add(observation.reason)
             seen.update(observation.seen)
             last = picture
-        logged = LoggedPicture(picture.name, observation, clearance)
+        logged = LoggedPicture(picture.name, observation, clearance, picture.number)
         if on_picture is not None:
             on_picture(picture, logged)
         yield logged
@@ -204,7 +209,8 @@ def track_cameras(
         model: Of the obstacles, to measure the clearance as well.
 
     Returns:
-        The fused measurement, and that of each camera with an image in the frame set.
+        The fused measurement, and that of each camera with an image in the frame set, all with the
+        number of the frame set.
 
     Raises:
         NoPlatformSeen: At the end, if no camera gave a pose.
@@ -213,7 +219,8 @@ def track_cameras(
     """
     poses, reason, common = 0, "the sources have no images", MultiCameraFusion(within)
     running = {name: _ignoring_no_platform(stream) for name, stream in streams.items()}
-    for alone in synchronize_frames(running, 2.0 * within):
+    for frame, images in enumerate(synchronize_frames(running, 2.0 * within)):
+        alone = {name: replace(one, frame=frame) for name, one in images.items()}
         found = common.of({name: one.observation for name, one in alone.items()})
         count.without_partner += len(alone) == 1
         count.apart, count.without_speed = common.apart, common.without_speed
@@ -223,7 +230,7 @@ def track_cameras(
             clearance = clearance_of(model, found) if model is not None else None
         else:
             reason = found.reason
-        yield LoggedPicture(next(iter(alone.values())).name, found, clearance), alone
+        yield LoggedPicture(next(iter(alone.values())).name, found, clearance, frame), alone
     if not poses:
         raise NoPlatformSeen(
             f"no camera gives a platform pose: {reason}",

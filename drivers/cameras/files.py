@@ -83,7 +83,7 @@ class ImageFolder:
             none_read &= image is None
             if image is not None and _size(image) == wanted:
                 upright = upright is not False
-                yield Frame(number / self._rate, image, path.name)
+                yield Frame(number / self._rate, image, path.name, number)
                 continue
             why = _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
             self.unused[path.name] = why

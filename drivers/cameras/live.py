@@ -179,11 +179,13 @@ class Frame:
         time: Time of capture, [s]; for files, since the first image.
         image: Grey, shape (height, width).
         name: File name, or number in the video or of the camera.
+        number: In the source, from 0, counting also images that are skipped or cannot be read.
     """
 
     time: float
     image: Image
     name: str
+    number: int = 0
 
 
 class VideoFile:
@@ -248,7 +250,7 @@ class VideoFile:
                 shown = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the rate may vary
                 is_later = np.isfinite(shown) and shown > seconds
                 seconds = shown if is_later else seconds + 1.0 / rate
-                yield Frame(seconds, image, f"image {number}")
+                yield Frame(seconds, image, f"image {number}", number)
                 number += 1
         finally:
             capture.release()
@@ -327,7 +329,8 @@ class LiveCamera:
         arrived = self._reader.newest()
         if arrived is not None:
             self._seen = True
-            return Frame(arrived.time, _grey(arrived.picture), f"image {arrived.number}")
+            number = arrived.number
+            return Frame(arrived.time, _grey(arrived.picture), f"image {number}", number)
         kind = Fault if self._seen else HardwareMissing
         raise kind(
             f"the camera failed to deliver an image {LOST_PICTURES} times in a row",

@@ -291,8 +291,8 @@ def _messages(pictures: Sequence[LoggedPicture], start: int, camera: str) -> Ite
     pose_topic, status_topic, clearance_topic = (
         topic_of(channel, camera) for channel in ("/tag_pose", "/tag_status", "/clearance")
     )
-    for frame, logged in enumerate(pictures):
-        found = logged.observation
+    for logged in pictures:
+        found, frame = logged.observation, logged.frame
         status: dict[str, Any] = {"frame": frame, "status": OK, "tags": "", "reprojection_px": None}
         if isinstance(found, NoPose):
             nothing = [None] * 36

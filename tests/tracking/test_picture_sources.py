@@ -267,7 +267,7 @@ def test_the_pose_log_has_a_row_a_picture_whether_it_gave_a_pose_or_not(
     lines = (tmp_path / "poses.csv").read_text().splitlines()
     assert lines[0].split(",") == list(POSE_COLUMNS)
     assert len(lines) == 3
-    row = dict(zip(POSE_COLUMNS, pose_row(0, logged[0]), strict=True))
+    row = dict(zip(POSE_COLUMNS, pose_row(logged[0]), strict=True))
     found = logged[0].observation
     assert isinstance(found, PoseMeasurement)
     assert float(row["x_mm"]) == pytest.approx(found.pose.position[0] * 1e3, abs=1e-6)

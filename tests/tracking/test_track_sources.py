@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from drivers.cameras.live import Frame
 from executor.track import track_sources
@@ -46,6 +49,45 @@ def test_a_folder_is_measured_and_saved(folder: Path, rig: Rig, tmp_path: Path) 
     head, *rows = (tmp_path / "poses.csv").read_text().splitlines()
     assert head == ",".join(POSE_COLUMNS)
     assert len(rows) == 3
+
+
+def column(path: Path, name: str) -> list[str]:
+    with path.open(newline="") as stream:
+        return [row[name] for row in csv.DictReader(stream)]
+
+
+def test_a_frame_is_the_number_of_the_image_and_not_of_the_row(
+    folder: Path, rig: Rig, tmp_path: Path
+) -> None:
+    (folder / "1.png").write_bytes(b"cut short")
+    result = track_sources(rig, {rig.cameras[0]: str(folder)})
+    result.save(tmp_path / "poses.csv", tmp_path / "poses.mcap")
+    assert column(tmp_path / "poses.csv", "picture") == ["0.png", "2.png"]
+    assert column(tmp_path / "poses.csv", "frame") == ["0", "2"]
+    with (tmp_path / "poses.mcap").open("rb") as stream:
+        status = make_reader(stream).iter_messages(topics=["/tag_status"])
+        assert [json.loads(message.data)["frame"] for _, _, message in status] == [0, 2]
+
+
+def test_frames_of_several_cameras_are_those_of_one_time(
+    rig: Rig, scene: Scene, tmp_path: Path
+) -> None:
+    """The second image of the first camera, and the third of the second one, cannot be read."""
+    front = rig.cameras[0]
+    cameras = {"front": front, "side": other_side(front)}
+    for (name, camera), broken in zip(cameras.items(), (1, 2), strict=True):
+        (tmp_path / name).mkdir()
+        eye = SyntheticCamera(rig, replace(scene, obstacles=()), camera, seed=4)
+        for k, pose in enumerate([*TRUTH, TRUTH[-1]]):
+            cv2.imwrite(str(tmp_path / name / f"{k}.png"), eye.render(pose, k))
+        (tmp_path / name / f"{broken}.png").write_bytes(b"cut short")
+    sources = {camera: str(tmp_path / name) for name, camera in cameras.items()}
+    track_sources(replace(rig, cameras=tuple(sources)), sources).save(tmp_path / "poses.csv")
+    assert column(tmp_path / "poses.csv", "frame") == ["0", "1", "2", "3"]
+    for camera, kept in zip(sources, ([0, 2, 3], [0, 1, 3]), strict=True):
+        path = tmp_path / f"poses-{camera.name}.csv"
+        assert column(path, "frame") == [str(k) for k in kept]
+        assert column(path, "picture") == [f"{k}.png" for k in kept]
 
 
 def test_it_stops_before_the_next_picture_when_it_is_asked_to(folder: Path, rig: Rig) -> None:
