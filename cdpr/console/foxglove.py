@@ -156,7 +156,6 @@ def _drives(status: dict[str, Any]) -> dict[str, Any]:
         "state": status["state"],
         "path_mm": status["path_mm"],
         "lateness_ms": status["lateness_ms"],
-        "missing": status["lost_replies"],
         "following_error_mm": status["following_error_mm"],
         "drives": [
             {

@@ -101,6 +101,8 @@ def test_a_client_sees_robot_scene_drives_clearance_and_events(run_status: dict[
     names = {entity.id for entity in seen["/scene"].entities}
     assert names == {f"obstacle {o.name}" for o in run_status["obstacles"]} | {"planned path"}
     assert len(seen["/drives"]["drives"]) == 8
+    # In ``run.mcap``: drives that did not answer in that cycle; a status has those of the run.
+    assert "missing" not in seen["/drives"]
     assert seen["/events"].message == "what [drives] reported"
     assert 0.0 < seen["/clearance"]["distance_mm"] < 1000.0
 
