@@ -17,12 +17,12 @@ from dataclasses import dataclass
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Any, NoReturn
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from cdpr.cli.arguments import check_arguments
+from cdpr.cli.arguments import check_arguments, option, with_options
 from model.errors import AlreadyExists, BadInput, CdprError, Fault, StoppedByOperator
 from model.files.reading import shown
 
@@ -148,7 +148,7 @@ def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
         )
     module, _, function = verb.target.partition(":")
     app = typer.Typer(rich_markup_mode="rich", add_completion=False)
-    called = getattr(import_module(f"cdpr.cli.{module}"), function)
+    called = with_options(getattr(import_module(f"cdpr.cli.{module}"), function))
     typed: dict[str, str] = {}
     app.command(verb.name, cls=_VerbCommand)(_guarded(called, typed))
     command: Any = typer.main.get_command(app)
@@ -218,17 +218,15 @@ def build_app() -> typer.Typer:
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    app.callback()(_options)
+    app.callback()(with_options(_options))
     return app
 
 
 def _options(
-    _version: Annotated[
-        bool,
-        typer.Option(
-            "--version", help="Show the version and exit.", callback=_show_version, is_eager=True
-        ),
-    ] = False,
+    *,
+    _version: bool = option(
+        False, "Show the version and exit.", "--version", callback=_show_version, is_eager=True
+    ),
 ) -> None:
     """Plan, prove, run and measure paths of cable-driven parallel robots."""
 

@@ -1,19 +1,99 @@
-"""Checks of every verb's arguments, before the verb opens or writes anything.
+"""Arguments and options of the verbs: their declaration, and checks that all verbs share.
 
-Invalid paths, outputs that would overwrite an input or each other, and numbers beyond any machine
-are refused here, for all verbs.
+A verb declares each as a parameter, ``cost: float = option(1.0, "help")``. Options that belong
+together are the fields of a dataclass, which is then one parameter of the verb. Invalid paths,
+outputs that would overwrite an input or each other, and numbers beyond any machine are refused
+here, before a verb opens or writes anything.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import MISSING, Field, field, fields, is_dataclass
+from functools import wraps
 from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_type_hints
+
+import typer
 
 from model.errors import BadInput
 from model.files.output import file_identity, refuse_overwriting
 from model.files.reading import shown
+
+T = TypeVar("T")
+
+
+def option(default: T, text: str, *names: str, **more: Any) -> T:
+    """Declares an option.
+
+    Args:
+        default: The value where the option is not given.
+        text: As the help displays it.
+        names: How it is typed (default: as the parameter).
+        more: See `typer.Option`, such as ``min`` and ``metavar``.
+    """
+    return field(default=default, metadata=_declaration(typer.Option, text, names, more))
+
+
+def required(text: str, *names: str, **more: Any) -> Any:
+    """Declares an option that must be given; see `option`."""
+    return field(metadata=_declaration(typer.Option, text, names, more))
+
+
+def argument(text: str, metavar: str | None = None, *, default: Any = MISSING, **more: Any) -> Any:
+    """Declares a positional argument; without a default it must be given; see `option`."""
+    more["metavar"] = metavar
+    return field(default=default, metadata=_declaration(typer.Argument, text, (), more))
+
+
+def _declaration(
+    typer_kind: Callable[..., Any], text: str, names: tuple[str, ...], more: dict[str, Any]
+) -> dict[str, Any]:
+    return {"kind": typer_kind, "names": names, "more": {"help": text, **more}}
+
+
+def with_options(verb: Callable[..., None]) -> Callable[..., None]:
+    """The verb with one parameter per option, annotated as Typer reads it."""
+    expanded: dict[str, list[inspect.Parameter]] = {}
+    groups: dict[str, Any] = {}
+    for one in inspect.signature(verb, eval_str=True).parameters.values():
+        if is_dataclass(one.annotation):
+            hints = get_type_hints(one.annotation)
+            groups[one.name] = one.annotation
+            expanded[one.name] = [
+                _parameter(f.name, hints[f.name], f) for f in fields(one.annotation)
+            ]
+        else:
+            expanded[one.name] = [_parameter(one.name, one.annotation, one.default)]
+
+    @wraps(verb)
+    def called(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{p.name: values.pop(p.name) for p in expanded[name]})
+        verb(**values)
+
+    parameters = [parameter for each in expanded.values() for parameter in each]
+    as_seen: Any = called
+    as_seen.__signature__ = inspect.Signature(parameters)
+    as_seen.__annotations__ = {p.name: p.annotation for p in parameters}
+    return called
+
+
+def _parameter(name: str, kind: Any, declared: Field[Any]) -> inspect.Parameter:
+    names = declared.metadata["names"]
+    if kind is bool and not names:
+        names = (f"--{name.replace('_', '-')}",)  # otherwise Typer adds ``--no-…``
+    declaration = declared.metadata["kind"](*names, **declared.metadata["more"])
+    return inspect.Parameter(
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if declared.default is MISSING else declared.default,
+        annotation=Annotated[kind, declaration],
+    )
+
 
 OUTPUTS = ("output", "mcap", "overlay")
 """The arguments that name what a verb writes; every other path is read."""

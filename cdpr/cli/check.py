@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from cdpr.cli.options import JsonOption
+from cdpr.cli.arguments import argument, option
+from cdpr.cli.options import JSON
 from cdpr.cli.output import Terminal, out, show_facts, show_json
 from model.plan import load_plan, require_same_rig
 from model.rig import load_rig
@@ -15,12 +15,10 @@ from planner.check import check_path
 
 
 def check(
-    plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
-    rig: Annotated[
-        Path | None,
-        typer.Option(help="also require that the plan fits this rig file"),
-    ] = None,
-    as_json: JsonOption = False,
+    *,
+    plan: Path = argument("plan file (JSON)", "PLAN"),
+    rig: Path | None = option(None, "also require that the plan fits this rig file"),
+    as_json: bool = JSON,
 ) -> None:
     """Verify a plan independently: distances at dense poses, with bounds in between.
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from rich.table import Table
 
-from cdpr.cli.options import JsonOption
+from cdpr.cli.arguments import argument, option
+from cdpr.cli.options import JSON
 from cdpr.cli.output import out, show_json, show_line
 from executor.doctor import MachineCheck, check_machine, check_rig, examine, stopping_text
 from model.errors import BadInput
@@ -21,18 +22,13 @@ if TYPE_CHECKING:  # needs canopen, which may be missing
 
 
 def doctor(
-    rig: Annotated[
-        Path | None,
-        typer.Argument(help="also check this rig's bus and cameras", metavar="[RIG]"),
-    ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(help="also capture an image with this camera: index, device or address"),
-    ] = None,
-    drives: Annotated[
-        bool, typer.Option("--drives", help="also read every object of every CANopen drive")
-    ] = False,
-    as_json: JsonOption = False,
+    *,
+    rig: Path | None = argument("also check this rig's bus and cameras", "[RIG]", default=None),
+    camera: str | None = option(
+        None, "also capture an image with this camera: index, device or address"
+    ),
+    drives: bool = option(False, "also read every object of every CANopen drive"),
+    as_json: bool = JSON,
 ) -> None:
     """Check that this machine can run a rig; with a rig file, also its bus and cameras.
 

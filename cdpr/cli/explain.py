@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-import typer
-
+from cdpr.cli.arguments import argument
 from cdpr.cli.output import show_line
 from executor.recording.verdict import fault_titles, page_of_fault
 
 
 def explain(
-    code: Annotated[
-        str | None, typer.Argument(help="code of the fault, such as drive_silent", metavar="CODE")
-    ] = None,
+    *,
+    code: str | None = argument("code of the fault, such as drive_silent", "CODE", default=None),
 ) -> None:
     """Explain a fault that a run reported: meaning, likely cause, state of the machine, next step.
 

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from functools import wraps
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
 
 import numpy as np
-import typer
 
 import calibration  # loads names lazily: `cdpr stop` must not wait for scientific libraries
+from cdpr.cli.arguments import argument, option, required
 from cdpr.cli.output import Terminal
 from model.errors import BadInput
 from model.files.documents import millimetres
 from model.pose import Array, Pose, matrix_from_quaternion
 from model.rig import Rig, load_rig
 
-RigArgument = Annotated[Path, typer.Argument(help="rig file (YAML)", metavar="RIG")]
-SceneArgument = Annotated[Path, typer.Argument(help="scene file (YAML)", metavar="SCENE")]
-PlanFileOption = Annotated[Path, typer.Option("-o", "--output", help="plan file to write (JSON)")]
-ReplacePlanOption = Annotated[bool, typer.Option("--force", help="replace an existing plan file")]
-JsonOption = Annotated[bool, typer.Option("--json", help="print the result as JSON")]
+RIG = argument("rig file (YAML)", "RIG")
+SCENE = argument("scene file (YAML)", "SCENE")
+PLAN_FILE = required("plan file to write (JSON)", "-o", "--output")
+REPLACE_PLAN = option(False, "replace an existing plan file", "--force")
+JSON = option(False, "print the result as JSON", "--json")
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -67,49 +64,14 @@ def simulated_start(rig: Rig, position_mm: Triple | None, wxyz: Quaternion | Non
     return Pose(position, rig.home.rotation if rotation is None else rotation)
 
 
-def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with each dataclass parameter expanded into options, one per field.
-
-    Fields are annotated like options, and have defaults.
-    """
-    whole = inspect.signature(command, eval_str=True)
-    groups: dict[str, Any] = {
-        p.name: p.annotation for p in whole.parameters.values() if is_dataclass(p.annotation)
-    }
-    expanded = {name: _parameters(group) for name, group in groups.items()}
-
-    @wraps(command)
-    def with_options(**values: Any) -> None:
-        for name, group in groups.items():
-            values[name] = group(**{p.name: values.pop(p.name) for p in expanded[name]})
-        command(**values)
-
-    parameters = [p for one in whole.parameters.values() for p in expanded.get(one.name, [one])]
-    as_seen: Any = with_options
-    as_seen.__signature__ = whole.replace(parameters=parameters)
-    as_seen.__annotations__ = {p.name: p.annotation for p in parameters}
-    return with_options
-
-
-def _parameters(group: Any) -> list[inspect.Parameter]:
-    hints = get_type_hints(group, include_extras=True)
-    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
-    return [
-        inspect.Parameter(option.name, kind, default=option.default, annotation=hints[option.name])
-        for option in fields(group)
-    ]
-
-
 # Calibration results that replace values of the rig file.
 
-CalibrationOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--calibration",
-        help="result file of `cdpr calibrate`, used instead of the rig file's values; repeatable",
-        metavar="FILE",
-    ),
-]
+CALIBRATION = option(
+    None,
+    "result file of `cdpr calibrate`, used instead of the rig file's values; repeatable",
+    "--calibration",
+    metavar="FILE",
+)
 
 
 def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
@@ -132,37 +94,28 @@ def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
 
 # Verbs that reach drives: the rig, its bus, and the motion.
 
-InterfaceOption = Annotated[
-    str | None,
-    typer.Option("--interface", help="python-can interface, overriding the rig file's"),
-]
-ChannelOption = Annotated[str | None, typer.Option("--channel", help="channel of the interface")]
-FastOption = Annotated[bool, typer.Option("--fast", help="simulated time, as fast as possible")]
-YesOption = Annotated[
-    bool, typer.Option("--yes", help="do not ask before moving drives on a real bus")
-]
-NoQuestionOption = Annotated[bool, typer.Option("--yes", help="do not ask")]
-WithoutRealTimeOption = Annotated[
-    bool,
-    typer.Option("--without-real-time", help="move even if real-time scheduling is denied"),
-]
-SummaryJsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON")]
+INTERFACE = option(None, "python-can interface, overriding the rig file's", "--interface")
+CHANNEL = option(None, "channel of the interface", "--channel")
+FAST = option(False, "simulated time, as fast as possible", "--fast")
+YES = option(False, "do not ask before moving drives on a real bus", "--yes")
+NO_QUESTION = option(False, "do not ask", "--yes")
+WITHOUT_REAL_TIME = option(
+    False, "move even if real-time scheduling is denied", "--without-real-time"
+)
+SUMMARY_JSON = option(False, "print the summary as JSON", "--json")
 
 
 @dataclass(frozen=True, slots=True)
 class BusOptions:
     """Bus and calibration of a rig; every field is an option."""
 
-    interface: InterfaceOption = None
-    channel: ChannelOption = None
-    calibration: CalibrationOption = None
+    interface: str | None = INTERFACE
+    channel: str | None = CHANNEL
+    calibration: list[Path] | None = CALIBRATION
 
     def rig(self, path: Path) -> Rig:
         """See `rig_on_bus`."""
         return rig_on_bus(path, self.interface, self.channel, self.calibration)
-
-
-DEFAULT_BUS = BusOptions()
 
 
 def rig_on_bus(

@@ -7,21 +7,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
+from cdpr.cli.arguments import option
 from cdpr.cli.options import (
-    CalibrationOption,
-    JsonOption,
-    PlanFileOption,
-    ReplacePlanOption,
-    RigArgument,
-    SceneArgument,
+    CALIBRATION,
+    JSON,
+    PLAN_FILE,
+    REPLACE_PLAN,
+    RIG,
+    SCENE,
     Triple,
     calibrated_rig,
     level_pose,
-    with_option_groups,
 )
 from cdpr.cli.output import Terminal, show_facts, show_json
 from executor.recording.resume import passing, require_room, scene_after
@@ -44,71 +42,45 @@ _PANEL = "Open readings of the paper's text (docs/paper.md)"
 class SearchOptions:
     """Planner and its settings; every field is an option of `cdpr plan`."""
 
-    planner: Annotated[
-        PlannerName,
-        typer.Option(help="optimal (recommended), or the paper's: adaptive, goal-bias"),
-    ] = "optimal"
-    cost: Annotated[
-        Objective | None,
-        typer.Option(help="objective (default: length; the paper's planners: kinematic)"),
-    ] = None
-    weight: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--weight", help="NAME=NUMBER, repeatable for a weighted sum: length, kinematic, …"
-        ),
-    ] = None
-    longest_mm: Annotated[
-        float | None, typer.Option(min=0.001, help="optimal: upper limit of the path length")
-    ] = None
-    budget_ms: Annotated[
-        float | None,
-        typer.Option(
-            min=0.001,
-            help="optimal: time for improvement (default: 50 ms; 500 with --free-rotation)",
-        ),
-    ] = None
-    rounds: Annotated[
-        list[int] | None,
-        typer.Option(min=1, help="optimal: fixed number of improvement rounds (reproducible)"),
-    ] = None
-    free_rotation: Annotated[
-        bool,
-        typer.Option(
-            "--free-rotation", help="optimal: also rotate the platform, within the scene's limits"
-        ),
-    ] = False
-    mode: Annotated[
-        Mode | None,
-        typer.Option(help="the paper's planners: RRT* (rewire), or stop at the first path (paper)"),
-    ] = None
-    max_iterations: Annotated[
-        int | None,
-        typer.Option(min=1, max=1_000_000, help="the paper's planners: largest number of samples"),
-    ] = None
-    failure_rate: Annotated[
-        FailureRate | None,
-        typer.Option(help="e_r, k: failures in a row", rich_help_panel=_PANEL),
-    ] = None
-    focus: Annotated[Focus | None, typer.Option(help="the node x_c", rich_help_panel=_PANEL)] = None
-    cone_draw: Annotated[
-        ConeDraw | None,
-        typer.Option(help="r and θ₁ uniform, or points uniform in volume", rich_help_panel=_PANEL),
-    ] = None
-    steer: Annotated[
-        Steer | None,
-        typer.Option(help="steps of --mode paper: as Eq. 9, or as RRT*", rich_help_panel=_PANEL),
-    ] = None
-    spacing_mm: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0, help="reject nodes closer than this to another", rich_help_panel=_PANEL
-        ),
-    ] = None
-    goal_sight: Annotated[
-        bool,
-        typer.Option("--goal-sight", help="every new node tries the goal", rich_help_panel=_PANEL),
-    ] = False
+    planner: PlannerName = option(
+        "optimal", "optimal (recommended), or the paper's: adaptive, goal-bias"
+    )
+    cost: Objective | None = option(
+        None, "objective (default: length; the paper's planners: kinematic)"
+    )
+    weight: list[str] | None = option(
+        None, "NAME=NUMBER, repeatable for a weighted sum: length, kinematic, …"
+    )
+    longest_mm: float | None = option(None, "optimal: upper limit of the path length", min=0.001)
+    budget_ms: float | None = option(
+        None, "optimal: time for improvement (default: 50 ms; 500 with --free-rotation)", min=0.001
+    )
+    rounds: list[int] | None = option(
+        None, "optimal: fixed number of improvement rounds (reproducible)", min=1
+    )
+    free_rotation: bool = option(
+        False, "optimal: also rotate the platform, within the scene's limits"
+    )
+    mode: Mode | None = option(
+        None, "the paper's planners: RRT* (rewire), or stop at the first path (paper)"
+    )
+    max_iterations: int | None = option(
+        None, "the paper's planners: largest number of samples", min=1, max=1_000_000
+    )
+    failure_rate: FailureRate | None = option(
+        None, "e_r, k: failures in a row", rich_help_panel=_PANEL
+    )
+    focus: Focus | None = option(None, "the node x_c", rich_help_panel=_PANEL)
+    cone_draw: ConeDraw | None = option(
+        None, "r and θ₁ uniform, or points uniform in volume", rich_help_panel=_PANEL
+    )
+    steer: Steer | None = option(
+        None, "steps of --mode paper: as Eq. 9, or as RRT*", rich_help_panel=_PANEL
+    )
+    spacing_mm: float | None = option(
+        None, "reject nodes closer than this to another", min=0.0, rich_help_panel=_PANEL
+    )
+    goal_sight: bool = option(False, "every new node tries the goal", rich_help_panel=_PANEL)
 
     def with_seed(self, seed: int) -> PlanningOptions:
         """As options of the planner's library."""
@@ -116,44 +88,30 @@ class SearchOptions:
         return PlanningOptions(seed=seed, **{k: v for k, v in given.items() if v is not None})
 
 
-DEFAULT_SEARCH = SearchOptions()
-
-
 # `cdpr plan`: a path from start to goal.
 
 
-@with_option_groups
 def plan(
-    rig: RigArgument,
-    scene: SceneArgument,
-    output: PlanFileOption,
-    seed: Annotated[
-        int,
-        typer.Option(min=0, help="random seed; with --rounds the plan is reproducible"),
-    ] = 0,
-    calibration: CalibrationOption = None,
-    clearance_mm: Annotated[
-        float | None, typer.Option(min=0.0, help="obstacle clearance, overriding the scene's")
-    ] = None,
-    search: SearchOptions = DEFAULT_SEARCH,
-    start_mm: Annotated[
-        Triple | None, typer.Option(help="start position x y z, overriding the scene's")
-    ] = None,
-    goal_mm: Annotated[
-        Triple | None, typer.Option(help="goal position x y z, overriding the scene's")
-    ] = None,
-    via_mm: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="position x y z to pass before the scene's stops; repeatable", metavar="X Y Z"
-        ),
-    ] = None,
-    from_run: Annotated[
-        Path | None,
-        typer.Option(help="start where this run ended, with the remaining stops", metavar="RUNDIR"),
-    ] = None,
-    force: ReplacePlanOption = False,
-    as_json: JsonOption = False,
+    *,
+    rig: Path = RIG,
+    scene: Path = SCENE,
+    output: Path = PLAN_FILE,
+    seed: int = option(0, "random seed; with --rounds the plan is reproducible", min=0),
+    calibration: list[Path] | None = CALIBRATION,
+    clearance_mm: float | None = option(
+        None, "obstacle clearance, overriding the scene's", min=0.0
+    ),
+    search: SearchOptions,
+    start_mm: Triple | None = option(None, "start position x y z, overriding the scene's"),
+    goal_mm: Triple | None = option(None, "goal position x y z, overriding the scene's"),
+    via_mm: list[str] | None = option(
+        None, "position x y z to pass before the scene's stops; repeatable", metavar="X Y Z"
+    ),
+    from_run: Path | None = option(
+        None, "start where this run ended, with the remaining stops", metavar="RUNDIR"
+    ),
+    force: bool = REPLACE_PLAN,
+    as_json: bool = JSON,
 ) -> None:
     """Plan a collision-free path and write it to a file.
 

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
+from cdpr.cli.arguments import argument, option
 from cdpr.cli.output import Terminal, show_json, show_line
 from executor.evaluation import rewrite_report
 from executor.recording.run_folder import RunFolder
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="run folder", metavar="RUNDIR")],
-    as_json: Annotated[bool, typer.Option("--json", help="print the run's summary")] = False,
+    *,
+    run: Path = argument("run folder", "RUNDIR"),
+    as_json: bool = option(False, "print the run's summary", "--json"),
 ) -> None:
     """Write the report of a run again, from the files of its folder.
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
+from cdpr.cli.arguments import option
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import (
-    CalibrationOption,
-    ChannelOption,
-    InterfaceOption,
-    RigArgument,
+    CALIBRATION,
+    CHANNEL,
+    INTERFACE,
+    RIG,
     Triple,
     calibrated_rig,
     level_pose,
@@ -34,50 +34,32 @@ from simulation.ground_truth import PowerLoss
 
 
 def sim(
-    rig: RigArgument,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    start_mm: Annotated[
-        Triple | None,
-        typer.Option("--at-mm", help="initial position of the platform x y z (default: home)"),
-    ] = None,
-    power_lost: Annotated[
-        int | None,
-        typer.Option(
-            "--power-lost",
-            help="simulate a power loss (lost counts, slack cables) with this random seed",
-            min=0,
-        ),
-    ] = None,
-    slack_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="with --power-lost: largest slack")
-    ] = 5.0,
-    on_a_stand: Annotated[
-        bool,
-        typer.Option(
-            "--on-a-stand", help="with --power-lost: platform supported until all cables are taut"
-        ),
-    ] = False,
-    plan: Annotated[
-        Path | None,
-        typer.Option(help="start the platform at the start of this plan, with its load"),
-    ] = None,
-    eds: Annotated[
-        Path | None,
-        typer.Option(
-            help="EDS file of the simulated drives, such as their maker's"
-            " (default: that of the rig file's drive profile)"
-        ),
-    ] = None,
-    drive_behaviour: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--drive-behaviour",
-            metavar="NAME[=VALUE]",
-            help="deviation of the drives from strict CiA 402, repeatable; 'list' shows all",
-        ),
-    ] = None,
-    calibration: CalibrationOption = None,
+    *,
+    rig: Path = RIG,
+    interface: str | None = INTERFACE,
+    channel: str | None = CHANNEL,
+    start_mm: Triple | None = option(
+        None, "initial position of the platform x y z (default: home)", "--at-mm"
+    ),
+    power_lost: int | None = option(
+        None, "simulate a power loss (lost counts, slack cables) with this random seed", min=0
+    ),
+    slack_mm: float = option(5.0, "with --power-lost: largest slack", min=0.0, max=100.0),
+    on_a_stand: bool = option(
+        False, "with --power-lost: platform supported until all cables are taut"
+    ),
+    plan: Path | None = option(None, "start the platform at the start of this plan, with its load"),
+    eds: Path | None = option(
+        None,
+        "EDS file of the simulated drives, such as their maker's (default: that of the rig"
+        " file's drive profile)",
+    ),
+    drive_behaviour: list[str] | None = option(
+        None,
+        "deviation of the drives from strict CiA 402, repeatable; 'list' shows all",
+        metavar="NAME[=VALUE]",
+    ),
+    calibration: list[Path] | None = CALIBRATION,
 ) -> None:
     """Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import shlex
 import sys
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
+from cdpr.cli.arguments import argument, option
+from cdpr.cli.options import Triple
 from cdpr.cli.output import out, show_json, show_line
 from model.errors import AlreadyExists, BadInput
 from model.files.documents import write_atomic
@@ -19,25 +19,20 @@ from model.files.examples import (
     rig_text,
     select_examples,
 )
-from model.files.new_rig import OPTIONS, RigQuestion, collect_answers, read_coordinates
+from model.files.new_rig import RigQuestion, collect_answers, read_coordinates
 
 
 def examples(
-    names: Annotated[
-        list[str] | None, typer.Argument(help="examples to copy; without a name, list all")
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", help="folder to copy to (default: the current one)", metavar="DIR"
-        ),
-    ] = None,
-    everything: Annotated[
-        bool,
-        typer.Option("--all", help="copy all, into configs/ and examples/ as in the repository"),
-    ] = False,
-    force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the list as JSON")] = False,
+    *,
+    names: list[str] | None = argument("examples to copy; without a name, list all", default=None),
+    output: Path | None = option(
+        None, "folder to copy to (default: the current one)", "-o", "--output", metavar="DIR"
+    ),
+    everything: bool = option(
+        False, "copy all, into configs/ and examples/ as in the repository", "--all"
+    ),
+    force: bool = option(False, "replace files that exist"),
+    as_json: bool = option(False, "print the list as JSON", "--json"),
 ) -> None:
     """List the example rigs, scenes and recorded sessions, or copy some of them.
 
@@ -75,49 +70,38 @@ def examples(
 # `cdpr new`: asks for the essentials of a rig, and writes its file.
 
 
-_Point = tuple[float, float, float]
+@dataclass(frozen=True, slots=True)
+class RigOptions:
+    """Answers to the questions of `cdpr new`, by their keys; every field is an option."""
+
+    platform_mm: Triple | None = option(None, "platform size", metavar="X Y Z")
+    mass_kg: float | None = option(None, "mass of the platform")
+    home_mm: Triple | None = option(None, "home position", metavar="X Y Z")
+    lower_mm: Triple | None = option(None, "lower corner of the workspace", metavar="X Y Z")
+    upper_mm: Triple | None = option(None, "upper corner of the workspace", metavar="X Y Z")
+    radius_mm: float | None = option(None, "radius of the cables")
+    stiffness_n: float | None = option(None, "axial stiffness of a cable")
+    min_tension_n: float | None = option(None, "smallest allowed tension of a cable")
+    max_tension_n: float | None = option(None, "largest tension of a cable")
+    drum_radius_mm: float | None = option(None, "radius of the drums")
+    gear_ratio: float | None = option(None, "motor turns per drum turn")
+    counts_per_rev: int | None = option(None, "encoder counts per motor turn")
+    encoder: str | None = option(None, "absolute or incremental")
+    max_speed_mm_s: float | None = option(None, "largest cable speed")
+    torque_constant_n: float | None = option(None, "cable tension at rated motor torque")
+    interface: str | None = option(None, "python-can interface of the bus")
+    channel: str | None = option(None, "channel of the bus")
+    bitrate: int | None = option(None, "bit rate of the bus, bit/s")
 
 
 def new(
-    context: typer.Context,
-    rig: Annotated[Path, typer.Argument(help="rig file to write")],
-    coordinates: Annotated[
-        Path | None,
-        typer.Option(
-            "--from", help="CSV with one line per cable; no questions, defaults for the rest"
-        ),
-    ] = None,
-    platform_mm: Annotated[
-        _Point | None, typer.Option(metavar="X Y Z", help="platform size")
-    ] = None,
-    mass_kg: Annotated[float | None, typer.Option(help="mass of the platform")] = None,
-    home_mm: Annotated[_Point | None, typer.Option(metavar="X Y Z", help="home position")] = None,
-    lower_mm: Annotated[
-        _Point | None, typer.Option(metavar="X Y Z", help="lower corner of the workspace")
-    ] = None,
-    upper_mm: Annotated[
-        _Point | None, typer.Option(metavar="X Y Z", help="upper corner of the workspace")
-    ] = None,
-    radius_mm: Annotated[float | None, typer.Option(help="radius of the cables")] = None,
-    stiffness_n: Annotated[float | None, typer.Option(help="axial stiffness of a cable")] = None,
-    min_tension_n: Annotated[
-        float | None, typer.Option(help="smallest allowed tension of a cable")
-    ] = None,
-    max_tension_n: Annotated[float | None, typer.Option(help="largest tension of a cable")] = None,
-    drum_radius_mm: Annotated[float | None, typer.Option(help="radius of the drums")] = None,
-    gear_ratio: Annotated[float | None, typer.Option(help="motor turns per drum turn")] = None,
-    counts_per_rev: Annotated[
-        int | None, typer.Option(help="encoder counts per motor turn")
-    ] = None,
-    encoder: Annotated[str | None, typer.Option(help="absolute or incremental")] = None,
-    max_speed_mm_s: Annotated[float | None, typer.Option(help="largest cable speed")] = None,
-    torque_constant_n: Annotated[
-        float | None, typer.Option(help="cable tension at rated motor torque")
-    ] = None,
-    interface: Annotated[str | None, typer.Option(help="python-can interface of the bus")] = None,
-    channel: Annotated[str | None, typer.Option(help="channel of the bus")] = None,
-    bitrate: Annotated[int | None, typer.Option(help="bit rate of the bus, bit/s")] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
+    *,
+    rig: Path = argument("rig file to write"),
+    coordinates: Path | None = option(
+        None, "CSV with one line per cable; no questions, defaults for the rest", "--from"
+    ),
+    values: RigOptions,
+    force: bool = option(False, "replace an existing file"),
 ) -> None:
     """Ask for the essentials of a rig and write a commented rig file.
 
@@ -132,7 +116,7 @@ def new(
     """
     if rig.exists() and not force:
         raise AlreadyExists("the file exists already", str(rig))
-    given = {key: context.params[key] for key in OPTIONS if context.params[key] is not None}
+    given = {key: value for key, value in asdict(values).items() if value is not None}
     if coordinates is None:
         answers = collect_answers(rig.stem, given, _ask, _refuse)
     else:

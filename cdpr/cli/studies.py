@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.table import Table
 
-from cdpr.cli.options import Quaternion, RigArgument, Triple, rotation_of
+from cdpr.cli.arguments import option, required
+from cdpr.cli.options import RIG, Quaternion, Triple, rotation_of
 from cdpr.cli.output import Terminal, out, show_facts, show_json
 from model.files.documents import millimetres
 from model.files.examples import PAPER_RIG, ready_folder
@@ -27,56 +27,38 @@ from planner.workspace.grid import parsed_slice
 from planner.workspace.maps import Question
 from planner.workspace.report import summary_facts
 
-WorkersOption = Annotated[
-    int | None, typer.Option(min=1, help="number of processes (default: one per core)", metavar="N")
-]
-DaskOption = Annotated[
-    str | None, typer.Option(help="compute on this Dask cluster", metavar="ADDRESS")
-]
+WORKERS = option(None, "number of processes (default: one per core)", min=1, metavar="N")
+DASK = option(None, "compute on this Dask cluster", metavar="ADDRESS")
 
 
 def workspace(
-    rig: RigArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", help="folder to write", metavar="DIR")],
-    scene: Annotated[
-        Path | None, typer.Option(help="scene file: obstacles, clearances, load", metavar="SCENE")
-    ] = None,
-    slices: Annotated[
-        list[str] | None,
-        typer.Option("--slice", help="plane to map; repeatable", metavar="z=MM"),
-    ] = None,
-    volume: Annotated[
-        bool | None,
-        typer.Option(
-            "--volume/--no-volume", help="also map the whole box (default: without --slice)"
-        ),
-    ] = None,
-    step_mm: Annotated[
-        float | None, typer.Option(help="grid spacing (default: a fiftieth of the longest side)")
-    ] = None,
-    lower_mm: Annotated[
-        Triple | None,
-        typer.Option(help="lower corner of the region x y z (default: the workspace's)"),
-    ] = None,
-    upper_mm: Annotated[
-        Triple | None,
-        typer.Option(help="upper corner of the region x y z (default: the workspace's)"),
-    ] = None,
-    rotation_wxyz: Annotated[
-        Quaternion | None,
-        typer.Option(help="platform orientation (default: the scene's start, else home)"),
-    ] = None,
-    length_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--characteristic-length-mm",
-            help="characteristic length for moments (default: the anchors' mean radius)",
-        ),
-    ] = None,
-    workers: WorkersOption = None,
-    dask: DaskOption = None,
-    force: Annotated[bool, typer.Option("--force", help="replace the maps in the folder")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON")] = False,
+    *,
+    rig: Path = RIG,
+    output: Path = required("folder to write", "-o", "--output", metavar="DIR"),
+    scene: Path | None = option(None, "scene file: obstacles, clearances, load", metavar="SCENE"),
+    slices: list[str] | None = option(None, "plane to map; repeatable", "--slice", metavar="z=MM"),
+    volume: bool | None = option(
+        None, "also map the whole box (default: without --slice)", "--volume/--no-volume"
+    ),
+    step_mm: float | None = option(None, "grid spacing (default: a fiftieth of the longest side)"),
+    lower_mm: Triple | None = option(
+        None, "lower corner of the region x y z (default: the workspace's)"
+    ),
+    upper_mm: Triple | None = option(
+        None, "upper corner of the region x y z (default: the workspace's)"
+    ),
+    rotation_wxyz: Quaternion | None = option(
+        None, "platform orientation (default: the scene's start, else home)"
+    ),
+    length_mm: float | None = option(
+        None,
+        "characteristic length for moments (default: the anchors' mean radius)",
+        "--characteristic-length-mm",
+    ),
+    workers: int | None = WORKERS,
+    dask: str | None = DASK,
+    force: bool = option(False, "replace the maps in the folder"),
+    as_json: bool = option(False, "print the summary as JSON", "--json"),
 ) -> None:
     """Map the workspace: wrench feasibility and closure, capacity margin, dexterity, clearance.
 
@@ -121,17 +103,14 @@ DEFAULT_FOLDER = Path("bench-paper")
 
 
 def paper(
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="folder to write", metavar="DIR")
-    ] = DEFAULT_FOLDER,
-    seeds: Annotated[int, typer.Option(min=2, help="searches per planner and case")] = 100,
-    workers: WorkersOption = None,
-    dask: DaskOption = None,
-    check: Annotated[
-        bool, typer.Option("--check", help="also run `cdpr check` on every path of Fig. 9")
-    ] = False,
-    force: Annotated[bool, typer.Option("--force", help="replace the folder's content")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the findings as JSON")] = False,
+    *,
+    output: Path = option(DEFAULT_FOLDER, "folder to write", "-o", "--output", metavar="DIR"),
+    seeds: int = option(100, "searches per planner and case", min=2),
+    workers: int | None = WORKERS,
+    dask: str | None = DASK,
+    check: bool = option(False, "also run `cdpr check` on every path of Fig. 9"),
+    force: bool = option(False, "replace the folder's content"),
+    as_json: bool = option(False, "print the findings as JSON", "--json"),
 ) -> None:
     """Repeat the paper's evaluation (section 5.3, Fig. 9) and report which claims hold.
 

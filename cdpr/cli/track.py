@@ -5,22 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
+from cdpr.cli.arguments import argument, option, required
 from cdpr.cli.operate.supervision import stop_requests
-from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
+from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig
 from cdpr.cli.output import Terminal, err, show_facts, show_json, show_line
 from executor.cameras.sources import parse_camera_sources
 from executor.supervision import LocalRequests
-from executor.track import (
-    TrackResult,
-    own_drawing,
-    own_file,
-    require_plan_used,
-    track_sources,
-)
+from executor.track import TrackResult, own_drawing, own_file, require_plan_used, track_sources
 from model.files.output import refuse_overwriting, require_new_file
 from model.plan import load_plan, require_same_rig
 from model.rig import Camera, load_rig
@@ -28,47 +20,30 @@ from model.scene import load_scene
 
 
 def track(
-    rig: RigArgument,
-    source: Annotated[
-        list[str],
-        typer.Argument(
-            help="folder of images, video file, camera index, or 'synthetic' with --plan;"
-            " for several cameras NAME=SOURCE, repeated",
-            metavar="SOURCE...",
-        ),
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="pose log to write (CSV)", metavar="CSV")
-    ],
-    camera: Annotated[
-        str | None, typer.Option(help="name of the camera in the rig file (default: the first)")
-    ] = None,
-    calibration: CalibrationOption = None,
-    scene: Annotated[
-        Path | None, typer.Option(help="also measure the clearance to this scene's obstacles")
-    ] = None,
-    plan: Annotated[
-        Path | None, typer.Option(help="with 'synthetic': plan that the platform follows")
-    ] = None,
-    pictures: Annotated[
-        int | None, typer.Option(min=1, help="largest number of images; Ctrl-C also stops")
-    ] = None,
-    detector: Annotated[
-        str | None,
-        typer.Option(help="opencv or apriltag, overriding tags.detector of the rig file"),
-    ] = None,
-    mcap: Annotated[
-        Path | None, typer.Option(help="also write the poses as MCAP", metavar="MCAP")
-    ] = None,
-    overlay: Annotated[
-        Path | None,
-        typer.Option(
-            help="also write images with the measurements: a folder or a video (.mp4, .avi)",
-            metavar="DIR|VIDEO",
-        ),
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace existing output")] = False,
-    as_json: JsonOption = False,
+    *,
+    rig: Path = RIG,
+    source: list[str] = argument(
+        "folder of images, video file, camera index, or 'synthetic' with --plan; for several"
+        " cameras NAME=SOURCE, repeated",
+        "SOURCE...",
+    ),
+    output: Path = required("pose log to write (CSV)", "-o", "--output", metavar="CSV"),
+    camera: str | None = option(None, "name of the camera in the rig file (default: the first)"),
+    calibration: list[Path] | None = CALIBRATION,
+    scene: Path | None = option(None, "also measure the clearance to this scene's obstacles"),
+    plan: Path | None = option(None, "with 'synthetic': plan that the platform follows"),
+    pictures: int | None = option(None, "largest number of images; Ctrl-C also stops", min=1),
+    detector: str | None = option(
+        None, "opencv or apriltag, overriding tags.detector of the rig file"
+    ),
+    mcap: Path | None = option(None, "also write the poses as MCAP", metavar="MCAP"),
+    overlay: Path | None = option(
+        None,
+        "also write images with the measurements: a folder or a video (.mp4, .avi)",
+        metavar="DIR|VIDEO",
+    ),
+    force: bool = option(False, "replace existing output"),
+    as_json: bool = JSON,
 ) -> None:
     """Measure the platform's pose from its tags, image by image.
 

@@ -293,10 +293,6 @@ AFTER_COORDINATES = (
     RigQuestion("channel", "channel of the bus", "", _name, _channel),
     RigQuestion("bitrate", "bit rate", "bit/s", _whole(10_000, 1_000_000), _always(1_000_000)),
 )
-OPTIONS = tuple(
-    q.key for q in (*BEFORE_COORDINATES, *AFTER_COORDINATES) if q.key not in ("name", "cables")
-)
-"""The answers that the command line takes as options."""
 
 
 def collect_answers(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from cdpr.cli.arguments import with_options
 from cdpr.cli.calibrate.boards import BoardOptions, print_
 from cdpr.cli.calibrate.camera import camera
 from tests.calibration.pages import pages_in
@@ -58,7 +59,8 @@ def test_prints_that_cannot_be_are_refused(tmp_path: Path, options, named: str) 
 
 
 def test_camera_and_print_know_boards_by_the_same_options() -> None:
-    commands = [inspect.signature(command).parameters for command in (camera, print_)]
+    verbs = [with_options(verb) for verb in (camera, print_)]
+    commands = [inspect.signature(verb).parameters for verb in verbs]
     for option in fields(BoardOptions):
         one, other = (command[option.name] for command in commands)
         assert one.default == other.default == option.default

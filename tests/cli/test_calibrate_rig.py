@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -242,7 +241,7 @@ def test_a_run_of_another_rig_is_refused(finished_run: Path) -> None:
 
 def test_the_options_have_the_deviations_that_poses_are_chosen_by() -> None:
     """The options have other units, so the defaults are repeated there."""
-    options = inspect.signature(rig_verb.rig).parameters
+    options = {one.name: one for one in fields(rig_verb.Deviations)}
     for group, deviation in DEFAULT_DEVIATIONS.items():
         percent = group in ("drum_scale", "stiffness")
         unit, scale = ("percent", 1e2) if percent else ("mm", 1e3)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from model.files.new_rig import CSV_COLUMNS
+from cdpr.cli.start import RigOptions
+from model.files.new_rig import AFTER_COORDINATES, BEFORE_COORDINATES, CSV_COLUMNS
 from model.rig import load_rig
 from tests.cli.plans import CONFIGS
 from tests.cli.program import call, nothing_written, one_message
@@ -23,6 +25,14 @@ def cables_csv(folder: Path, rows: int = 8) -> Path:
     path = folder / "cables.csv"
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def test_every_question_can_be_answered_by_an_option() -> None:
+    """All but the name, which is that of the file, and what the file of cables states."""
+    keys = [question.key for question in (*BEFORE_COORDINATES, *AFTER_COORDINATES)]
+    assert [one.name for one in fields(RigOptions)] == [
+        key for key in keys if key not in ("name", "cables")
+    ]
 
 
 def test_enter_for_every_question_makes_a_rig_that_can_be_planned_and_looked_at(

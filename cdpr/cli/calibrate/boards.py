@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
-
-import typer
+from typing import Literal
 
 from calibration.targets.boards import Board, Charuco, Chessboard
 from calibration.targets.grids import CircleGrid, TagGrid, TagOrder
 from calibration.targets.printing import PaperName, printout
-from cdpr.cli.options import JsonOption, with_option_groups
+from cdpr.cli.arguments import argument, option
+from cdpr.cli.options import JSON
 from cdpr.cli.output import show_facts, show_json
 from model.errors import BadInput
 from model.files.documents import write_bytes_atomic
@@ -32,39 +31,25 @@ _SIZES = ("square_mm", "marker_mm", "spacing_mm", "diameter_mm", "tag_mm", "gap_
 class BoardOptions:
     """Description of a board; every field is an option of the verbs that use boards."""
 
-    board: Annotated[BoardName, typer.Option(help="kind of target")] = "chessboard"
-    columns: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="inner corners (chessboard), squares (charuco), circles or tags in a row"
-        ),
-    ] = None
-    rows: Annotated[int | None, typer.Option(min=1, help="number of rows")] = None
-    square_mm: Annotated[
-        float | None, typer.Option(help="side of a square (chessboard, charuco)")
-    ] = None
-    marker_mm: Annotated[float | None, typer.Option(help="side of a marker (charuco)")] = None
-    dictionary: Annotated[
-        str, typer.Option(help="marker dictionary (charuco), such as 5X5_100")
-    ] = "4X4_50"
-    legacy: Annotated[
-        bool, typer.Option("--legacy", help="charuco layout of OpenCV before 4.6")
-    ] = False
-    spacing_mm: Annotated[
-        float | None, typer.Option(help="row spacing, centre to centre (circles)")
-    ] = None
-    diameter_mm: Annotated[float | None, typer.Option(help="circle diameter (circles)")] = None
-    asymmetric: Annotated[
-        bool, typer.Option("--asymmetric", help="every other row is shifted (circles)")
-    ] = False
-    tag_mm: Annotated[float | None, typer.Option(help="side of a tag's black square (tags)")] = None
-    gap_mm: Annotated[float | None, typer.Option(help="gap between black squares (tags)")] = None
-    family: Annotated[str, typer.Option(help="tag family (tags)")] = "tag36h11"
-    first: Annotated[int, typer.Option(min=0, help="lowest tag number (tags)")] = 0
-    order: Annotated[
-        TagOrder,
-        typer.Option(help="numbered from the top left, or as in Kalibr's AprilGrid (tags)"),
-    ] = "rows"
+    board: BoardName = option("chessboard", "kind of target")
+    columns: int | None = option(
+        None, "inner corners (chessboard), squares (charuco), circles or tags in a row", min=1
+    )
+    rows: int | None = option(None, "number of rows", min=1)
+    square_mm: float | None = option(None, "side of a square (chessboard, charuco)")
+    marker_mm: float | None = option(None, "side of a marker (charuco)")
+    dictionary: str = option("4X4_50", "marker dictionary (charuco), such as 5X5_100")
+    legacy: bool = option(False, "charuco layout of OpenCV before 4.6")
+    spacing_mm: float | None = option(None, "row spacing, centre to centre (circles)")
+    diameter_mm: float | None = option(None, "circle diameter (circles)")
+    asymmetric: bool = option(False, "every other row is shifted (circles)")
+    tag_mm: float | None = option(None, "side of a tag's black square (tags)")
+    gap_mm: float | None = option(None, "gap between black squares (tags)")
+    family: str = option("tag36h11", "tag family (tags)")
+    first: int = option(0, "lowest tag number (tags)", min=0)
+    order: TagOrder = option(
+        "rows", "numbered from the top left, or as in Kalibr's AprilGrid (tags)"
+    )
 
     def made(self) -> Board:
         """The board.
@@ -111,17 +96,14 @@ def _listed(names: list[str]) -> str:
 # `cdpr calibrate print`: boards and tags on paper.
 
 
-@with_option_groups
 def print_(
-    output: Annotated[Path, typer.Argument(help="file to write (PDF)", metavar="PDF")],
+    *,
+    output: Path = argument("file to write (PDF)", "PDF"),
     printed: BoardOptions,
-    rig: Annotated[
-        Path | None,
-        typer.Option("--rig", help="print this rig's tags instead of a board", metavar="RIG"),
-    ] = None,
-    paper: Annotated[PaperName, typer.Option(help="paper size")] = "a4",
-    force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
-    as_json: JsonOption = False,
+    rig: Path | None = option(None, "print this rig's tags instead of a board", metavar="RIG"),
+    paper: PaperName = option("a4", "paper size"),
+    force: bool = option(False, "replace an existing file"),
+    as_json: bool = JSON,
 ) -> None:
     """Make a calibration board, or the tags of a rig, as a PDF at exact scale.
 

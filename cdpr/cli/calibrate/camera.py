@@ -3,33 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from calibration.intrinsics.lens import LensChoice
 from calibration.pictures import capture_images
-from calibration.procedures import (
-    calibrate_camera,
-    calibrate_camera_from_corners,
-    measure_readout,
-)
+from calibration.procedures import calibrate_camera, calibrate_camera_from_corners, measure_readout
 from calibration.results import require_file_name
 from calibration.targets.boards import Board
+from cdpr.cli.arguments import argument, option
 from cdpr.cli.calibrate.boards import BoardOptions
-from cdpr.cli.calibrate.results import (
-    DEFAULT_RESULT,
-    CameraOption,
-    ResultOptions,
-    WantedOption,
-)
+from cdpr.cli.calibrate.results import CAMERA, ResultOptions, wanted_option
 from cdpr.cli.operate.supervision import stop_requests
-from cdpr.cli.options import (
-    CalibrationOption,
-    RigArgument,
-    calibrated_rig,
-    with_option_groups,
-)
+from cdpr.cli.options import CALIBRATION, RIG, calibrated_rig
 from cdpr.cli.output import err, show_line
 from executor.cameras.sources import require_camera_source
 from executor.supervision import LocalRequests
@@ -38,37 +22,26 @@ from model.files.output import make_folder
 from model.rig import load_rig
 
 
-@with_option_groups
 def camera(
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            help="folder of images of the board, a video, or corners (CSV); output of --live",
-            metavar="DIR",
-        ),
-    ],
+    *,
+    folder: Path = argument(
+        "folder of images of the board, a video, or corners (CSV); output of --live", "DIR"
+    ),
     printed: BoardOptions,
-    live: Annotated[
-        str | None,
-        typer.Option(help="first capture images from this camera or video into DIR"),
-    ] = None,
-    pictures: Annotated[
-        int | None, typer.Option(min=4, help="with --live: minimum number of images (default: 40)")
-    ] = None,
-    size_px: Annotated[
-        tuple[int, int] | None,
-        typer.Option(help="image width and height, of --live (default: 1280 720) or of corners"),
-    ] = None,
-    name: Annotated[str, typer.Option(help="name of the camera in the rig file")] = "camera",
-    wanted_mm: WantedOption = 1.0,
-    distance_m: Annotated[
-        float | None,
-        typer.Option(min=0.01, help="working distance of the camera (default: the target's)"),
-    ] = None,
-    lens: Annotated[
-        LensChoice, typer.Option(help="lens model; auto: the one that fits held-out images best")
-    ] = "auto",
-    result: ResultOptions = DEFAULT_RESULT,
+    live: str | None = option(None, "first capture images from this camera or video into DIR"),
+    pictures: int | None = option(
+        None, "with --live: minimum number of images (default: 40)", min=4
+    ),
+    size_px: tuple[int, int] | None = option(
+        None, "image width and height, of --live (default: 1280 720) or of corners"
+    ),
+    name: str = option("camera", "name of the camera in the rig file"),
+    wanted_mm: float = wanted_option(1.0),
+    distance_m: float | None = option(
+        None, "working distance of the camera (default: the target's)", min=0.01
+    ),
+    lens: LensChoice = option("auto", "lens model; auto: the one that fits held-out images best"),
+    result: ResultOptions,
 ) -> None:
     """Calibrate a camera's matrix and lens distortion, and state the accuracy.
 
@@ -152,24 +125,20 @@ def _take_pictures(
 # `cdpr calibrate readout`: readout time of a rolling shutter, top row to bottom row.
 
 
-@with_option_groups
 def readout(
-    rig: RigArgument,
-    source: Annotated[
-        Path, typer.Argument(help="video file, or folder of images", metavar="SOURCE")
-    ],
-    camera: CameraOption = None,
-    rate_hz: Annotated[
-        float | None,
-        typer.Option(min=0.1, help="images per second of a folder (default: the camera's)"),
-    ] = None,
-    speed_mm_s: Annotated[
-        float | None,
-        typer.Option(min=0.1, help="speed for the error bound (default: the motion's)"),
-    ] = None,
-    calibration: CalibrationOption = None,
-    wanted_mm: WantedOption = 0.1,
-    result: ResultOptions = DEFAULT_RESULT,
+    *,
+    rig: Path = RIG,
+    source: Path = argument("video file, or folder of images", "SOURCE"),
+    camera: str | None = CAMERA,
+    rate_hz: float | None = option(
+        None, "images per second of a folder (default: the camera's)", min=0.1
+    ),
+    speed_mm_s: float | None = option(
+        None, "speed for the error bound (default: the motion's)", min=0.1
+    ),
+    calibration: list[Path] | None = CALIBRATION,
+    wanted_mm: float = wanted_option(0.1),
+    result: ResultOptions,
 ) -> None:
     """Measure a rolling shutter, from images of the platform while it moves.
 

@@ -5,74 +5,46 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import radians
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from calibration.extrinsics.camera_pairs import locate_camera_by_another
 from calibration.extrinsics.surveyed_tags import Survey
 from calibration.pictures import DEFAULT_IMAGES, DEFAULT_TAG_IMAGES, ImageSet, open_source
 from calibration.procedures import locate_camera, locate_tags
+from cdpr.cli.arguments import option
 from cdpr.cli.calibrate.boards import BoardOptions
-from cdpr.cli.calibrate.results import (
-    DEFAULT_RESULT,
-    CameraOption,
-    PicturesOption,
-    ResultOptions,
-    SourceArgument,
-    WantedOption,
-)
-from cdpr.cli.options import (
-    CalibrationOption,
-    RigArgument,
-    calibrated_rig,
-    with_option_groups,
-)
+from cdpr.cli.calibrate.results import CAMERA, PICTURES, SOURCE, ResultOptions, wanted_option
+from cdpr.cli.options import CALIBRATION, RIG, calibrated_rig
 from model.errors import BadInput
 from model.rig import Camera, load_rig
 
-NO_BOARD = BoardOptions()
 
-
-@with_option_groups
 def extrinsics(
-    rig: RigArgument,
-    source: SourceArgument,
-    camera: CameraOption = None,
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            help="use the rig's motion: poses per image (CSV), or a run folder",
-            metavar="FILE",
-        ),
-    ] = None,
-    beside: Annotated[
-        str | None,
-        typer.Option(
-            help="use another camera of known pose, and its images taken at the same times",
-            metavar="NAME=SOURCE",
-        ),
-    ] = None,
-    survey_mm: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            help="standard deviation of the surveyed corners of frame tags",
-        ),
-    ] = 0.5,
-    survey_deg: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            help="standard deviation of frame tags' rotations; --survey-mm then applies to whole"
-            " tags (default: each corner was surveyed separately)",
-        ),
-    ] = None,
-    printed: BoardOptions = NO_BOARD,
-    pictures: PicturesOption = None,
-    calibration: CalibrationOption = None,
-    wanted_mm: WantedOption = 1.0,
-    result: ResultOptions = DEFAULT_RESULT,
+    *,
+    rig: Path = RIG,
+    source: str = SOURCE,
+    camera: str | None = CAMERA,
+    poses: Path | None = option(
+        None, "use the rig's motion: poses per image (CSV), or a run folder", metavar="FILE"
+    ),
+    beside: str | None = option(
+        None,
+        "use another camera of known pose, and its images taken at the same times",
+        metavar="NAME=SOURCE",
+    ),
+    survey_mm: float = option(
+        0.5, "standard deviation of the surveyed corners of frame tags", min=0.0
+    ),
+    survey_deg: float | None = option(
+        None,
+        "standard deviation of frame tags' rotations; --survey-mm then applies to whole tags"
+        " (default: each corner was surveyed separately)",
+        min=0.0,
+    ),
+    printed: BoardOptions,
+    pictures: int | None = PICTURES,
+    calibration: list[Path] | None = CALIBRATION,
+    wanted_mm: float = wanted_option(1.0),
+    result: ResultOptions,
 ) -> None:
     """Find a camera's pose: from surveyed tags, the rig's motion, or another camera.
 
@@ -103,14 +75,14 @@ def extrinsics(
             the_camera,
             the_rig.camera(name),
             (_opener(source, the_camera, pictures), _opener(other, the_rig.camera(name), pictures)),
-            board=printed.made() if printed != NO_BOARD else None,
+            board=printed.made() if printed != BoardOptions() else None,
             wanted=wanted_mm / 1e3,
             output=result.to,
             listener=result.listener,
         )
         result.show(made)
         return
-    if printed != NO_BOARD:
+    if printed != BoardOptions():
         raise BadInput(
             "a board is only for --beside, where both cameras see it",
             where="calibrate extrinsics",
@@ -138,21 +110,18 @@ def _opener(
 # `cdpr calibrate tags`: poses of the tags on the platform.
 
 
-@with_option_groups
 def tags(
-    rig: RigArgument,
-    source: SourceArgument,
-    camera: CameraOption = None,
-    fixed_tag: Annotated[
-        int | None,
-        typer.Option(
-            min=0, help="keep this tag's pose from the rig file (default: best fit of all tags)"
-        ),
-    ] = None,
-    pictures: PicturesOption = None,
-    calibration: CalibrationOption = None,
-    wanted_mm: WantedOption = 0.2,
-    result: ResultOptions = DEFAULT_RESULT,
+    *,
+    rig: Path = RIG,
+    source: str = SOURCE,
+    camera: str | None = CAMERA,
+    fixed_tag: int | None = option(
+        None, "keep this tag's pose from the rig file (default: best fit of all tags)", min=0
+    ),
+    pictures: int | None = PICTURES,
+    calibration: list[Path] | None = CALIBRATION,
+    wanted_mm: float = wanted_option(0.2),
+    result: ResultOptions,
 ) -> None:
     """Find the tags' poses on the platform, from images that each show two or more.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
@@ -12,37 +12,30 @@ from calibration.intrinsics.exchange import FORMATS, FormatName, write_rig_with_
 from calibration.intrinsics.result import camera_named
 from calibration.result_files import compare, load_result, write_calibrated_rig
 from calibration.results import Calibration, Destination
-from cdpr.cli.options import CalibrationOption, JsonOption, RigArgument, calibrated_rig
+from cdpr.cli.arguments import argument, option, required
+from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig
 from cdpr.cli.output import Terminal, err, show_facts, show_json, show_line
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
 from model.rig import load_rig
 
-WantedOption = Annotated[float, typer.Option(min=0.001, help="required accuracy, 95 %")]
-SourceArgument = Annotated[
-    str,
-    typer.Argument(help="folder of images, video file or camera index", metavar="SOURCE"),
-]
-PicturesOption = Annotated[
-    int | None,
-    typer.Option(min=1, help="number of images from a video or camera (default: 20; tags: 40)"),
-]
-CameraOption = Annotated[
-    str | None, typer.Option(help="name of the camera in the rig file (default: the first)")
-]
+SOURCE = argument("folder of images, video file or camera index", "SOURCE")
+PICTURES = option(None, "number of images from a video or camera (default: 20; tags: 40)", min=1)
+CAMERA = option(None, "name of the camera in the rig file (default: the first)")
+
+
+def wanted_option(default_mm: float) -> float:
+    """Declares ``--wanted-mm``, whose default depends on what is calibrated."""
+    return option(default_mm, "required accuracy, 95 %", min=0.001)
 
 
 @dataclass(frozen=True, slots=True)
 class ResultOptions:
     """Destination and output format of a calibration's result; every field is an option."""
 
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="folder for the result and its report")
-    ] = None
-    force: Annotated[
-        bool, typer.Option("--force", help="replace a result with the same name and date")
-    ] = False
-    as_json: JsonOption = False
+    output: Path | None = option(None, "folder for the result and its report", "-o", "--output")
+    force: bool = option(False, "replace a result with the same name and date")
+    as_json: bool = JSON
 
     @property
     def to(self) -> Destination:
@@ -72,13 +65,11 @@ class ResultOptions:
             raise typer.Exit(3)
 
 
-DEFAULT_RESULT = ResultOptions()
-
-
 def diff(
-    first: Annotated[Path, typer.Argument(help="result file (YAML)", metavar="A")],
-    second: Annotated[Path, typer.Argument(help="result file (YAML)", metavar="B")],
-    as_json: JsonOption = False,
+    *,
+    first: Path = argument("result file (YAML)", "A"),
+    second: Path = argument("result file (YAML)", "B"),
+    as_json: bool = JSON,
 ) -> None:
     """Compare two calibration results: each number with its interval, and the effect in mm.
 
@@ -103,14 +94,11 @@ def diff(
 
 
 def apply(
-    rig: RigArgument,
-    results: Annotated[
-        list[Path], typer.Argument(help="result files of `cdpr calibrate`", metavar="RESULT...")
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="rig file to write; must not exist")
-    ],
-    as_json: JsonOption = False,
+    *,
+    rig: Path = RIG,
+    results: list[Path] = argument("result files of `cdpr calibrate`", "RESULT..."),
+    output: Path = required("rig file to write; must not exist", "-o", "--output"),
+    as_json: bool = JSON,
 ) -> None:
     """Write a new rig file in which calibration results replace the values of RIG.
 
@@ -138,13 +126,14 @@ def apply(
 
 
 def export(
-    rig: RigArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", help="file to write")],
-    to: Annotated[FormatName, typer.Option(help="file format")] = "opencv",
-    camera: CameraOption = None,
-    calibration: CalibrationOption = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an existing file")] = False,
-    as_json: JsonOption = False,
+    *,
+    rig: Path = RIG,
+    output: Path = required("file to write", "-o", "--output"),
+    to: FormatName = option("opencv", "file format"),
+    camera: str | None = CAMERA,
+    calibration: list[Path] | None = CALIBRATION,
+    force: bool = option(False, "replace an existing file"),
+    as_json: bool = JSON,
 ) -> None:
     """Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.
 
@@ -167,18 +156,13 @@ def export(
 
 
 def import_(
-    rig: RigArgument,
-    file: Annotated[
-        Path, typer.Argument(help="camera file of OpenCV, ROS, Kalibr or mrcal", metavar="CAMERA")
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="rig file to write; must not exist")
-    ],
-    camera: CameraOption = None,
-    entry: Annotated[
-        str | None, typer.Option(help="camera of a Kalibr camchain with several, such as cam1")
-    ] = None,
-    as_json: JsonOption = False,
+    *,
+    rig: Path = RIG,
+    file: Path = argument("camera file of OpenCV, ROS, Kalibr or mrcal", "CAMERA"),
+    output: Path = required("rig file to write; must not exist", "-o", "--output"),
+    camera: str | None = CAMERA,
+    entry: str | None = option(None, "camera of a Kalibr camchain with several, such as cam1"),
+    as_json: bool = JSON,
 ) -> None:
     """Write a new rig file with a camera's matrix and lens from another program.
 

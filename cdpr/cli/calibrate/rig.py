@@ -7,22 +7,21 @@ from dataclasses import dataclass
 from enum import StrEnum
 from math import degrees, radians
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any, TypeVar
 
 from calibration.geometry.pose_selection import measurement_poses
 from calibration.procedures import calibrate_rig
-from cdpr.cli.calibrate.results import DEFAULT_RESULT, ResultOptions, WantedOption
+from cdpr.cli.arguments import argument, option
+from cdpr.cli.calibrate.results import ResultOptions, wanted_option
 from cdpr.cli.options import (
-    CalibrationOption,
-    JsonOption,
-    PlanFileOption,
-    ReplacePlanOption,
-    RigArgument,
-    SceneArgument,
+    CALIBRATION,
+    JSON,
+    PLAN_FILE,
+    REPLACE_PLAN,
+    RIG,
+    SCENE,
+    Triple,
     calibrated_rig,
-    with_option_groups,
 )
 from cdpr.cli.output import Terminal, show_facts, show_json
 from model.files.output import require_new_file
@@ -32,30 +31,22 @@ from model.scene import load_scene
 
 
 def poses(
-    rig: RigArgument,
-    scene: SceneArgument,
-    output: PlanFileOption,
-    count: Annotated[int, typer.Option(min=10, max=500, help="number of poses")] = 60,
-    tilt_deg: Annotated[
-        float, typer.Option(min=0.0, max=45.0, help="largest tilt of the platform")
-    ] = 15.0,
-    turn_deg: Annotated[
-        float, typer.Option(min=0.0, max=45.0, help="largest rotation about the vertical")
-    ] = 15.0,
-    dwell_s: Annotated[float, typer.Option(min=0.7, help="time at rest at each pose")] = 1.5,
-    candidates: Annotated[
-        int, typer.Option(min=10, max=5000, help="number of candidate poses")
-    ] = 300,
-    reserve_n: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0, help="distance kept from the tension limits (default: 7.5 % of their range)"
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="random seed of the candidates and paths")] = 0,
-    calibration: CalibrationOption = None,
-    force: ReplacePlanOption = False,
-    as_json: JsonOption = False,
+    *,
+    rig: Path = RIG,
+    scene: Path = SCENE,
+    output: Path = PLAN_FILE,
+    count: int = option(60, "number of poses", min=10, max=500),
+    tilt_deg: float = option(15.0, "largest tilt of the platform", min=0.0, max=45.0),
+    turn_deg: float = option(15.0, "largest rotation about the vertical", min=0.0, max=45.0),
+    dwell_s: float = option(1.5, "time at rest at each pose", min=0.7),
+    candidates: int = option(300, "number of candidate poses", min=10, max=5000),
+    reserve_n: float | None = option(
+        None, "distance kept from the tension limits (default: 7.5 % of their range)", min=0.0
+    ),
+    seed: int = option(0, "random seed of the candidates and paths", min=0),
+    calibration: list[Path] | None = CALIBRATION,
+    force: bool = REPLACE_PLAN,
+    as_json: bool = JSON,
 ) -> None:
     """Choose the most informative poses for calibration, and plan a path with stops at them.
 
@@ -106,34 +97,29 @@ class GroupName(StrEnum):
     swivel_zeros = "swivel_zeros"
 
 
-def _deviation(of: str, most: float | None = None) -> Any:
-    """An option that is a standard deviation."""
-    return typer.Option(min=1e-6, max=most, help=f"standard deviation of {of}")
+_T = TypeVar("_T")
+
+
+def _deviation(default: _T, of: str, most: float | None = None) -> _T:
+    """Declares a standard deviation."""
+    return option(default, f"standard deviation of {of}", min=1e-6, max=most)
 
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
     """Standard deviations of the rig file's numbers; every field is an option."""
 
-    outlets_mm: Annotated[float, _deviation("the outlets in the rig file")] = 4.0
-    anchors_mm: Annotated[float, _deviation("the anchors")] = 1.0
-    pulleys_mm: Annotated[float, _deviation("the pulleys' radius")] = 0.5
-    drum_scale_percent: Annotated[float, _deviation("the cable per drum turn")] = 0.5
-    offsets_mm: Annotated[float, _deviation("the cable length at home")] = 2.0
-    stiffness_percent: Annotated[float, _deviation("the cables' stiffness", 1000.0)] = 20.0
-    stiffness_per_cable: Annotated[
-        bool,
-        typer.Option(
-            "--stiffness-per-cable", help="find each cable's stiffness, from measured tensions"
-        ),
-    ] = False
-    swivel_zeros_deg: Annotated[float, _deviation("the zeros of swivel angles")] = 1.0
-    imu_mounting_deg: Annotated[
-        float | None,
-        _deviation(
-            "an IMU's mounting, then estimated too (default: its axes are the platform's)", 45.0
-        ),
-    ] = None
+    outlets_mm: float = _deviation(4.0, "the outlets in the rig file")
+    anchors_mm: float = _deviation(1.0, "the anchors")
+    pulleys_mm: float = _deviation(0.5, "the pulleys' radius")
+    drum_scale_percent: float = _deviation(0.5, "the cable per drum turn")
+    offsets_mm: float = _deviation(2.0, "the cable length at home")
+    stiffness_percent: float = _deviation(20.0, "the cables' stiffness", 1000.0)
+    stiffness_per_cable: bool = option(False, "find each cable's stiffness, from measured tensions")
+    swivel_zeros_deg: float = _deviation(1.0, "the zeros of swivel angles")
+    imu_mounting_deg: float | None = _deviation(
+        None, "an IMU's mounting, then estimated too (default: its axes are the platform's)", 45.0
+    )
 
     def without(self, known: Sequence[GroupName]) -> dict[str, float]:
         """By group, in [m], [rad] or as a fraction, without the known groups."""
@@ -158,11 +144,11 @@ class Deviations:
 class Accuracies:
     """Standard deviations of the measurements; every field is an option."""
 
-    length_mm: Annotated[float, _deviation("cable lengths from the encoders")] = 0.1
-    pose_mm: Annotated[float, _deviation("positions, added to that of their file")] = 0.1
-    pose_deg: Annotated[float, _deviation("orientations, added to that of their file")] = 0.02
-    swivel_deg: Annotated[float, _deviation("swivel angles")] = 0.1
-    imu_deg: Annotated[float, _deviation("the vertical by an IMU")] = 0.1
+    length_mm: float = _deviation(0.1, "cable lengths from the encoders")
+    pose_mm: float = _deviation(0.1, "positions, added to that of their file")
+    pose_deg: float = _deviation(0.02, "orientations, added to that of their file")
+    swivel_deg: float = _deviation(0.1, "swivel angles")
+    imu_deg: float = _deviation(0.1, "the vertical by an IMU")
 
     def in_si(self) -> dict[str, Any]:
         """As arguments of `calibrate_rig`, [m] and [rad]."""
@@ -174,42 +160,26 @@ class Accuracies:
         }
 
 
-DEFAULT_DEVIATIONS, DEFAULT_ACCURACIES = Deviations(), Accuracies()
-
-
-@with_option_groups
 def rig(
-    rig: RigArgument,
-    data: Annotated[
-        list[Path],
-        typer.Argument(
-            help="run folders and CSV files of stationary samples (docs/data-formats.md)",
-            metavar="DATA...",
-        ),
-    ],
-    without_poses: Annotated[
-        bool,
-        typer.Option("--without-poses", help="use drive positions alone, without camera poses"),
-    ] = False,
-    reflector_mm: Annotated[
-        tuple[float, float, float],
-        typer.Option(
-            help="point whose positions a file without rotations contains, in the platform frame"
-        ),
-    ] = (0.0, 0.0, 0.0),
-    known: Annotated[
-        list[GroupName] | None,
-        typer.Option(help="parameters to keep as in the rig file; repeatable"),
-    ] = None,
-    deviations: Deviations = DEFAULT_DEVIATIONS,
-    accuracies: Accuracies = DEFAULT_ACCURACIES,
-    tilt_deg: Annotated[
-        float,
-        typer.Option(min=0.0, max=90.0, help="largest rotation of the platform in use"),
-    ] = 5.0,
-    wanted_mm: WantedOption = 1.0,
-    name: Annotated[str, typer.Option(help="name of the result")] = "rig",
-    result: ResultOptions = DEFAULT_RESULT,
+    *,
+    rig: Path = RIG,
+    data: list[Path] = argument(
+        "run folders and CSV files of stationary samples (docs/data-formats.md)", "DATA..."
+    ),
+    without_poses: bool = option(False, "use drive positions alone, without camera poses"),
+    reflector_mm: Triple = option(
+        (0.0, 0.0, 0.0),
+        "point whose positions a file without rotations contains, in the platform frame",
+    ),
+    known: list[GroupName] | None = option(
+        None, "parameters to keep as in the rig file; repeatable"
+    ),
+    deviations: Deviations,
+    accuracies: Accuracies,
+    tilt_deg: float = option(5.0, "largest rotation of the platform in use", min=0.0, max=90.0),
+    wanted_mm: float = wanted_option(1.0),
+    name: str = option("rig", "name of the result"),
+    result: ResultOptions,
 ) -> None:
     """Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.
 

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from cdpr import console as page  # loads the server where it is asked for
+from cdpr.cli.arguments import option
 from cdpr.cli.operate.run import agreement, show, show_files
 from cdpr.cli.operate.supervision import RunSupervisor
-from cdpr.cli.options import (
-    DEFAULT_BUS,
-    BusOptions,
-    RigArgument,
-    WithoutRealTimeOption,
-    with_option_groups,
-)
+from cdpr.cli.options import RIG, WITHOUT_REAL_TIME, BusOptions
 from cdpr.cli.output import Terminal, out, show_facts, show_line
 from cdpr.console.session import Console, ConsoleFiles
 from executor import runner
@@ -34,39 +28,26 @@ from planner.settings import OptimalSettings
 _LOCAL = ("127.0.0.1", "::1", "localhost")
 
 
-@with_option_groups
 def console(
-    rig: RigArgument,
-    scene: Annotated[
-        Path | None,
-        typer.Option(help="scene file: obstacles and payload for jogging"),
-    ] = None,
-    plan: Annotated[Path | None, typer.Option(help="plan file to load at the start")] = None,
-    host: Annotated[
-        str,
-        typer.Option(help="address to listen on; other than localhost needs --allow-others"),
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port; 0 for a free one")] = 8402,
-    read_only: Annotated[
-        bool, typer.Option("--read-only", help="show only; STOP still works")
-    ] = False,
-    allow_others: Annotated[
-        bool,
-        typer.Option(
-            "--allow-others", help="let other machines connect: anyone with the address can operate"
-        ),
-    ] = False,
-    camera: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--camera",
-            help="camera that measures runs (the first also homing): SOURCE or NAME=SOURCE;"
-            " repeatable",
-            metavar="SOURCE",
-        ),
-    ] = None,
-    bus: BusOptions = DEFAULT_BUS,
-    without_real_time: WithoutRealTimeOption = False,
+    *,
+    rig: Path = RIG,
+    scene: Path | None = option(None, "scene file: obstacles and payload for jogging"),
+    plan: Path | None = option(None, "plan file to load at the start"),
+    host: str = option(
+        "127.0.0.1", "address to listen on; other than localhost needs --allow-others"
+    ),
+    port: int = option(8402, "port; 0 for a free one", min=0, max=65535),
+    read_only: bool = option(False, "show only; STOP still works"),
+    allow_others: bool = option(
+        False, "let other machines connect: anyone with the address can operate"
+    ),
+    camera: list[str] | None = option(
+        None,
+        "camera that measures runs (the first also homing): SOURCE or NAME=SOURCE; repeatable",
+        metavar="SOURCE",
+    ),
+    bus: BusOptions,
+    without_real_time: bool = WITHOUT_REAL_TIME,
 ) -> None:
     """Serve the operator's page: live view, jog, teach, preview, run, hold, stop.
 
@@ -139,18 +120,13 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
 
 
 def demo(
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", help="folder to create (default: runs/demo)", metavar="DIR"),
-    ] = None,
-    environment: Annotated[
-        int, typer.Option(min=1, max=3, help="number of the paper's environment")
-    ] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="random seed of the planner")] = 0,
-    console: Annotated[
-        bool,
-        typer.Option("--console", help="load it into the operator's page, in real time"),
-    ] = False,
+    *,
+    output: Path | None = option(
+        None, "folder to create (default: runs/demo)", "-o", "--output", metavar="DIR"
+    ),
+    environment: int = option(1, "number of the paper's environment", min=1, max=3),
+    seed: int = option(0, "random seed of the planner", min=0),
+    console: bool = option(False, "load it into the operator's page, in real time"),
 ) -> None:
     """Plan, check, run on simulated drives, track with a synthetic camera, and report.
 

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from pathlib import Path
 
-import typer
-
+from cdpr.cli.arguments import option
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
-    CalibrationOption,
-    ChannelOption,
-    FastOption,
-    InterfaceOption,
-    RigArgument,
-    WithoutRealTimeOption,
-    YesOption,
+    CALIBRATION,
+    CHANNEL,
+    FAST,
+    INTERFACE,
+    RIG,
+    WITHOUT_REAL_TIME,
+    YES,
+    Triple,
     level_pose,
     require_unused,
     rig_on_bus,
-    with_option_groups,
 )
 from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
 from executor import homing
@@ -44,26 +43,18 @@ REACH_MM, SPEED_MM_S, SLACK_MM = 1000.0 * REACH, 1000.0 * SPEED, 1000.0 * SLACK
 class WindingOptions:
     """Settings of pretension and pose measurement; every field is an option."""
 
-    tension_n: Annotated[
-        float | None, typer.Option(help="pretension (default: twice the rig's smallest tension)")
-    ] = None
-    limit_n: Annotated[
-        float | None, typer.Option(help="tension limit of any cable (default: 60 % of the range)")
-    ] = None
-    reach_mm: Annotated[
-        float,
-        typer.Option(min=0.1, max=1000.0 * FURTHEST, help="largest length to wind in per cable"),
-    ] = REACH_MM
-    speed_mm_s: Annotated[
-        float, typer.Option(min=0.01, max=FASTEST_MM_S, help="largest winch speed")
-    ] = SPEED_MM_S
-    pictures: Annotated[
-        int,
-        typer.Option(min=FEWEST_IMAGES, max=MOST_IMAGES, help="number of images for the pose"),
-    ] = PICTURES
-    simulated_slack_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="largest slack of simulated cables")
-    ] = SLACK_MM
+    tension_n: float | None = option(None, "pretension (default: twice the rig's smallest tension)")
+    limit_n: float | None = option(None, "tension limit of any cable (default: 60 % of the range)")
+    reach_mm: float = option(
+        REACH_MM, "largest length to wind in per cable", min=0.1, max=1000.0 * FURTHEST
+    )
+    speed_mm_s: float = option(SPEED_MM_S, "largest winch speed", min=0.01, max=FASTEST_MM_S)
+    pictures: int = option(
+        PICTURES, "number of images for the pose", min=FEWEST_IMAGES, max=MOST_IMAGES
+    )
+    simulated_slack_mm: float = option(
+        SLACK_MM, "largest slack of simulated cables", min=0.0, max=100.0
+    )
 
     def given(self) -> dict[str, object]:
         """Value of each option by name, false for a default."""
@@ -77,41 +68,26 @@ class WindingOptions:
         }
 
 
-DEFAULT_WINDING = WindingOptions()
-
-
-@with_option_groups
 def home(
-    rig: RigArgument,
-    at_home: Annotated[
-        bool, typer.Option("--at-home", help="a jig holds the platform at the rig's home pose")
-    ] = False,
-    pose_mm: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option("--pose-mm", help="a jig holds the platform level at x y z"),
-    ] = None,
-    camera: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="the platform hangs freely and a camera measures it: 'synthetic', an index, or"
-            " NAME=SOURCE for a camera other than the rig file's first",
-            metavar="SOURCE",
-        ),
-    ] = None,
-    calibration: CalibrationOption = None,
-    as_rig_file: Annotated[
-        bool,
-        typer.Option(
-            "--as-rig-file", help="move nothing: absolute encoders agree with the rig file"
-        ),
-    ] = False,
-    winding: WindingOptions = DEFAULT_WINDING,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    fast: FastOption = False,
-    yes: YesOption = False,
-    without_real_time: WithoutRealTimeOption = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the reference as JSON")] = False,
+    *,
+    rig: Path = RIG,
+    at_home: bool = option(False, "a jig holds the platform at the rig's home pose"),
+    pose_mm: Triple | None = option(None, "a jig holds the platform level at x y z"),
+    camera: list[str] | None = option(
+        None,
+        "the platform hangs freely and a camera measures it: 'synthetic', an index, or"
+        " NAME=SOURCE for a camera other than the rig file's first",
+        metavar="SOURCE",
+    ),
+    calibration: list[Path] | None = CALIBRATION,
+    as_rig_file: bool = option(False, "move nothing: absolute encoders agree with the rig file"),
+    winding: WindingOptions,
+    interface: str | None = INTERFACE,
+    channel: str | None = CHANNEL,
+    fast: bool = FAST,
+    yes: bool = YES,
+    without_real_time: bool = WITHOUT_REAL_TIME,
+    as_json: bool = option(False, "print the reference as JSON", "--json"),
 ) -> None:
     """Pretension all cables, then set the encoder reference at a known pose.
 

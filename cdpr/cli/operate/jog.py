@@ -8,13 +8,13 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import typer
 from rich.live import Live
 from rich.text import Text
 
+from cdpr.cli.arguments import option
 from cdpr.cli.operate.run import agreement, show, show_files
 from cdpr.cli.operate.supervision import (
     Keys,
@@ -24,18 +24,16 @@ from cdpr.cli.operate.supervision import (
     speed_by_key,
 )
 from cdpr.cli.options import (
-    DEFAULT_BUS,
+    FAST,
+    RIG,
+    SUMMARY_JSON,
+    WITHOUT_REAL_TIME,
+    YES,
     BusOptions,
-    FastOption,
     Quaternion,
-    RigArgument,
-    SummaryJsonOption,
     Triple,
-    WithoutRealTimeOption,
-    YesOption,
     require_unused,
     simulated_start,
-    with_option_groups,
 )
 from cdpr.cli.output import Terminal, err, out, show_json, show_line
 from executor import jogging
@@ -56,26 +54,14 @@ from model.scene import Scene, load_scene
 class PathOptions:
     """Distance and surroundings of a jog; every field is an option of `cdpr jog`."""
 
-    by_mm: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option("--by-mm", help="distance x y z, at most 50 mm"),
-    ] = None
-    to_home: Annotated[
-        bool, typer.Option("--to-home", help="move to the rig's home pose and orientation")
-    ] = False
-    scene: Annotated[Path | None, typer.Option(help="scene file: obstacles and payload")] = None
-    no_scene: Annotated[
-        bool, typer.Option("--no-scene", help="jog without a description of obstacles")
-    ] = False
-    clearance_mm: Annotated[
-        float | None, typer.Option(min=0.0, help="obstacle clearance instead of the scene's")
-    ] = None
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", help="run folder to create (default: runs/jog, runs/jog-2 …)"
-        ),
-    ] = None
+    by_mm: Triple | None = option(None, "distance x y z, at most 50 mm")
+    to_home: bool = option(False, "move to the rig's home pose and orientation")
+    scene: Path | None = option(None, "scene file: obstacles and payload")
+    no_scene: bool = option(False, "jog without a description of obstacles")
+    clearance_mm: float | None = option(None, "obstacle clearance instead of the scene's", min=0.0)
+    output: Path | None = option(
+        None, "run folder to create (default: runs/jog, runs/jog-2 …)", "-o", "--output"
+    )
 
     def given(self) -> dict[str, object]:
         """Value of each option by name."""
@@ -93,47 +79,31 @@ class PathOptions:
 class HeldOptions:
     """Hold-to-run controls; every field is an option of `cdpr jog`."""
 
-    hold_to_run: Annotated[
-        bool,
-        typer.Option(
-            "--hold-to-run",
-            help="enable the drives and follow held controls, such as those of `cdpr console`",
-        ),
-    ] = False
-    keys: Annotated[
-        bool,
-        typer.Option(
-            "--keys", help="as --hold-to-run, with keys: arrows for x and y, page up and down for z"
-        ),
-    ] = False
-    one_cable: Annotated[
-        bool,
-        typer.Option(
-            "--one-cable",
-            help="with --hold-to-run: wind one cable in or pay it out, homed or not",
-        ),
-    ] = False
-    simulated_start_mm: Annotated[
-        Triple | None,
-        typer.Option(
-            help="with --hold-to-run or --keys: initial position of the simulated platform x y z"
-            " (default: home)",
-        ),
-    ] = None
-    simulated_start_wxyz: Annotated[
-        Quaternion | None,
-        typer.Option(help="its orientation (default: as at home)"),
-    ] = None
+    hold_to_run: bool = option(
+        False, "enable the drives and follow held controls, such as those of `cdpr console`"
+    )
+    keys: bool = option(
+        False, "as --hold-to-run, with keys: arrows for x and y, page up and down for z"
+    )
+    one_cable: bool = option(
+        False, "with --hold-to-run: wind one cable in or pay it out, homed or not"
+    )
+    simulated_start_mm: Triple | None = option(
+        None,
+        "with --hold-to-run or --keys: initial position of the simulated platform x y z"
+        " (default: home)",
+    )
+    simulated_start_wxyz: Quaternion | None = option(None, "its orientation (default: as at home)")
 
 
 @dataclass(frozen=True, slots=True)
 class DriveOptions:
     """Settings of drives and output; every field is an option of `cdpr jog`."""
 
-    fast: FastOption = False
-    yes: YesOption = False
-    without_real_time: WithoutRealTimeOption = False
-    as_json: SummaryJsonOption = False
+    fast: bool = FAST
+    yes: bool = YES
+    without_real_time: bool = WITHOUT_REAL_TIME
+    as_json: bool = SUMMARY_JSON
 
     def confirm(self, rig: Rig) -> Callable[[Proposal], bool]:
         """See `confirmation`; simulated drives move without a question."""
@@ -152,31 +122,23 @@ DIRECTIONS = {
 HELP = "arrows x and y · page up and down z · + and - speed · f frame · space stop · q end"
 #: Update period of the line with the position, [s].
 SHOWN_EVERY = 0.2
-DEFAULT_PATH, DEFAULT_HELD, DEFAULT_DRIVES = PathOptions(), HeldOptions(), DriveOptions()
 
 
-@with_option_groups
 def jog(
-    rig: RigArgument,
-    path: PathOptions = DEFAULT_PATH,
-    cable: Annotated[
-        int | None, typer.Option("--cable", min=1, help="move one winch by --mm")
-    ] = None,
-    mm: Annotated[
-        float | None, typer.Option("--mm", help="length to pay out, at most 50; negative: wind in")
-    ] = None,
-    held: HeldOptions = DEFAULT_HELD,
-    limit_n: Annotated[
-        float | None,
-        typer.Option(
-            help="with --cable or --one-cable: tension limit of any cable (default: 60 %)"
-        ),
-    ] = None,
-    speed_mm_s: Annotated[
-        float, typer.Option(min=0.1, max=1000.0 * FASTEST, help="largest speed, at most the rig's")
-    ] = 1000.0 * SPEED,
-    bus: BusOptions = DEFAULT_BUS,
-    drives: DriveOptions = DEFAULT_DRIVES,
+    *,
+    rig: Path = RIG,
+    path: PathOptions,
+    cable: int | None = option(None, "move one winch by --mm", min=1),
+    mm: float | None = option(None, "length to pay out, at most 50; negative: wind in"),
+    held: HeldOptions,
+    limit_n: float | None = option(
+        None, "with --cable or --one-cable: tension limit of any cable (default: 60 %)"
+    ),
+    speed_mm_s: float = option(
+        1000.0 * SPEED, "largest speed, at most the rig's", min=0.1, max=1000.0 * FASTEST
+    ),
+    bus: BusOptions,
+    drives: DriveOptions,
 ) -> None:
     """Move the platform slowly and straight by a few millimetres from its current pose.
 
@@ -218,7 +180,7 @@ def jog(
         {"--limit-n": limit_n},
         "only with --cable or --one-cable; a path uses the rig's limits",
     )
-    if held != DEFAULT_HELD:
+    if held != HeldOptions():
         _held(the_rig, path, held, speed, drives)
         return
     by = None if path.by_mm is None else millimetres(list(path.by_mm))

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.console import Group
@@ -19,6 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cdpr import console  # loads Foxglove where it is asked for
+from cdpr.cli.arguments import option
 from cdpr.cli.operate.supervision import Keys, speed_by_key
 from cdpr.cli.output import err, out, show_json, show_line
 from cdpr.console.view import RobotNow, RobotView
@@ -46,37 +47,22 @@ _STATES = {"moving": "green", "holding": "yellow", "stopping": "yellow", "latche
 
 
 def monitor(
-    once: Annotated[bool, typer.Option("--once", help="show the state once and exit")] = False,
-    as_json: Annotated[
-        bool,
-        typer.Option(
-            "--json", help="print JSON: one document with --once, otherwise one line per update"
-        ),
-    ] = False,
-    rate: Annotated[
-        float, typer.Option("--rate-hz", min=0.1, max=50.0, help="updates per second")
-    ] = 5.0,
-    process: Annotated[
-        int | None,
-        typer.Option("--process", help="process number, if several runs are in progress"),
-    ] = None,
-    wait: Annotated[
-        bool, typer.Option("--wait", help="wait for a run to begin; in a terminal it always waits")
-    ] = False,
-    foxglove: Annotated[
-        int | None,
-        typer.Option(
-            "--foxglove",
-            min=0,
-            max=65535,
-            help="also serve Foxglove on this local port, such as 8765",
-            metavar="PORT",
-        ),
-    ] = None,
-    foxglove_layout: Annotated[
-        Path | None,
-        typer.Option("--foxglove-layout", help="write a layout for Foxglove and exit"),
-    ] = None,
+    *,
+    once: bool = option(False, "show the state once and exit"),
+    as_json: bool = option(
+        False, "print JSON: one document with --once, otherwise one line per update", "--json"
+    ),
+    rate: float = option(5.0, "updates per second", "--rate-hz", min=0.1, max=50.0),
+    process: int | None = option(None, "process number, if several runs are in progress"),
+    wait: bool = option(False, "wait for a run to begin; in a terminal it always waits"),
+    foxglove: int | None = option(
+        None,
+        "also serve Foxglove on this local port, such as 8765",
+        min=0,
+        max=65535,
+        metavar="PORT",
+    ),
+    foxglove_layout: Path | None = option(None, "write a layout for Foxglove and exit"),
 ) -> None:
     """Show a run live: state, pose, clearance, tensions, drives, lateness, progress and events.
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-from cdpr.cli.options import JsonOption
+from cdpr.cli.arguments import argument, option
+from cdpr.cli.options import JSON
 from cdpr.cli.output import out, show_json, show_line
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
 from executor.state_machine import State
@@ -15,7 +16,8 @@ from executor.supervision import FASTEST, SLOWEST
 
 
 def stop(
-    as_json: JsonOption = False,
+    *,
+    as_json: bool = JSON,
 ) -> None:
     """Stop every run of this user: all drives slow down together along the path, then hold.
 
@@ -43,13 +45,11 @@ def stop(
 _ENDING = (State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED, State.LATCHED)
 OVER = frozenset(state.value for state in _ENDING)
 
-_Process = Annotated[
-    int | None, typer.Option("--process", help="process number, if several runs are in progress")
-]
-_Json = Annotated[bool, typer.Option("--json", help="print the run's status as JSON")]
+PROCESS = option(None, "process number, if several runs are in progress", "--process")
+STATUS_JSON = option(False, "print the run's status as JSON", "--json")
 
 
-def hold(process: _Process = None, as_json: _Json = False) -> None:
+def hold(*, process: int | None = PROCESS, as_json: bool = STATUS_JSON) -> None:
     """Feed hold: the platform slows down along the path and waits there under tension.
 
     [dim]Example:[/dim]
@@ -59,7 +59,7 @@ def hold(process: _Process = None, as_json: _Json = False) -> None:
     _request("hold", process, as_json)
 
 
-def resume(process: _Process = None, as_json: _Json = False) -> None:
+def resume(*, process: int | None = PROCESS, as_json: bool = STATUS_JSON) -> None:
     """Continue after `cdpr hold`, at the last requested speed.
 
     [dim]Example:[/dim]
@@ -70,14 +70,10 @@ def resume(process: _Process = None, as_json: _Json = False) -> None:
 
 
 def speed(
-    percent: Annotated[
-        int,
-        typer.Argument(
-            min=SLOWEST, max=FASTEST, help="percentage of the planned speed", metavar="PERCENT"
-        ),
-    ],
-    process: _Process = None,
-    as_json: _Json = False,
+    *,
+    percent: int = argument("percentage of the planned speed", "PERCENT", min=SLOWEST, max=FASTEST),
+    process: int | None = PROCESS,
+    as_json: bool = STATUS_JSON,
 ) -> None:
     """Scale the speed along the path to a percentage of the planned one.
 

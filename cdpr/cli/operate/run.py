@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.markup import escape
 
+from cdpr.cli.arguments import argument, option
 from cdpr.cli.operate.supervision import RunSupervisor, confirmation, print_safely
 from cdpr.cli.options import (
-    CalibrationOption,
-    ChannelOption,
-    FastOption,
-    InterfaceOption,
-    SummaryJsonOption,
-    WithoutRealTimeOption,
-    YesOption,
+    CALIBRATION,
+    CHANNEL,
+    FAST,
+    INTERFACE,
+    SUMMARY_JSON,
+    WITHOUT_REAL_TIME,
+    YES,
+    Triple,
     calibrated_rig,
     level_pose,
     require_unused,
@@ -37,53 +38,39 @@ COLOURS = {"PASSED": "green", "STOPPED": "yellow", "FAILED": "red"}
 
 
 def run(
-    plan: Annotated[Path, typer.Argument(help="plan file (JSON)", metavar="PLAN")],
-    rig: Annotated[
-        Path | None,
-        typer.Option(
-            help="rig file (YAML; default: the plan's rig, on simulated drives)",
-            metavar="RIG",
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            help="run folder to create, with its parents (default: runs/TIME)",
-            metavar="RUNDIR",
-        ),
-    ] = None,
-    fast: FastOption = False,
-    camera: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="camera index, or 'synthetic' for all of the rig file's cameras (default with the"
-            " interface 'virtual'); for several cameras NAME=SOURCE, repeated",
-            metavar="SOURCE",
-        ),
-    ] = None,
-    calibration: CalibrationOption = None,
-    no_camera: Annotated[bool, typer.Option("--no-camera", help="run without a camera")] = False,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    simulated_start_mm: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(help="initial position of the simulated platform x y z (default: the start)"),
-    ] = None,
-    yes: YesOption = False,
-    without_real_time: WithoutRealTimeOption = False,
-    no_clearance_stop: Annotated[
-        bool,
-        typer.Option(
-            "--no-clearance-stop", help="do not stop when the measured clearance is too small"
-        ),
-    ] = False,
-    plan_hash: Annotated[
-        str | None,
-        typer.Option(help="refuse another plan than that of this `hash`, as the console does"),
-    ] = None,
-    as_json: SummaryJsonOption = False,
+    *,
+    plan: Path = argument("plan file (JSON)", "PLAN"),
+    rig: Path | None = option(
+        None, "rig file (YAML; default: the plan's rig, on simulated drives)", metavar="RIG"
+    ),
+    output: Path | None = option(
+        None,
+        "run folder to create, with its parents (default: runs/TIME)",
+        "-o",
+        "--output",
+        metavar="RUNDIR",
+    ),
+    fast: bool = FAST,
+    camera: list[str] | None = option(
+        None,
+        "camera index, or 'synthetic' for all of the rig file's cameras (default with the"
+        " interface 'virtual'); for several cameras NAME=SOURCE, repeated",
+        metavar="SOURCE",
+    ),
+    calibration: list[Path] | None = CALIBRATION,
+    no_camera: bool = option(False, "run without a camera"),
+    interface: str | None = INTERFACE,
+    channel: str | None = CHANNEL,
+    simulated_start_mm: Triple | None = option(
+        None, "initial position of the simulated platform x y z (default: the start)"
+    ),
+    yes: bool = YES,
+    without_real_time: bool = WITHOUT_REAL_TIME,
+    no_clearance_stop: bool = option(False, "do not stop when the measured clearance is too small"),
+    plan_hash: str | None = option(
+        None, "refuse another plan than that of this `hash`, as the console does"
+    ),
+    as_json: bool = SUMMARY_JSON,
 ) -> None:
     """Run a plan: check it, compute set-points, arm the drives, move, measure, report.
 

@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
-from cdpr.cli.options import (
-    DEFAULT_BUS,
-    BusOptions,
-    JsonOption,
-    NoQuestionOption,
-    RigArgument,
-    WithoutRealTimeOption,
-    with_option_groups,
-)
+from cdpr.cli.options import JSON, NO_QUESTION, RIG, WITHOUT_REAL_TIME, BusOptions
 from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
 from executor import service
 
 
-@with_option_groups
 def status(
-    rig: RigArgument,
-    bus: BusOptions = DEFAULT_BUS,
-    as_json: JsonOption = False,
+    *,
+    rig: Path = RIG,
+    bus: BusOptions,
+    as_json: bool = JSON,
 ) -> None:
     """Show the state of a rig: faults, reference, drives, tensions, pose. Moves nothing.
 
@@ -47,12 +40,12 @@ def status(
 # `cdpr reset`: the only command that clears a latched fault.
 
 
-@with_option_groups
 def reset(
-    rig: RigArgument,
-    bus: BusOptions = DEFAULT_BUS,
-    yes: NoQuestionOption = False,
-    as_json: JsonOption = False,
+    *,
+    rig: Path = RIG,
+    bus: BusOptions,
+    yes: bool = NO_QUESTION,
+    as_json: bool = JSON,
 ) -> None:
     """Clear a latched fault once its cause is removed: reset drives in fault, move nothing.
 
@@ -84,13 +77,13 @@ def reset(
 # `cdpr release`: close all brakes, then remove the torque of all drives.
 
 
-@with_option_groups
 def release(
-    rig: RigArgument,
-    bus: BusOptions = DEFAULT_BUS,
-    yes: NoQuestionOption = False,
-    without_real_time: WithoutRealTimeOption = False,
-    as_json: JsonOption = False,
+    *,
+    rig: Path = RIG,
+    bus: BusOptions,
+    yes: bool = NO_QUESTION,
+    without_real_time: bool = WITHOUT_REAL_TIME,
+    as_json: bool = JSON,
 ) -> None:
     """Release the drives with the platform on a support: close brakes, remove torque.
 
