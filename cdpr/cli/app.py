@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import gc
+import inspect
 import io
 import json
 import os
@@ -150,10 +151,21 @@ def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
     app = typer.Typer(rich_markup_mode="rich", add_completion=False)
     called = with_options(getattr(import_module(f"cdpr.cli.{module}"), function))
     typed: dict[str, str] = {}
-    app.command(verb.name, cls=_VerbCommand)(_guarded(called, typed))
+    text = _help_of(called)
+    app.command(verb.name, cls=_VerbCommand, help=text)(_guarded(called, typed))
     command: Any = typer.main.get_command(app)
     typed.update((one.name, max(one.opts, key=len)) for one in command.params)
     return command  # type: ignore[no-any-return]
+
+
+def _help_of(verb: Callable[..., None]) -> str:
+    """A verb's docstring as Typer displays it, which joins the lines of a paragraph.
+
+    A heading is dimmed, and each example becomes a paragraph.
+    """
+    text = re.sub(r"^([A-Z][a-z ]+:)$", r"[dim]\1[/dim]", inspect.getdoc(verb) or "", flags=re.M)
+    text = re.sub(r"\n  (?=cdpr )", r"\n\n  ", text)
+    return re.sub(r"\n {6}(?=-)", r"\n  ", text)
 
 
 class _VerbCommand(TyperCommand):

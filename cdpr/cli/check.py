@@ -24,10 +24,8 @@ def check(
 
     Exit code 3 where a value violates the scene's requirements.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr check plan.json
-
       cdpr check plan.json --rig configs/gachon_8_6.yaml --json
     """
     the_plan = load_plan(plan)

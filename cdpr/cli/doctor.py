@@ -35,12 +35,9 @@ def doctor(
     Whatever is missing is listed with the command that fixes it. Nothing is sent on the bus; with
     --drives only read requests are sent, and no drive is changed.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr doctor
-
       cdpr doctor rig.yaml --camera 0
-
       cdpr doctor rig.yaml --drives
     """
     if camera is not None and rig is None:

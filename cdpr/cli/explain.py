@@ -15,8 +15,7 @@ def explain(
 
     Without a code, lists all of them.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr explain drive_silent
     """
     if code is None:

@@ -115,18 +115,14 @@ def plan(
 ) -> None:
     """Plan a collision-free path and write it to a file.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr plan configs/gachon_8_6.yaml configs/environment_1.yaml -o plan.json
-
       cdpr plan configs/gachon_8_6.yaml configs/environment_3.yaml -o plan.json
-      --clearance-mm 20 --cost kinematic --longest-mm 1000
-
+          --clearance-mm 20 --cost kinematic --longest-mm 1000
       cdpr plan configs/gachon_8_6.yaml configs/environment_2.yaml -o plan.json
-      --planner adaptive --mode paper --seed 7
-
+          --planner adaptive --mode paper --seed 7
       cdpr plan configs/gachon_8_6.yaml configs/pick_and_place.yaml -o rest.json
-      --from-run runs/stopped
+          --from-run runs/stopped
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)
     if from_run is not None and start_mm is not None:

@@ -20,8 +20,7 @@ def report(
     For a run that was killed, or whose disk was full, missing results are recovered from the files
     that exist.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr report runs/first
     """
     folder = RunFolder.open_cut_short(run)

@@ -63,16 +63,14 @@ def sim(
 ) -> None:
     """Simulate the drives and the platform of a rig on a bus, in real time, until Ctrl-C.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr sim configs/gachon_8_6.yaml --interface udp_multicast --channel 239.74.163.2
-      --plan plan.json
+          --plan plan.json
 
-    [dim]In another terminal:[/dim]
-
+    In another terminal:
       cdpr run plan.json --rig configs/gachon_8_6.yaml --interface udp_multicast
-      --channel 239.74.163.2 --no-camera -o runs/udp --yes
-      --without-real-time
+          --channel 239.74.163.2 --no-camera -o runs/udp --yes
+          --without-real-time
     """
     behaviour = _behaviour(drive_behaviour or [])
     the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)

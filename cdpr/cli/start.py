@@ -36,12 +36,9 @@ def examples(
 ) -> None:
     """List the example rigs, scenes and recorded sessions, or copy some of them.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr examples
-
       cdpr examples gachon_8_6 environment_1 -o my_robot
-
       cdpr examples --all
     """
     if names and everything:
@@ -108,10 +105,8 @@ def new(
     Each question shows a unit and a default, which Enter accepts; values given as options are not
     asked for.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr new my_rig.yaml
-
       cdpr new my_rig.yaml --from cables.csv --mass-kg 2.5 --interface socketcan --channel can0
     """
     if rig.exists() and not force:

@@ -64,12 +64,10 @@ def workspace(
 
     The maps are written as arrays and as one HTML page.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr workspace configs/gachon_8_6.yaml -o maps
-
       cdpr workspace configs/gachon_8_6.yaml --scene configs/environment_1.yaml
-      --slice z=445 --slice x=0 --step-mm 5 -o maps
+          --slice z=445 --slice x=0 --step-mm 5 -o maps
     """
     the_rig = load_rig(rig)
     the_scene = None if scene is None else load_scene(scene)
@@ -119,8 +117,7 @@ def paper(
     ones, and for every reading of the text. Writes index.html, images, trials.csv, summary.csv and
     findings.json. Apart from times, the numbers depend only on the seeds.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr bench paper --seeds 100 -o bench-paper
     """
     rig = load_rig(ready_folder() / PAPER_RIG)

@@ -47,14 +47,10 @@ def track(
 ) -> None:
     """Measure the platform's pose from its tags, image by image.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr track rig.yaml pictures/ -o poses.csv
-
       cdpr track rig.yaml 0 -o poses.csv --scene scene.yaml --pictures 100
-
       cdpr track configs/gachon_8_6.yaml synthetic --plan plan.json -o poses.csv
-
       cdpr track rig.yaml front=0 side=1 -o poses.csv
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)

@@ -107,13 +107,10 @@ def print_(
 ) -> None:
     """Make a calibration board, or the tags of a rig, as a PDF at exact scale.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr calibrate print board.pdf --columns 9 --rows 6 --square-mm 25
-
       cdpr calibrate print board.pdf --board charuco --columns 7 --rows 5 --square-mm 35
-      --marker-mm 26 --paper a3
-
+          --marker-mm 26 --paper a3
       cdpr calibrate print tags.pdf --rig configs/gachon_8_6.yaml
     """
     require_new_file(output, force)

@@ -47,15 +47,11 @@ def camera(
 
     Exit code 3 where the result is not good enough. Files that cannot be used are listed.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr calibrate camera pictures/ --columns 9 --rows 6 --square-mm 25 -o calibration
-
       cdpr calibrate camera pictures/ --board charuco --columns 7 --rows 5 --square-mm 30
-      --marker-mm 22 --dictionary 4X4_50
-
+          --marker-mm 22 --dictionary 4X4_50
       cdpr calibrate camera corners.csv --size-px 1280 720 -o calibration
-
       cdpr calibrate camera pictures/ --live 0 --columns 9 --rows 6 --square-mm 25 -o calibration
     """
     require_file_name(name, "--name")
@@ -145,10 +141,8 @@ def readout(
     Move the platform up, down and sideways in front of the stationary camera. Exit code 3 where the
     result is not good enough.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr calibrate readout rig.yaml moving.mp4 -o calibration
-
       cdpr calibrate readout rig.yaml moving/ --rate-hz 30
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)

@@ -50,14 +50,10 @@ def extrinsics(
 
     The camera must not move between images. Exit code 3 where the result is not good enough.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr calibrate extrinsics rig.yaml pictures/ -o calibration
-
       cdpr calibrate extrinsics rig.yaml 0 --calibration calibration_camera_front_2026-03-01.yaml
-
       cdpr calibrate extrinsics rig.yaml runs/first/pictures --poses runs/first
-
       cdpr calibrate extrinsics rig.yaml side/ --camera side --beside front=front/
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)
@@ -128,10 +124,8 @@ def tags(
     Rotate the platform in front of the camera, or carry the camera around it. Exit code 3 where the
     result is not good enough.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr calibrate tags rig.yaml pictures/ -o calibration
-
       cdpr calibrate tags rig.yaml pictures/ --calibration calibration_camera_front_2026-03-01.yaml
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)

@@ -75,8 +75,7 @@ def diff(
 
     Exit code 3 where they differ by more than their intervals.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr calibrate diff calibration_camera_front_2026-03-01.yaml
       calibration_camera_front_2026-06-01.yaml
     """
@@ -104,8 +103,7 @@ def apply(
 
     RIG itself is not changed; its comments are not copied.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr calibrate apply rig.yaml calibration_rig_rig_2026-03-14.yaml -o rig_calibrated.yaml
     """
     loaded = [load_result(path) for path in results]
@@ -137,10 +135,8 @@ def export(
 ) -> None:
     """Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr calibrate export configs/gachon_8_6.yaml -o front.yaml --to ros
-
       cdpr calibrate export rig.yaml -o front.yaml --calibration
       calibration_camera_front_2026-03-01.yaml
     """
@@ -169,8 +165,7 @@ def import_(
     CAMERA is OpenCV's YAML, ROS's camera_info, Kalibr's camchain or mrcal's .cameramodel. These
     files state no uncertainty; `cdpr calibrate camera` does.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr calibrate import rig.yaml camera_info.yaml --camera front -o rig_with_lens.yaml
     """
     loaded = load_rig(rig)

@@ -53,8 +53,7 @@ def poses(
     Each pose is wrench-feasible and collision-free, and rotated as far as cables and tensions
     allow. `cdpr run` runs the plan; `cdpr calibrate rig` reads the run folder.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr calibrate poses configs/gachon_8_6_rehearsal.yaml configs/turn.yaml -o measure.json
     """
     require_new_file(output, force)
@@ -186,10 +185,8 @@ def rig(
     Every number comes with its uncertainty; what cannot be identified keeps the rig file's value,
     and is reported. Exit code 3 where the result is not good enough.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr calibrate rig rig.yaml runs/measuring -o calibration
-
       cdpr calibrate rig rig.yaml lengths.csv --without-poses --known drum_scale
     """
     made = calibrate_rig(

@@ -55,10 +55,8 @@ def console(
     console ends; jogging ends with it. STOP on the page is a software stop: it does not replace the
     emergency-stop button.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr console configs/gachon_8_6.yaml --scene configs/environment_1.yaml
-
       cdpr console rig.yaml --interface socketcan --channel can0 --read-only
     """
     if host not in _LOCAL and not allow_others:
@@ -133,10 +131,8 @@ def demo(
     With --console the plan is loaded into the operator's page at the printed address, with drives
     and cameras simulated in real time: take control there, then run, jog or teach.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr demo --environment 3
-
       cdpr demo --console
     """
     folder = output or free_folder("demo")

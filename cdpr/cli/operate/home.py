@@ -95,10 +95,8 @@ def home(
     the limit, or still slack after the full reach, stops all. The reference is stored in a file
     that `cdpr run` and `cdpr jog` use. With the interface 'virtual' it is a rehearsal.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr home rig.yaml --at-home
-
       cdpr home configs/gachon_8_6.yaml --camera synthetic --fast
     """
     the_rig = rig_on_bus(rig, interface, channel, calibration)

@@ -149,10 +149,8 @@ def jog(
     has such controls. With --keys it moves while a key is held in this terminal. With --hold-to-run
     --one-cable controls move one winch at a time instead of the platform.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr jog rig.yaml --cable 3 --mm -5
-
       cdpr jog configs/gachon_8_6.yaml --by-mm 0 0 10 --scene configs/environment_1.yaml --fast
     """
     the_rig = bus.rig(rig)

@@ -71,12 +71,9 @@ def monitor(
     q ends the monitor, not the run. Exit code: 0 if the motion finished, 130 if it was stopped, 1
     otherwise.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr monitor
-
       cdpr monitor --once --json
-
       cdpr monitor --foxglove 8765 --rate-hz 20
     """
     if foxglove_layout is not None:

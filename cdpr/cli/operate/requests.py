@@ -23,8 +23,7 @@ def stop(
 
     This is a software stop. It does not replace the emergency-stop button.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr stop
     """
     result = stop_runs()
@@ -52,8 +51,7 @@ STATUS_JSON = option(False, "print the run's status as JSON", "--json")
 def hold(*, process: int | None = PROCESS, as_json: bool = STATUS_JSON) -> None:
     """Feed hold: the platform slows down along the path and waits there under tension.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr hold
     """
     _request("hold", process, as_json)
@@ -62,8 +60,7 @@ def hold(*, process: int | None = PROCESS, as_json: bool = STATUS_JSON) -> None:
 def resume(*, process: int | None = PROCESS, as_json: bool = STATUS_JSON) -> None:
     """Continue after `cdpr hold`, at the last requested speed.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr resume
     """
     _request("resume", process, as_json)
@@ -77,8 +74,7 @@ def speed(
 ) -> None:
     """Scale the speed along the path to a percentage of the planned one.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr speed 25
     """
     _request("speed", process, as_json, percent)

@@ -77,12 +77,9 @@ def run(
     With the interface 'virtual' the drives, the platform and the camera are simulated in this
     process. Ctrl-C and `cdpr stop` slow all drives down together along the path; they then hold.
 
-    [dim]Examples:[/dim]
-
+    Examples:
       cdpr run plan.json --fast
-
       cdpr run plan.json --rig rig.yaml -o runs/second --camera 0
-
       cdpr run plan.json --rig rig.yaml -o runs/third --camera front=0 --camera side=1
     """
     the_plan = load_plan(plan)

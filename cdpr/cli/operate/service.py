@@ -21,8 +21,7 @@ def status(
 
     Drives are not queried while a run is in progress or being prepared; `cdpr monitor` shows them.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr status configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
     the_rig = bus.rig(rig)
@@ -52,8 +51,7 @@ def reset(
     Drives that hold keep holding. A drive in fault is not reset while others hold the platform.
     The next run must start at the platform's current pose.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr reset configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
     the_rig = bus.rig(rig)
@@ -90,8 +88,7 @@ def release(
     All drives are released together, without motion commands. Winches without brakes pay out
     their cables, so home the rig again afterwards.
 
-    [dim]Example:[/dim]
-
+    Example:
       cdpr release configs/gachon_8_6.yaml --interface socketcan --channel can0
     """
     result = service.release(
