@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from executor.evaluation import rewrite_report
-from executor.recording.resume import passing, require_room, scene_after
+from executor.recording.resume import passing, scene_after
 from executor.recording.run_folder import RunFolder
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
 from executor.supervision import FASTEST, SLOWEST
@@ -109,7 +109,6 @@ def plan(
     done: Sequence[StopDocument] = ()
     if from_run is not None:
         scene, done, _ = scene_after(scene, rig, Path(from_run))
-        require_room(scene, rig)
     scene = passing(scene, via)
     each = of_legs if len(of_legs) > 1 else ()
     return plan_from_document(plan_path(rig, scene, settings, listener, rounds=each, done=done))

@@ -101,7 +101,7 @@ PANELS: dict[str, tuple[Verb, ...]] = {
     ),
     "Measure": _verbs("track:track"),
     "Analyse": (
-        *_verbs("report:report", "explain:explain", "studies:workspace"),
+        *_verbs("report:report", "check:explain", "studies:workspace"),
         Verb("bench", verbs=BENCH, about="Measure the planner."),
     ),
 }

@@ -11,7 +11,7 @@ from __future__ import annotations
 import inspect
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -85,7 +85,7 @@ def with_options(verb: Callable[..., None]) -> Callable[..., None]:
 def _parameter(name: str, kind: Any, declared: Field[Any]) -> inspect.Parameter:
     names = declared.metadata["names"]
     if kind is bool and not names:
-        names = (f"--{name.replace('_', '-')}",)  # otherwise Typer adds ``--no-…``
+        names = (_typed(name),)  # otherwise Typer adds ``--no-…``
     declaration = declared.metadata["kind"](*names, **declared.metadata["more"])
     return inspect.Parameter(
         name,
@@ -93,6 +93,20 @@ def _parameter(name: str, kind: Any, declared: Field[Any]) -> inspect.Parameter:
         default=inspect.Parameter.empty if declared.default is MISSING else declared.default,
         annotation=Annotated[kind, declaration],
     )
+
+
+def given_options(group: Any) -> dict[str, object]:
+    """Value of each option of a group, as typed, that differs from its default; else None."""
+    values = {one: getattr(group, one.name) for one in fields(group)}
+    return {
+        _typed(one.name, one.metadata["names"]): None if value == one.default else value
+        for one, value in values.items()
+    }
+
+
+def _typed(name: str, names: Sequence[str] = ()) -> str:
+    """How an option is typed, in full."""
+    return max(names, key=len) if names else f"--{name.replace('_', '-')}"
 
 
 OUTPUTS = ("output", "mcap", "overlay")

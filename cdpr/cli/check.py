@@ -1,4 +1,4 @@
-"""`cdpr check`: verifies a plan by an independent method."""
+"""`cdpr check` verifies a plan by an independent method; `cdpr explain` explains a fault."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import typer
 
 from cdpr.cli.arguments import argument, option
 from cdpr.cli.options import JSON
-from cdpr.cli.output import Terminal, out, show_facts, show_json
+from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
+from executor.recording.verdict import fault_titles, page_of_fault
 from model.plan import load_plan, require_same_rig
 from model.rig import load_rig
 from planner.check import check_path
@@ -43,3 +44,24 @@ def check(
         out.print("[green]passed[/green]" if report.passed else "[red]not passed[/red]")
     if not report.passed:
         raise typer.Exit(3)
+
+
+# `cdpr explain`: meaning, likely cause and next step of a fault.
+
+
+def explain(
+    *,
+    code: str | None = argument("code of the fault, such as drive_silent", "CODE", default=None),
+) -> None:
+    """Explain a fault that a run reported: meaning, likely cause, state of the machine, next step.
+
+    Without a code, lists all of them.
+
+    Example:
+      cdpr explain drive_silent
+    """
+    if code is None:
+        for known, title in fault_titles().items():
+            show_line(f"  {known:<22} {title}")
+        return
+    show_line(page_of_fault(code).rstrip())

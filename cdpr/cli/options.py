@@ -19,7 +19,7 @@ from model.rig import Rig, load_rig
 RIG = argument("rig file (YAML)", "RIG")
 SCENE = argument("scene file (YAML)", "SCENE")
 PLAN_FILE = required("plan file to write (JSON)", "-o", "--output")
-REPLACE_PLAN = option(False, "replace an existing plan file", "--force")
+REPLACE_PLAN = option(False, "replace an existing plan file")
 JSON = option(False, "print the result as JSON", "--json")
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -47,29 +47,11 @@ def rotation_of(wxyz: Quaternion | None) -> Array | None:
     return matrix_from_quaternion(np.array(wxyz) / norm)
 
 
-def simulated_start(rig: Rig, position_mm: Triple | None, wxyz: Quaternion | None) -> Pose | None:
-    """The pose of options ``--simulated-start-mm`` and ``--simulated-start-wxyz``.
-
-    Raises:
-        BadInput: Only the orientation is stated, or it is none.
-    """
-    rotation = rotation_of(wxyz)
-    if position_mm is None:
-        if rotation is not None:
-            raise BadInput(
-                "an orientation without a position", next_step="add --simulated-start-mm X Y Z"
-            )
-        return None
-    position = millimetres(list(position_mm))
-    return Pose(position, rig.home.rotation if rotation is None else rotation)
-
-
 # Calibration results that replace values of the rig file.
 
 CALIBRATION = option(
     None,
     "result file of `cdpr calibrate`, used instead of the rig file's values; repeatable",
-    "--calibration",
     metavar="FILE",
 )
 
@@ -94,14 +76,12 @@ def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
 
 # Verbs that reach drives: the rig, its bus, and the motion.
 
-INTERFACE = option(None, "python-can interface, overriding the rig file's", "--interface")
-CHANNEL = option(None, "channel of the interface", "--channel")
-FAST = option(False, "simulated time, as fast as possible", "--fast")
-YES = option(False, "do not ask before moving drives on a real bus", "--yes")
-NO_QUESTION = option(False, "do not ask", "--yes")
-WITHOUT_REAL_TIME = option(
-    False, "move even if real-time scheduling is denied", "--without-real-time"
-)
+INTERFACE = option(None, "python-can interface, overriding the rig file's")
+CHANNEL = option(None, "channel of the interface")
+FAST = option(False, "simulated time, as fast as possible")
+YES = option(False, "do not ask before moving drives on a real bus")
+NO_QUESTION = option(False, "do not ask")
+WITHOUT_REAL_TIME = option(False, "move even if real-time scheduling is denied")
 SUMMARY_JSON = option(False, "print the summary as JSON", "--json")
 
 

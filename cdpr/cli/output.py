@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import IO, Any, cast
 
@@ -72,6 +72,16 @@ def show_facts(title: str, facts: list[tuple[str, str]], on: Console = out) -> N
     for name, value in facts:
         table.add_row(escape(name), escape(value))
     on.print(table)
+
+
+def present(
+    as_json: bool, document: Mapping[str, Any], title: str, facts: list[tuple[str, str]]
+) -> None:
+    """Prints a result: for programs as JSON, for people as names and values."""
+    if as_json:
+        show_json(document)
+    else:
+        show_facts(title, facts)
 
 
 @contextmanager

@@ -21,8 +21,8 @@ from cdpr.cli.options import (
     calibrated_rig,
     level_pose,
 )
-from cdpr.cli.output import Terminal, show_facts, show_json
-from executor.recording.resume import passing, require_room, scene_after
+from cdpr.cli.output import Terminal, present
+from executor.recording.resume import passing, scene_after
 from model.errors import BadInput
 from model.files.documents import millimetres
 from model.files.output import require_new_file
@@ -88,9 +88,6 @@ class SearchOptions:
         return PlanningOptions(seed=seed, **{k: v for k, v in given.items() if v is not None})
 
 
-# `cdpr plan`: a path from start to goal.
-
-
 def plan(
     *,
     rig: Path = RIG,
@@ -138,7 +135,6 @@ def plan(
     begun: list[tuple[str, str]] = []
     if from_run is not None:
         the_scene, done, end = scene_after(the_scene, the_rig, from_run)
-        require_room(the_scene, the_rig)
         begun = end.facts(from_run, len(done), len(the_scene.stops))
     the_scene = passing(the_scene, [_via_point(text) for text in via_mm or []])
     require_new_file(output, force)
@@ -147,14 +143,12 @@ def plan(
     listener = Terminal(quiet=as_json)
     document = plan_path(the_rig, the_scene, settings, listener, rounds=of_legs, done=done)
     save_plan(document, output)
-    if as_json:
-        show_json({"plan": str(output), **plan_as_dict(document)})
-        return
     more = "".join(f" --calibration {quote(str(file))}" for file in calibration or [])
     file = quote(str(output))
     run_it = f"cdpr run {file} --rig {quote(str(rig))}{more} -o RUNDIR"
     next_step = f"cdpr check {file}, then {run_it}"
-    show_facts(f"plan {output}", [*begun, *plan_facts(document), ("next", next_step)])
+    facts = [*begun, *plan_facts(document), ("next", next_step)]
+    present(as_json, {"plan": str(output), **plan_as_dict(document)}, f"plan {output}", facts)
 
 
 def _via_point(text: str) -> Pose:
@@ -163,14 +157,12 @@ def _via_point(text: str) -> Pose:
     Raises:
         BadInput: It cannot be read.
     """
+    hint = "write --via-mm 0 40 430"
     try:
         x, y, z = map(float, text.split())
     except ValueError:
-        raise BadInput(
-            f"--via-mm {text}: three numbers are required", next_step="write --via-mm 0 40 430"
-        ) from None
+        what = f"--via-mm {text}: three numbers are required"
+        raise BadInput(what, next_step=hint) from None
     if not all(map(math.isfinite, (x, y, z))):
-        raise BadInput(
-            f"--via-mm {text}: finite numbers are required", next_step="write --via-mm 0 40 430"
-        )
+        raise BadInput(f"--via-mm {text}: finite numbers are required", next_step=hint)
     return Pose.level(millimetres([x, y, z]))

@@ -8,16 +8,7 @@ import typer
 
 from cdpr.cli.arguments import option
 from cdpr.cli.operate.supervision import stop_requests
-from cdpr.cli.options import (
-    CALIBRATION,
-    CHANNEL,
-    INTERFACE,
-    RIG,
-    Triple,
-    calibrated_rig,
-    level_pose,
-    rig_on_bus,
-)
+from cdpr.cli.options import CALIBRATION, CHANNEL, INTERFACE, RIG, Triple, level_pose, rig_on_bus
 from cdpr.cli.output import Terminal, out, show_line
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
 from executor.kernels import ready_to_simulate
@@ -73,7 +64,7 @@ def sim(
           --without-real-time
     """
     behaviour = _behaviour(drive_behaviour or [])
-    the_rig = calibrated_rig(rig_on_bus(rig, interface, channel), calibration)
+    the_rig = rig_on_bus(rig, interface, channel, calibration)
     if the_rig.document.bus.interface == IN_PROCESS:
         raise BadInput(
             "the interface 'virtual' cannot reach another process",

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from cdpr.cli.arguments import option, required
 from cdpr.cli.options import RIG, Quaternion, Triple, rotation_of
-from cdpr.cli.output import Terminal, out, show_facts, show_json
+from cdpr.cli.output import Terminal, out, present, show_json
 from model.files.documents import millimetres
 from model.files.examples import PAPER_RIG, ready_folder
 from model.files.output import make_folder
@@ -86,11 +86,9 @@ def workspace(
     made = map_workspace(question, grids, workers=workers, dask=dask, listener=listener)
     with listener.waiting("drawing"):
         summary = write_maps(output, made, question, the_scene)
-    if as_json:
-        show_json({"folder": str(output), "maps": summary})
-    else:
-        facts = [*summary_facts(summary), ("next", f"open {output / 'index.html'}")]
-        show_facts(f"maps of {the_rig.name} in {output}", facts)
+    facts = [*summary_facts(summary), ("next", f"open {output / 'index.html'}")]
+    document = {"folder": str(output), "maps": summary}
+    present(as_json, document, f"maps of {the_rig.name} in {output}", facts)
 
 
 # `cdpr bench`: long measurements of the planner.

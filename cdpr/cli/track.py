@@ -9,7 +9,7 @@ from pathlib import Path
 from cdpr.cli.arguments import argument, option, required
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig
-from cdpr.cli.output import Terminal, err, show_facts, show_json, show_line
+from cdpr.cli.output import Terminal, err, present, show_line
 from executor.cameras.sources import parse_camera_sources
 from executor.supervision import LocalRequests
 from executor.track import TrackResult, own_drawing, own_file, require_plan_used, track_sources
@@ -83,11 +83,9 @@ def track(
             listener=Terminal(quiet=as_json),
         )
     result.save(output, mcap)
-    facts = {"poses_file": str(output), **result.summary()}
-    if as_json:
-        show_json({**facts, "unused": result.unused_files()})
-    else:
-        show_facts(f"poses in {output}", [(k.replace("_", " "), str(v)) for k, v in facts.items()])
+    found = {"poses_file": str(output), **result.summary()}
+    facts = [(name.replace("_", " "), str(value)) for name, value in found.items()]
+    present(as_json, {**found, "unused": result.unused_files()}, f"poses in {output}", facts)
 
 
 def _require_outputs(
@@ -98,15 +96,14 @@ def _require_outputs(
     force: bool,
 ) -> None:
     """Refuses outputs that cannot be written, or that are the same file as another or an input."""
-    several = len(sources) > 1
-    logs = {c.name: own_file(output, c.name) for c in sources} if several else {}
-    for path in [output, *([] if mcap is None else [mcap]), *logs.values()]:
+    several = [camera.name for camera in sources] if len(sources) > 1 else []
+    written = {"--output": output}
+    if mcap is not None:
+        written["--mcap"] = mcap
+    written |= {f"the log of {name}": own_file(output, name) for name in several}
+    for path in written.values():
         require_new_file(path, force)
-    written: dict[str, Path | None] = {"--output": output, "--mcap": mcap, "--overlay": overlay}
-    written |= {f"the log of {name}": path for name, path in logs.items()}
-    if overlay is not None and several:
-        written |= {f"the overlay of {c.name}": own_drawing(overlay, c.name) for c in sources}
-    refuse_overwriting(
-        {name: path for name, path in written.items() if path is not None},
-        [Path(source) for source in sources.values()],
-    )
+    if overlay is not None:
+        written["--overlay"] = overlay
+        written |= {f"the overlay of {name}": own_drawing(overlay, name) for name in several}
+    refuse_overwriting(written, [Path(source) for source in sources.values()])

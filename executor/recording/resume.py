@@ -172,7 +172,8 @@ def scene_after(
     """The scene from the end of a run, its visited stops, and that end.
 
     Raises:
-        BadInput: The folder is incomplete, or of another rig or task; or nothing remains to do.
+        BadInput: The folder is incomplete, or of another rig or task; nothing remains to do; or the
+            clearance is too small for a plan from there.
         Refused: The platform pose is unknown.
     """
     opened = RunFolder.open(folder)
@@ -185,6 +186,7 @@ def scene_after(
             where=str(folder),
             next_step="give another scene, or another goal with --goal-mm",
         )
+    _require_room(after, rig)
     return after, done, end
 
 
@@ -193,7 +195,7 @@ def _is_there(scene: Scene) -> bool:
     return start.distance_to(goal) <= AT_GOAL_M and start.angle_to(goal) <= AT_GOAL_RAD
 
 
-def require_room(scene: Scene, rig: Rig) -> None:
+def _require_room(scene: Scene, rig: Rig) -> None:
     """Requires enough clearance at the start for a plan.
 
     Raises:

@@ -11,7 +11,7 @@ from calibration.targets.grids import CircleGrid, TagGrid, TagOrder
 from calibration.targets.printing import PaperName, printout
 from cdpr.cli.arguments import argument, option
 from cdpr.cli.options import JSON
-from cdpr.cli.output import show_facts, show_json
+from cdpr.cli.output import present
 from model.errors import BadInput
 from model.files.documents import write_bytes_atomic
 from model.files.output import require_new_file
@@ -135,19 +135,16 @@ def print_(
     pages, what = made.pages, made.what
     write_bytes_atomic(output, made.pdf())
     step = "print at 100 %, measure the ruler and the squares, glue it to a flat, stiff plate"
-    if as_json:
-        show_json(
-            {
-                "file": str(output),
-                "what": what,
-                "paper": paper,
-                "pages": len(pages),
-                "width_mm": pages[0].width_mm,
-                "height_mm": pages[0].height_mm,
-                "next_steps": [step],
-            }
-        )
-    else:
-        layout = "portrait" if pages[0].width_mm < pages[0].height_mm else "landscape"
-        on = f"{len(pages)} of {paper}, {layout}"
-        show_facts("print", [("what", what), ("pages", on), ("file", str(output)), ("next", step)])
+    width, height = pages[0].width_mm, pages[0].height_mm
+    document = {
+        "file": str(output),
+        "what": what,
+        "paper": paper,
+        "pages": len(pages),
+        "width_mm": width,
+        "height_mm": height,
+        "next_steps": [step],
+    }
+    on = f"{len(pages)} of {paper}, {'portrait' if width < height else 'landscape'}"
+    facts = [("what", what), ("pages", on), ("file", str(output)), ("next", step)]
+    present(as_json, document, "print", facts)

@@ -14,7 +14,7 @@ from calibration.result_files import compare, load_result, write_calibrated_rig
 from calibration.results import Calibration, Destination
 from cdpr.cli.arguments import argument, option, required
 from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig
-from cdpr.cli.output import Terminal, err, show_facts, show_json, show_line
+from cdpr.cli.output import Terminal, err, present, show_facts, show_json, show_line
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
 from model.rig import load_rig
@@ -81,10 +81,8 @@ def diff(
     """
     one, other = load_result(first), load_result(second)
     found = compare(one, other)
-    if as_json:
-        show_json(found.as_dict())
-    else:
-        show_facts(f"{one.kind} {one.name}: from {one.date} to {other.date}", found.facts())
+    title = f"{one.kind} {one.name}: from {one.date} to {other.date}"
+    present(as_json, found.as_dict(), title, found.facts())
     if not found.agree:
         raise typer.Exit(3)
 
@@ -112,12 +110,10 @@ def apply(
         if not result.good_enough:
             what = f"calibration {result.kind} {result.name}, {result.date}"
             show_line(f"remark {what}: {result.verdict}", err)
-    if as_json:
-        show_json({"rig": str(output), "results": [str(path) for path in results]})
-        return
     facts = [(f"{one.kind} {one.name}", f"{one.date}: {one.verdict}") for one in loaded]
     facts += [("rig file", str(output)), ("next", f"`cdpr home {output}`, then plan with it")]
-    show_facts(f"{new.name} with its calibration", facts)
+    document = {"rig": str(output), "results": [str(path) for path in results]}
+    present(as_json, document, f"{new.name} with its calibration", facts)
 
 
 # `cdpr calibrate export` and `import`: camera files of OpenCV, ROS, Kalibr and mrcal.
@@ -144,11 +140,8 @@ def export(
     document = camera_named(loaded.document, loaded.camera(camera).name)
     require_new_file(output, force)
     write_atomic(output, FORMATS[to](document))
-    if as_json:
-        show_json({"file": str(output), "format": to, "camera": document.name})
-    else:
-        facts = [("camera", document.name), ("format", to), ("file", str(output))]
-        show_facts("export", facts)
+    result = {"file": str(output), "format": to, "camera": document.name}
+    present(as_json, result, "export", [(k, result[k]) for k in ("camera", "format", "file")])
 
 
 def import_(
@@ -170,9 +163,8 @@ def import_(
     """
     loaded = load_rig(rig)
     found = write_rig_with_camera(output, loaded, loaded.camera(camera).name, file, entry)
-    if as_json:
-        show_json({"rig": str(output), "camera": found.name, "lens": found.lens})
-        return
     lens = f"{found.lens}, {len(found.distortion)} coefficients"
     size = f"{found.width_px} x {found.height_px} px, fx {found.fx_px:.6g} px"
-    show_facts(f"camera {found.name}", [("size", size), ("lens", lens), ("rig file", str(output))])
+    document = {"rig": str(output), "camera": found.name, "lens": found.lens}
+    facts = [("size", size), ("lens", lens), ("rig file", str(output))]
+    present(as_json, document, f"camera {found.name}", facts)

@@ -23,7 +23,7 @@ from cdpr.cli.options import (
     Triple,
     calibrated_rig,
 )
-from cdpr.cli.output import Terminal, show_facts, show_json
+from cdpr.cli.output import Terminal, present
 from model.files.output import require_new_file
 from model.plan import plan_as_dict, plan_facts, save_plan
 from model.rig import load_rig
@@ -72,13 +72,12 @@ def poses(
     )
     save_plan(made.document, output)
     angles = [degrees(pose.angle_to(the_rig.home)) for pose in made.poses]
-    if as_json:
-        show_json({"plan": str(output), "turned_deg": angles, **plan_as_dict(made.document)})
-        return
     sentences = [s for s in plan_facts(made.document) if s[0] not in ("via", "search")]
     text = f"{len(made.poses)}, rotated by up to {max(angles):.1f}°"
     next_step = f"cdpr run {output} --rig {rig} -o RUNDIR, then cdpr calibrate rig {rig} RUNDIR"
-    show_facts(f"plan {output}", [("poses", text), *sentences, ("next", next_step)])
+    document = {"plan": str(output), "turned_deg": angles, **plan_as_dict(made.document)}
+    facts = [("poses", text), *sentences, ("next", next_step)]
+    present(as_json, document, f"plan {output}", facts)
 
 
 # `cdpr calibrate rig`: outlets, anchors, pulleys, winches, stiffness, from stationary samples.

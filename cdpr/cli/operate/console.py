@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import typer
 
 from cdpr import console as page  # loads the server where it is asked for
 from cdpr.cli.arguments import option
-from cdpr.cli.operate.run import agreement, show, show_files
-from cdpr.cli.operate.supervision import RunSupervisor
+from cdpr.cli.operate.run import supervise
 from cdpr.cli.options import RIG, WITHOUT_REAL_TIME, BusOptions
 from cdpr.cli.output import Terminal, out, show_facts, show_line
 from cdpr.console.session import Console, ConsoleFiles
@@ -144,21 +144,12 @@ def demo(
     show_facts("plan", plan_facts(document))
     if console:
         folder.mkdir(parents=True)
-        plan = folder / "plan.json"
-        save_plan(document, plan)
+        plan_file = folder / "plan.json"
+        save_plan(document, plan_file)
         files = ConsoleFiles(ready_folder() / PAPER_RIG, rig, (), (), (), scene_file, False, False)
-        serve(files, plan, "127.0.0.1", 0)
+        serve(files, plan_file, "127.0.0.1", 0)
         return
-    with RunSupervisor(lambda result: show(result, False)) as supervisor:
-        result = runner.run(
-            plan_from_document(document),
-            rig,
-            folder=folder,
-            realtime=False,
-            listener=Terminal(),
-            confirm=agreement(supervisor, rig, False, False),
-            supervisor=supervisor,
-        )
-        show_files(result, False)
+    plan = plan_from_document(document)
+    code = supervise(partial(runner.run, plan, rig, folder=folder, realtime=False), rig)
     out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
-    raise typer.Exit(result.exit_code)
+    raise typer.Exit(code)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from cdpr.cli.arguments import option
+from cdpr.cli.arguments import given_options, option
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
     CALIBRATION,
@@ -23,20 +23,6 @@ from cdpr.cli.options import (
 from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
 from executor import homing
 from executor.drives import is_simulated, require_own_time
-from executor.homing import (
-    FASTEST,
-    FEWEST_IMAGES,
-    FURTHEST,
-    MOST_IMAGES,
-    PICTURES,
-    REACH,
-    SLACK,
-    SPEED,
-)
-from model.rig import Rig
-
-FASTEST_MM_S = 1000.0 * FASTEST
-REACH_MM, SPEED_MM_S, SLACK_MM = 1000.0 * REACH, 1000.0 * SPEED, 1000.0 * SLACK
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,26 +32,23 @@ class WindingOptions:
     tension_n: float | None = option(None, "pretension (default: twice the rig's smallest tension)")
     limit_n: float | None = option(None, "tension limit of any cable (default: 60 % of the range)")
     reach_mm: float = option(
-        REACH_MM, "largest length to wind in per cable", min=0.1, max=1000.0 * FURTHEST
+        1000.0 * homing.REACH,
+        "largest length to wind in per cable",
+        min=0.1,
+        max=1000.0 * homing.FURTHEST,
     )
-    speed_mm_s: float = option(SPEED_MM_S, "largest winch speed", min=0.01, max=FASTEST_MM_S)
+    speed_mm_s: float = option(
+        1000.0 * homing.SPEED, "largest winch speed", min=0.01, max=1000.0 * homing.FASTEST
+    )
     pictures: int = option(
-        PICTURES, "number of images for the pose", min=FEWEST_IMAGES, max=MOST_IMAGES
+        homing.PICTURES,
+        "number of images for the pose",
+        min=homing.FEWEST_IMAGES,
+        max=homing.MOST_IMAGES,
     )
     simulated_slack_mm: float = option(
-        SLACK_MM, "largest slack of simulated cables", min=0.0, max=100.0
+        1000.0 * homing.SLACK, "largest slack of simulated cables", min=0.0, max=100.0
     )
-
-    def given(self) -> dict[str, object]:
-        """Value of each option by name, false for a default."""
-        return {
-            "--tension-n": self.tension_n,
-            "--limit-n": self.limit_n,
-            "--reach-mm": self.reach_mm != REACH_MM,
-            "--speed-mm-s": self.speed_mm_s != SPEED_MM_S,
-            "--pictures": self.pictures != PICTURES,
-            "--simulated-slack-mm": self.simulated_slack_mm != SLACK_MM,
-        }
 
 
 def home(
@@ -100,17 +83,21 @@ def home(
       cdpr home configs/gachon_8_6.yaml --camera synthetic --fast
     """
     the_rig = rig_on_bus(rig, interface, channel, calibration)
-    asks = not (is_simulated(the_rig) or yes)
+    confirm = confirmation(asks=not (is_simulated(the_rig) or yes), as_json=as_json)
     require_own_time(the_rig, not fast)
     if as_rig_file:
         if at_home or pose_mm or camera:
             homing.require_one_pose(False, None, [])
         require_unused(
             "cdpr home",
-            winding.given() | {"--fast": fast, "--without-real-time": without_real_time},
+            given_options(winding) | {"--fast": fast, "--without-real-time": without_real_time},
             "--as-rig-file neither moves nor measures",
         )
-        _use_rig_file_counts(the_rig, asks, as_json)
+        homing.use_rig_file_counts(the_rig, confirm=confirm)
+        if as_json:
+            show_json({"file": None})
+        else:
+            out.print("no reference is stored; drives match the rig file at home")
         return
     result = homing.home(
         the_rig,
@@ -126,7 +113,7 @@ def home(
         realtime=not fast,
         need_real_time_rights=not without_real_time,
         listener=Terminal(quiet=as_json),
-        confirm=confirmation(asks=asks, as_json=as_json),
+        confirm=confirm,
         supervisor=SignalSupervisor(),
     )
     if as_json:
@@ -137,13 +124,3 @@ def home(
         show_line(
             "next: `cdpr jog RIG --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`"
         )
-
-
-def _use_rig_file_counts(rig: Rig, asks: bool, as_json: bool) -> None:
-    """Deletes the reference, so that the rig file's counts apply again."""
-    confirm = confirmation(asks=asks, as_json=as_json)
-    homing.use_rig_file_counts(rig, confirm=confirm)
-    if as_json:
-        show_json({"file": None})
-    else:
-        out.print("no reference is stored; drives match the rig file at home")

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,9 @@ import typer
 from rich.live import Live
 from rich.text import Text
 
-from cdpr.cli.arguments import option
-from cdpr.cli.operate.run import agreement, show, show_files
-from cdpr.cli.operate.supervision import (
-    Keys,
-    RunSupervisor,
-    SignalSupervisor,
-    confirmation,
-    speed_by_key,
-)
+from cdpr.cli.arguments import given_options, option
+from cdpr.cli.operate.run import supervise
+from cdpr.cli.operate.supervision import Keys, SignalSupervisor, confirmation, speed_by_key
 from cdpr.cli.options import (
     FAST,
     RIG,
@@ -33,7 +28,7 @@ from cdpr.cli.options import (
     Quaternion,
     Triple,
     require_unused,
-    simulated_start,
+    rotation_of,
 )
 from cdpr.cli.output import Terminal, err, out, show_json, show_line
 from executor import jogging
@@ -46,33 +41,40 @@ from executor.proposals import Proposal
 from executor.state_machine import CycleRecord, State
 from model.errors import BadInput
 from model.files.documents import millimetres
+from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, load_scene
 
 
 @dataclass(frozen=True, slots=True)
-class PathOptions:
-    """Distance and surroundings of a jog; every field is an option of `cdpr jog`."""
+class DistanceOptions:
+    """Where a jog moves to; every field is an option of `cdpr jog`."""
 
     by_mm: Triple | None = option(None, "distance x y z, at most 50 mm")
     to_home: bool = option(False, "move to the rig's home pose and orientation")
+
+
+@dataclass(frozen=True, slots=True)
+class SceneOptions:
+    """Surroundings of a jog; every field is an option of `cdpr jog`."""
+
     scene: Path | None = option(None, "scene file: obstacles and payload")
     no_scene: bool = option(False, "jog without a description of obstacles")
     clearance_mm: float | None = option(None, "obstacle clearance instead of the scene's", min=0.0)
-    output: Path | None = option(
-        None, "run folder to create (default: runs/jog, runs/jog-2 …)", "-o", "--output"
-    )
 
-    def given(self) -> dict[str, object]:
-        """Value of each option by name."""
-        return {
-            "--by-mm": self.by_mm,
-            "--to-home": self.to_home,
-            "--scene": self.scene,
-            "--no-scene": self.no_scene,
-            "--clearance-mm": self.clearance_mm,
-            "--output": self.output,
-        }
+    def loaded(self) -> Scene | None:
+        """The surroundings; None only with ``--no-scene``."""
+        if (self.scene is None) != self.no_scene:
+            raise BadInput(
+                "obstacles are unknown: pass either --scene SCENE or --no-scene",
+                where="--scene",
+                next_step="pass --scene with the scene file, or --no-scene if there are no"
+                " obstacles",
+            )
+        if self.scene is None:
+            return None
+        clearance = None if self.clearance_mm is None else self.clearance_mm / 1000.0
+        return load_scene(self.scene).changed(stops=()).changed(clearance=clearance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +96,22 @@ class HeldOptions:
         " (default: home)",
     )
     simulated_start_wxyz: Quaternion | None = option(None, "its orientation (default: as at home)")
+
+    def start(self, rig: Rig) -> Pose | None:
+        """The initial pose of the simulated platform, ``world_from_platform``; None for home.
+
+        Raises:
+            BadInput: Only the orientation is stated, or it is none.
+        """
+        rotation = rotation_of(self.simulated_start_wxyz)
+        if self.simulated_start_mm is None:
+            if rotation is not None:
+                raise BadInput(
+                    "an orientation without a position", next_step="add --simulated-start-mm X Y Z"
+                )
+            return None
+        position = millimetres(list(self.simulated_start_mm))
+        return Pose(position, rig.home.rotation if rotation is None else rotation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +145,11 @@ SHOWN_EVERY = 0.2
 def jog(
     *,
     rig: Path = RIG,
-    path: PathOptions,
+    distance: DistanceOptions,
+    surroundings: SceneOptions,
+    output: Path | None = option(
+        None, "run folder to create (default: runs/jog, runs/jog-2 …)", "-o", "--output"
+    ),
     cable: int | None = option(None, "move one winch by --mm", min=1),
     mm: float | None = option(None, "length to pay out, at most 50; negative: wind in"),
     held: HeldOptions,
@@ -156,116 +178,74 @@ def jog(
     the_rig = bus.rig(rig)
     require_own_time(the_rig, not drives.fast)
     speed = speed_mm_s / 1000.0
+    path = given_options(distance) | given_options(surroundings) | {"--output": output}
     if cable is not None or mm is not None:
-        require_unused(
-            "cdpr jog",
-            path.given(),
-            "a single cable is moved without a path, and obstacles are not checked",
-        )
+        why = "a single cable is moved without a path, and obstacles are not checked"
+        require_unused("cdpr jog", path, why)
         _one_cable(the_rig, cable, mm, limit_n, speed, drives)
         return
     if not (held.hold_to_run or held.keys):
-        unused = {
+        simulated_start = {
             "--simulated-start-mm": held.simulated_start_mm,
             "--simulated-start-wxyz": held.simulated_start_wxyz,
         }
-        require_unused("cdpr jog", unused, "only with --hold-to-run or --keys")
+        require_unused("cdpr jog", simulated_start, "only with --hold-to-run or --keys")
+    no_effect = {"--json": drives.as_json, "--fast": drives.fast}
     if held.one_cable:
-        _held_cables(the_rig, path, held, limit_n, speed, drives)
+        if not held.hold_to_run or held.keys:
+            raise BadInput(
+                "--one-cable needs --hold-to-run, without --keys",
+                where="cdpr jog",
+                why="single cables are jogged by held controls, such as those of `cdpr console`",
+                next_step="pass --hold-to-run --one-cable, or --cable N --mm X for a fixed length",
+            )
+        why = "controls move one cable at a time, without a path"
+        require_unused("cdpr jog", path | no_effect, why)
+        _hold_to_run(partial(cable_session, the_rig, limit=limit_n, speed=speed), the_rig, drives)
         return
-    require_unused(
-        "cdpr jog",
-        {"--limit-n": limit_n},
-        "only with --cable or --one-cable; a path uses the rig's limits",
-    )
-    if held != HeldOptions():
-        _held(the_rig, path, held, speed, drives)
-        return
-    by = None if path.by_mm is None else millimetres(list(path.by_mm))
-    jogging.require_distance(by, to_home=path.to_home)
-    the_scene = _scene(path.scene, path.no_scene, path.clearance_mm)
-    with RunSupervisor(lambda result: show(result, drives.as_json)) as supervisor:
-        result = jogging.jog(
+    why = "only with --cable or --one-cable; a path uses the rig's limits"
+    require_unused("cdpr jog", {"--limit-n": limit_n}, why)
+    if held.hold_to_run or held.keys:
+        unused = given_options(distance) | {"--output": output} | no_effect
+        require_unused("cdpr jog", unused, "held controls set the direction, in real time")
+        keys = JogKeys(Keys(), 1000.0 * speed) if held.keys else None
+        session = partial(
+            jog_session,
             the_rig,
-            the_scene,
-            by=by,
-            to_home=path.to_home,
+            surroundings.loaded(),
             speed=speed,
-            folder=path.output,
-            realtime=not drives.fast,
-            need_real_time_rights=not drives.without_real_time,
-            listener=Terminal(quiet=drives.as_json),
-            confirm=agreement(supervisor, the_rig, drives.yes, drives.as_json),
-            supervisor=supervisor,
-        )
-        show_files(result, drives.as_json)
-    raise typer.Exit(result.exit_code)
-
-
-def _held(
-    rig: Rig,
-    path: PathOptions,
-    held: HeldOptions,
-    speed: float,
-    drives: DriveOptions,
-) -> None:
-    require_unused(
-        "cdpr jog",
-        {
-            "--by-mm": path.by_mm,
-            "--to-home": path.to_home,
-            "--output": path.output,
-            "--json": drives.as_json,
-            "--fast": drives.fast,
-        },
-        "held controls set the direction, in real time",
-    )
-    keys = JogKeys(Keys(), 1000.0 * speed) if held.keys else None
-    with keys or ExitStack():
-        jog_session(
-            rig,
-            _scene(path.scene, path.no_scene, path.clearance_mm),
-            speed=speed,
-            start=simulated_start(rig, held.simulated_start_mm, held.simulated_start_wxyz),
-            need_real_time_rights=not drives.without_real_time,
-            listener=Terminal(quiet=False),
-            confirm=drives.confirm(rig),
-            supervisor=SignalSupervisor(),
+            start=held.start(the_rig),
             on_cycle=None if keys is None else keys.take_cycle,
         )
-    _say_ended(rig)
-
-
-def _held_cables(
-    rig: Rig,
-    path: PathOptions,
-    held: HeldOptions,
-    limit_n: float | None,
-    speed: float,
-    drives: DriveOptions,
-) -> None:
-    if not held.hold_to_run or held.keys:
-        raise BadInput(
-            "--one-cable needs --hold-to-run, without --keys",
-            where="cdpr jog",
-            why="single cables are jogged by held controls, such as those of `cdpr console`",
-            next_step="pass --hold-to-run --one-cable, or --cable N --mm X for a fixed length",
-        )
-    unused = {**path.given(), "--json": drives.as_json, "--fast": drives.fast}
-    require_unused("cdpr jog", unused, "controls move one cable at a time, without a path")
-    cable_session(
-        rig,
-        limit=limit_n,
+        _hold_to_run(session, the_rig, drives, keys)
+        return
+    by = None if distance.by_mm is None else millimetres(list(distance.by_mm))
+    jogging.require_distance(by, to_home=distance.to_home)
+    motion = partial(
+        jogging.jog,
+        the_rig,
+        surroundings.loaded(),
+        by=by,
+        to_home=distance.to_home,
         speed=speed,
+        folder=output,
+        realtime=not drives.fast,
         need_real_time_rights=not drives.without_real_time,
-        listener=Terminal(quiet=False),
-        confirm=drives.confirm(rig),
-        supervisor=SignalSupervisor(),
     )
-    _say_ended(rig)
+    raise typer.Exit(supervise(motion, the_rig, yes=drives.yes, as_json=drives.as_json))
 
 
-def _say_ended(rig: Rig) -> None:
+def _hold_to_run(
+    session: Callable[..., object], rig: Rig, drives: DriveOptions, keys: JogKeys | None = None
+) -> None:
+    """Holds a session of hold-to-run controls, until it ends."""
+    with keys or ExitStack():
+        session(
+            need_real_time_rights=not drives.without_real_time,
+            listener=Terminal(),
+            confirm=drives.confirm(rig),
+            supervisor=SignalSupervisor(),
+        )
     out.print("jogging ended" + ("" if is_simulated(rig) else "; the drives hold"))
 
 
@@ -392,17 +372,3 @@ def _one_cable(
         return
     out.print(f"cable {cable} moved by {moved_mm:+.3f} mm, positive pays out; the drives hold")
     show_line(f"tensions: {', '.join(f'{t:.1f}' for t in tensions)} N")
-
-
-def _scene(path: Path | None, without: bool, clearance_mm: float | None) -> Scene | None:
-    """The surroundings; None only with ``--no-scene``."""
-    if (path is None) != without:
-        raise BadInput(
-            "obstacles are unknown: pass either --scene SCENE or --no-scene",
-            where="--scene",
-            next_step="pass --scene with the scene file, or --no-scene if there are no obstacles",
-        )
-    if path is None:
-        return None
-    clearance = None if clearance_mm is None else clearance_mm / 1000.0
-    return load_scene(path).changed(stops=()).changed(clearance=clearance)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import typer
@@ -95,38 +96,45 @@ def run(
         the_rig = rig_on_bus(rig, interface, channel, calibration)
     if no_camera:
         _refuse_camera_options(camera, no_clearance_stop)
-    with RunSupervisor(lambda result: show(result, as_json)) as supervisor:
-        result = runner.run(
-            the_plan,
-            the_rig,
-            folder=output,
-            cameras=[] if no_camera else camera or None,
-            realtime=not fast,
-            start=level_pose(simulated_start_mm),
-            clearance_stop=not no_clearance_stop,
-            need_real_time_rights=not without_real_time,
-            listener=Terminal(quiet=as_json),
-            confirm=agreement(supervisor, the_rig, yes, as_json),
-            supervisor=supervisor,
-            plan_file=plan,
-        )
-        show_files(result, as_json)
-    raise typer.Exit(result.exit_code)
+    motion = partial(
+        runner.run,
+        the_plan,
+        the_rig,
+        folder=output,
+        cameras=[] if no_camera else camera or None,
+        realtime=not fast,
+        start=level_pose(simulated_start_mm),
+        clearance_stop=not no_clearance_stop,
+        need_real_time_rights=not without_real_time,
+        plan_file=plan,
+    )
+    raise typer.Exit(supervise(motion, the_rig, yes=yes, as_json=as_json))
 
 
-def agreement(
-    supervisor: RunSupervisor, rig: Rig, yes: bool, as_json: bool
-) -> Callable[[MotionProposal], bool]:
-    """A `confirm` callback that hands the signals to the run once the operator agrees."""
+def supervise(
+    motion: Callable[..., RunResult], rig: Rig, *, yes: bool = False, as_json: bool = False
+) -> int:
+    """Runs a motion for the operator at the terminal, shows its result, returns its exit code.
+
+    Args:
+        motion: Called with ``listener``, ``confirm`` and ``supervisor``; signals go to the run once
+            the operator agreed.
+        rig: Simulated drives move without a question.
+        yes: Other drives, too.
+        as_json: Standard output is for a program.
+    """
     ask = confirmation(asks=not (is_simulated(rig) or yes), as_json=as_json)
+    with RunSupervisor(lambda result: show(result, as_json)) as supervisor:
 
-    def confirm(proposal: MotionProposal) -> bool:
-        agreed = ask(proposal)
-        if agreed:
-            supervisor.take_over()
-        return agreed
+        def confirm(proposal: MotionProposal) -> bool:
+            agreed = ask(proposal)
+            if agreed:
+                supervisor.take_over()
+            return agreed
 
-    return confirm
+        result = motion(listener=Terminal(quiet=as_json), confirm=confirm, supervisor=supervisor)
+        show_files(result, as_json)
+    return result.exit_code
 
 
 def show(result: RunResult, as_json: bool) -> None:
