@@ -111,10 +111,9 @@ VERBS = tuple(verb for verbs in PANELS.values() for verb in verbs)
 class LazyGroup(TyperGroup):
     """A command group over a table; help and completion of names import no verb's module."""
 
-    verbs: tuple[Verb, ...] = VERBS
-
-    def __init__(self, **attributes: Any) -> None:
+    def __init__(self, verbs: tuple[Verb, ...] = VERBS, **attributes: Any) -> None:
         super().__init__(**attributes)
+        self.verbs = verbs
         panels = {verb: panel for panel, verbs in PANELS.items() for verb in verbs}
         self.commands = {
             verb.name: TyperCommand(verb.name, help=verb.help, rich_help_panel=panels.get(verb))
@@ -131,22 +130,10 @@ class LazyGroup(TyperGroup):
         return name, self.loaded(name) if command is not None and name else command, rest
 
 
-class _CalibrateGroup(LazyGroup):
-    verbs = CALIBRATE
-
-
-class _BenchGroup(LazyGroup):
-    verbs = BENCH
-
-
-_GROUPS = {"calibrate": _CalibrateGroup, "bench": _BenchGroup}
-
-
 def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
     if verb.verbs:
-        return _GROUPS[verb.name](
-            name=verb.name, help=verb.help, no_args_is_help=True, rich_markup_mode="rich"
-        )
+        about = {"name": verb.name, "help": verb.help}
+        return LazyGroup(verb.verbs, **about, no_args_is_help=True, rich_markup_mode="rich")
     module, _, function = verb.target.partition(":")
     app = typer.Typer(rich_markup_mode="rich", add_completion=False)
     called = with_options(getattr(import_module(f"cdpr.cli.{module}"), function))

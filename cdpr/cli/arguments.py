@@ -97,10 +97,10 @@ def _parameter(name: str, kind: Any, declared: Field[Any]) -> inspect.Parameter:
 
 def given_options(group: Any) -> dict[str, object]:
     """Value of each option of a group, as typed, that differs from its default; else None."""
-    values = {one: getattr(group, one.name) for one in fields(group)}
+    values = [(one, getattr(group, one.name)) for one in fields(group)]
     return {
         _typed(one.name, one.metadata["names"]): None if value == one.default else value
-        for one, value in values.items()
+        for one, value in values
     }
 
 
@@ -134,7 +134,6 @@ def check_arguments(arguments: Mapping[str, object], options: Mapping[str, str])
     given = {
         name: list(value) if isinstance(value, (list, tuple)) else [value]
         for name, value in arguments.items()
-        if name in options  # all but Typer's context
     }
     for name, values in given.items():
         for value in values:
@@ -144,28 +143,28 @@ def check_arguments(arguments: Mapping[str, object], options: Mapping[str, str])
     refuse_overwriting(outputs, inputs)
 
 
-def _check(name: str, option: str, value: object) -> None:
+def _check(name: str, typed: str, value: object) -> None:
     match value:
         case bool() | None:
             return
         case int():
-            _check_whole(option, value, MOST_OF.get(name, MOST_WHOLE))
+            _check_whole(typed, value, MOST_OF.get(name, MOST_WHOLE))
         case float():
-            _check_number(option, value)
+            _check_number(typed, value)
         case Path():
             file_identity(value)
         case str():
-            _check_text(option, value, is_name=name in NAMES)
+            _check_text(typed, value, is_name=name in NAMES)
 
 
-def _check_whole(option: str, value: int, most: int) -> None:
+def _check_whole(typed: str, value: int, most: int) -> None:
     if abs(value) > most:
-        what = f"{option} is {str(value)[:40]}; the limit is {most}"
+        what = f"{typed} is {str(value)[:40]}; the limit is {most}"
         raise BadInput(what, where="command line", next_step="give a smaller number")
 
 
-def _check_number(option: str, value: float) -> None:
-    what, hint = f"{option} is {value:g}", "in the option's unit"
+def _check_number(typed: str, value: float) -> None:
+    what, hint = f"{typed} is {value:g}", "in the option's unit"
     if not math.isfinite(value):
         raise BadInput(what, where="command line", next_step=f"give a finite number, {hint}")
     if abs(value) > MOST:
@@ -173,10 +172,10 @@ def _check_number(option: str, value: float) -> None:
         raise BadInput(what, where="command line", next_step=f"give a smaller number, {hint}")
 
 
-def _check_text(option: str, text: str, *, is_name: bool) -> None:
+def _check_text(typed: str, text: str, *, is_name: bool) -> None:
     size = len(os.fsencode(text))
     if "\0" in text or (is_name and size > LONGEST_TEXT):
-        what = f"{option} has {size} bytes and is not a valid name"
+        what = f"{typed} has {size} bytes and is not a valid name"
         hint = f"give a name of {LONGEST_TEXT} bytes at most"
         raise BadInput(what, where=shown(text), next_step=hint)
     if "://" not in text:

@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,8 @@ def monitor(
         else:
             typer.echo(status_text(status))
         return
-    with _foxglove(foxglove) as stream:
+    # Ctrl-C ends the monitor, not the run.
+    with _foxglove(foxglove) as stream, suppress(KeyboardInterrupt):
         if as_json or not out.is_terminal:
             _lines(follow_run(process, rate, waits=wait), as_json, stream)
         else:
@@ -123,41 +124,35 @@ def _lines(
     seen: list[dict[str, Any]] = []
     status: dict[str, Any] = {"state": "gone"}
     robot = _Robot()
-    try:
-        for status in statuses:
-            if stream is not None:
-                stream.take(status, robot.seen(status))
-            if as_json:
-                typer.echo(json.dumps(status, allow_nan=False))
-                continue
-            for event in status["events"]:
-                if event not in seen:
-                    typer.echo(f"{event['time_s']:9.3f} s  {event['code']}: {event['text']}")
-            seen = status["events"]
-            typer.echo(status_line(status))
-    except KeyboardInterrupt:
-        return
+    for status in statuses:
+        if stream is not None:
+            stream.take(status, robot.seen(status))
+        if as_json:
+            typer.echo(json.dumps(status, allow_nan=False))
+            continue
+        for event in status["events"]:
+            if event not in seen:
+                typer.echo(f"{event['time_s']:9.3f} s  {event['code']}: {event['text']}")
+        seen = status["events"]
+        typer.echo(status_line(status))
     _show_end(status, as_json)
 
 
 def _live(process: int | None, rate: float, stream: console.FoxgloveStream | None) -> None:
     status: dict[str, Any] = {"state": "gone"}
     robot = _Robot()
-    try:
-        with (
-            Keys() if sys.stdin.isatty() else nullcontext() as keys,
-            Live(console=out, auto_refresh=False, vertical_overflow="crop") as live,
-        ):
-            operator = _Operator(keys)
-            live.update(Text("waiting for a run to begin; Ctrl-C ends the monitor"), refresh=True)
-            for status in follow_run(process, rate, waits=True, between=operator.between):
-                operator.status = status
-                seen = robot.seen(status)
-                if stream is not None:
-                    stream.take(status, seen)
-                live.update(_view(status, seen, operator.line), refresh=True)
-    except KeyboardInterrupt:
-        return
+    with (
+        Keys() if sys.stdin.isatty() else nullcontext() as keys,
+        Live(console=out, auto_refresh=False, vertical_overflow="crop") as live,
+    ):
+        operator = _Operator(keys)
+        live.update(Text("waiting for a run to begin; Ctrl-C ends the monitor"), refresh=True)
+        for status in follow_run(process, rate, waits=True, between=operator.between):
+            operator.status = status
+            seen = robot.seen(status)
+            if stream is not None:
+                stream.take(status, seen)
+            live.update(_view(status, seen, operator.line), refresh=True)
     _show_end(status, False)
 
 
