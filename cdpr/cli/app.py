@@ -70,10 +70,7 @@ def _verbs(*targets: str) -> tuple[Verb, ...]:
 
 
 CALIBRATE = _verbs(
-    "calibrate.camera:camera",
-    "calibrate.extrinsics:extrinsics",
-    "calibrate.camera:readout",
-    "calibrate.extrinsics:tags",
+    "calibrate.camera:camera,extrinsics,readout,tags",
     "calibrate.rig:poses,rig",
     "calibrate.boards:print_",
     "calibrate.results:diff,apply,export,import_",
@@ -101,7 +98,7 @@ PANELS: dict[str, tuple[Verb, ...]] = {
     ),
     "Measure": _verbs("track:track"),
     "Analyse": (
-        *_verbs("report:report", "check:explain", "studies:workspace"),
+        *_verbs("operate.run:report", "check:explain", "studies:workspace"),
         Verb("bench", verbs=BENCH, about="Measure the planner."),
     ),
 }

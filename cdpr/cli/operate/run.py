@@ -1,4 +1,4 @@
-"""`cdpr run`: runs a plan on the drives and measures it."""
+"""`cdpr run` runs a plan on the drives and measures it; `cdpr report` writes its report again."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ from cdpr.cli.output import Terminal, err, out, show_json, show_line
 from drivers.can_bus import IN_PROCESS
 from executor import runner
 from executor.drives import is_simulated
+from executor.evaluation import rewrite_report
 from executor.proposals import MotionProposal
+from executor.recording.run_folder import RunFolder
 from executor.runner import RunResult
 from model.errors import BadInput
 from model.plan import load_plan
@@ -180,3 +182,28 @@ def _refuse_camera_options(camera: list[str] | None, no_clearance_stop: bool) ->
         )
     why = "without a camera no clearance is measured, so it cannot stop the run"
     require_unused("cdpr run", {"--no-clearance-stop": no_clearance_stop}, why)
+
+
+# `cdpr report`: the report of a run, from its folder.
+
+
+def report(
+    *,
+    run: Path = argument("run folder", "RUNDIR"),
+    as_json: bool = option(False, "print the run's summary", "--json"),
+) -> None:
+    """Write the report of a run again, from the files of its folder.
+
+    For a run that was killed, or whose disk was full, missing results are recovered from the files
+    that exist.
+
+    Example:
+      cdpr report runs/first
+    """
+    folder = RunFolder.open_cut_short(run)
+    with Terminal(quiet=as_json).waiting("writing the report"):
+        rewrite_report(folder)
+    if as_json:
+        show_json(folder.summary())
+        return
+    show_line(f"report: {folder.report}")
