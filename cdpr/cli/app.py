@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import gc
 import inspect
 import io
@@ -12,7 +11,7 @@ import re
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -23,8 +22,8 @@ from typing import Any, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from cdpr.cli.arguments import check_arguments, option, with_options
-from model.errors import AlreadyExists, BadInput, CdprError, Fault, StoppedByOperator
+from cdpr.cli.arguments import as_command, flag
+from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.reading import shown
 
 
@@ -133,12 +132,9 @@ def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
         return LazyGroup(verb.verbs, **about, no_args_is_help=True, rich_markup_mode="rich")
     module, _, function = verb.target.partition(":")
     app = typer.Typer(rich_markup_mode="rich", add_completion=False)
-    called = with_options(getattr(import_module(f"cdpr.cli.{module}"), function))
-    typed: dict[str, str] = {}
-    text = _help_of(called)
-    app.command(verb.name, cls=_VerbCommand, help=text)(_guarded(called, typed))
+    called = getattr(import_module(f"cdpr.cli.{module}"), function)
+    app.command(verb.name, cls=_VerbCommand, help=_help_of(called))(as_command(called))
     command: Any = typer.main.get_command(app)
-    typed.update((one.name, max(one.opts, key=len)) for one in command.params)
     return command  # type: ignore[no-any-return]
 
 
@@ -174,20 +170,6 @@ def joined_points(arguments: Sequence[str]) -> list[str]:
     return joined
 
 
-def _guarded(verb: Callable[..., None], typed: Mapping[str, str]) -> Callable[..., None]:
-    """Checks the arguments first; Ctrl-C outside a run counts as the operator's stop."""
-
-    @functools.wraps(verb)
-    def guarded(*args: object, **options: object) -> None:
-        try:
-            check_arguments(options, typed)
-            verb(*args, **options)
-        except KeyboardInterrupt:
-            raise StoppedByOperator("interrupted") from None
-
-    return guarded
-
-
 EPILOG = (
     "Exit codes: 0 ok, 1 fault, 2 bad input, 3 refused by a safety check,"
     " 4 hardware missing, 130 stopped by the operator."
@@ -214,14 +196,14 @@ def build_app() -> typer.Typer:
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    app.callback()(with_options(_options))
+    app.callback()(as_command(_options))
     return app
 
 
 def _options(
     *,
-    _version: bool = option(
-        False, "Show the version and exit.", "--version", callback=_show_version, is_eager=True
+    _version: bool = flag(
+        "Show the version and exit.", "--version", callback=_show_version, is_eager=True
     ),
 ) -> None:
     """Plan, prove, run and measure paths of cable-driven parallel robots."""

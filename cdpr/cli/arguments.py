@@ -1,9 +1,9 @@
 """Arguments and options of the verbs: their declaration, and checks that all verbs share.
 
-A verb declares each as a parameter, ``cost: float = option(1.0, "help")``. Options that belong
-together are the fields of a dataclass, which is then one parameter of the verb. Invalid paths,
-outputs that would overwrite an input or each other, and numbers beyond any machine are refused
-here, before a verb opens or writes anything.
+A verb declares each as a parameter, ``cost: float = option("help", default=1.0)``. Options that
+belong together are the fields of a dataclass, which is then one parameter of the verb. Invalid
+paths, outputs that would overwrite an input or each other, and numbers beyond any machine are
+refused here, before a verb opens or writes anything.
 """
 
 from __future__ import annotations
@@ -11,36 +11,49 @@ from __future__ import annotations
 import inspect
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints, overload
 
 import typer
 
-from model.errors import BadInput
+from model.errors import BadInput, StoppedByOperator
 from model.files.output import file_identity, refuse_overwriting
 from model.files.reading import shown
 
 T = TypeVar("T")
 
 
-def option(default: T, text: str, *names: str, **more: Any) -> T:
+@overload
+def option(text: str, *names: str, default: T, **more: Any) -> T: ...
+
+
+@overload
+def option(text: str, *names: str, **more: Any) -> None: ...
+
+
+def option(text: str, *names: str, default: Any = None, **more: Any) -> Any:
     """Declares an option.
 
     Args:
-        default: The value where the option is not given.
         text: As the help displays it.
         names: How it is typed (default: as the parameter).
+        default: The value where it is not given.
         more: See `typer.Option`, such as ``min`` and ``metavar``.
     """
     return field(default=default, metadata=_declaration(typer.Option, text, names, more))
 
 
+def flag(text: str, *names: str, **more: Any) -> bool:
+    """Declares an option without a value, false unless it is given; see `option`."""
+    return option(text, *names, default=False, **more)
+
+
 def required(text: str, *names: str, **more: Any) -> Any:
     """Declares an option that must be given; see `option`."""
-    return field(metadata=_declaration(typer.Option, text, names, more))
+    return option(text, *names, default=MISSING, **more)
 
 
 def argument(text: str, metavar: str | None = None, *, default: Any = MISSING, **more: Any) -> Any:
@@ -50,42 +63,48 @@ def argument(text: str, metavar: str | None = None, *, default: Any = MISSING, *
 
 
 def _declaration(
-    typer_kind: Callable[..., Any], text: str, names: tuple[str, ...], more: dict[str, Any]
+    kind: Callable[..., Any], text: str, names: tuple[str, ...], more: dict[str, Any]
 ) -> dict[str, Any]:
-    return {"kind": typer_kind, "names": names, "more": {"help": text, **more}}
+    return {"kind": kind, "names": names, "more": {"help": text, **more}}
 
 
-def with_options(verb: Callable[..., None]) -> Callable[..., None]:
-    """The verb with one parameter per option, annotated as Typer reads it."""
+def as_command(verb: Callable[..., None]) -> Callable[..., None]:
+    """The verb with one parameter per option, annotated as Typer reads it.
+
+    It checks the values first. Ctrl-C outside a run counts as the operator's stop.
+    """
     expanded: dict[str, list[inspect.Parameter]] = {}
     groups: dict[str, Any] = {}
+    typed: dict[str, str] = {}
     for one in inspect.signature(verb, eval_str=True).parameters.values():
+        declared = [(one.name, one.annotation, one.default)]
         if is_dataclass(one.annotation):
-            hints = get_type_hints(one.annotation)
-            groups[one.name] = one.annotation
-            expanded[one.name] = [
-                _parameter(f.name, hints[f.name], f) for f in fields(one.annotation)
-            ]
-        else:
-            expanded[one.name] = [_parameter(one.name, one.annotation, one.default)]
+            groups[one.name], hints = one.annotation, get_type_hints(one.annotation)
+            declared = [(each.name, hints[each.name], each) for each in fields(one.annotation)]
+        expanded[one.name] = [_parameter(*each) for each in declared]
+        typed |= {name: _typed(name, declaration) for name, _, declaration in declared}
 
     @wraps(verb)
-    def called(**values: Any) -> None:
-        for name, group in groups.items():
-            values[name] = group(**{p.name: values.pop(p.name) for p in expanded[name]})
-        verb(**values)
+    def command(**values: Any) -> None:
+        try:
+            check_arguments(values, typed)
+            for name, group in groups.items():
+                values[name] = group(**{p.name: values.pop(p.name) for p in expanded[name]})
+            verb(**values)
+        except KeyboardInterrupt:
+            raise StoppedByOperator("interrupted") from None
 
     parameters = [parameter for each in expanded.values() for parameter in each]
-    as_seen: Any = called
+    as_seen: Any = command
     as_seen.__signature__ = inspect.Signature(parameters)
     as_seen.__annotations__ = {p.name: p.annotation for p in parameters}
-    return called
+    return command
 
 
 def _parameter(name: str, kind: Any, declared: Field[Any]) -> inspect.Parameter:
     names = declared.metadata["names"]
     if kind is bool and not names:
-        names = (_typed(name),)  # otherwise Typer adds ``--no-…``
+        names = (_typed(name, declared),)  # otherwise Typer adds ``--no-…``
     declaration = declared.metadata["kind"](*names, **declared.metadata["more"])
     return inspect.Parameter(
         name,
@@ -95,18 +114,17 @@ def _parameter(name: str, kind: Any, declared: Field[Any]) -> inspect.Parameter:
     )
 
 
+def _typed(name: str, declared: Field[Any]) -> str:
+    """How an argument or option is typed, in full."""
+    if declared.metadata["kind"] is typer.Argument:
+        return name
+    return max(declared.metadata["names"], key=len, default=f"--{name.replace('_', '-')}")
+
+
 def given_options(group: Any) -> dict[str, object]:
     """Value of each option of a group, as typed, that differs from its default; else None."""
     values = [(one, getattr(group, one.name)) for one in fields(group)]
-    return {
-        _typed(one.name, one.metadata["names"]): None if value == one.default else value
-        for one, value in values
-    }
-
-
-def _typed(name: str, names: Sequence[str] = ()) -> str:
-    """How an option is typed, in full."""
-    return max(names, key=len) if names else f"--{name.replace('_', '-')}"
+    return {_typed(one.name, one): None if value == one.default else value for one, value in values}
 
 
 OUTPUTS = ("output", "mcap", "overlay")

@@ -18,7 +18,7 @@ from planner.check import check_path
 def check(
     *,
     plan: Path = argument("plan file (JSON)", "PLAN"),
-    rig: Path | None = option(None, "also require that the plan fits this rig file"),
+    rig: Path | None = option("also require that the plan fits this rig file"),
     as_json: bool = JSON,
 ) -> None:
     """Verify a plan independently: distances at dense poses, with bounds in between.

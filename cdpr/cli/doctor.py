@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 from rich.table import Table
 
-from cdpr.cli.arguments import argument, option
+from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import JSON
 from cdpr.cli.output import out, show_json, show_line
 from executor.doctor import MachineCheck, check_machine, check_rig, examine, stopping_text
@@ -24,10 +24,8 @@ if TYPE_CHECKING:  # needs canopen, which may be missing
 def doctor(
     *,
     rig: Path | None = argument("also check this rig's bus and cameras", "[RIG]", default=None),
-    camera: str | None = option(
-        None, "also capture an image with this camera: index, device or address"
-    ),
-    drives: bool = option(False, "also read every object of every CANopen drive"),
+    camera: str | None = option("also capture an image with this camera: index, device or address"),
+    drives: bool = flag("also read every object of every CANopen drive"),
     as_json: bool = JSON,
 ) -> None:
     """Check that this machine can run a rig; with a rig file, also its bus and cameras.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import calibration  # loads names lazily: `cdpr stop` must not wait for scientific libraries
-from cdpr.cli.arguments import argument, option, required
+from cdpr.cli.arguments import argument, flag, option, required
 from cdpr.cli.output import Terminal
 from model.errors import BadInput
 from model.files.documents import millimetres
@@ -19,8 +19,8 @@ from model.rig import Rig, load_rig
 RIG = argument("rig file (YAML)", "RIG")
 SCENE = argument("scene file (YAML)", "SCENE")
 PLAN_FILE = required("plan file to write (JSON)", "-o", "--output")
-REPLACE_PLAN = option(False, "replace an existing plan file")
-JSON = option(False, "print the result as JSON", "--json")
+REPLACE_PLAN = flag("replace an existing plan file")
+JSON = flag("print the result as JSON", "--json")
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -50,7 +50,6 @@ def rotation_of(wxyz: Quaternion | None) -> Array | None:
 # Calibration results that replace values of the rig file.
 
 CALIBRATION = option(
-    None,
     "result file of `cdpr calibrate`, used instead of the rig file's values; repeatable",
     metavar="FILE",
 )
@@ -76,13 +75,13 @@ def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
 
 # Verbs that reach drives: the rig, its bus, and the motion.
 
-INTERFACE = option(None, "python-can interface, overriding the rig file's")
-CHANNEL = option(None, "channel of the interface")
-FAST = option(False, "simulated time, as fast as possible")
-YES = option(False, "do not ask before moving drives on a real bus")
-NO_QUESTION = option(False, "do not ask")
-WITHOUT_REAL_TIME = option(False, "move even if real-time scheduling is denied")
-SUMMARY_JSON = option(False, "print the summary as JSON", "--json")
+INTERFACE = option("python-can interface, overriding the rig file's")
+CHANNEL = option("channel of the interface")
+FAST = flag("simulated time, as fast as possible")
+YES = flag("do not ask before moving drives on a real bus")
+NO_QUESTION = flag("do not ask")
+WITHOUT_REAL_TIME = flag("move even if real-time scheduling is denied")
+SUMMARY_JSON = flag("print the summary as JSON", "--json")
 
 
 @dataclass(frozen=True, slots=True)

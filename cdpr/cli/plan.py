@@ -9,7 +9,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from cdpr.cli.arguments import option
+from cdpr.cli.arguments import flag, option
 from cdpr.cli.options import (
     CALIBRATION,
     JSON,
@@ -43,44 +43,38 @@ class SearchOptions:
     """Planner and its settings; every field is an option of `cdpr plan`."""
 
     planner: PlannerName = option(
-        "optimal", "optimal (recommended), or the paper's: adaptive, goal-bias"
+        "optimal (recommended), or the paper's: adaptive, goal-bias", default="optimal"
     )
-    cost: Objective | None = option(
-        None, "objective (default: length; the paper's planners: kinematic)"
-    )
+    cost: Objective | None = option("objective (default: length; the paper's planners: kinematic)")
     weight: list[str] | None = option(
-        None, "NAME=NUMBER, repeatable for a weighted sum: length, kinematic, …"
+        "NAME=NUMBER, repeatable for a weighted sum: length, kinematic, …"
     )
-    longest_mm: float | None = option(None, "optimal: upper limit of the path length", min=0.001)
+    longest_mm: float | None = option("optimal: upper limit of the path length", min=0.001)
     budget_ms: float | None = option(
-        None, "optimal: time for improvement (default: 50 ms; 500 with --free-rotation)", min=0.001
+        "optimal: time for improvement (default: 50 ms; 500 with --free-rotation)", min=0.001
     )
     rounds: list[int] | None = option(
-        None, "optimal: fixed number of improvement rounds (reproducible)", min=1
+        "optimal: fixed number of improvement rounds (reproducible)", min=1
     )
-    free_rotation: bool = option(
-        False, "optimal: also rotate the platform, within the scene's limits"
-    )
+    free_rotation: bool = flag("optimal: also rotate the platform, within the scene's limits")
     mode: Mode | None = option(
-        None, "the paper's planners: RRT* (rewire), or stop at the first path (paper)"
+        "the paper's planners: RRT* (rewire), or stop at the first path (paper)"
     )
     max_iterations: int | None = option(
-        None, "the paper's planners: largest number of samples", min=1, max=1_000_000
+        "the paper's planners: largest number of samples", min=1, max=1_000_000
     )
-    failure_rate: FailureRate | None = option(
-        None, "e_r, k: failures in a row", rich_help_panel=_PANEL
-    )
-    focus: Focus | None = option(None, "the node x_c", rich_help_panel=_PANEL)
+    failure_rate: FailureRate | None = option("e_r, k: failures in a row", rich_help_panel=_PANEL)
+    focus: Focus | None = option("the node x_c", rich_help_panel=_PANEL)
     cone_draw: ConeDraw | None = option(
-        None, "r and θ₁ uniform, or points uniform in volume", rich_help_panel=_PANEL
+        "r and θ₁ uniform, or points uniform in volume", rich_help_panel=_PANEL
     )
     steer: Steer | None = option(
-        None, "steps of --mode paper: as Eq. 9, or as RRT*", rich_help_panel=_PANEL
+        "steps of --mode paper: as Eq. 9, or as RRT*", rich_help_panel=_PANEL
     )
     spacing_mm: float | None = option(
-        None, "reject nodes closer than this to another", min=0.0, rich_help_panel=_PANEL
+        "reject nodes closer than this to another", min=0.0, rich_help_panel=_PANEL
     )
-    goal_sight: bool = option(False, "every new node tries the goal", rich_help_panel=_PANEL)
+    goal_sight: bool = flag("every new node tries the goal", rich_help_panel=_PANEL)
 
     def with_seed(self, seed: int) -> PlanningOptions:
         """As options of the planner's library."""
@@ -93,19 +87,17 @@ def plan(
     rig: Path = RIG,
     scene: Path = SCENE,
     output: Path = PLAN_FILE,
-    seed: int = option(0, "random seed; with --rounds the plan is reproducible", min=0),
+    seed: int = option("random seed; with --rounds the plan is reproducible", default=0, min=0),
     calibration: list[Path] | None = CALIBRATION,
-    clearance_mm: float | None = option(
-        None, "obstacle clearance, overriding the scene's", min=0.0
-    ),
+    clearance_mm: float | None = option("obstacle clearance, overriding the scene's", min=0.0),
     search: SearchOptions,
-    start_mm: Triple | None = option(None, "start position x y z, overriding the scene's"),
-    goal_mm: Triple | None = option(None, "goal position x y z, overriding the scene's"),
+    start_mm: Triple | None = option("start position x y z, overriding the scene's"),
+    goal_mm: Triple | None = option("goal position x y z, overriding the scene's"),
     via_mm: list[str] | None = option(
-        None, "position x y z to pass before the scene's stops; repeatable", metavar="X Y Z"
+        "position x y z to pass before the scene's stops; repeatable", metavar="X Y Z"
     ),
     from_run: Path | None = option(
-        None, "start where this run ended, with the remaining stops", metavar="RUNDIR"
+        "start where this run ended, with the remaining stops", metavar="RUNDIR"
     ),
     force: bool = REPLACE_PLAN,
     as_json: bool = JSON,

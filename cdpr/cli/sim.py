@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from cdpr.cli.arguments import option
+from cdpr.cli.arguments import flag, option
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CALIBRATION, CHANNEL, INTERFACE, RIG, Triple, level_pose, rig_on_bus
 from cdpr.cli.output import Terminal, out, show_line
@@ -30,23 +30,19 @@ def sim(
     interface: str | None = INTERFACE,
     channel: str | None = CHANNEL,
     start_mm: Triple | None = option(
-        None, "initial position of the platform x y z (default: home)", "--at-mm"
+        "initial position of the platform x y z (default: home)", "--at-mm"
     ),
     power_lost: int | None = option(
-        None, "simulate a power loss (lost counts, slack cables) with this random seed", min=0
+        "simulate a power loss (lost counts, slack cables) with this random seed", min=0
     ),
-    slack_mm: float = option(5.0, "with --power-lost: largest slack", min=0.0, max=100.0),
-    on_a_stand: bool = option(
-        False, "with --power-lost: platform supported until all cables are taut"
-    ),
-    plan: Path | None = option(None, "start the platform at the start of this plan, with its load"),
+    slack_mm: float = option("with --power-lost: largest slack", default=5.0, min=0.0, max=100.0),
+    on_a_stand: bool = flag("with --power-lost: platform supported until all cables are taut"),
+    plan: Path | None = option("start the platform at the start of this plan, with its load"),
     eds: Path | None = option(
-        None,
         "EDS file of the simulated drives, such as their maker's (default: that of the rig"
-        " file's drive profile)",
+        " file's drive profile)"
     ),
     drive_behaviour: list[str] | None = option(
-        None,
         "deviation of the drives from strict CiA 402, repeatable; 'list' shows all",
         metavar="NAME[=VALUE]",
     ),

@@ -7,7 +7,7 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from cdpr.cli.arguments import argument, option
+from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import Triple
 from cdpr.cli.output import out, show_json, show_line
 from model.errors import AlreadyExists, BadInput
@@ -26,13 +26,11 @@ def examples(
     *,
     names: list[str] | None = argument("examples to copy; without a name, list all", default=None),
     output: Path | None = option(
-        None, "folder to copy to (default: the current one)", "-o", "--output", metavar="DIR"
+        "folder to copy to (default: the current one)", "-o", "--output", metavar="DIR"
     ),
-    everything: bool = option(
-        False, "copy all, into configs/ and examples/ as in the repository", "--all"
-    ),
-    force: bool = option(False, "replace files that exist"),
-    as_json: bool = option(False, "print the list as JSON", "--json"),
+    everything: bool = flag("copy all, into configs/ and examples/ as in the repository", "--all"),
+    force: bool = flag("replace files that exist"),
+    as_json: bool = flag("print the list as JSON", "--json"),
 ) -> None:
     """List the example rigs, scenes and recorded sessions, or copy some of them.
 
@@ -71,34 +69,34 @@ def examples(
 class RigOptions:
     """Answers to the questions of `cdpr new`, by their keys; every field is an option."""
 
-    platform_mm: Triple | None = option(None, "platform size", metavar="X Y Z")
-    mass_kg: float | None = option(None, "mass of the platform")
-    home_mm: Triple | None = option(None, "home position", metavar="X Y Z")
-    lower_mm: Triple | None = option(None, "lower corner of the workspace", metavar="X Y Z")
-    upper_mm: Triple | None = option(None, "upper corner of the workspace", metavar="X Y Z")
-    radius_mm: float | None = option(None, "radius of the cables")
-    stiffness_n: float | None = option(None, "axial stiffness of a cable")
-    min_tension_n: float | None = option(None, "smallest allowed tension of a cable")
-    max_tension_n: float | None = option(None, "largest tension of a cable")
-    drum_radius_mm: float | None = option(None, "radius of the drums")
-    gear_ratio: float | None = option(None, "motor turns per drum turn")
-    counts_per_rev: int | None = option(None, "encoder counts per motor turn")
-    encoder: str | None = option(None, "absolute or incremental")
-    max_speed_mm_s: float | None = option(None, "largest cable speed")
-    torque_constant_n: float | None = option(None, "cable tension at rated motor torque")
-    interface: str | None = option(None, "python-can interface of the bus")
-    channel: str | None = option(None, "channel of the bus")
-    bitrate: int | None = option(None, "bit rate of the bus, bit/s")
+    platform_mm: Triple | None = option("platform size", metavar="X Y Z")
+    mass_kg: float | None = option("mass of the platform")
+    home_mm: Triple | None = option("home position", metavar="X Y Z")
+    lower_mm: Triple | None = option("lower corner of the workspace", metavar="X Y Z")
+    upper_mm: Triple | None = option("upper corner of the workspace", metavar="X Y Z")
+    radius_mm: float | None = option("radius of the cables")
+    stiffness_n: float | None = option("axial stiffness of a cable")
+    min_tension_n: float | None = option("smallest allowed tension of a cable")
+    max_tension_n: float | None = option("largest tension of a cable")
+    drum_radius_mm: float | None = option("radius of the drums")
+    gear_ratio: float | None = option("motor turns per drum turn")
+    counts_per_rev: int | None = option("encoder counts per motor turn")
+    encoder: str | None = option("absolute or incremental")
+    max_speed_mm_s: float | None = option("largest cable speed")
+    torque_constant_n: float | None = option("cable tension at rated motor torque")
+    interface: str | None = option("python-can interface of the bus")
+    channel: str | None = option("channel of the bus")
+    bitrate: int | None = option("bit rate of the bus, bit/s")
 
 
 def new(
     *,
     rig: Path = argument("rig file to write"),
     coordinates: Path | None = option(
-        None, "CSV with one line per cable; no questions, defaults for the rest", "--from"
+        "CSV with one line per cable; no questions, defaults for the rest", "--from"
     ),
     values: RigOptions,
-    force: bool = option(False, "replace an existing file"),
+    force: bool = flag("replace an existing file"),
 ) -> None:
     """Ask for the essentials of a rig and write a commented rig file.
 

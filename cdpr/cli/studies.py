@@ -9,7 +9,7 @@ from pathlib import Path
 import typer
 from rich.table import Table
 
-from cdpr.cli.arguments import option, required
+from cdpr.cli.arguments import flag, option, required
 from cdpr.cli.options import RIG, Quaternion, Triple, rotation_of
 from cdpr.cli.output import Terminal, out, present, show_json
 from model.files.documents import millimetres
@@ -27,38 +27,33 @@ from planner.workspace.grid import parsed_slice
 from planner.workspace.maps import Question
 from planner.workspace.report import summary_facts
 
-WORKERS = option(None, "number of processes (default: one per core)", min=1, metavar="N")
-DASK = option(None, "compute on this Dask cluster", metavar="ADDRESS")
+WORKERS = option("number of processes (default: one per core)", min=1, metavar="N")
+DASK = option("compute on this Dask cluster", metavar="ADDRESS")
 
 
 def workspace(
     *,
     rig: Path = RIG,
     output: Path = required("folder to write", "-o", "--output", metavar="DIR"),
-    scene: Path | None = option(None, "scene file: obstacles, clearances, load", metavar="SCENE"),
-    slices: list[str] | None = option(None, "plane to map; repeatable", "--slice", metavar="z=MM"),
+    scene: Path | None = option("scene file: obstacles, clearances, load", metavar="SCENE"),
+    slices: list[str] | None = option("plane to map; repeatable", "--slice", metavar="z=MM"),
     volume: bool | None = option(
-        None, "also map the whole box (default: without --slice)", "--volume/--no-volume"
+        "also map the whole box (default: without --slice)", "--volume/--no-volume"
     ),
-    step_mm: float | None = option(None, "grid spacing (default: a fiftieth of the longest side)"),
-    lower_mm: Triple | None = option(
-        None, "lower corner of the region x y z (default: the workspace's)"
-    ),
-    upper_mm: Triple | None = option(
-        None, "upper corner of the region x y z (default: the workspace's)"
-    ),
+    step_mm: float | None = option("grid spacing (default: a fiftieth of the longest side)"),
+    lower_mm: Triple | None = option("lower corner of the region x y z (default: the workspace's)"),
+    upper_mm: Triple | None = option("upper corner of the region x y z (default: the workspace's)"),
     rotation_wxyz: Quaternion | None = option(
-        None, "platform orientation (default: the scene's start, else home)"
+        "platform orientation (default: the scene's start, else home)"
     ),
     length_mm: float | None = option(
-        None,
         "characteristic length for moments (default: the anchors' mean radius)",
         "--characteristic-length-mm",
     ),
     workers: int | None = WORKERS,
     dask: str | None = DASK,
-    force: bool = option(False, "replace the maps in the folder"),
-    as_json: bool = option(False, "print the summary as JSON", "--json"),
+    force: bool = flag("replace the maps in the folder"),
+    as_json: bool = flag("print the summary as JSON", "--json"),
 ) -> None:
     """Map the workspace: wrench feasibility and closure, capacity margin, dexterity, clearance.
 
@@ -100,13 +95,15 @@ DEFAULT_FOLDER = Path("bench-paper")
 
 def paper(
     *,
-    output: Path = option(DEFAULT_FOLDER, "folder to write", "-o", "--output", metavar="DIR"),
-    seeds: int = option(100, "searches per planner and case", min=2),
+    output: Path = option(
+        "folder to write", "-o", "--output", default=DEFAULT_FOLDER, metavar="DIR"
+    ),
+    seeds: int = option("searches per planner and case", default=100, min=2),
     workers: int | None = WORKERS,
     dask: str | None = DASK,
-    check: bool = option(False, "also run `cdpr check` on every path of Fig. 9"),
-    force: bool = option(False, "replace the folder's content"),
-    as_json: bool = option(False, "print the findings as JSON", "--json"),
+    check: bool = flag("also run `cdpr check` on every path of Fig. 9"),
+    force: bool = flag("replace the folder's content"),
+    as_json: bool = flag("print the findings as JSON", "--json"),
 ) -> None:
     """Repeat the paper's evaluation (section 5.3, Fig. 9) and report which claims hold.
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from cdpr.cli.arguments import argument, option, required
+from cdpr.cli.arguments import argument, flag, option, required
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig
 from cdpr.cli.output import Terminal, err, present, show_line
@@ -28,21 +28,18 @@ def track(
         "SOURCE...",
     ),
     output: Path = required("pose log to write (CSV)", "-o", "--output", metavar="CSV"),
-    camera: str | None = option(None, "name of the camera in the rig file (default: the first)"),
+    camera: str | None = option("name of the camera in the rig file (default: the first)"),
     calibration: list[Path] | None = CALIBRATION,
-    scene: Path | None = option(None, "also measure the clearance to this scene's obstacles"),
-    plan: Path | None = option(None, "with 'synthetic': plan that the platform follows"),
-    pictures: int | None = option(None, "largest number of images; Ctrl-C also stops", min=1),
-    detector: str | None = option(
-        None, "opencv or apriltag, overriding tags.detector of the rig file"
-    ),
-    mcap: Path | None = option(None, "also write the poses as MCAP", metavar="MCAP"),
+    scene: Path | None = option("also measure the clearance to this scene's obstacles"),
+    plan: Path | None = option("with 'synthetic': plan that the platform follows"),
+    pictures: int | None = option("largest number of images; Ctrl-C also stops", min=1),
+    detector: str | None = option("opencv or apriltag, overriding tags.detector of the rig file"),
+    mcap: Path | None = option("also write the poses as MCAP", metavar="MCAP"),
     overlay: Path | None = option(
-        None,
         "also write images with the measurements: a folder or a video (.mp4, .avi)",
         metavar="DIR|VIDEO",
     ),
-    force: bool = option(False, "replace existing output"),
+    force: bool = flag("replace existing output"),
     as_json: bool = JSON,
 ) -> None:
     """Measure the platform's pose from its tags, image by image.

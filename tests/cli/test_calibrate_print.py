@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cdpr.cli.arguments import with_options
+from cdpr.cli.arguments import as_command
 from cdpr.cli.calibrate.boards import BoardOptions, print_
 from cdpr.cli.calibrate.camera import camera
 from tests.calibration.pages import pages_in
@@ -59,7 +59,7 @@ def test_prints_that_cannot_be_are_refused(tmp_path: Path, options, named: str) 
 
 
 def test_camera_and_print_know_boards_by_the_same_options() -> None:
-    verbs = [with_options(verb) for verb in (camera, print_)]
+    verbs = [as_command(verb) for verb in (camera, print_)]
     commands = [inspect.signature(verb).parameters for verb in verbs]
     for option in fields(BoardOptions):
         one, other = (command[option.name] for command in commands)

@@ -9,7 +9,7 @@ from typing import Literal
 from calibration.targets.boards import Board, Charuco, Chessboard
 from calibration.targets.grids import CircleGrid, TagGrid, TagOrder
 from calibration.targets.printing import PaperName, printout
-from cdpr.cli.arguments import argument, option
+from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import JSON
 from cdpr.cli.output import present
 from model.errors import BadInput
@@ -31,24 +31,24 @@ _SIZES = ("square_mm", "marker_mm", "spacing_mm", "diameter_mm", "tag_mm", "gap_
 class BoardOptions:
     """Description of a board; every field is an option of the verbs that use boards."""
 
-    board: BoardName = option("chessboard", "kind of target")
+    board: BoardName = option("kind of target", default="chessboard")
     columns: int | None = option(
-        None, "inner corners (chessboard), squares (charuco), circles or tags in a row", min=1
+        "inner corners (chessboard), squares (charuco), circles or tags in a row", min=1
     )
-    rows: int | None = option(None, "number of rows", min=1)
-    square_mm: float | None = option(None, "side of a square (chessboard, charuco)")
-    marker_mm: float | None = option(None, "side of a marker (charuco)")
-    dictionary: str = option("4X4_50", "marker dictionary (charuco), such as 5X5_100")
-    legacy: bool = option(False, "charuco layout of OpenCV before 4.6")
-    spacing_mm: float | None = option(None, "row spacing, centre to centre (circles)")
-    diameter_mm: float | None = option(None, "circle diameter (circles)")
-    asymmetric: bool = option(False, "every other row is shifted (circles)")
-    tag_mm: float | None = option(None, "side of a tag's black square (tags)")
-    gap_mm: float | None = option(None, "gap between black squares (tags)")
-    family: str = option("tag36h11", "tag family (tags)")
-    first: int = option(0, "lowest tag number (tags)", min=0)
+    rows: int | None = option("number of rows", min=1)
+    square_mm: float | None = option("side of a square (chessboard, charuco)")
+    marker_mm: float | None = option("side of a marker (charuco)")
+    dictionary: str = option("marker dictionary (charuco), such as 5X5_100", default="4X4_50")
+    legacy: bool = flag("charuco layout of OpenCV before 4.6")
+    spacing_mm: float | None = option("row spacing, centre to centre (circles)")
+    diameter_mm: float | None = option("circle diameter (circles)")
+    asymmetric: bool = flag("every other row is shifted (circles)")
+    tag_mm: float | None = option("side of a tag's black square (tags)")
+    gap_mm: float | None = option("gap between black squares (tags)")
+    family: str = option("tag family (tags)", default="tag36h11")
+    first: int = option("lowest tag number (tags)", default=0, min=0)
     order: TagOrder = option(
-        "rows", "numbered from the top left, or as in Kalibr's AprilGrid (tags)"
+        "numbered from the top left, or as in Kalibr's AprilGrid (tags)", default="rows"
     )
 
     def made(self) -> Board:
@@ -100,9 +100,9 @@ def print_(
     *,
     output: Path = argument("file to write (PDF)", "PDF"),
     printed: BoardOptions,
-    rig: Path | None = option(None, "print this rig's tags instead of a board", metavar="RIG"),
-    paper: PaperName = option("a4", "paper size"),
-    force: bool = option(False, "replace an existing file"),
+    rig: Path | None = option("print this rig's tags instead of a board", metavar="RIG"),
+    paper: PaperName = option("paper size", default="a4"),
+    force: bool = flag("replace an existing file"),
     as_json: bool = JSON,
 ) -> None:
     """Make a calibration board, or the tags of a rig, as a PDF at exact scale.

@@ -44,19 +44,19 @@ def camera(
         "folder of images of the board, a video, or corners (CSV); output of --live", "DIR"
     ),
     printed: BoardOptions,
-    live: str | None = option(None, "first capture images from this camera or video into DIR"),
-    pictures: int | None = option(
-        None, "with --live: minimum number of images (default: 40)", min=4
-    ),
+    live: str | None = option("first capture images from this camera or video into DIR"),
+    pictures: int | None = option("with --live: minimum number of images (default: 40)", min=4),
     size_px: tuple[int, int] | None = option(
-        None, "image width and height, of --live (default: 1280 720) or of corners"
+        "image width and height, of --live (default: 1280 720) or of corners"
     ),
-    name: str = option("camera", "name of the camera in the rig file"),
+    name: str = option("name of the camera in the rig file", default="camera"),
     wanted_mm: float = wanted_option(1.0),
     distance_m: float | None = option(
-        None, "working distance of the camera (default: the target's)", min=0.01
+        "working distance of the camera (default: the target's)", min=0.01
     ),
-    lens: LensChoice = option("auto", "lens model; auto: the one that fits held-out images best"),
+    lens: LensChoice = option(
+        "lens model; auto: the one that fits held-out images best", default="auto"
+    ),
     result: ResultOptions,
 ) -> None:
     """Calibrate a camera's matrix and lens distortion, and state the accuracy.
@@ -143,11 +143,9 @@ def readout(
     source: Path = argument("video file, or folder of images", "SOURCE"),
     camera: str | None = CAMERA,
     rate_hz: float | None = option(
-        None, "images per second of a folder (default: the camera's)", min=0.1
+        "images per second of a folder (default: the camera's)", min=0.1
     ),
-    speed_mm_s: float | None = option(
-        None, "speed for the error bound (default: the motion's)", min=0.1
-    ),
+    speed_mm_s: float | None = option("speed for the error bound (default: the motion's)", min=0.1),
     calibration: list[Path] | None = CALIBRATION,
     wanted_mm: float = wanted_option(0.1),
     result: ResultOptions,
@@ -184,18 +182,16 @@ def extrinsics(
     source: str = SOURCE,
     camera: str | None = CAMERA,
     poses: Path | None = option(
-        None, "use the rig's motion: poses per image (CSV), or a run folder", metavar="FILE"
+        "use the rig's motion: poses per image (CSV), or a run folder", metavar="FILE"
     ),
     beside: str | None = option(
-        None,
         "use another camera of known pose, and its images taken at the same times",
         metavar="NAME=SOURCE",
     ),
     survey_mm: float = option(
-        0.5, "standard deviation of the surveyed corners of frame tags", min=0.0
+        "standard deviation of the surveyed corners of frame tags", default=0.5, min=0.0
     ),
     survey_deg: float | None = option(
-        None,
         "standard deviation of frame tags' rotations; --survey-mm then applies to whole tags"
         " (default: each corner was surveyed separately)",
         min=0.0,
@@ -272,7 +268,7 @@ def tags(
     source: str = SOURCE,
     camera: str | None = CAMERA,
     fixed_tag: int | None = option(
-        None, "keep this tag's pose from the rig file (default: best fit of all tags)", min=0
+        "keep this tag's pose from the rig file (default: best fit of all tags)", min=0
     ),
     pictures: int | None = PICTURES,
     calibration: list[Path] | None = CALIBRATION,

@@ -12,7 +12,7 @@ from calibration.intrinsics.exchange import FORMATS, FormatName, write_rig_with_
 from calibration.intrinsics.result import camera_named
 from calibration.result_files import compare, load_result, write_calibrated_rig
 from calibration.results import Calibration, Destination
-from cdpr.cli.arguments import argument, option, required
+from cdpr.cli.arguments import argument, flag, option, required
 from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig
 from cdpr.cli.output import Terminal, err, present, show_facts, show_json, show_line
 from model.files.documents import write_atomic
@@ -20,21 +20,21 @@ from model.files.output import require_new_file
 from model.rig import load_rig
 
 SOURCE = argument("folder of images, video file or camera index", "SOURCE")
-PICTURES = option(None, "number of images from a video or camera (default: 20; tags: 40)", min=1)
-CAMERA = option(None, "name of the camera in the rig file (default: the first)")
+PICTURES = option("number of images from a video or camera (default: 20; tags: 40)", min=1)
+CAMERA = option("name of the camera in the rig file (default: the first)")
 
 
 def wanted_option(default_mm: float) -> float:
     """Declares ``--wanted-mm``, whose default depends on what is calibrated."""
-    return option(default_mm, "required accuracy, 95 %", min=0.001)
+    return option("required accuracy, 95 %", default=default_mm, min=0.001)
 
 
 @dataclass(frozen=True, slots=True)
 class ResultOptions:
     """Destination and output format of a calibration's result; every field is an option."""
 
-    output: Path | None = option(None, "folder for the result and its report", "-o", "--output")
-    force: bool = option(False, "replace a result with the same name and date")
+    output: Path | None = option("folder for the result and its report", "-o", "--output")
+    force: bool = flag("replace a result with the same name and date")
     as_json: bool = JSON
 
     @property
@@ -123,10 +123,10 @@ def export(
     *,
     rig: Path = RIG,
     output: Path = required("file to write", "-o", "--output"),
-    to: FormatName = option("opencv", "file format"),
+    to: FormatName = option("file format", default="opencv"),
     camera: str | None = CAMERA,
     calibration: list[Path] | None = CALIBRATION,
-    force: bool = option(False, "replace an existing file"),
+    force: bool = flag("replace an existing file"),
     as_json: bool = JSON,
 ) -> None:
     """Write a camera's matrix and lens for OpenCV, ROS, Kalibr or mrcal.
@@ -150,7 +150,7 @@ def import_(
     file: Path = argument("camera file of OpenCV, ROS, Kalibr or mrcal", "CAMERA"),
     output: Path = required("rig file to write; must not exist", "-o", "--output"),
     camera: str | None = CAMERA,
-    entry: str | None = option(None, "camera of a Kalibr camchain with several, such as cam1"),
+    entry: str | None = option("camera of a Kalibr camchain with several, such as cam1"),
     as_json: bool = JSON,
 ) -> None:
     """Write a new rig file with a camera's matrix and lens from another program.

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from math import degrees, radians
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from calibration.geometry.pose_selection import measurement_poses
 from calibration.procedures import calibrate_rig
-from cdpr.cli.arguments import argument, option
+from cdpr.cli.arguments import T, argument, flag, option
 from cdpr.cli.calibrate.results import ResultOptions, wanted_option
 from cdpr.cli.options import (
     CALIBRATION,
@@ -35,15 +35,17 @@ def poses(
     rig: Path = RIG,
     scene: Path = SCENE,
     output: Path = PLAN_FILE,
-    count: int = option(60, "number of poses", min=10, max=500),
-    tilt_deg: float = option(15.0, "largest tilt of the platform", min=0.0, max=45.0),
-    turn_deg: float = option(15.0, "largest rotation about the vertical", min=0.0, max=45.0),
-    dwell_s: float = option(1.5, "time at rest at each pose", min=0.7),
-    candidates: int = option(300, "number of candidate poses", min=10, max=5000),
-    reserve_n: float | None = option(
-        None, "distance kept from the tension limits (default: 7.5 % of their range)", min=0.0
+    count: int = option("number of poses", default=60, min=10, max=500),
+    tilt_deg: float = option("largest tilt of the platform", default=15.0, min=0.0, max=45.0),
+    turn_deg: float = option(
+        "largest rotation about the vertical", default=15.0, min=0.0, max=45.0
     ),
-    seed: int = option(0, "random seed of the candidates and paths", min=0),
+    dwell_s: float = option("time at rest at each pose", default=1.5, min=0.7),
+    candidates: int = option("number of candidate poses", default=300, min=10, max=5000),
+    reserve_n: float | None = option(
+        "distance kept from the tension limits (default: 7.5 % of their range)", min=0.0
+    ),
+    seed: int = option("random seed of the candidates and paths", default=0, min=0),
     calibration: list[Path] | None = CALIBRATION,
     force: bool = REPLACE_PLAN,
     as_json: bool = JSON,
@@ -95,28 +97,25 @@ class GroupName(StrEnum):
     swivel_zeros = "swivel_zeros"
 
 
-_T = TypeVar("_T")
-
-
-def _deviation(default: _T, of: str, most: float | None = None) -> _T:
+def _deviation(of: str, default: T, most: float | None = None) -> T:
     """Declares a standard deviation."""
-    return option(default, f"standard deviation of {of}", min=1e-6, max=most)
+    return option(f"standard deviation of {of}", default=default, min=1e-6, max=most)
 
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
     """Standard deviations of the rig file's numbers; every field is an option."""
 
-    outlets_mm: float = _deviation(4.0, "the outlets in the rig file")
-    anchors_mm: float = _deviation(1.0, "the anchors")
-    pulleys_mm: float = _deviation(0.5, "the pulleys' radius")
-    drum_scale_percent: float = _deviation(0.5, "the cable per drum turn")
-    offsets_mm: float = _deviation(2.0, "the cable length at home")
-    stiffness_percent: float = _deviation(20.0, "the cables' stiffness", 1000.0)
-    stiffness_per_cable: bool = option(False, "find each cable's stiffness, from measured tensions")
-    swivel_zeros_deg: float = _deviation(1.0, "the zeros of swivel angles")
+    outlets_mm: float = _deviation("the outlets in the rig file", 4.0)
+    anchors_mm: float = _deviation("the anchors", 1.0)
+    pulleys_mm: float = _deviation("the pulleys' radius", 0.5)
+    drum_scale_percent: float = _deviation("the cable per drum turn", 0.5)
+    offsets_mm: float = _deviation("the cable length at home", 2.0)
+    stiffness_percent: float = _deviation("the cables' stiffness", 20.0, 1000.0)
+    stiffness_per_cable: bool = flag("find each cable's stiffness, from measured tensions")
+    swivel_zeros_deg: float = _deviation("the zeros of swivel angles", 1.0)
     imu_mounting_deg: float | None = _deviation(
-        None, "an IMU's mounting, then estimated too (default: its axes are the platform's)", 45.0
+        "an IMU's mounting, then estimated too (default: its axes are the platform's)", None, 45.0
     )
 
     def without(self, known: Sequence[GroupName]) -> dict[str, float]:
@@ -142,11 +141,11 @@ class Deviations:
 class Accuracies:
     """Standard deviations of the measurements; every field is an option."""
 
-    length_mm: float = _deviation(0.1, "cable lengths from the encoders")
-    pose_mm: float = _deviation(0.1, "positions, added to that of their file")
-    pose_deg: float = _deviation(0.02, "orientations, added to that of their file")
-    swivel_deg: float = _deviation(0.1, "swivel angles")
-    imu_deg: float = _deviation(0.1, "the vertical by an IMU")
+    length_mm: float = _deviation("cable lengths from the encoders", 0.1)
+    pose_mm: float = _deviation("positions, added to that of their file", 0.1)
+    pose_deg: float = _deviation("orientations, added to that of their file", 0.02)
+    swivel_deg: float = _deviation("swivel angles", 0.1)
+    imu_deg: float = _deviation("the vertical by an IMU", 0.1)
 
     def in_si(self) -> dict[str, Any]:
         """As arguments of `calibrate_rig`, [m] and [rad]."""
@@ -164,19 +163,19 @@ def rig(
     data: list[Path] = argument(
         "run folders and CSV files of stationary samples (docs/data-formats.md)", "DATA..."
     ),
-    without_poses: bool = option(False, "use drive positions alone, without camera poses"),
+    without_poses: bool = flag("use drive positions alone, without camera poses"),
     reflector_mm: Triple = option(
-        (0.0, 0.0, 0.0),
         "point whose positions a file without rotations contains, in the platform frame",
+        default=(0.0, 0.0, 0.0),
     ),
-    known: list[GroupName] | None = option(
-        None, "parameters to keep as in the rig file; repeatable"
-    ),
+    known: list[GroupName] | None = option("parameters to keep as in the rig file; repeatable"),
     deviations: Deviations,
     accuracies: Accuracies,
-    tilt_deg: float = option(5.0, "largest rotation of the platform in use", min=0.0, max=90.0),
+    tilt_deg: float = option(
+        "largest rotation of the platform in use", default=5.0, min=0.0, max=90.0
+    ),
     wanted_mm: float = wanted_option(1.0),
-    name: str = option("rig", "name of the result"),
+    name: str = option("name of the result", default="rig"),
     result: ResultOptions,
 ) -> None:
     """Calibrate outlets, anchors, pulleys, drum scales, home lengths and cable stiffness.

@@ -8,7 +8,7 @@ from pathlib import Path
 import typer
 
 from cdpr import console as page  # loads the server where it is asked for
-from cdpr.cli.arguments import option
+from cdpr.cli.arguments import flag, option
 from cdpr.cli.operate.run import supervise
 from cdpr.cli.options import RIG, WITHOUT_REAL_TIME, BusOptions
 from cdpr.cli.output import Terminal, out, show_facts, show_line
@@ -31,18 +31,15 @@ _LOCAL = ("127.0.0.1", "::1", "localhost")
 def console(
     *,
     rig: Path = RIG,
-    scene: Path | None = option(None, "scene file: obstacles and payload for jogging"),
-    plan: Path | None = option(None, "plan file to load at the start"),
+    scene: Path | None = option("scene file: obstacles and payload for jogging"),
+    plan: Path | None = option("plan file to load at the start"),
     host: str = option(
-        "127.0.0.1", "address to listen on; other than localhost needs --allow-others"
+        "address to listen on; other than localhost needs --allow-others", default="127.0.0.1"
     ),
-    port: int = option(8402, "port; 0 for a free one", min=0, max=65535),
-    read_only: bool = option(False, "show only; STOP still works"),
-    allow_others: bool = option(
-        False, "let other machines connect: anyone with the address can operate"
-    ),
+    port: int = option("port; 0 for a free one", default=8402, min=0, max=65535),
+    read_only: bool = flag("show only; STOP still works"),
+    allow_others: bool = flag("let other machines connect: anyone with the address can operate"),
     camera: list[str] | None = option(
-        None,
         "camera that measures runs (the first also homing): SOURCE or NAME=SOURCE; repeatable",
         metavar="SOURCE",
     ),
@@ -120,11 +117,11 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
 def demo(
     *,
     output: Path | None = option(
-        None, "folder to create (default: runs/demo)", "-o", "--output", metavar="DIR"
+        "folder to create (default: runs/demo)", "-o", "--output", metavar="DIR"
     ),
-    environment: int = option(1, "number of the paper's environment", min=1, max=3),
-    seed: int = option(0, "random seed of the planner", min=0),
-    console: bool = option(False, "load it into the operator's page, in real time"),
+    environment: int = option("number of the paper's environment", default=1, min=1, max=3),
+    seed: int = option("random seed of the planner", default=0, min=0),
+    console: bool = flag("load it into the operator's page, in real time"),
 ) -> None:
     """Plan, check, run on simulated drives, track with a synthetic camera, and report.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from cdpr.cli.arguments import given_options, option
+from cdpr.cli.arguments import flag, given_options, option
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import (
     CALIBRATION,
@@ -29,48 +29,47 @@ from executor.drives import is_simulated, require_own_time
 class WindingOptions:
     """Settings of pretension and pose measurement; every field is an option."""
 
-    tension_n: float | None = option(None, "pretension (default: twice the rig's smallest tension)")
-    limit_n: float | None = option(None, "tension limit of any cable (default: 60 % of the range)")
+    tension_n: float | None = option("pretension (default: twice the rig's smallest tension)")
+    limit_n: float | None = option("tension limit of any cable (default: 60 % of the range)")
     reach_mm: float = option(
-        1000.0 * homing.REACH,
         "largest length to wind in per cable",
+        default=1000.0 * homing.REACH,
         min=0.1,
         max=1000.0 * homing.FURTHEST,
     )
     speed_mm_s: float = option(
-        1000.0 * homing.SPEED, "largest winch speed", min=0.01, max=1000.0 * homing.FASTEST
+        "largest winch speed", default=1000.0 * homing.SPEED, min=0.01, max=1000.0 * homing.FASTEST
     )
     pictures: int = option(
-        homing.PICTURES,
         "number of images for the pose",
+        default=homing.PICTURES,
         min=homing.FEWEST_IMAGES,
         max=homing.MOST_IMAGES,
     )
     simulated_slack_mm: float = option(
-        1000.0 * homing.SLACK, "largest slack of simulated cables", min=0.0, max=100.0
+        "largest slack of simulated cables", default=1000.0 * homing.SLACK, min=0.0, max=100.0
     )
 
 
 def home(
     *,
     rig: Path = RIG,
-    at_home: bool = option(False, "a jig holds the platform at the rig's home pose"),
-    pose_mm: Triple | None = option(None, "a jig holds the platform level at x y z"),
+    at_home: bool = flag("a jig holds the platform at the rig's home pose"),
+    pose_mm: Triple | None = option("a jig holds the platform level at x y z"),
     camera: list[str] | None = option(
-        None,
         "the platform hangs freely and a camera measures it: 'synthetic', an index, or"
         " NAME=SOURCE for a camera other than the rig file's first",
         metavar="SOURCE",
     ),
     calibration: list[Path] | None = CALIBRATION,
-    as_rig_file: bool = option(False, "move nothing: absolute encoders agree with the rig file"),
+    as_rig_file: bool = flag("move nothing: absolute encoders agree with the rig file"),
     winding: WindingOptions,
     interface: str | None = INTERFACE,
     channel: str | None = CHANNEL,
     fast: bool = FAST,
     yes: bool = YES,
     without_real_time: bool = WITHOUT_REAL_TIME,
-    as_json: bool = option(False, "print the reference as JSON", "--json"),
+    as_json: bool = flag("print the reference as JSON", "--json"),
 ) -> None:
     """Pretension all cables, then set the encoder reference at a known pose.
 

@@ -15,7 +15,7 @@ import typer
 from rich.live import Live
 from rich.text import Text
 
-from cdpr.cli.arguments import given_options, option
+from cdpr.cli.arguments import flag, given_options, option
 from cdpr.cli.operate.run import supervise
 from cdpr.cli.operate.supervision import Keys, SignalSupervisor, confirmation, speed_by_key
 from cdpr.cli.options import (
@@ -50,17 +50,17 @@ from model.scene import Scene, load_scene
 class DistanceOptions:
     """Where a jog moves to; every field is an option of `cdpr jog`."""
 
-    by_mm: Triple | None = option(None, "distance x y z, at most 50 mm")
-    to_home: bool = option(False, "move to the rig's home pose and orientation")
+    by_mm: Triple | None = option("distance x y z, at most 50 mm")
+    to_home: bool = flag("move to the rig's home pose and orientation")
 
 
 @dataclass(frozen=True, slots=True)
 class SceneOptions:
     """Surroundings of a jog; every field is an option of `cdpr jog`."""
 
-    scene: Path | None = option(None, "scene file: obstacles and payload")
-    no_scene: bool = option(False, "jog without a description of obstacles")
-    clearance_mm: float | None = option(None, "obstacle clearance instead of the scene's", min=0.0)
+    scene: Path | None = option("scene file: obstacles and payload")
+    no_scene: bool = flag("jog without a description of obstacles")
+    clearance_mm: float | None = option("obstacle clearance instead of the scene's", min=0.0)
 
     def loaded(self) -> Scene | None:
         """The surroundings; None only with ``--no-scene``."""
@@ -81,21 +81,16 @@ class SceneOptions:
 class HeldOptions:
     """Hold-to-run controls; every field is an option of `cdpr jog`."""
 
-    hold_to_run: bool = option(
-        False, "enable the drives and follow held controls, such as those of `cdpr console`"
+    hold_to_run: bool = flag(
+        "enable the drives and follow held controls, such as those of `cdpr console`"
     )
-    keys: bool = option(
-        False, "as --hold-to-run, with keys: arrows for x and y, page up and down for z"
-    )
-    one_cable: bool = option(
-        False, "with --hold-to-run: wind one cable in or pay it out, homed or not"
-    )
+    keys: bool = flag("as --hold-to-run, with keys: arrows for x and y, page up and down for z")
+    one_cable: bool = flag("with --hold-to-run: wind one cable in or pay it out, homed or not")
     simulated_start_mm: Triple | None = option(
-        None,
         "with --hold-to-run or --keys: initial position of the simulated platform x y z"
-        " (default: home)",
+        " (default: home)"
     )
-    simulated_start_wxyz: Quaternion | None = option(None, "its orientation (default: as at home)")
+    simulated_start_wxyz: Quaternion | None = option("its orientation (default: as at home)")
 
     def start(self, rig: Rig) -> Pose | None:
         """The initial pose of the simulated platform, ``world_from_platform``; None for home.
@@ -148,16 +143,16 @@ def jog(
     distance: DistanceOptions,
     surroundings: SceneOptions,
     output: Path | None = option(
-        None, "run folder to create (default: runs/jog, runs/jog-2 …)", "-o", "--output"
+        "run folder to create (default: runs/jog, runs/jog-2 …)", "-o", "--output"
     ),
-    cable: int | None = option(None, "move one winch by --mm", min=1),
-    mm: float | None = option(None, "length to pay out, at most 50; negative: wind in"),
+    cable: int | None = option("move one winch by --mm", min=1),
+    mm: float | None = option("length to pay out, at most 50; negative: wind in"),
     held: HeldOptions,
     limit_n: float | None = option(
-        None, "with --cable or --one-cable: tension limit of any cable (default: 60 %)"
+        "with --cable or --one-cable: tension limit of any cable (default: 60 %)"
     ),
     speed_mm_s: float = option(
-        1000.0 * SPEED, "largest speed, at most the rig's", min=0.1, max=1000.0 * FASTEST
+        "largest speed, at most the rig's", default=1000.0 * SPEED, min=0.1, max=1000.0 * FASTEST
     ),
     bus: BusOptions,
     drives: DriveOptions,

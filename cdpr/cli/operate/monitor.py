@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cdpr import console  # loads Foxglove where it is asked for
-from cdpr.cli.arguments import option
+from cdpr.cli.arguments import flag, option
 from cdpr.cli.operate.supervision import Keys, speed_by_key
 from cdpr.cli.output import err, out, show_json, show_line
 from cdpr.console.view import RobotNow, RobotView
@@ -48,21 +48,17 @@ _STATES = {"moving": "green", "holding": "yellow", "stopping": "yellow", "latche
 
 def monitor(
     *,
-    once: bool = option(False, "show the state once and exit"),
-    as_json: bool = option(
-        False, "print JSON: one document with --once, otherwise one line per update", "--json"
+    once: bool = flag("show the state once and exit"),
+    as_json: bool = flag(
+        "print JSON: one document with --once, otherwise one line per update", "--json"
     ),
-    rate: float = option(5.0, "updates per second", "--rate-hz", min=0.1, max=50.0),
-    process: int | None = option(None, "process number, if several runs are in progress"),
-    wait: bool = option(False, "wait for a run to begin; in a terminal it always waits"),
+    rate: float = option("updates per second", "--rate-hz", default=5.0, min=0.1, max=50.0),
+    process: int | None = option("process number, if several runs are in progress"),
+    wait: bool = flag("wait for a run to begin; in a terminal it always waits"),
     foxglove: int | None = option(
-        None,
-        "also serve Foxglove on this local port, such as 8765",
-        min=0,
-        max=65535,
-        metavar="PORT",
+        "also serve Foxglove on this local port, such as 8765", min=0, max=65535, metavar="PORT"
     ),
-    foxglove_layout: Path | None = option(None, "write a layout for Foxglove and exit"),
+    foxglove_layout: Path | None = option("write a layout for Foxglove and exit"),
 ) -> None:
     """Show a run live: state, pose, clearance, tensions, drives, lateness, progress and events.
 

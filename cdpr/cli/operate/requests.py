@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from cdpr.cli.arguments import argument, option
+from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import JSON
 from cdpr.cli.output import out, show_json, show_line
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
@@ -44,8 +44,8 @@ def stop(
 _ENDING = (State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED, State.LATCHED)
 OVER = frozenset(state.value for state in _ENDING)
 
-PROCESS = option(None, "process number, if several runs are in progress", "--process")
-STATUS_JSON = option(False, "print the run's status as JSON", "--json")
+PROCESS = option("process number, if several runs are in progress", "--process")
+STATUS_JSON = flag("print the run's status as JSON", "--json")
 
 
 def hold(*, process: int | None = PROCESS, as_json: bool = STATUS_JSON) -> None:

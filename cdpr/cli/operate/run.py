@@ -9,7 +9,7 @@ from pathlib import Path
 import typer
 from rich.markup import escape
 
-from cdpr.cli.arguments import argument, option
+from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.operate.supervision import RunSupervisor, confirmation, print_safely
 from cdpr.cli.options import (
     CALIBRATION,
@@ -44,10 +44,9 @@ def run(
     *,
     plan: Path = argument("plan file (JSON)", "PLAN"),
     rig: Path | None = option(
-        None, "rig file (YAML; default: the plan's rig, on simulated drives)", metavar="RIG"
+        "rig file (YAML; default: the plan's rig, on simulated drives)", metavar="RIG"
     ),
     output: Path | None = option(
-        None,
         "run folder to create, with its parents (default: runs/TIME)",
         "-o",
         "--output",
@@ -55,23 +54,22 @@ def run(
     ),
     fast: bool = FAST,
     camera: list[str] | None = option(
-        None,
         "camera index, or 'synthetic' for all of the rig file's cameras (default with the"
         " interface 'virtual'); for several cameras NAME=SOURCE, repeated",
         metavar="SOURCE",
     ),
     calibration: list[Path] | None = CALIBRATION,
-    no_camera: bool = option(False, "run without a camera"),
+    no_camera: bool = flag("run without a camera"),
     interface: str | None = INTERFACE,
     channel: str | None = CHANNEL,
     simulated_start_mm: Triple | None = option(
-        None, "initial position of the simulated platform x y z (default: the start)"
+        "initial position of the simulated platform x y z (default: the start)"
     ),
     yes: bool = YES,
     without_real_time: bool = WITHOUT_REAL_TIME,
-    no_clearance_stop: bool = option(False, "do not stop when the measured clearance is too small"),
+    no_clearance_stop: bool = flag("do not stop when the measured clearance is too small"),
     plan_hash: str | None = option(
-        None, "refuse another plan than that of this `hash`, as the console does"
+        "refuse another plan than that of this `hash`, as the console does"
     ),
     as_json: bool = SUMMARY_JSON,
 ) -> None:
@@ -190,7 +188,7 @@ def _refuse_camera_options(camera: list[str] | None, no_clearance_stop: bool) ->
 def report(
     *,
     run: Path = argument("run folder", "RUNDIR"),
-    as_json: bool = option(False, "print the run's summary", "--json"),
+    as_json: bool = flag("print the run's summary", "--json"),
 ) -> None:
     """Write the report of a run again, from the files of its folder.
 
