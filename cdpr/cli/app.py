@@ -110,7 +110,7 @@ class LazyGroup(TyperGroup):
     def __init__(self, verbs: tuple[Verb, ...] = VERBS, **attributes: Any) -> None:
         super().__init__(**attributes)
         self.verbs = verbs
-        panels = {verb: panel for panel, verbs in PANELS.items() for verb in verbs}
+        panels = {verb: panel for panel, members in PANELS.items() for verb in members}
         self.commands = {
             verb.name: TyperCommand(verb.name, help=verb.help, rich_help_panel=panels.get(verb))
             for verb in self.verbs
@@ -128,8 +128,13 @@ class LazyGroup(TyperGroup):
 
 def _loaded(verb: Verb) -> TyperCommand | TyperGroup:
     if verb.verbs:
-        about = {"name": verb.name, "help": verb.help}
-        return LazyGroup(verb.verbs, **about, no_args_is_help=True, rich_markup_mode="rich")
+        return LazyGroup(
+            verb.verbs,
+            name=verb.name,
+            help=verb.help,
+            no_args_is_help=True,
+            rich_markup_mode="rich",
+        )
     module, _, function = verb.target.partition(":")
     app = typer.Typer(rich_markup_mode="rich", add_completion=False)
     called = getattr(import_module(f"cdpr.cli.{module}"), function)

@@ -1,4 +1,7 @@
-"""Options shared by several verbs, and groups of related options."""
+"""Options shared by several verbs, and groups of related options.
+
+Each belongs to one name: a dataclass that has it as a field writes the name into it.
+"""
 
 from __future__ import annotations
 

@@ -106,9 +106,7 @@ def test_verbs_that_must_be_fast_are_light(module: str) -> None:
     assert loaded_by(f"import cdpr.cli.{module}") == set()
 
 
-@pytest.mark.parametrize(
-    "module", ["cdpr.cli.check", "executor.trajectory.setpoints"]
-)
+@pytest.mark.parametrize("module", ["cdpr.cli.check", "executor.trajectory.setpoints"])
 def test_what_neither_searches_nor_measures_nor_sends_loads_no_library_for_it(module: str) -> None:
     assert not loaded_by(f"import {module}") & {"numba", "scipy", "cv2", "can"}
 

@@ -233,7 +233,7 @@ def jog(
 def _hold_to_run(
     session: Callable[..., object], rig: Rig, drives: DriveOptions, keys: JogKeys | None = None
 ) -> None:
-    """Holds a session of hold-to-run controls, until it ends."""
+    """Runs a session of hold-to-run controls until it ends."""
     with keys or ExitStack():
         session(
             need_real_time_rights=not drives.without_real_time,
