@@ -64,7 +64,7 @@ class InProcessBus(VirtualBus):
     """
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Gives all other ends one copy, which nobody may change."""
+        """Gives all other ends one copy, which none of them changes."""
         if self.receive_own_messages:
             super().send(msg, timeout)
             return

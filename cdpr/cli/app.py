@@ -266,6 +266,8 @@ def _exit_with(error: CdprError) -> NoReturn:
     with suppress(OSError):  # the cause may be that nothing can be written
         _print_error(error)
     with suppress(OSError):
+        if "--json" in sys.argv:
+            print(json.dumps(error.as_dict(), indent=1))
         sys.stdout.flush()
     _discard_output()
     sys.exit(error.exit_code)
@@ -302,8 +304,6 @@ def _from_os_error(error: OSError) -> CdprError:
 def _print_error(error: CdprError) -> None:
     if isinstance(error, AlreadyExists):  # the library knows no options
         error.next_step += ", or pass --force to replace it"
-    if "--json" in sys.argv:
-        print(json.dumps(error.as_dict(), indent=1))
     print(f"error: {error}", file=sys.stderr)
 
 

@@ -77,7 +77,9 @@ def _show_checks(checks: Iterable[MachineCheck]) -> None:
 
 def _show_table(found: Examined, rig: Rig) -> None:
     """Objects that need a change first, then the others, then the total."""
-    table = Table("", "object", "needed", "found", "meaning", "change")
+    table = Table("")
+    for title in ("object", "needed", "found", "meaning", "change"):
+        table.add_column(title, overflow="fold")  # the last one names keys that the user types
     marks = {"ok": "[green]ok[/]", "remark": "[yellow]remark[/]", "wrong": "[red]wrong[/]"}
     for verdict in ("wrong", "remark", "ok"):
         for row in found.rows:

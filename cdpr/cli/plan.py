@@ -136,6 +136,7 @@ def plan(
     document = plan_path(the_rig, the_scene, settings, listener, rounds=of_legs, done=done)
     save_plan(document, output)
     more = "".join(f" --calibration {quote(str(file))}" for file in calibration or [])
+    more += "" if the_rig.cameras and the_rig.platform_tags else " --no-camera"
     file = quote(str(output))
     run_it = f"cdpr run {file} --rig {quote(str(rig))}{more} -o RUNDIR"
     next_step = f"cdpr check {file}, then {run_it}"

@@ -166,9 +166,13 @@ def _program(*arguments: str | Path, **how: object) -> subprocess.CompletedProce
     )
 
 
-def test_a_full_disk_behind_standard_output_is_reported() -> None:
+@pytest.mark.parametrize("words", [("--version",), ("check", "PLAN", "--json")])
+def test_a_full_disk_behind_standard_output_is_reported(
+    tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    plan = write_short_plan(tmp_path / "plan.json")
     with open("/dev/full", "w") as full:
-        done = _program("--version", stdout=full)
+        done = _program(*(plan if word == "PLAN" else word for word in words), stdout=full)
     assert done.returncode == 1
     assert "could not write all its output" in done.stderr
     assert "defect" not in done.stderr

@@ -249,6 +249,8 @@ def test_drives_of_another_make_are_reported_with_what_to_change(
     objects = {one["object"][:8]: one for one in json.loads(answer.out)["drives"]["objects"]}
     assert objects["3001h:02"]["verdict"] == "wrong"
     assert objects["3001h:02"]["found"] == [{"drives": list(range(1, 9)), "value": "absent"}]
+    shown = call("doctor", with_profile(tmp_path, "epos4"), "--drives").out
+    assert "…" not in shown, "the keys that the user types are not cut"
 
 
 def test_drives_need_the_rig_and_a_profile_that_is_there(tmp_path: Path) -> None:

@@ -55,6 +55,21 @@ def test_after_a_plan_with_a_calibration_its_next_step_runs(
     assert (tmp_path / "my rig" / "RUNDIR" / "report.html").is_file()
 
 
+def test_the_next_step_after_a_plan_of_a_new_rig_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its file has no camera and no tags yet."""
+    monkeypatch.chdir(tmp_path)
+    assert call("new", "rig.yaml", answers="\n" * 50).code == 0
+    goal = ("--goal-mm", "170", "180", "300")
+    answer = call("plan", "rig.yaml", SCENE, "-o", "plan.json", *goal)
+    assert answer.code == 0, answer
+    (line,) = (line for line in answer.out.splitlines() if line.split()[:1] == ["next"])
+    assert "--no-camera" in line
+    for words in commands_in(line):
+        assert call(*words, *(("--fast",) if words[0] == "run" else ())).code == 0
+
+
 def test_a_plan_that_was_made_for_calibrated_numbers_is_refused_with_that_as_a_reason(
     short_plan: Path, tmp_path: Path
 ) -> None:

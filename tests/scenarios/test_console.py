@@ -281,7 +281,7 @@ def console_ended(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         assert me.command("jog_begin")["ok"]
         me.until(lambda state: state["jog"]["ready"])
         process.send_signal(signal.SIGINT)
-        process.wait()
+        assert process.wait() == 0
         while find_any():
             pass
     events = (folder / "runs" / "jog-session" / "events.jsonl").read_text()

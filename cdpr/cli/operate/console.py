@@ -108,7 +108,10 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
         show_line(f"console of {files.rig.name}: {address}")
         show_line("Ctrl-C ends the console and jogging; a run continues")
 
-    run_server(shown, host, port, show_address)
+    try:
+        run_server(shown, host, port, show_address)
+    except KeyboardInterrupt:  # the way to end it
+        show_line("console ended")
 
 
 # `cdpr demo`: all steps from plan to report on the paper's rig, simulated.

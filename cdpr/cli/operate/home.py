@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 from cdpr.cli.arguments import flag, given_options, option
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
@@ -120,6 +121,5 @@ def home(
         show_json({"file": file, **result.reference.model_dump(mode="json")})
     else:
         show_facts("drives homed; they hold", result.facts())
-        show_line(
-            "next: `cdpr jog RIG --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`"
-        )
+        jog = f"cdpr jog {quote(str(rig))}"
+        show_line(f"next: `{jog} --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`")
