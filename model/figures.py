@@ -96,7 +96,10 @@ def _draw_path(axes: Any, poses: Sequence[Pose], label: str, **style: Any) -> No
 
 
 def _draw_faces(axes: Any, solid: Solid, color: str, alpha: float) -> None:
-    corners = [solid.vertices[list(face)] * _MM for face in solid.faces]
+    # Matplotlib scales the axes by uninitialised memory unless all faces have one size.
+    most = max(map(len, solid.faces))
+    faces = [[*face, *[face[-1]] * (most - len(face))] for face in solid.faces]
+    corners = [solid.vertices[face] * _MM for face in faces]
     axes.add_collection3d(Poly3DCollection(corners, facecolor=color, alpha=alpha, linewidth=0))
 
 

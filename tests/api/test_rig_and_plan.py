@@ -186,3 +186,26 @@ def test_figures_show_cables_obstacles_and_path(
     assert lines[0] >= rig.cable_count
     assert lines[0] < lines[1] < lines[2]
     plt.close("all")
+
+
+def test_faces_of_a_cylinder_are_drawn_with_one_number_of_corners(
+    rig: cdpr.Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Matplotlib pads shorter faces with uninitialised memory, by which it scales the axes.
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from model import figures
+
+    drawn: list[list[Any]] = []
+
+    class Kept(figures.Poly3DCollection):
+        def __init__(self, faces: list[Any], **style: Any) -> None:
+            drawn.append(faces)
+            super().__init__(faces, **style)
+
+    monkeypatch.setattr(figures, "Poly3DCollection", Kept)
+    rig.plot(scene=cdpr.load_scene(CONFIGS / "hall_pillar.yaml"))
+    plt.close("all")
+    assert any(len(faces) > 6 for faces in drawn)
+    assert all(len({len(face) for face in faces}) == 1 for faces in drawn)
