@@ -121,14 +121,8 @@ def configure_drives(
     refusals = Refusals()
     entries: list[int] = []
     for drive, node in enumerate(nodes):
-        for expected in expectations(rig, profile, node):
-            refusals.note(require_expected, network, node, expected)
         refusals.note(require_idle, network, node, to_reset)
-        for setting in settings[drive]:
-            refusals.note(require_there, network, node, setting)
-        for setting in stated_absent(rig, drive, winch_map, max_tension):
-            refusals.note(require_absent, network, node, setting)
-        refusals.note(require_no_wrap, network, node, settings[drive])
+        _note_objects(rig, network, drive, settings[drive], max_tension, refusals)
         refusals.note(count_heartbeats, network, node, profile, entries)
     refusals.raise_any(UNCHANGED)
     _refuse_duplicates(network)
@@ -161,6 +155,49 @@ def configure_drives(
         min(count, rig.cable_count) if profile.watches_heartbeats else 0 for count in entries
     )
     return SetUp(remarks, tuple(watched))
+
+
+def _note_objects(
+    rig: Rig,
+    network: SetupNetwork,
+    drive: int,
+    settings: Sequence[Setting],
+    max_tension: float | None,
+    refusals: Refusals,
+) -> None:
+    """Records every object that a drive lacks, or has with an unsuitable value; only reads."""
+    profile, node = profile_of(rig), rig.winches[drive].node_id
+    for expected in expectations(rig, profile, node):
+        refusals.note(require_expected, network, node, expected)
+    for setting in settings:
+        refusals.note(require_there, network, node, setting)
+    for setting in stated_absent(rig, drive, WinchMap(rig), max_tension):
+        refusals.note(require_absent, network, node, setting)
+    refusals.note(require_no_wrap, network, node, settings)
+
+
+def require_objects(
+    rig: Rig, network: SetupNetwork, others: Sequence[tuple[int, str, int]]
+) -> None:
+    """Requires the objects of a configuration, and others, of all drives; writes nothing.
+
+    Args:
+        rig: The robot; its winches name the nodes.
+        network: The bus.
+        others: Index, name and size [bytes] of further objects.
+
+    Raises:
+        HardwareMissing: A drive does not answer.
+        Refused: Drives lack objects, or have unsuitable values; with all drives and objects.
+    """
+    winch_map, refusals = WinchMap(rig), Refusals()
+    for drive, winch in enumerate(rig.winches):
+        client = network.client(winch.node_id)
+        for index, name, size in others:
+            refusals.note(client.read, index, 0, name, size)
+        settings = settings_for(rig, drive, winch_map, None)
+        _note_objects(rig, network, drive, settings, None, refusals)
+    refusals.raise_any(UNCHANGED)
 
 
 class Refusals:

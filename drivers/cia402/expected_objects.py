@@ -10,12 +10,19 @@ import can
 
 from drivers.can_errors import in_fault, moved_by_another, wrong_setting
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
+from drivers.cia402.profile import load_profile, profile_names
 from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent
 from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
 from drivers.drive_group import Pump
 from model.errors import CdprError, Refused
-from model.files.drive_profile_file import ProfileDocument, object_key, object_name
+from model.files.drive_profile_file import (
+    NEEDED,
+    OBJECTS,
+    ProfileDocument,
+    object_key,
+    object_name,
+)
 from model.files.rig_file import Cia402Document
 from model.rig import Rig
 
@@ -126,6 +133,28 @@ HOW_WITHOUT_CSP = (
     f" PRBT; {_UNLISTED}"
 )
 BY_MAKERS_TOOL = "set it with the manufacturer's tool and store it"
+
+_BESIDE = {
+    "1006h:00": ", with monitoring: heartbeat",
+    "1016h:01": "; the SYNC time-out alone then stops the drive",
+    "6072h:00": ", with torque_limit",
+    "60C2h:01": ", where the drive needs no interpolation time",
+    "60C2h:02": ", where the drive needs no interpolation time",
+}
+"""Further entries of a profile in which an object is absent."""
+
+
+def how_without(index: int, sub: int) -> str:
+    """The next step for a required object that is missing."""
+    if index == SUPPORTED_MODES:
+        return HOW_WITHOUT_CSP
+    name = "1016h:01" if index == HEARTBEAT_CONSUMERS else object_name(index, sub)
+    if name not in OBJECTS or name in NEEDED:
+        return "use another drive or firmware: no profile can replace it"
+    own = f"list it as absent in your own drive profile{_BESIDE.get(name, '')}"
+    names = [each for each in profile_names() if name in load_profile(each).absent]
+    known = "".join(f"; for {load_profile(each).name} set drives.profile: {each}" for each in names)
+    return own + known
 
 
 # Checks of one drive before anything is written.

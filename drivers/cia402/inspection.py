@@ -10,19 +10,18 @@ from typing import Any, Literal
 import can
 import numpy as np
 
-from drivers.cia402.configure import is_still_set_up, require_answers
+from drivers.cia402.configure import is_still_set_up, require_answers, require_objects
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
     BY_MAKERS_TOOL,
-    HOW_WITHOUT_CSP,
     MODE_DISPLAY,
     NO_WRAP,
     POSITION_RANGE,
-    SUPPORTED_MODES,
     Expectation,
     expectations,
     holds_limits,
     how_to_set,
+    how_without,
     position_range,
 )
 from drivers.cia402.object_dictionary import (
@@ -31,14 +30,14 @@ from drivers.cia402.object_dictionary import (
     settings_for,
     stated_absent,
 )
-from drivers.cia402.profile import for_unused_pdos, load_profile, profile_names, profile_of
+from drivers.cia402.profile import for_unused_pdos, profile_of
 from drivers.cia402.sdo import WRITE_ONLY, SetupNetwork
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power
 from drivers.drive_group import DriveSnapshot, Pump
 from drivers.plausibility import winding_signs
 from model.errors import Refused
-from model.files.drive_profile_file import NEEDED, OBJECTS, ProfileDocument, object_name
+from model.files.drive_profile_file import ProfileDocument, object_name
 from model.rig import Rig
 from model.winches import WinchMap
 
@@ -386,34 +385,17 @@ class _Reader:
             good = absent and not instead
             row.note(self._node, text, "ok" if good else "remark", instead or "none required")
         else:
-            row.note(self._node, text, "wrong", _how_without(index, sub))
+            row.note(self._node, text, "wrong", how_without(index, sub))
         return None
 
 
-_BESIDE = {
-    "1006h:00": ", with monitoring: heartbeat",
-    "1016h:01": "; the SYNC time-out alone then stops the drive",
-    "6072h:00": ", with torque_limit",
-    "60C2h:01": ", where the drive needs no interpolation time",
-    "60C2h:02": ", where the drive needs no interpolation time",
-}
-"""Further entries of a profile in which an object is absent."""
-
-
-def _how_without(index: int, sub: int) -> str:
-    """The next step for a required object that is missing."""
-    if index == SUPPORTED_MODES:
-        return HOW_WITHOUT_CSP
-    name = "1016h:01" if index == HEARTBEAT_CONSUMERS else object_name(index, sub)
-    if name not in OBJECTS or name in NEEDED:
-        return "use another drive or firmware: no profile can replace it"
-    own = f"list it as absent in your own drive profile{_BESIDE.get(name, '')}"
-    names = [each for each in profile_names() if name in load_profile(each).absent]
-    known = "".join(f"; for {load_profile(each).name} set drives.profile: {each}" for each in names)
-    return own + known
-
-
 # Reads the state of CiA 402 drives by SDO without changing anything.
+
+_STATE = (
+    (0x6041, "status word", 2),
+    (0x6064, "position actual value", 4),
+    (0x6077, "torque actual value", 2),
+)
 
 
 def read_states(
@@ -431,15 +413,19 @@ def read_states(
         data = [network.client(node).read(index, 0, name, size) for node in nodes]
         return [int.from_bytes(value, "little", signed=True) for value in data]
 
-    words = [word & 0xFFFF for word in read(0x6041, "status word", 2)]
-    return DriveSnapshot(
-        positions=np.array(read(0x6064, "position actual value", 4), dtype=np.int64),
-        torques=np.array(read(0x6077, "torque actual value", 2), dtype=np.int64)
-        * winding_signs(rig),
-        status_words=np.array(words, dtype=np.int64),
-        restarted=tuple(
+    try:
+        words, positions, torques = (read(*each) for each in _STATE)
+        restarted = tuple(
             node
             for drive, node in enumerate(nodes)
             if not is_still_set_up(network, node, settings_for(rig, drive, winch_map, None))
-        ),
+        )
+    except Refused:
+        require_objects(rig, network, _STATE)  # names all missing ones, not only the first
+        raise
+    return DriveSnapshot(
+        positions=np.array(positions, dtype=np.int64),
+        torques=np.array(torques, dtype=np.int64) * winding_signs(rig),
+        status_words=np.array(words, dtype=np.int64) & 0xFFFF,
+        restarted=restarted,
     )

@@ -386,6 +386,25 @@ def test_a_required_object_that_is_missing_is_refused_before_anything_is_written
     assert not downloads(bus)
 
 
+@pytest.mark.parametrize("first", [0x6077, 0x1017], ids=hex)
+@pytest.mark.parametrize("to_reset", [False, True])
+def test_what_drives_lack_is_named_at_once_before_a_reset_and_by_the_status(
+    rig: Rig, first: int, to_reset: bool
+) -> None:
+    """The state is read before the set-up, and the first missing object ended it."""
+    bus = eight_of("cia402")
+    for index in (first, 0x1006, 0x6066, 0x6072):
+        bus.drives[3].aborts[index, 0] = 0x06020000
+    bus.drives[5].aborts[0x1006, 0] = 0x06020000
+    with pytest.raises(Refused) as caught:
+        examine.read_states(rig, bus, None, to_reset=to_reset)  # type: ignore[arg-type]
+    for missing in (f"drive 3, object {first:04X}h", "drive 3, object 6066h", "object 6072h"):
+        assert missing in caught.value.what
+    assert "drive 3, 5, object 1006h" in caught.value.what
+    assert "the drives were not changed" in caught.value.next_step
+    assert not downloads(bus)
+
+
 @pytest.mark.parametrize("index", UNUSED_PDOS, ids=hex)
 @pytest.mark.parametrize("code", ABORTS, ids=hex)
 def test_a_pdo_that_is_not_used_may_be_refused_with_any_code(
