@@ -15,6 +15,12 @@ from model.winches import WinchMap
 BAD_CYCLES = 2
 """Consecutive bad cycles that are a fault: one bad frame may happen, two are a defect."""
 
+HOMING_OPTIONS = "--at-home, --pose-mm X Y Z or --camera SOURCE"
+"""One of them states or measures the pose for `cdpr home`."""
+
+HOME = f"`cdpr home RIG` with {HOMING_OPTIONS}"
+"""The next step for drives without a valid reference."""
+
 JUMP_RESERVE, JUMP_COUNTS = 4.0, 8.0
 """Largest plausible change of a position in a cycle: a multiple of the winch's motion at top speed,
 and at least some counts of noise."""
@@ -156,8 +162,8 @@ def require_within_limits(rig: Rig, positions: Sequence[int]) -> None:
                 f" {high}",
                 where="drive group",
                 why="once enabled it would move to its limit (607Dh)",
-                next_step="configure limits that include this position, or home with"
-                " `cdpr home RIG`; nothing was enabled",
+                next_step=f"configure limits that include this position, or run {HOME};"
+                " nothing was enabled",
                 values={"node": node},
             )
 

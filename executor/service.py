@@ -15,6 +15,7 @@ import numpy as np
 from drivers.can_bus import BusSettings, open_bus
 from drivers.drive_group import CycleStatus
 from drivers.factory import drive_states, read_drives
+from drivers.plausibility import HOMING_OPTIONS
 from executor.control.standstill import (
     FaultReset,
     Release,
@@ -57,7 +58,7 @@ class DriveStatus:
         state: Of its state machine, as text.
         position: Of its encoder, [counts].
         tension: Of its cable, from the drive's torque, [N].
-        set_up: It has kept this program's configuration: no power cycle since.
+        set_up: It has the configuration for this rig: no power cycle or other cycle time since.
     """
 
     node: int
@@ -130,8 +131,7 @@ class StatusResult:
         if self.latched is not None:
             steps.append(f"find the cause and check the platform, then run cdpr reset {file}")
         if not self.reference.counts:
-            options = "--at-home, --pose-mm X Y Z or --camera SOURCE"
-            steps.append(f"cdpr home {file} with {options}")
+            steps.append(f"cdpr home {file} with {HOMING_OPTIONS}")
         return "; then ".join(steps)
 
     def drive_lines(self, names: Mapping[int, str]) -> list[str]:
@@ -143,7 +143,7 @@ class StatusResult:
         return [
             f"{names[drive.node]:<19} {drive.state:<24} {drive.position:>11} counts"
             f" {drive.tension:8.2f} N"
-            f"{'' if drive.set_up else '  not configured since power-up'}"
+            f"{'' if drive.set_up else '  not set up, or for another cycle'}"
             for drive in self.drives or ()
         ]
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from drivers.drive_group import Capabilities, DriveSnapshot
+from drivers.plausibility import HOME
 from executor.interlock.reference import RESTARTED, HomingReference, moved_since
 from executor.trajectory.setpoints import CheckedSetpoints
 from model.errors import Refused
@@ -135,7 +136,7 @@ def _lost(rig: Rig, drive: int, how: str) -> Refused:
         f"the homing reference of {rig.drive_names[node]} is lost: {how}",
         where="arming",
         why="its encoder is not absolute: its position is arbitrary after power-up",
-        next_step="home the drives again with `cdpr home RIG`; nothing was enabled",
+        next_step=f"home the drives again: {HOME}; nothing was enabled",
         values={"cable": drive + 1, "drive": node},
     )
 

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from drivers.can_bus import BusSettings
+from drivers.plausibility import HOME
 from executor.interlock.locks import read_state_file, state_file
 from model.errors import CdprError, Refused
 from model.files.documents import Document, PoseDocument, content_hash, document_hash, write_atomic
@@ -24,7 +25,7 @@ from model.rig import Rig, rig_from_document
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
-AGAIN = "home the drives with `cdpr home RIG`; nothing was moved"
+AGAIN = f"home the drives: {HOME}; nothing was moved"
 
 #: Why a drive lost its configuration, and with it the reference of an incremental encoder.
 RESTARTED = "power-cycled, or `bus.cycle_ms` was changed, after homing"

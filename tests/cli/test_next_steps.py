@@ -18,7 +18,7 @@ from executor.interlock.interlock import ReferenceStatus
 from executor.recording.verdict import page_text
 from executor.remote.client import request_run as request
 from executor.run_result import RunResult
-from executor.service import StatusResult
+from executor.service import DriveStatus, StatusResult
 from model.errors import Fault
 from model.rig import load_rig
 from model.scene import load_scene
@@ -131,6 +131,14 @@ def test_status_says_what_has_to_be_done_before_a_run() -> None:
     both = replace(lost, latched="cable 3 is slack").next_step(rig)
     assert both.index("cdpr reset 'my rig.yaml'") < both.index("cdpr home 'my rig.yaml'")
     assert replace(lost, run=17).next_step(rig) == ""
+
+
+def test_a_drive_set_up_for_another_cycle_is_not_said_to_have_lost_power() -> None:
+    drive = DriveStatus(node=1, state="quick stop active", position=0, tension=5.0, set_up=False)
+    (line,) = replace(STANDING, drives=(drive,)).drive_lines({1: "cable 1 (drive 1)"})
+    assert line.endswith("not set up, or for another cycle")
+    (line,) = replace(STANDING, drives=(replace(drive, set_up=True),)).drive_lines({1: "cable 1"})
+    assert line.endswith(" N")
 
 
 def test_monitor_calls_itself_by_its_name() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.plausibility import require_within_limits
 from executor.control.preconditions import require_still_referenced
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
@@ -54,6 +55,19 @@ def test_without_one_only_absolute_encoders_move() -> None:
         with pytest.raises(Refused, match=r"homed: cable 1 \(drive 1\), cable 2 ") as caught:
             ask()
         assert "cdpr home" in caught.value.next_step
+
+
+def test_the_next_step_without_one_names_the_ways_to_state_the_pose() -> None:
+    with pytest.raises(Refused) as unhomed:
+        MotionInterlock(rig_with("incremental")).reference()
+    with pytest.raises(Refused) as moved:
+        rig = rig_with("incremental")
+        require_still_referenced(rig, reference_of(rig), (1,), [0] * 8)
+    with pytest.raises(Refused) as beyond:
+        require_within_limits(rig, [2**31 - 1] * 8)
+    for caught in (unhomed, moved, beyond):
+        wanted = "`cdpr home RIG` with --at-home, --pose-mm X Y Z or --camera SOURCE"
+        assert wanted in caught.value.next_step
 
 
 def test_it_counts_for_its_rig_file_alone() -> None:
