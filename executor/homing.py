@@ -176,6 +176,7 @@ def use_rig_file_counts(
         StoppedByOperator: Cancelled.
     """
     interlock = MotionInterlock(rig)
+    interlock.require_rig_file_counts()
     require_confirmed(confirm, ForgetProposal(interlock))
     interlock.use_rig_file_counts()
 

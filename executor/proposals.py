@@ -183,8 +183,9 @@ class ForgetProposal:
     @property
     def title(self) -> str:
         """See `Proposal`."""
-        text = reference_status(self.interlock)
-        return f"the present homing reference, which is discarded: {text}"
+        status = reference_status(self.interlock)
+        gone = "the present homing reference, which would be discarded"
+        return f"{gone if status.file else 'homing reference'}: {status}"
 
     def facts(self) -> Facts:
         """See `Proposal`."""

@@ -245,9 +245,17 @@ class MotionInterlock:
         Raises:
             Refused: A drive without absolute encoder cannot do so; or a fault is latched.
         """
+        self.require_rig_file_counts()
+        self.file.remove()
+
+    def require_rig_file_counts(self) -> None:
+        """Requires a free bus and absolute encoders, which can count as in the rig file.
+
+        Raises:
+            Refused: As `use_rig_file_counts`.
+        """
         self.require_free()
         self._require_absolute()
-        self.file.remove()
 
     def _require_absolute(self) -> None:
         if not self._is_kept:

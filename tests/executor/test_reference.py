@@ -9,8 +9,10 @@ import pytest
 
 from drivers.plausibility import require_within_limits
 from executor.control.preconditions import require_still_referenced
+from executor.homing import use_rig_file_counts
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
+from executor.proposals import ForgetProposal
 from executor.state_machine import State
 from model.errors import Refused
 from model.rig import Rig, load_rig, rig_from_document
@@ -58,16 +60,36 @@ def test_without_one_only_absolute_encoders_move() -> None:
 
 
 def test_the_next_step_without_one_names_the_ways_to_state_the_pose() -> None:
+    rig = rig_with("incremental")
     with pytest.raises(Refused) as unhomed:
-        MotionInterlock(rig_with("incremental")).reference()
+        MotionInterlock(rig).reference()
     with pytest.raises(Refused) as moved:
-        rig = rig_with("incremental")
         require_still_referenced(rig, reference_of(rig), (1,), [0] * 8)
     with pytest.raises(Refused) as beyond:
         require_within_limits(rig, [2**31 - 1] * 8)
     for caught in (unhomed, moved, beyond):
         wanted = "`cdpr home RIG` with --at-home, --pose-mm X Y Z or --camera SOURCE"
         assert wanted in caught.value.next_step
+
+
+def test_a_reference_is_not_announced_as_discarded_where_none_will_be() -> None:
+    asked: list[str] = []
+
+    def confirm(proposal: ForgetProposal) -> bool:
+        asked.append(proposal.title)
+        return True
+
+    with pytest.raises(Refused, match="never homed"):
+        use_rig_file_counts(rig_with("incremental"), confirm=confirm)
+    assert asked == []
+    rig = rig_with("absolute")
+    use_rig_file_counts(rig, confirm=confirm)
+    MotionInterlock(rig).file.write(reference_of(rig))
+    use_rig_file_counts(rig, confirm=confirm)
+    none, one = asked
+    assert none == "homing reference: none: absolute encoders match the rig file"
+    assert one.startswith("the present homing reference, which would be discarded: valid, made")
+    assert MotionInterlock(rig).kept_reference() is None
 
 
 def test_it_counts_for_its_rig_file_alone() -> None:
