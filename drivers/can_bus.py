@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import errno
+import ipaddress
 import json
 import os
 import shutil
@@ -12,6 +13,8 @@ import stat
 import struct
 import subprocess
 import time
+import traceback
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -153,6 +156,7 @@ def open_bus(settings: BusSettings) -> can.BusABC:
         bus = can.Bus(interface=settings.interface, ignore_config=True, **options)
     # Back ends raise errors of their vendors' libraries; each means that the bus did not open.
     except Exception as error:
+        _close_unopened(error)
         raise _cannot_open(settings, error) from error
     try:
         _prepare_socket(bus)
@@ -160,6 +164,15 @@ def open_bus(settings: BusSettings) -> can.BusABC:
         bus.shutdown()
         raise _cannot_open(settings, error) from error
     return bus
+
+
+def _close_unopened(error: Exception) -> None:
+    """Closes the bus whose opening failed; python-can would report it as not shut down."""
+    for frame, _line in traceback.walk_tb(error.__traceback__):
+        bus = frame.f_locals.get("self")
+        if isinstance(bus, can.BusABC):
+            with suppress(Exception):  # of a back end, on a bus that it opened in part
+                bus.shutdown()
 
 
 def _options(settings: BusSettings) -> dict[str, Any]:
@@ -173,6 +186,13 @@ def _udp_options(settings: BusSettings) -> dict[str, Any]:
     group, _, port = settings.channel.partition(":") if "." in settings.channel else ("", "", "")
     if settings.channel and not group:
         group = settings.channel  # an IPv6 group, which contains colons
+    if group and not _is_multicast(group):
+        raise BadInput(
+            f"{group!r} is not a multicast address",
+            where="bus.channel",
+            next_step="the channel is a multicast address, such as 239.74.163.77 or"
+            " 239.74.163.77:43114",
+        )
     options: dict[str, Any] = {
         "channel": group or UDP_DEFAULT_GROUP,
         "hop_limit": 0,
@@ -187,6 +207,13 @@ def _udp_options(settings: BusSettings) -> dict[str, Any]:
             )
         options["port"] = int(port)
     return options
+
+
+def _is_multicast(group: str) -> bool:
+    try:
+        return ipaddress.ip_address(group).is_multicast
+    except ValueError:
+        return False
 
 
 def _check_kernel_interface(settings: BusSettings) -> None:
@@ -319,46 +346,6 @@ def receive_frame(bus: can.BusABC, timeout: float) -> can.Message | None:
         return bus.recv(timeout)
     except Exception as error:  # back ends raise errors of their own libraries
         raise bus_fault("the bus cannot be read", bus_name(bus), error) from error
-
-
-# Distinguishes this master's frames from those of another master. No bus.
-
-
-class EchoFilter:
-    """Counts sent frames, so that their echoes are not taken for another master's frames.
-
-    On a bus with echoes each sent frame excuses one received frame.
-    """
-
-    #: Largest number of pending echoes per identifier, which limits the credit of lost frames.
-    MOST_CREDIT = 8
-
-    def __init__(self, ids: frozenset[int], *, echoes_own_frames: bool, batch: int = 0) -> None:
-        """Starts without a frame sent.
-
-        Args:
-            ids: Identifiers to watch.
-            echoes_own_frames: Whether the bus echoes sent frames.
-            batch: Largest number of frames of one identifier sent before an echo is read.
-        """
-        self._ids, self._most = ids, max(self.MOST_CREDIT, batch)
-        self._credit: dict[int, int] | None = dict.fromkeys(ids, 0) if echoes_own_frames else None
-
-    def sent(self, can_id: int) -> None:
-        """Counts a sent frame."""
-        if self._credit is not None and can_id in self._credit:
-            self._credit[can_id] = min(self._most, self._credit[can_id] + 1)
-
-    def is_foreign(self, can_id: int) -> bool:
-        """Whether a received frame is another master's."""
-        if can_id not in self._ids:
-            return False
-        if self._credit is None:
-            return True
-        if self._credit[can_id] > 0:
-            self._credit[can_id] -= 1
-            return False
-        return True
 
 
 # CAN interfaces of Linux: state, bit rate, queue, state of the controller.

@@ -123,6 +123,46 @@ def bus_fault(what: str, where: str, error: Exception) -> BusFault:
     return kind(f"{what}: {str(error) or type(error).__name__}", where)
 
 
+# Distinguishes this master's frames from those of another master. No bus.
+
+
+class EchoFilter:
+    """Counts sent frames, so that their echoes are not taken for another master's frames.
+
+    On a bus with echoes each sent frame excuses one received frame.
+    """
+
+    #: Largest number of pending echoes per identifier, which limits the credit of lost frames.
+    MOST_CREDIT = 8
+
+    def __init__(self, ids: frozenset[int], *, echoes_own_frames: bool, batch: int = 0) -> None:
+        """Starts without a frame sent.
+
+        Args:
+            ids: Identifiers to watch.
+            echoes_own_frames: Whether the bus echoes sent frames.
+            batch: Largest number of frames of one identifier sent before an echo is read.
+        """
+        self._ids, self._most = ids, max(self.MOST_CREDIT, batch)
+        self._credit: dict[int, int] | None = dict.fromkeys(ids, 0) if echoes_own_frames else None
+
+    def sent(self, can_id: int) -> None:
+        """Counts a sent frame."""
+        if self._credit is not None and can_id in self._credit:
+            self._credit[can_id] = min(self._most, self._credit[can_id] + 1)
+
+    def is_foreign(self, can_id: int) -> bool:
+        """Whether a received frame is another master's."""
+        if can_id not in self._ids:
+            return False
+        if self._credit is None:
+            return True
+        if self._credit[can_id] > 0:
+            self._credit[can_id] -= 1
+            return False
+        return True
+
+
 # Error frames of CAN controllers: meaning, and when they end a run. Pure.
 #
 # Source: Linux, include/uapi/linux/can/error.h. Other back ends of python-can give error frames the

@@ -10,7 +10,6 @@ from typing import Protocol
 import can
 
 from drivers.can_bus import (
-    EchoFilter,
     echoes_own_frames,
     lost_frames,
     receive_frame,
@@ -19,6 +18,7 @@ from drivers.can_bus import (
 from drivers.can_errors import (
     SETTING_UP,
     BusFault,
+    EchoFilter,
     ErrorFrames,
     ForeignMaster,
     ReceiveOverflow,

@@ -17,8 +17,8 @@ from math import ceil
 
 import can
 
-from drivers.can_bus import EchoFilter, echoes_own_frames, receive_frame, transmit
-from drivers.can_errors import SETTING_UP, ForeignMaster, error_frame_fault
+from drivers.can_bus import echoes_own_frames, receive_frame, transmit
+from drivers.can_errors import SETTING_UP, EchoFilter, ForeignMaster, error_frame_fault
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import (
     HEARTBEAT_BASE,

@@ -10,7 +10,6 @@ from pathlib import Path
 import can
 
 from drivers.can_bus import (
-    EchoFilter,
     SentFrame,
     echoes_own_frames,
     receive_frame,
@@ -18,6 +17,7 @@ from drivers.can_bus import (
 )
 from drivers.can_errors import (
     SETTING_UP,
+    EchoFilter,
     ForeignMaster,
     answers_twice,
     bus_name,

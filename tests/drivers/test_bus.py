@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import gc
 from pathlib import Path
 
 import can
 import pytest
+from can.interfaces.udp_multicast import bus as udp_bus
 
 from drivers import can_bus as bus_module
 from drivers.can_bus import BusSettings, SentFrame, open_bus
@@ -77,6 +80,32 @@ def test_what_a_back_end_raises_becomes_hardware_missing() -> None:
 def test_a_udp_port_that_is_none_is_refused(port: str) -> None:
     with pytest.raises(BadInput, match="port"):
         open_bus(BusSettings("udp_multicast", f"239.74.163.2:{port}"))
+
+
+@pytest.mark.parametrize("channel", ["foo", "foo.bar:43113", "localhost", "10.0.0.1", "can0"])
+def test_a_udp_channel_that_is_no_multicast_address_is_refused(channel: str) -> None:
+    with pytest.raises(BadInput, match="is not a multicast address") as caught:
+        open_bus(BusSettings("udp_multicast", channel))
+    assert "239.74.163.77:43114" in caught.value.next_step
+
+
+def test_a_udp_bus_may_have_an_ipv6_group() -> None:
+    assert BusSettings("udp_multicast", "ff15::17").canonical == "udp_multicast ff15::17:43113"
+
+
+def test_a_bus_that_did_not_open_is_not_said_to_be_left_open(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def unreachable(*_arguments: object) -> None:
+        raise OSError(errno.ENODEV, "No such device")
+
+    monkeypatch.setattr(udp_bus, "GeneralPurposeUdpMulticastBus", unreachable)
+    with pytest.raises(HardwareMissing, match="cannot be opened") as caught:
+        open_bus(BusSettings("udp_multicast", "239.74.163.77"))
+    assert "route multicast" in caught.value.next_step
+    del caught
+    gc.collect()
+    assert caplog.messages == []
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from can.interfaces.virtual import VirtualBus
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.can_bus import BusSettings, EchoFilter, lost_frames, open_bus
+from drivers.can_bus import BusSettings, lost_frames, open_bus
 from drivers.can_errors import (
     ERROR_CYCLES,
     WITH_CLASSES,
@@ -26,6 +26,7 @@ from drivers.can_errors import (
     BusGone,
     BusOff,
     BusPassive,
+    EchoFilter,
     ErrorFrames,
     ForeignMaster,
     ReceiveOverflow,
