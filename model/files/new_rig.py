@@ -375,7 +375,7 @@ def read_coordinates(path: Path) -> dict[str, Any]:
     count = len(table.rows) - 1
     if not 6 <= count <= CABLES_MOST:
         what = f"{count} cables; a rig has from 6 to {CABLES_MOST}"
-        raise BadInput(what, where=str(path), next_step=hint)
+        raise BadInput(what, where=str(path), next_step="give one line per cable, 6 or more")
     columns = [header.index(name) for name in CSV_COLUMNS]
     points = []
     for line, row in zip(table.lines[1:], table.rows[1:], strict=True):

@@ -147,7 +147,8 @@ def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:
         call("new", tmp_path / "rig.yaml", "--from", table), 2, "column outlet_y_mm is missing"
     )
     few = call("new", tmp_path / "rig.yaml", "--from", cables_csv(tmp_path, 5))
-    one_message(few, 2, "5 cables", "from 6")
+    one_message(few, 2, "5 cables", "from 6", "one line per cable, 6 or more")
+    assert "begin with the line" not in few.err
 
 
 def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:

@@ -11,12 +11,15 @@ from pathlib import Path
 from shutil import which
 from typing import get_args
 
+import numpy as np
 import pytest
+import yaml
 from pydantic import BaseModel
 
 from model.files.plan_file import PlanDocument
 from model.files.rig_file import RigDocument
 from model.files.scene_file import SceneDocument
+from model.rig import load_rig, rig_from_document
 
 ROOT = Path(__file__).parents[2]
 OUTSIDE = re.compile(r"^\s*(https?:)?//", re.IGNORECASE)
@@ -125,6 +128,24 @@ def test_every_key_of_a_file_is_documented(
     words = set(re.findall(r"\w+", (ROOT / "docs" / page).read_text()))
     assert len(keys(model)) > 8
     assert not keys(model) - elsewhere - words
+
+
+def test_the_example_of_tags_and_cameras_completes_a_rig_without() -> None:
+    page = (ROOT / "docs" / "rig-file.md").read_text()
+    (example,) = (block for block in page.split("```yaml\n")[1:] if block.startswith("tags:"))
+    document = load_rig(ROOT / "configs" / "gachon_8_6.yaml").document.model_dump()
+    added = yaml.safe_load(example.split("```")[0])
+    assert set(added) == {"tags", "cameras"}
+    rig = rig_from_document(RigDocument.model_validate({**document, **added}))
+    camera, tag = rig.camera(), rig.platform_tags[0]
+    camera_from_tag = camera.world_from_camera.inverse().compose(rig.home.compose(tag.pose))
+    x, y, z = camera_from_tag.position
+    u, v, _ = camera.matrix @ (x / z, y / z, 1.0)
+    assert z > 1.0
+    assert abs(u - camera.width / 2.0) < 300.0
+    assert abs(v - camera.height / 2.0) < 200.0
+    assert camera_from_tag.rotation[2, 2] < -0.9, "it faces the camera"
+    np.testing.assert_allclose(camera_from_tag.rotation[:, 1], [0, -1, 0], atol=1e-9)
 
 
 OURS = re.compile(
