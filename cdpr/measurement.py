@@ -11,6 +11,7 @@ from drivers.cameras.files import ImageFolder
 from drivers.cameras.live import LiveCamera, VideoFile
 from executor.cameras.sources import parse_camera_sources, require_camera_source
 from executor.track import TrackResult, track_sources
+from model.errors import require_types
 from model.plan import Plan
 from model.progress import SILENT, Listener
 from model.rig import Rig
@@ -31,6 +32,7 @@ def open_camera(
         BadInput: The source cannot be used, or the rig has no such camera.
         HardwareMissing: The live camera does not open.
     """
+    require_types((rig, Rig))
     taken_by, path = rig.camera(camera), Path(str(source))
     if path.is_dir():
         return ImageFolder(path, taken_by)
@@ -73,6 +75,7 @@ def track(
         NoPlatformSeen: No image gave a pose.
         BadInput: A source cannot be used, or an image has another size.
     """
+    require_types((rig, Rig))
     if isinstance(source, Mapping):
         sources = [f"{name}={one}" for name, one in source.items()]
     else:

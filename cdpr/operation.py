@@ -13,7 +13,7 @@ from executor.recording.resume import passing, scene_after
 from executor.recording.run_folder import RunFolder
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
 from executor.supervision import FASTEST, SLOWEST
-from model.errors import BadInput
+from model.errors import BadInput, require_types
 from model.files.scene_file import StopDocument
 from model.plan import Plan, plan_from_document, require_same_rig
 from model.pose import Array, Pose
@@ -88,6 +88,8 @@ def plan(
         Refused: The pose at the end of the run is unknown.
         NoSolution: There is no path, or the search ended at its limit.
     """
+    poses = [pose for pose in (start, goal, *via) if pose is not None]
+    require_types((rig, Rig), (scene, Scene), *((pose, Pose) for pose in poses))
     if from_run is not None and start is not None:
         raise BadInput("from_run and start contradict each other", next_step="leave out one")
     of_legs: list[int] = [] if rounds is None else np.atleast_1d(rounds).tolist()
@@ -125,10 +127,12 @@ def check(plan: Plan, rig: Rig | None = None) -> CheckReport:
         The figures of the path; those named `proved_` hold everywhere on it.
 
     Raises:
-        BadInput: The plan was made for another rig.
+        BadInput: An argument is of another type, or the plan was made for another rig.
         PlanRejected: With every violation: what, by how much, and where.
     """
+    require_types((plan, Plan))
     the_rig = plan.rig if rig is None else rig
+    require_types((the_rig, Rig))
     require_same_rig(plan, the_rig, f"plan for {plan.rig.name} in {plan.scene.name}")
     return verify(plan, the_rig).report
 
@@ -162,6 +166,7 @@ def workspace_map(
     Raises:
         BadInput: A plane is outside the workspace, or there are too many points.
     """
+    require_types((rig, Rig), *([] if scene is None else [(scene, Scene)]))
     planes = [("xyz".index(axis), position) for axis, position in slices]
     grids = workspace_grids(rig, planes, volume=volume, step=step)
     question = Question.about(rig, scene, rotation)

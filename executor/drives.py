@@ -19,7 +19,7 @@ from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
 from executor.kernels import ready_to_simulate
 from executor.realtime.child import ReadyDrives
-from model.errors import BadInput, CdprError, Fault, Refused
+from model.errors import BadInput, CdprError, Fault, Refused, require_types
 from model.files.rig_file import RigDocument
 from model.kinematics import forward_kinematics
 from model.pose import Array, Pose
@@ -38,7 +38,12 @@ ALONE = 1.0
 
 
 def is_simulated(rig: Rig) -> bool:
-    """Whether the drives are simulated in this process: the rig's interface is ``virtual``."""
+    """Whether the drives are simulated in this process: the rig's interface is ``virtual``.
+
+    Raises:
+        BadInput: It is not a rig; verbs that move or read drives ask this first.
+    """
+    require_types((rig, Rig))
     return rig.document.bus.interface == IN_PROCESS
 
 
@@ -53,7 +58,7 @@ def require_other_process(rig: Rig) -> None:
             "the interface 'virtual' keeps no state",
             where="bus",
             why="its drives are simulated inside a run and end with it",
-            next_step="name the bus with --interface and --channel",
+            next_step="name the bus: --interface and --channel, in Python rig.with_bus()",
         )
 
 
@@ -68,7 +73,7 @@ def require_own_time(rig: Rig, realtime: bool) -> None:
             "--fast needs drives simulated in this process",
             where="--fast",
             why="time on a real bus cannot run faster",
-            next_step="leave out --fast, or use the interface 'virtual'",
+            next_step="leave out --fast (in Python realtime=False), or use the interface 'virtual'",
         )
 
 

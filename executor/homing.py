@@ -193,7 +193,8 @@ def require_one_pose(at_home: bool, pose: Pose | None, cameras: Sequence[str]) -
             where="cdpr home",
             why="homing needs a known pose",
             next_step="put the platform on a jig and pass --at-home or --pose-mm X Y Z, or let it"
-            " hang in view of a calibrated camera and pass --camera INDEX",
+            " hang in view of a calibrated camera and pass --camera INDEX; in Python at_home=True,"
+            " pose= or camera=",
         )
 
 

@@ -21,7 +21,7 @@ from executor.recording.run_folder import RunEvent, RunFolder
 from executor.runner import RunOptions, RunResult, prepare_plan, run_prepared
 from executor.supervision import Supervisor
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
-from model.errors import BadInput, Refused
+from model.errors import BadInput, Refused, require_types
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument
 from model.jit import KernelSet, compilation
@@ -79,6 +79,7 @@ def jog(
     Raises:
         CdprError: As for `executor.runner.run`; or the straight path is too long or not free.
     """
+    require_types((rig, Rig), *([] if scene is None else [(scene, Scene)]))
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     require_distance(by, to_home=to_home)

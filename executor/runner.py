@@ -41,7 +41,7 @@ from executor.run_result import RunResult
 from executor.state_machine import LoopEvent, State
 from executor.supervision import LocalRequests, Supervisor
 from executor.trajectory.setpoints import PreparedRun, prepare
-from model.errors import CdprError
+from model.errors import CdprError, require_types
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -124,6 +124,7 @@ def run(
         StoppedByOperator: Cancelled before anything moved.
         KeyboardInterrupt: Ctrl-C, after the drives stopped together and the record was written.
     """
+    require_types((plan, Plan), (rig, Rig))
     require_same_rig(plan, rig, plan_file)
     chosen = resolve_cameras(rig, cameras, is_simulated(rig))
     require_synthetic_images(chosen.values(), not realtime)

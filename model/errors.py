@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from os import PathLike
+from typing import Any, ClassVar
 
 
 class CdprError(Exception):
@@ -98,6 +99,34 @@ class AlreadyExists(BadInput):
 
     def __init__(self, what: str, where: str, why: str = "") -> None:
         super().__init__(what, where=where, why=why, next_step="choose another name")
+
+
+_MAKERS = {
+    "Rig": "cdpr.load_rig",
+    "Scene": "cdpr.load_scene",
+    "Plan": "cdpr.load_plan",
+    "Pose": "cdpr.Pose.level",
+    "CalibrationResult": "cdpr.load_calibration",
+}
+
+
+def require_types(*given: tuple[object, type[Any]]) -> None:
+    """Requires objects of these types of `cdpr`, where a script may pass a path or a list.
+
+    Raises:
+        BadInput: One is of another type; with the function that makes it.
+    """
+    for value, kind in given:
+        if not isinstance(value, kind):
+            maker, shown = _MAKERS[kind.__name__], repr(value)
+            if isinstance(value, PathLike):
+                shown = repr(str(value))
+            made_from = isinstance(value, str | PathLike) or kind.__name__ == "Pose"
+            found = "text" if isinstance(value, str) else type(value).__name__
+            raise BadInput(
+                f"expected a {kind.__name__}, not {found}",
+                next_step=f"pass {maker}({shown if made_from and len(shown) < 80 else '...'})",
+            )
 
 
 class Refused(CdprError):

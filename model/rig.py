@@ -6,13 +6,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from model.cameras import Camera, Tag, camera_from, tag_from
-from model.errors import BadInput
+from model.errors import BadInput, require_types
 from model.files.documents import document_hash, key_path, load_yaml, millimetres
 from model.files.rig_file import MotionDocument, RigDocument, WinchDocument
 from model.pages.page import html_table
@@ -87,6 +87,7 @@ class Motion:
     stuck_speed: float
 
 
+@runtime_checkable
 class CalibrationResult(Protocol):
     """A result of `calibration`, as `Rig.with_calibration` accepts it."""
 
@@ -227,6 +228,7 @@ class Rig:
         Raises:
             NoCable: A cable has no path at this pose.
         """
+        require_types((pose, Pose))
         return posed_rig(self, pose, load)
 
     def clipped(self, pose: Pose) -> Pose:
@@ -243,7 +245,10 @@ class Rig:
         names = [camera.name for camera in self.cameras]
         if not names:
             raise BadInput(
-                "the rig file has no camera", where=self.name, next_step="add a `cameras` section"
+                "the rig file has no camera",
+                where=self.name,
+                next_step="add `tags` and `cameras`, as in the example of docs/rig-file.md"
+                " (Tags and cameras)",
             )
         if name is None:
             return self.cameras[0]
@@ -276,6 +281,7 @@ class Rig:
             BadInput: A result does not fit this rig, or two calibrate the same thing.
         """
         seen: dict[tuple[str, str], str] = {}
+        require_types(*((result, CalibrationResult) for result in results))
         for result in results:
             what = (result.kind, result.name)
             if what in seen:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from model.errors import BadInput, Fault, NoSolution
+from model.errors import BadInput, Fault, NoSolution, require_types
 from model.files.documents import PoseDocument
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import StopDocument
@@ -327,6 +327,7 @@ def plan_from_waypoints(
         BadInput: There are fewer than two waypoints, or ``stops`` does not match the scene's stops.
         PlanRejected: With every violation: what, by how much and where.
     """
+    require_types((rig, Rig), (scene, Scene), *((pose, Pose) for pose in waypoints))
     if len(waypoints) < 2:
         raise BadInput(
             f"a path needs two waypoints, not {len(waypoints)}",

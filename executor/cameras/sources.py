@@ -34,7 +34,8 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
         raise BadInput(
             "the rig file has no camera or no tags",
             where=rig.name,
-            next_step="add cameras and tags to the rig file, or pass --no-camera",
+            next_step="add cameras and tags to the rig file, as in the example of docs/rig-file.md,"
+            " or run without a camera: --no-camera, in Python cameras=[]",
         )
     if wanted is None:
         if not in_process:
@@ -42,14 +43,16 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
                 "no camera was named",
                 where="--camera",
                 why="the drives are not simulated in this process, so no image can be rendered",
-                next_step="pass --camera INDEX for a real camera, or --no-camera",
+                next_step="name a real camera: --camera INDEX, in Python cameras=INDEX; or run"
+                " without one: --no-camera, cameras=[]",
             )
         return SYNTHETIC
     if wanted == SYNTHETIC and not in_process:
         raise BadInput(
             "the synthetic camera needs drives simulated in this process",
             where="--camera",
-            next_step="use the interface 'virtual', a real camera, or --no-camera",
+            next_step="use the interface 'virtual', a real camera, or none: --no-camera, in Python"
+            " cameras=[]",
         )
     if wanted != SYNTHETIC:
         _require_live(wanted)
@@ -244,5 +247,6 @@ def require_synthetic_images(sources: Iterable[str], fast: bool) -> None:
             "--fast needs synthetic cameras",
             where=f"--camera {real[0]}",
             why="a real camera takes images in real time; a fast run would end before",
-            next_step="leave out --fast, or pass --camera synthetic",
+            next_step="leave out --fast (in Python realtime=False), or pass --camera synthetic"
+            " (cameras='synthetic')",
         )

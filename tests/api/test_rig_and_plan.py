@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +13,11 @@ import numpy as np
 import pytest
 
 import cdpr
+from executor.cameras.sources import choose_camera
 from model.files.documents import PoseDocument
 from model.files.scene_file import StopDocument
 from model.kinematics import cable_lengths
+from model.rig import rig_from_document
 from model.statics.gravity import weight_wrench
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -137,6 +141,71 @@ def test_arguments_that_contradict_each_other_are_refused(rig: cdpr.Rig, scene: 
         cdpr.plan(rig, scene, cost="length", weights={"length": 1.0})
     with pytest.raises(cdpr.BadInput, match="objective"):
         cdpr.plan(rig, scene, cost="beauty")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("call", "what", "step"),
+    [
+        (lambda rig, _: cdpr.run("hp.json", rig), "a Plan, not text", "cdpr.load_plan('hp.json')"),
+        (lambda _, scene: cdpr.plan("r.yaml", scene), "a Rig", "cdpr.load_rig('r.yaml')"),
+        (lambda rig, _: cdpr.plan(rig, Path("s.yaml")), "a Scene", "cdpr.load_scene('s.yaml')"),
+        (lambda rig, scene: cdpr.plan(rig, scene, goal=[0, 0, 1]), "a Pose", "Pose.level("),
+        (lambda rig, scene: cdpr.plan(rig, scene.document), "a Scene", "cdpr.load_scene(...)"),
+        (lambda *_: cdpr.check("plan.json"), "a Plan, not text", "cdpr.load_plan('plan.json')"),
+        (lambda rig, _: rig.at([0, 0, 1]), "a Pose, not list", "cdpr.Pose.level([0, 0, 1])"),
+        (
+            lambda rig, _: rig.with_calibration("x.yaml"),
+            "a CalibrationResult, not text",
+            "cdpr.load_calibration('x.yaml')",
+        ),
+        (
+            lambda rig, scene: cdpr.plan_from_waypoints(rig, scene, [[0, 0, 1], [1, 0, 1]]),
+            "a Pose, not list",
+            "cdpr.Pose.level([0, 0, 1])",
+        ),
+        (lambda *_: cdpr.home("r.yaml", at_home=True), "a Rig", "cdpr.load_rig('r.yaml')"),
+        (lambda *_: cdpr.jog("r.yaml", None, to_home=True), "a Rig", "cdpr.load_rig('r.yaml')"),
+        (lambda *_: cdpr.status("r.yaml"), "a Rig, not text", "cdpr.load_rig('r.yaml')"),
+        (lambda *_: cdpr.open_camera("r.yaml", 0), "a Rig", "cdpr.load_rig('r.yaml')"),
+        (lambda *_: cdpr.track("r.yaml", 0), "a Rig, not text", "cdpr.load_rig('r.yaml')"),
+        (lambda *_: cdpr.workspace_map("r.yaml"), "a Rig", "cdpr.load_rig('r.yaml')"),
+    ],
+)
+def test_a_path_in_place_of_an_object_is_refused_with_what_loads_it(
+    rig: cdpr.Rig, scene: cdpr.Scene, call: Callable[..., object], what: str, step: str
+) -> None:
+    with pytest.raises(cdpr.BadInput, match=f"expected {what}") as caught:
+        call(rig, scene)
+    assert step in caught.value.next_step
+
+
+def test_messages_of_the_library_name_what_a_script_passes(rig: cdpr.Rig) -> None:
+    bare = rig_from_document(rig.document.model_copy(update={"cameras": []}))
+    with pytest.raises(cdpr.BadInput, match="no camera or no tags") as without:
+        choose_camera(bare, None, False, True)
+    with pytest.raises(cdpr.BadInput, match="no camera was named") as unnamed:
+        choose_camera(rig, None, False, False)
+    with pytest.raises(cdpr.BadInput, match="keeps no state") as virtual:
+        cdpr.status(rig)
+    with pytest.raises(cdpr.BadInput, match="exactly one") as unknown:
+        cdpr.home(rig)
+    for caught, option, argument in (
+        (without, "--no-camera", "cameras=[]"),
+        (unnamed, "--camera INDEX", "cameras=INDEX"),
+        (virtual, "--interface", "rig.with_bus"),
+        (unknown, "--at-home", "at_home=True"),
+    ):
+        assert option in caught.value.next_step
+        assert argument in caught.value.next_step
+
+
+def test_a_rig_without_a_camera_is_referred_to_the_example(rig: cdpr.Rig) -> None:
+    bare = rig_from_document(rig.document.model_copy(update={"cameras": []}))
+    with pytest.raises(cdpr.BadInput, match="no camera") as caught:
+        bare.camera()
+    (page,) = re.findall(r"docs/[a-z-]+\.md", caught.value.next_step)
+    (title,) = re.findall(r"\((.+)\)", caught.value.next_step)
+    assert f"## {title}\n" in (CONFIGS.parent / page).read_text()
 
 
 def test_a_saved_plan_is_loaded_and_proved_again(
