@@ -216,6 +216,8 @@ def _name_of(loader: _Loader, key: yaml.Node, path: KeyPath, tree: YamlTree) -> 
     name = str(key.value) if isinstance(key, yaml.ScalarNode) else "?"
     if key.tag not in (_TAG + "str", _TAG + "merge"):
         what = f"the key {name} is not text"
+        if key.tag in (_TAG + "int", _TAG + "float"):  # as in {payload_kg: 10,5}
+            what += "; in numbers write a decimal point, not a comma"
         tree.faults.append(YamlFault((*path, name), what, *_position_of(key)))
         if not (isinstance(key, yaml.ScalarNode) and _is_plain(loader, key)):
             tree.typed = True
