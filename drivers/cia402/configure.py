@@ -207,7 +207,7 @@ class Refusals:
         """Starts empty."""
         self._found: list[Refused] = []
 
-    def note(self, action: Callable[..., None], *arguments: Any) -> bool:
+    def note(self, action: Callable[..., object], *arguments: Any) -> bool:
         """Calls an action; records a refusal of the drive and returns False."""
         try:
             action(*arguments)

@@ -85,7 +85,7 @@ class NamedBehaviour:
     Attributes:
         name: Name on the command line.
         value: Meaning of its value; empty if it takes none.
-        example: Default value, shown by ``list``; empty if a value is required.
+        example: Default value; empty if a value is required.
         text: Description in one line.
         put: Returns a behaviour with this one added, given the value.
     """
@@ -314,5 +314,12 @@ def behaviour_named(names: Iterable[str], base: DriveBehaviour = STRICT) -> Driv
 
 
 def table() -> list[tuple[str, str]]:
-    """Name with value, and description, of each behaviour."""
-    return [(b.name + (f"={b.value}" if b.value else ""), b.text) for b in BEHAVIOURS]
+    """Name with value and its default, and description, of each behaviour."""
+    return [(_usage(behaviour), behaviour.text) for behaviour in BEHAVIOURS]
+
+
+def _usage(behaviour: NamedBehaviour) -> str:
+    name, value, default = behaviour.name, behaviour.value, behaviour.example
+    if default:
+        return f"{name}[={value}] ({default})"
+    return f"{name}={value}" if value else name

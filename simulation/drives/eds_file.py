@@ -123,7 +123,7 @@ def read_eds(path: Path) -> Eds:
         parser.read_string(_text(path))
     except (OSError, configparser.Error) as error:
         raise BadInput(
-            f"cannot be read as an EDS file: {error}",
+            f"cannot be read as an EDS file: {_fault_of(error)}",
             where=str(path),
             next_step="pass an electronic data sheet (.eds) of CiA 306",
         ) from error
@@ -157,6 +157,14 @@ def _text(path: Path) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
+
+
+def _fault_of(error: OSError | configparser.Error) -> str:
+    """First line and line number of an error, without what the parser adds for programmers."""
+    first = str(error).splitlines()[0].removesuffix(": '<string>'").rstrip(".")
+    listed = getattr(error, "errors", None) or [(getattr(error, "lineno", None), "")]
+    number = listed[0][0]
+    return first if number is None else f"{first}, line {number}"
 
 
 def _described(

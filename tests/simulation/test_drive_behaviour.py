@@ -352,8 +352,20 @@ def test_a_wrong_name_or_value_is_explained(text: str) -> None:
 
 def test_the_documentation_has_every_behaviour() -> None:
     page = (Path(__file__).parents[2] / "docs" / "drives.md").read_text()
-    missing = [name for name, _ in table() if f"`{name}`" not in page]
-    assert missing == []
+    rows = []
+    for name, _ in table():
+        usage, _, default = name.partition(" ")
+        rows.append(f"| `{usage}` {default}".rstrip() + " |")
+    assert [row for row in rows if row not in page] == []
+
+
+def test_the_list_names_the_value_that_is_used_without_one() -> None:
+    for one, (usage, _) in zip(BEHAVIOURS, table(), strict=True):
+        if one.example:
+            assert usage == f"{one.name}[={one.value}] ({one.example})"
+            assert behaviour_named([one.name]) == behaviour_named([f"{one.name}={one.example}"])
+        else:
+            assert "(" not in usage
 
 
 def test_the_command_line_lists_them_and_explains_a_wrong_one() -> None:

@@ -193,6 +193,8 @@ def test_it_says_that_it_is_simulated_whatever_the_file_says(tmp_path: Path) -> 
     ("text", "says"),
     [
         ("no section", "cannot be read"),
+        ("hello\n", "EDS file: File contains no section headers, line 1\n"),
+        ("[1000]\nDataType\n", "EDS file: Source contains parsing errors, line 2\n"),
         ("[1000]\nDataType=0x7\nAccessType=ro\n", "no object of a drive profile"),
         ("[6040]\nDataType=0x6\nAccessType=never\n", "access type"),
         ("[6040]\nDataType=0x6\nDefaultValue=many\n", "not a number"),
@@ -205,6 +207,7 @@ def test_a_file_that_cannot_be_used_says_why(tmp_path: Path, text: str, says: st
     with pytest.raises(BadInput, match=says) as caught:
         read_eds(path)
     assert "bad.eds" in str(caught.value)
+    assert "<string>" not in str(caught.value)
 
 
 def test_a_profile_without_a_file_names_those_that_have_one() -> None:
