@@ -196,10 +196,10 @@ def _lines(points: list[list[float]]) -> str:
 
 
 def _winch(number: int, answers: Answers) -> str:
-    drum = 2.0 * math.pi * answers["drum_radius_mm"]
+    centre_line = answers["drum_radius_mm"] + answers["radius_mm"]
     parts = {
         "node_id": number,
-        "drum_mm_per_rev": drum,
+        "drum_mm_per_rev": 2.0 * math.pi * centre_line,
         "gear_ratio": answers["gear_ratio"],
         "counts_per_rev": answers["counts_per_rev"],
         "direction": 1,
@@ -240,12 +240,13 @@ cables:
 
 # Where swivelling pulleys guide the cables, outlets_mm are the points where cables enter them:
 # pulleys:
-#   radius_mm: 13
+#   radius_mm: 13  # to the cable's centre line: radius of the bare groove and of the cable
 #   feed_directions: [[0, 0, 1], ...]  # of each cable: its travel where it enters the pulley
 
 # A winch for each cable, in the same order. Of each winch check node_id and direction with
 # `cdpr jog RIG --cable N --mm 5`: +1 where positive counts pay cable out.
-# drum_mm_per_rev is the cable for one turn of a drum of {drum_radius_mm} mm radius.
+# drum_mm_per_rev is the cable for one turn, 2 pi times the radius of its centre line on the drum:
+# {drum_radius_mm} mm of the bare drum and {radius_mm} mm of the cable.
 winches:
 {winches}
 

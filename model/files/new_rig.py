@@ -259,7 +259,13 @@ AFTER_COORDINATES = (
         lambda answers: 20.0 * answers["min_tension_n"],
         _above_least,
     ),
-    RigQuestion("drum_radius_mm", "radius of the drums", "mm", _number(), _always(32.8)),
+    RigQuestion(
+        "drum_radius_mm",
+        "radius of the bare drums, at the bottom of the groove; the cable's radius is added",
+        "mm",
+        _number(),
+        _always(32.3),
+    ),
     RigQuestion("gear_ratio", "motor turns for one drum turn", "", _number(), _always(1.0)),
     RigQuestion(
         "counts_per_rev",

@@ -122,7 +122,9 @@ class CableDocument(Document):
 class PulleysDocument(Document):
     """Swivelling pulleys at the outlets; left out, cables leave at the outlet points."""
 
-    radius_mm: Positive
+    radius_mm: Positive = Field(
+        description="to the cable's centre line: radius of the bare groove plus that of the cable"
+    )
     feed_directions: Annotated[list[UnitVector], Field(min_length=1)] = Field(
         description="per cable: unit direction of travel of the cable where it enters the pulley,"
         " along the swivel axis"
@@ -133,7 +135,10 @@ class WinchDocument(Document):
     """One winch and its drive."""
 
     node_id: Annotated[int, Field(ge=1, le=126)]
-    drum_mm_per_rev: Positive
+    drum_mm_per_rev: Positive = Field(
+        description="2π times the radius of the cable's centre line on the drum: that of the bare"
+        " drum plus that of the cable"
+    )
     gear_ratio: Positive = Field(default=1.0, description="motor turns for one drum turn")
     counts_per_rev: Annotated[int, Field(ge=1, le=WHOLE_LARGEST)] = Field(
         description="of the motor shaft"

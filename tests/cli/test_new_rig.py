@@ -9,7 +9,14 @@ from pathlib import Path
 import pytest
 
 from cdpr.cli.start import RigOptions
-from model.files.new_rig import AFTER_COORDINATES, BEFORE_COORDINATES, CSV_COLUMNS
+from model.files.examples import rig_text
+from model.files.new_rig import (
+    AFTER_COORDINATES,
+    BEFORE_COORDINATES,
+    CSV_COLUMNS,
+    collect_answers,
+)
+from model.files.validation import parse_yaml
 from model.rig import load_rig
 from tests.cli.plans import CONFIGS
 from tests.cli.program import call, nothing_written, one_message
@@ -107,7 +114,26 @@ def test_coordinates_from_a_table_ask_nothing(tmp_path: Path) -> None:
     assert document.outlets_mm == PAPER.document.outlets_mm
     assert document.anchors_mm == PAPER.document.anchors_mm
     assert document.platform.mass_kg == 0.7
-    assert document.winches[7].drum_mm_per_rev == pytest.approx(314.159265)
+    assert document.winches[7].drum_mm_per_rev == pytest.approx(2.0 * math.pi * (50.0 + 0.5))
+
+
+@pytest.mark.parametrize(("drum", "cable"), [(32.3, 0.5), (50.0, 0.0), (8.0, 1.5)])
+def test_a_drum_turn_moves_the_circumference_of_the_cables_centre_line(
+    drum: float, cable: float
+) -> None:
+    """A cable wound on a bare drum has its centre line one cable radius farther out."""
+    answers = collect_answers("rig", {"drum_radius_mm": drum, "radius_mm": cable})
+    tree = parse_yaml(rig_text(answers)).data
+    outer, inner = 2.0 * math.pi * (drum + 2.0 * cable), 2.0 * math.pi * drum
+    for winch in tree["winches"]:
+        assert winch["drum_mm_per_rev"] == pytest.approx((outer + inner) / 2.0, rel=1e-9)
+
+
+def test_the_question_about_drums_says_which_radius(tmp_path: Path) -> None:
+    answer = call("new", tmp_path / "rig.yaml", answers="\n" * 50)
+    assert "radius of the bare drums" in answer.err
+    assert "the cable's radius is added [32.3] mm: " in answer.err
+    assert "32.3 mm of the bare drum and 0.5 mm of the cable" in (tmp_path / "rig.yaml").read_text()
 
 
 def test_a_suspended_robot_gets_a_home_below_its_outlets(tmp_path: Path) -> None:
