@@ -42,6 +42,8 @@ from model.scene import Scene
 _STUB_SHARE = 0.25
 _SAME = 1e-6
 """Ends nearer to each other are the same, [m]."""
+_TOUCHING = 1e-9
+"""Distance that may be round-off, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,12 +100,12 @@ class SelfModel:
         half, radius = self.rig.half_size, self.rig.cable_radius
         start = cables.anchors + self.stub * cables.directions
         origin = positions[..., None, :]
-        on_cable, in_box = segment_box_points(
-            (start - origin) @ rotations, (cables.exits - origin) @ rotations, half
-        )
-        apart = np.linalg.norm(on_cable - in_box, axis=-1)
-        inside = np.minimum(np.max(np.abs(on_cable) - half, axis=-1), 0.0)
-        distances = np.where(apart > 0.0, apart, inside) - radius
+        start, end = (start - origin) @ rotations, (cables.exits - origin) @ rotations
+        on_cable, in_box = segment_box_points(start, end, half)
+        distances = np.linalg.norm(on_cable - in_box, axis=-1)
+        touching = distances <= _TOUCHING
+        distances[touching] = -_depths(start[touching], end[touching], half)
+        distances -= radius
         rotated = np.swapaxes(rotations, -1, -2)
         return Gaps(distances, on_cable @ rotated + origin, in_box @ rotated + origin)
 
@@ -112,6 +114,32 @@ class SelfModel:
         start = cables.anchors[..., chosen, :] + self.stubs[:, :1] * along
         end = cables.exits[..., chosen, :] - self.stubs[:, 1:] * along
         return start, end
+
+
+def _depths(start: Array, end: Array, half_size: Array) -> Array:
+    """The shortest translations that separate segments from a box about the origin.
+
+    The sum of segment and box has faces parallel to those of the box, and to the segment and an
+    edge of the box. The shortest way out leads through one of them.
+
+    Args:
+        start: Frame of the box, shape (k, 3), [m].
+        end: Frame of the box, shape (k, 3), [m].
+        half_size: Half extents of the box, shape (3,), [m].
+
+    Returns:
+        Shape (k,), [m]; 0 where they are apart.
+    """
+    faces = np.broadcast_to(np.eye(3), (len(start), 3, 3))
+    across = np.cross((end - start)[:, None, :], faces)
+    size = np.linalg.norm(across, axis=-1, keepdims=True)
+    # An edge parallel to the segment spans no face with it.
+    across = np.where(size > _TOUCHING, across / np.where(size > _TOUCHING, size, 1.0), faces)
+    normals = np.concatenate([faces, across], axis=1)
+    along = np.stack([normals @ point[..., None] for point in (start, end)])[..., 0]
+    nearest = np.maximum(along.min(axis=0), -along.max(axis=0))
+    depths: Array = (np.abs(normals) @ half_size - nearest).min(axis=-1)
+    return np.maximum(depths, 0.0)
 
 
 PLATFORM = "platform"

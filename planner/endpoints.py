@@ -151,7 +151,7 @@ def _require_clear(scene: Scene, model: ClearanceModel, name: str, pose: Pose) -
 def _clearance_error(name: str, near: Nearest, needed: float, key: str) -> BadInput:
     distance, limit = near.distance * 1e3, needed * 1e3
     if near.distance <= 0.0:
-        depth = f" ({-distance:.1f} mm inside)" if distance < -0.05 else ""
+        depth = f" (overlap {-distance:.1f} mm)" if distance < -0.05 else ""
         what = f"at the {name} {near.first} touches {near.second}{depth}"
     else:
         what = (

@@ -290,6 +290,25 @@ def test_a_cable_along_a_face_of_the_platform_has_no_self_clearance() -> None:
     assert model.self_clearance(GACHON.home).distance > 0.010
 
 
+@given(seeds)
+def test_the_depth_of_a_cable_in_the_platform_is_the_shortest_way_out(seed: int) -> None:
+    """Rotated far, cables pass through the platform: against the general distance of bodies."""
+    rng, model = np.random.default_rng(seed), SelfModel(GACHON)
+    pose = Pose(GACHON.home.position, Rotation.random(rng=rng).as_matrix())
+    cables = cables_at(GACHON, pose)
+    found = model.to_platform(cables, pose.position, pose.rotation).distances
+    box = box_body(GACHON.half_size, pose)
+    starts = cables.anchors + model.stub * cables.directions
+    for start, end, distance in zip(starts, cables.exits, found, strict=True):
+        expected = separation(segment_body(start, end), box).distance - GACHON.cable_radius
+        assert distance == pytest.approx(expected, abs=2e-7)
+        if distance < -GACHON.cable_radius:  # no point of the cable is deeper than that
+            points = start + np.linspace(0.0, 1.0, 101)[:, None] * (end - start)
+            local = (points - pose.position) @ pose.rotation
+            deepest = np.min(GACHON.half_size - np.abs(local), axis=-1).max()
+            assert deepest + GACHON.cable_radius <= -distance + 1e-9
+
+
 def test_cables_that_share_an_anchor_are_compared_beyond_a_stub() -> None:
     document = GACHON.document
     anchors = [list(a) for a in document.anchors_mm]

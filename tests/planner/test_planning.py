@@ -132,7 +132,7 @@ def test_a_rotated_platform_keeps_its_orientation(gachon, scene_with) -> None:
 @pytest.mark.parametrize(
     ("start_mm", "words"),
     [
-        ([-150, 0, 300], ["start", "touches obstacle_1", "inside"]),
+        ([-150, 0, 300], ["start", "touches obstacle_1", "overlap"]),
         ([-40, 0, 300], ["start", "platform", "obstacle_1"]),
         ([300, 0, 300], ["start", "50.0 mm outside the workspace", "x = 300.0 mm"]),
         ([0, 0, 100], ["start", "50.0 mm outside the workspace", "z = 100.0 mm"]),
