@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from model.clearance import PLATFORM, ClearanceModel, Nearest, SelfModel
+from model.clearance import PLATFORM, ClearanceModel, Nearest, SelfModel, cable_name
 from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig
@@ -145,10 +145,10 @@ def _require_clear(scene: Scene, model: ClearanceModel, name: str, pose: Pose) -
     for near, asked, key in pairs:
         needed = asked + CLEARANCE_RESERVE
         if near.distance < needed:
-            raise _clearance_error(name, near, needed, key)
+            raise _clearance_error(name, near, needed, key, model.rig)
 
 
-def _clearance_error(name: str, near: Nearest, needed: float, key: str) -> BadInput:
+def _clearance_error(name: str, near: Nearest, needed: float, key: str, rig: Rig) -> BadInput:
     distance, limit = near.distance * 1e3, needed * 1e3
     if near.distance <= 0.0:
         depth = f" (overlap {-distance:.1f} mm)" if distance < -0.05 else ""
@@ -158,16 +158,40 @@ def _clearance_error(name: str, near: Nearest, needed: float, key: str) -> BadIn
             f"at the {name} {near.first} is {distance:.2f} mm from {near.second},"
             f" less than the required {limit:.2f} mm"
         )
-    hint = " or the obstacle"
-    if key == "self_mm" and near.second == PLATFORM:
-        hint = ", correct the anchor or the platform's box in the rig file"
-    return BadInput(
-        what,
-        where=f"scene {name}",
-        why=f"the scene's clearance.{key} plus 0.05 mm that the planner keeps in reserve",
-        next_step=f"move the {name}{hint}, or reduce the clearance",
-        values={"distance_mm": distance, "required_mm": limit, "pair": _pair(near)},
-    )
+    why = f"the scene's clearance.{key} plus 0.05 mm that the planner keeps in reserve"
+    next_step = f"move the {name} or the obstacle, or reduce the clearance"
+    values: dict[str, float | str] = {
+        "distance_mm": distance,
+        "required_mm": limit,
+        "pair": _pair(near),
+    }
+    if key == "self_mm":
+        next_step = f"move the {name}, or reduce clearance.self_mm in the scene"
+        if near.second == PLATFORM:
+            box = "correct the anchor or the platform's box in the rig file"
+            next_step = f"move the {name}, {box}, or reduce the clearance"
+        elif shared := _shared_end(rig, near):
+            end, exempt = shared
+            why += (
+                f"; they share an {end}, and only the first {exempt * 1e3:.1f} mm from there, a"
+                " quarter of the box's shortest side, may be nearer"
+            )
+            next_step = (
+                "declare a thicker platform box in the rig file, reduce clearance.self_mm in the"
+                f" scene, or move the {name}"
+            )
+            values["exempt_mm"] = exempt * 1e3
+    return BadInput(what, where=f"scene {name}", why=why, next_step=next_step, values=values)
+
+
+def _shared_end(rig: Rig, near: Nearest) -> tuple[str, float] | None:
+    """The end that two cables share, and the length there that is not compared, [m]."""
+    own = SelfModel(rig)
+    pair = {near.first, near.second}
+    for cables, stubs in zip(own.pairs.tolist(), own.stubs.tolist(), strict=True):
+        if {cable_name(cable) for cable in cables} == pair and max(stubs) > 0.0:
+            return ("anchor" if stubs[0] > 0.0 else "outlet"), max(stubs)
+    return None
 
 
 def _pair(near: Nearest) -> str:

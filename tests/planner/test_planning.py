@@ -152,11 +152,11 @@ def test_a_start_that_cannot_be_used_names_what_and_by_how_much(
         make_plan(gachon, mirrored, QUICK)
 
 
-def test_a_start_that_barely_touches_is_not_reported_as_zero_inside(gachon, ready_scene) -> None:
+def test_a_start_that_barely_touches_is_not_reported_as_no_overlap(gachon, ready_scene) -> None:
     bad = ready_scene("environment_1").changed(start=Pose.level([-0.045 - 1e-12, 0.0, 0.3]))
     with pytest.raises(BadInput, match="platform touches obstacle_1") as refusal:
         make_plan(gachon, bad, QUICK)
-    assert "inside" not in str(refusal.value)
+    assert "overlap" not in str(refusal.value)
 
 
 def test_a_start_nearer_than_the_clearance_asked_for_states_both_figures(
@@ -212,6 +212,25 @@ def test_anchors_inside_the_platforms_box_are_named(gachon, scene_with, share, w
     with pytest.raises(BadInput) as refusal:
         make_plan(rig, scene_with(goal={"position_mm": [5.0, 0.0, 445.0]}), QUICK)
     assert all(word in str(refusal.value) for word in words)
+
+
+def test_cables_too_near_each_other_get_no_advice_about_obstacles(gachon, scene_with) -> None:
+    """Crossing cables may be moved apart; those from one anchor are near whatever the pose."""
+    crossing = replace(scene_with(), self_clearance=0.017)
+    with pytest.raises(BadInput, match=r"cable \d is .* mm from cable \d") as refusal:
+        require_usable_ends(gachon, crossing)
+    assert "share" not in refusal.value.why
+    assert refusal.value.next_step == "move the start, or reduce clearance.self_mm in the scene"
+    document = gachon.document.model_copy(deep=True)
+    document.platform.size_mm[2] = 20.0
+    document.anchors_mm[1] = document.anchors_mm[0]
+    shared = replace(scene_with(), self_clearance=0.012)
+    with pytest.raises(BadInput, match=r"cable 1 is .* mm from cable 2") as refusal:
+        require_usable_ends(rig_from_document(document), shared)
+    assert "they share an anchor, and only the first 5.0 mm" in refusal.value.why
+    assert refusal.value.next_step.startswith("declare a thicker platform box")
+    assert "obstacle" not in refusal.value.next_step
+    assert refusal.value.values["exempt_mm"] == pytest.approx(5.0)
 
 
 def test_anchors_a_little_inside_the_platforms_box_are_planned_with(gachon, scene_with) -> None:
