@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
 from model.files.camera_file import CameraDocument, TagsDocument
@@ -226,10 +227,11 @@ class RigDocument(Document):
     simulation: SimulationDocument | None = None
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
-        """Mismatched counts, duplicate numbers, a home pose outside the workspace."""
+        """Mismatched counts, ends on a line, duplicate numbers, a home outside the workspace."""
         return (
             self._enough_cables,
             self._an_anchor_each,
+            self._ends_off_a_line,
             self._a_winch_each,
             self._a_pulley_each,
             self._nodes_once,
@@ -249,6 +251,23 @@ class RigDocument(Document):
 
     def _an_anchor_each(self) -> list[Finding]:
         return self._one_each(("anchors_mm",), len(self.anchors_mm))
+
+    def _ends_off_a_line(self) -> list[Finding]:
+        """Cables that all meet one line exert no moment about it, at any pose."""
+        ends = {"anchors_mm": self.anchors_mm}
+        if self.pulleys is None:  # else the exits move off the line
+            ends["outlets_mm"] = self.outlets_mm
+        found: list[Finding] = []
+        for key, points in ends.items():
+            if len(points) < 3 or not (where := _point_or_line(points)):
+                continue
+            what = (
+                f"all {len(points)} {key.removesuffix('_mm')} are {where}, about which the cables"
+                " exert no moment: they cannot hold six degrees of freedom; use three or more"
+                " points that are not on one line"
+            )
+            found.append(((key,), what))
+        return found
 
     def _a_winch_each(self) -> list[Finding]:
         return self._one_each(("winches",), len(self.winches))
@@ -336,6 +355,25 @@ class RigDocument(Document):
         }
         found = self.simulation.misfits(len(self.outlets_mm), self.pulleys is not None, rates)
         return found + self.simulation.tags.misfits(tags)
+
+
+_ON_A_LINE_MM = 1e-3
+"""Distance from a line that counts as on it."""
+
+
+def _point_or_line(points: Sequence[Sequence[float]]) -> str:
+    """Whether points, [mm], are all at one point or on one line, in words; else empty."""
+    with np.errstate(over="ignore"):
+        offsets = np.asarray(points) - np.asarray(points[0])
+    size = float(np.abs(offsets).max())
+    if size <= _ON_A_LINE_MM:
+        return "at one point"
+    if not np.isfinite(size):
+        return ""
+    offsets = offsets / size
+    direction = offsets[np.argmax(np.abs(offsets).max(axis=1))]
+    beside = np.linalg.norm(np.cross(offsets, direction), axis=1).max()
+    return "on one line" if beside * size <= _ON_A_LINE_MM * np.linalg.norm(direction) else ""
 
 
 def _repeated(

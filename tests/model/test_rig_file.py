@@ -372,3 +372,46 @@ def test_any_content_of_a_file_makes_a_rig_or_one_of_our_errors(
     except CdprError as error:
         found = str(error)
     assert not JARGON.search(found), found
+
+
+def rig_with(**changes: object) -> RigDocument:
+    return RigDocument.model_validate(yaml.safe_load(PAPER) | changes)
+
+
+@pytest.mark.parametrize("key", ["anchors_mm", "outlets_mm"])
+@settings(max_examples=30)
+@given(
+    at=st.tuples(*[st.floats(-2000.0, 2000.0)] * 3),
+    along=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    aside=st.sampled_from([0.0, 10.0]),
+)
+def test_cables_that_meet_one_point_or_line_are_refused(key: str, at, along, aside: float) -> None:
+    """About it no cable exerts a moment; files round to a tenth of a micrometre."""
+    steps = np.array([-50.0, 20.0, 0.0, 65.0, -10.0, 35.0, 80.0, -90.0])
+    points = np.array(at) + np.outer(steps, along)
+    points[3] += aside * np.array([-1.0 - along[1], 1.0 + along[0], 0.0])
+    found = rig_with(**{key: np.round(points, 4).tolist()}).findings()
+    beside = points - points[0]
+    rank = np.linalg.matrix_rank(beside, tol=0.1)
+    if rank >= 2:
+        assert found == []
+    elif np.linalg.matrix_rank(beside, tol=1e-3 / 10) < 2:
+        [(path, what)] = found
+        assert path == (key,)
+        assert ("at one point" if np.ptp(points, axis=0).max() < 1e-4 else "on one") in what
+        assert "cannot hold six degrees of freedom; use three or more points" in what
+
+
+def test_a_point_mass_is_refused_with_its_line(tmp_path: Path) -> None:
+    text = yaml.safe_dump(yaml.safe_load(PAPER) | {"anchors_mm": [[0, 0, 0]] * 8})
+    [(line, _, key, what)] = problems_in(text, tmp_path)
+    assert text.splitlines()[line - 1].startswith("anchors_mm")
+    assert (key, what.split(",")[0]) == ("anchors_mm", "all 8 anchors are at one point")
+
+
+def test_outlets_on_a_line_are_accepted_with_pulleys() -> None:
+    """The exits are a pulley's radius beside the line."""
+    outlets = [[100.0 * i, 0.0, 900.0] for i in range(8)]
+    pulleys = {"radius_mm": 13, "feed_directions": [[0, 0, 1]] * 8}
+    assert rig_with(outlets_mm=outlets, pulleys=pulleys).findings() == []
+    assert len(rig_with(outlets_mm=outlets).findings()) == 1

@@ -239,7 +239,7 @@ def test_anchors_a_little_inside_the_platforms_box_are_planned_with(gachon, scen
 
 
 @given(
-    share=st.floats(0.0, 1.0),
+    share=st.floats(0.01, 1.0),
     at=st.tuples(*[st.floats(0.0, 1.0)] * 3),
     turn=st.tuples(*[st.floats(-0.5, 0.5)] * 3),
     clearance_mm=st.floats(0.0, 20.0),
