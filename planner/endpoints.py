@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from math import comb
+
 import numpy as np
 
 from model.clearance import PLATFORM, ClearanceModel, Nearest, SelfModel, cable_name
 from model.errors import BadInput
+from model.files.new_rig import CABLES_MOST
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Leg, Scene, legs_of
@@ -29,10 +32,11 @@ def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) 
         free_rotation: Whether they may differ in orientation.
 
     Raises:
-        BadInput: An anchor is too deep inside the platform's box; one of them is outside the
-            workspace box, violates an obstacle or self clearance, or cannot be held; or they
-            differ in orientation.
+        BadInput: The rig has too many cables; an anchor is too deep inside the platform's box; one
+            of them is outside the workspace box, violates an obstacle or self clearance, or cannot
+            be held; or they differ in orientation.
     """
+    _require_few_cables(rig)
     _require_outer_anchors(rig, scene)
     model = ClearanceModel(rig, scene)
     for leg in legs_of(scene):
@@ -61,6 +65,20 @@ def require_feasible_length(scene: Scene, longest: float) -> None:
         next_step="allow a longer path with --longest-mm, or leave it out",
         values={"longest_mm": longest * 1e3, "straight_mm": straight * 1e3},
     )
+
+
+def _require_few_cables(rig: Rig) -> None:
+    """Refuses rigs for which planning would take minutes without a word."""
+    count = rig.cable_count
+    if count > CABLES_MOST:
+        raise BadInput(
+            f"{count} cables are too many to plan for; the largest number is {CABLES_MOST}",
+            where=f"rig {rig.name}",
+            why=f"every five of them bound the forces and moments that all can give: there are"
+            f" {comb(count, 5)} such bounds at each of thousands of poses",
+            next_step="plan with fewer cables, such as one where several pull in parallel",
+            values={"cables": count, "cables_most": CABLES_MOST},
+        )
 
 
 def _require_outer_anchors(rig: Rig, scene: Scene) -> None:

@@ -19,7 +19,8 @@ from model.files.documents import Name, NonNegative, Number, Positive
 from model.files.reading import CsvFile
 
 Answers = Mapping[str, Any]
-CABLES_MOST = 64
+CABLES_MOST = 24
+"""For which paths are planned: the work grows with the fifth power of their number."""
 CSV_COLUMNS = tuple(f"{end}_{axis}_mm" for end in ("outlet", "anchor") for axis in "xyz")
 
 

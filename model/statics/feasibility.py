@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model.errors import BadInput, Fault
 from model.statics.wrench_sets import (
+    FACET_COLUMNS,
     FORCE_ROWS,
     RANK_TOLERANCE,
     WRENCH_SIZE,
@@ -137,7 +139,7 @@ def capacity_margin(
         _for_each_pose(part, batch) for part in (external.centre, external.half_widths)
     )
     margins = np.zeros(len(matrices))
-    for block in blocks(len(matrices)):
+    for block in blocks(len(matrices), math.comb(shape[1], FACET_COLUMNS)):
         facets = wrench_facets(matrices[block], lows[block], highs[block], characteristic_length)
         box = WrenchBox(centres[block], half_widths[block])
         margins[block] = _margins(facets, box, characteristic_length)
@@ -325,7 +327,7 @@ def closure_margin(
     batch, shape = matrix.shape[:-2], matrix.shape[-2:]
     matrices = matrix.reshape(-1, *shape)
     margins = np.zeros(len(matrices))
-    for block in blocks(len(matrices)):
+    for block in blocks(len(matrices), math.comb(shape[1], FACET_COLUMNS)):
         facets = wrench_facets(matrices[block], 0.0, 1.0, characteristic_length)
         margins[block] = _closure_margins(matrices[block], facets)
     return margins.reshape(batch)
@@ -342,8 +344,8 @@ def _closure_margins(matrices: NDArray[np.float64], facets: WrenchFacets) -> NDA
     room = np.minimum(facets.upper, -facets.lower).min(axis=-1)
     margins[closed] = room[closed]
     opened = facets.full_rank & ~closed
-    null_space = np.linalg.svd(matrices[opened])[2][..., WRENCH_SIZE:, :]
-    missed = np.where(one_sided[opened], _weaker_pull(facet_gains(null_space), freedom), 0.0)
+    gains = facet_gains(np.linalg.svd(matrices[opened])[2])
+    missed = np.where(one_sided[opened], _weaker_pull(gains, freedom), 0.0)
     margins[opened] = np.minimum(missed.min(axis=-1), 0.0)
     return margins
 

@@ -23,8 +23,13 @@ from model.errors import BadInput
 
 FORCE_ROWS = 3
 WRENCH_SIZE = 6
+FACET_COLUMNS = WRENCH_SIZE - 1
+"""Columns of the structure matrix that span a facet."""
 POSES_IN_A_BLOCK = 128
 """Batches are processed in blocks that stay in the processor's cache."""
+_ROWS_IN_A_BLOCK = 40_000
+_FEW_CABLES = 8
+"""Up to this number, facets are taken from the null space."""
 
 
 def checked_structure_matrix(structure_matrix: ArrayLike) -> NDArray[np.float64]:
@@ -109,10 +114,16 @@ def with_scaled_moments(
     return scaled
 
 
-def blocks(count: int) -> Iterator[slice]:
-    """Yield slices that cover a batch of ``count`` poses block by block."""
-    for start in range(0, count, POSES_IN_A_BLOCK):
-        yield slice(start, start + POSES_IN_A_BLOCK)
+def blocks(count: int, subset_count: int) -> Iterator[slice]:
+    """Yield slices that cover a batch of ``count`` poses block by block.
+
+    Args:
+        count: Number of poses.
+        subset_count: Subsets of the cables per pose; blocks have fewer poses where it is large.
+    """
+    size = min(max(_ROWS_IN_A_BLOCK // max(subset_count, 1), 1), POSES_IN_A_BLOCK)
+    for start in range(0, count, size):
+        yield slice(start, start + size)
 
 
 def force_volume(structure_matrix: ArrayLike, tension_ranges: ArrayLike) -> NDArray[np.float64]:
@@ -173,7 +184,7 @@ def zonotope_volume(generators: NDArray[np.float64]) -> NDArray[np.float64]:
     if count >= dimension:
         flat = generators.reshape(-1, dimension, count)
         chosen = subsets(count, dimension)
-        for block in blocks(len(flat)):
+        for block in blocks(len(flat), len(chosen)):
             columns = np.swapaxes(flat[block][:, :, chosen], 1, 2)
             volumes[block] = np.abs(_determinants(columns)).sum(axis=-1)
     return volumes.reshape(batch)
@@ -210,7 +221,9 @@ def _generators(
 # its normal c is orthogonal to them: ``y = Jᵀc`` is zero on these columns. Such a y lies in the row
 # space of J, that is, orthogonal to the null space; supported on m - n + 1 cables only, it is the
 # generalised cross product of their null-space rows. For m - n = 2 this takes 3-vectors where the
-# columns themselves would take 5×5 minors, and it is the same set of normals.
+# columns themselves would take 5×5 minors, and it is the same set of normals. With more cables the
+# minors are the smaller ones; they are expanded from those of four columns, these from those of
+# three, and so on.
 
 
 RANK_TOLERANCE = 1e-10
@@ -285,9 +298,9 @@ def _normals(
     largest, smallest = singular_values[..., 0], singular_values[..., -1]
     full_rank = smallest > RANK_TOLERANCE * largest
     inverse = 1.0 / np.where(full_rank[..., np.newaxis], singular_values, 1.0)
-    row_space, null_space = right[..., :WRENCH_SIZE, :], right[..., WRENCH_SIZE:, :]
-    gains = facet_gains(null_space)
-    normals = gains @ np.swapaxes(row_space, -1, -2) * inverse[..., np.newaxis, :]
+    gains = facet_gains(right)
+    row_space = np.swapaxes(right[..., :WRENCH_SIZE, :], -1, -2)
+    normals = gains @ row_space * inverse[..., np.newaxis, :]
     normals = normals @ np.swapaxes(left, -1, -2)
     usable = np.einsum("...i,...i", gains, gains) > DEPENDENT_COLUMNS**2
     usable &= full_rank[..., np.newaxis]
@@ -296,17 +309,23 @@ def _normals(
     return normals * scale[..., np.newaxis], usable, full_rank
 
 
-def facet_gains(null_space: NDArray[np.float64]) -> NDArray[np.float64]:
+def facet_gains(right: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return ``Jᵀc`` of every facet normal c; its norm vanishes as columns become dependent.
 
     Args:
-        null_space: Orthonormal rows that span the null space of J, shape (..., d, m).
+        right: Orthonormal rows, shape (..., m, m): six that span the row space of J, then those of
+            its null space.
 
     Returns:
-        shape (..., k, m), in the order of ``subsets(m, d + 1)``, whose cables have the gains.
+        shape (..., k, m), in the order of ``subsets(m, m - 5)``, whose cables have the gains; those
+        of the others are zero, or round-off.
     """
-    freedom, cable_count = null_space.shape[-2:]
-    chosen = subsets(cable_count, freedom + 1)
+    cable_count = right.shape[-1]
+    if cable_count > _FEW_CABLES:
+        row_space = right[..., :WRENCH_SIZE, :]
+        return np.asarray(_spanned_normals(row_space)[..., ::-1, :] @ row_space)
+    null_space = right[..., WRENCH_SIZE:, :]
+    chosen = subsets(cable_count, cable_count - WRENCH_SIZE + 1)
     products = generalised_cross(np.moveaxis(null_space[..., chosen], -3, -2))
     gains = np.zeros((*null_space.shape[:-2], len(chosen), cable_count))
     gains[..., np.arange(len(chosen))[:, np.newaxis], chosen] = products
@@ -317,7 +336,7 @@ def generalised_cross(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the vector orthogonal to d vectors of d + 1 components.
 
     Args:
-        rows: shape (..., d, d + 1), one vector per row.
+        rows: shape (..., d, d + 1), one vector per row; d is 0, 1 or 2.
 
     Returns:
         shape (..., d + 1); its norm is the volume that the vectors span.
@@ -327,11 +346,44 @@ def generalised_cross(rows: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.ones((*rows.shape[:-2], 1))
     if count == 1:
         return np.stack([rows[..., 0, 1], -rows[..., 0, 0]], axis=-1)
-    if count == 2:
-        return np.asarray(np.cross(rows[..., 0, :], rows[..., 1, :]))
-    minors = [np.linalg.det(np.delete(rows, skipped, axis=-1)) for skipped in range(count + 1)]
-    signs = (-1.0) ** np.arange(count + 1)
-    return np.asarray(np.stack(minors, axis=-1) * signs)
+    return np.asarray(np.cross(rows[..., 0, :], rows[..., 1, :]))
+
+
+def _spanned_normals(columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the vectors orthogonal to every five columns, their norms the spanned volumes.
+
+    Args:
+        columns: shape (..., 6, m).
+
+    Returns:
+        shape (..., k, 6), in the order of ``subsets(m, 5)``, the reverse of that of the other
+        m - 5 columns.
+    """
+    minors = np.swapaxes(columns, -1, -2)  # of all choices of columns and rows, by expansion
+    for size in range(2, WRENCH_SIZE):
+        before, last = _expansion(columns.shape[-1], size)
+        rows = subsets(WRENCH_SIZE, size)
+        smaller = {tuple(row): i for i, row in enumerate(subsets(WRENCH_SIZE, size - 1).tolist())}
+        parts = []
+        for row in rows.tolist():
+            total = np.zeros((*columns.shape[:-2], len(last)))
+            for k, left_out in enumerate(row):
+                rest = smaller[tuple(row[:k] + row[k + 1 :])]
+                part = columns[..., left_out, :][..., last] * minors[..., rest][..., before]
+                total += part if (size - 1 - k) % 2 == 0 else -part
+            parts.append(total)
+        minors = np.stack(parts, axis=-1)
+    signs = (-1.0) ** np.arange(WRENCH_SIZE)
+    return np.asarray(minors[..., ::-1] * signs)
+
+
+@cache
+def _expansion(count: int, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Of every ``size``-subset: the index of the subset without its last member, and that."""
+    chosen = subsets(count, size)
+    index = {tuple(row): i for i, row in enumerate(subsets(count, size - 1).tolist())}
+    before = np.array([index[tuple(row[:-1])] for row in chosen.tolist()], dtype=np.intp)
+    return before, chosen[:, -1]
 
 
 # Dexterity: how evenly the cables convert tensions into wrenches.

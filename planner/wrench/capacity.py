@@ -1,7 +1,10 @@
 """The capacity margin at a pose; its definition is `model.statics.feasibility.capacity_margin`.
 
-Every facet of the available wrench set belongs to m - 5 cables: the gains of its normal are zero on
-all others, and on these they form the vector orthogonal to their rows of the null space.
+Five cables span a facet of the available wrench set: the gains of its normal are zero on them. With
+up to eight cables the gains on the others form the vector orthogonal to their rows of the null
+space. With more, the row space is projected along the first four of the five cables, one after the
+other, for all facets that share them; in the plane that is left, the gains are areas. So a facet
+takes as many steps as there are cables.
 """
 
 from __future__ import annotations
@@ -56,20 +59,21 @@ def structure_columns(
 
 
 @kernel
-def factored(columns: Array, inverse: Array, null_space: Array) -> float:
-    """The pseudo-inverse and the null space of a structure matrix A, by Householder reflections.
+def factored(columns: Array, inverse: Array, basis: Array) -> float:
+    """The pseudo-inverse of a structure matrix A and a basis, by Householder reflections.
 
     Args:
         columns: Aᵀ, shape (m ≥ 6, 6).
         inverse: Written: A⁺, shape (m, 6).
-        null_space: Written: an orthonormal basis as columns, shape (m, m - 6).
+        basis: Written: an orthonormal basis as columns, shape (m, m): six of the row space, then
+            those of the null space.
 
     Returns:
         Smallest over largest absolute diagonal factor; 0 where A contains NaN.
     """
     count = len(columns)
     upper = columns.copy()
-    square = np.eye(count)
+    basis[:] = np.eye(count)
     for k in range(6):
         size = 0.0
         for i in range(k, count):
@@ -96,9 +100,9 @@ def factored(columns: Array, inverse: Array, null_space: Array) -> float:
             for i in range(count):
                 along = 0.0
                 for j in range(k, count):
-                    along += square[i, j] * reflector[j]
+                    along += basis[i, j] * reflector[j]
                 for j in range(k, count):
-                    square[i, j] -= 2.0 * along / scale * reflector[j]
+                    basis[i, j] -= 2.0 * along / scale * reflector[j]
     smallest, largest = np.inf, 0.0
     for k in range(6):
         smallest, largest = min(smallest, abs(upper[k, k])), max(largest, abs(upper[k, k]))
@@ -107,18 +111,18 @@ def factored(columns: Array, inverse: Array, null_space: Array) -> float:
     # Aᵀ = Q R, hence A⁺ Rᵀ = Q: each row by back substitution.
     for i in range(count):
         for k in range(5, -1, -1):
-            value = square[i, k]
+            value = basis[i, k]
             for j in range(k + 1, 6):
                 value -= inverse[i, j] * upper[k, j]
             inverse[i, k] = value / upper[k, k]
-        for k in range(6, count):
-            null_space[i, k - 6] = square[i, k]
     return smallest / largest
 
 
 Integers = NDArray[np.int64]
 
 _DEPENDENT = 1e-12
+_FEW_CABLES = 8
+"""Up to this number, facets are taken from the null space."""
 
 
 class LoadArrays(NamedTuple):
@@ -132,7 +136,7 @@ class LoadArrays(NamedTuple):
         spread: Half widths of the box of wrenches about it, shape (6,), [N].
         lever: Sum of weights times their centres, platform frame, shape (3,), [N·m]: the part of
             the wrench that rotates with the platform.
-        facets: Cables of each facet, shape (k, m - 5).
+        facets: Cables that do not span each facet, shape (k, m - 5); none above eight cables.
     """
 
     low: float
@@ -149,7 +153,8 @@ def build_load(rig: Rig, scene: Scene, rotation: Array) -> LoadArrays:
     length = float(rms_anchor_radius(rig.anchors))
     units = np.repeat([1.0, length], 3)
     box = external_wrenches(rig, scene, rotation)
-    facets = list(combinations(range(rig.cable_count), rig.cable_count - 5))
+    few = rig.cable_count <= _FEW_CABLES
+    facets = list(combinations(range(rig.cable_count), rig.cable_count - 5)) if few else []
     return LoadArrays(
         low=float(rig.min_tension),
         high=float(rig.max_tension),
@@ -157,7 +162,7 @@ def build_load(rig: Rig, scene: Scene, rotation: Array) -> LoadArrays:
         wrench=-box.centre / units,
         spread=box.half_widths / units,
         lever=_lever(rig, scene),
-        facets=np.array(facets, dtype=np.int64),
+        facets=np.array(facets, dtype=np.int64).reshape(-1, rig.cable_count - 5),
     )
 
 
@@ -184,11 +189,11 @@ def margin_at(world: World, load: LoadArrays, rotation: Array, position: Vector)
     """The capacity margin, [N]; minus infinity where cables do not act in every direction."""
     count = len(world.cables)
     columns, inverse = np.empty((count, 6)), np.empty((count, 6))
-    null_space = np.empty((count, count - 6))
+    basis = np.empty((count, count))
     structure_columns(world, rotation, position, load.length, columns)
-    if factored(columns, inverse, null_space) == 0.0:
+    if factored(columns, inverse, basis) == 0.0:
         return -np.inf
-    return margin_of(load, inverse, null_space)
+    return margin_of(load, inverse, basis)
 
 
 @kernel
@@ -202,8 +207,15 @@ def margins(world: World, load: LoadArrays, positions: Array) -> Array:
 
 
 @kernel
-def margin_of(load: LoadArrays, inverse: Array, null_space: Array) -> float:
+def margin_of(load: LoadArrays, inverse: Array, basis: Array) -> float:
     """The capacity margin, [N], from the factors of the structure matrix."""
+    if len(basis) <= _FEW_CABLES:
+        return _margin_of_few(load, inverse, basis)
+    return _margin_of_many(load, inverse, basis)
+
+
+@kernel
+def _margin_of_few(load: LoadArrays, inverse: Array, basis: Array) -> float:
     size = load.facets.shape[1]
     middle, half = (load.high + load.low) / 2.0, (load.high - load.low) / 2.0
     gains, rows = np.empty(size), np.empty((max(size - 1, 1), size))
@@ -212,7 +224,7 @@ def margin_of(load: LoadArrays, inverse: Array, null_space: Array) -> float:
         cables = load.facets[facet]
         for i in range(size):
             for j in range(size - 1):
-                rows[j, i] = null_space[cables[i], j]
+                rows[j, i] = basis[cables[i], 6 + j]
         orthogonal_vector(rows, size, gains)
         total, reach, offset, squared, along, spread = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(size):
@@ -237,37 +249,115 @@ def orthogonal_vector(rows: Array, size: int, found: Array) -> None:
     """The generalised cross product: orthogonal to size - 1 rows, its norm their volume.
 
     Args:
-        rows: Shape (size - 1, size) or more; destroyed.
-        size: Number of components.
+        rows: Shape (size - 1, size) or more.
+        size: Number of components, 1 to 3.
         found: Written, shape (size,); zeros where the rows are dependent.
     """
-    if size == 3:
+    if size == 1:
+        found[0] = 1.0
+    elif size == 2:
+        found[0], found[1] = rows[0, 1], -rows[0, 0]
+    else:
         found[0] = rows[0, 1] * rows[1, 2] - rows[0, 2] * rows[1, 1]
         found[1] = rows[0, 2] * rows[1, 0] - rows[0, 0] * rows[1, 2]
         found[2] = rows[0, 0] * rows[1, 1] - rows[0, 1] * rows[1, 0]
-        return
-    order, volume = np.arange(size), 1.0
-    for k in range(size - 1):
-        best, at_row, at_column = 0.0, k, k
-        for i in range(k, size - 1):
-            for j in range(k, size):
-                if abs(rows[i, order[j]]) > best:
-                    best, at_row, at_column = abs(rows[i, order[j]]), i, j
-        if best == 0.0:
-            found[:] = 0.0
-            return
-        order[k], order[at_column] = order[at_column], order[k]
-        for j in range(size):
-            rows[k, j], rows[at_row, j] = rows[at_row, j], rows[k, j]
-        pivot = rows[k, order[k]]
-        volume *= pivot
-        for i in range(k + 1, size - 1):
-            factor = rows[i, order[k]] / pivot
-            for j in range(k, size):
-                rows[i, order[j]] -= factor * rows[k, order[j]]
-    found[order[size - 1]] = volume
-    for k in range(size - 2, -1, -1):
-        value = 0.0
-        for j in range(k + 1, size):
-            value += rows[k, order[j]] * found[order[j]]
-        found[order[k]] = -value / rows[k, order[k]]
+
+
+@kernel
+def _margin_of_many(load: LoadArrays, inverse: Array, basis: Array) -> float:
+    """As `margin_of`, for any number of cables.
+
+    A facet's normal n, in coordinates of the row space, gives each quantity as n times a vector:
+    the gain of a cable, a component of the wrench normal, the required wrench from the middle of
+    the available ones. These m + 7 vectors are projected; the normal is never formed.
+    """
+    count = len(basis)
+    middle = (load.high + load.low) / 2.0
+    first, second = np.empty((6, count + 7)), np.empty((5, count + 7))
+    third, fourth = np.empty((4, count + 7)), np.empty((3, count + 7))
+    plane, shares = np.empty((2, count + 7)), np.empty(count + 7)
+    for k in range(6):
+        first[k, :] = 0.0
+        for i in range(count):
+            first[k, i] = basis[i, k]
+            first[k, count + 6] -= middle * basis[i, k]
+            for j in range(6):
+                first[k, count + j] += basis[i, k] * inverse[i, j]
+        for j in range(6):
+            first[k, count + 6] += first[k, count + j] * load.wrench[j]
+    least = np.inf
+    for a in range(count - 4):
+        one = _projected(first, a, shares, second)
+        if not one > _DEPENDENT:
+            continue
+        for b in range(a + 1, count - 3):
+            two = one * _projected(second, b, shares, third)
+            if not two > _DEPENDENT:
+                continue
+            for c in range(b + 1, count - 2):
+                three = two * _projected(third, c, shares, fourth)
+                if not three > _DEPENDENT:
+                    continue
+                for d in range(c + 1, count - 1):
+                    four = three * _projected(fourth, d, shares, plane)
+                    if four > _DEPENDENT:
+                        least = min(least, _least_in_plane(load, plane, d + 1, four))
+    return least
+
+
+@kernel
+def _projected(vectors: Array, pivot: int, shares: Array, found: Array) -> float:
+    """Writes vectors, as columns, projected along one of them, in one coordinate less.
+
+    Returns:
+        The norm of that one; 0, with nothing written, where it is zero.
+    """
+    squared = 0.0
+    for k in range(len(vectors)):
+        squared += vectors[k, pivot] * vectors[k, pivot]
+    size = math.sqrt(squared)
+    if not size > 0.0:
+        return 0.0
+    # Reflected onto the first axis, which is then left out.
+    head = vectors[0, pivot]
+    head += size if head > 0.0 else -size
+    scale = 2.0 / (squared - vectors[0, pivot] * vectors[0, pivot] + head * head)
+    for i in range(vectors.shape[1]):
+        shares[i] = head * vectors[0, i]
+    for k in range(1, len(vectors)):
+        part = vectors[k, pivot]
+        for i in range(vectors.shape[1]):
+            shares[i] += part * vectors[k, i]
+    for k in range(1, len(vectors)):
+        part = scale * vectors[k, pivot]
+        for i in range(vectors.shape[1]):
+            found[k - 1, i] = vectors[k, i] - part * shares[i]
+    return size
+
+
+@kernel
+def _least_in_plane(load: LoadArrays, plane: Array, begin: int, volume: float) -> float:
+    """The least margin at the facets of four cables and each one from ``begin`` on.
+
+    Args:
+        load: Required wrenches.
+        plane: The vectors of `_margin_of_many`, projected along the four, shape (2, m + 7).
+        begin: The first cable that may be the fifth.
+        volume: That of the four.
+    """
+    count = plane.shape[1] - 7
+    half, least = (load.high - load.low) / 2.0, np.inf
+    for e in range(begin, count):
+        x, y = plane[0, e], plane[1, e]
+        if not volume * math.sqrt(x * x + y * y) > _DEPENDENT:
+            continue
+        reach, squared, spread = 0.0, 0.0, 0.0
+        for i in range(count):
+            reach += abs(y * plane[0, i] - x * plane[1, i])
+        for k in range(6):
+            normal = y * plane[0, count + k] - x * plane[1, count + k]
+            squared += normal * normal
+            spread += abs(normal) * load.spread[k]
+        off = abs(y * plane[0, count + 6] - x * plane[1, count + 6])
+        least = min(least, (half * reach - spread - off) / math.sqrt(squared))
+    return least

@@ -51,9 +51,9 @@ def tensions_prove(
     """
     count = len(world.cables)
     columns, inverse = np.empty((count, 6)), np.empty((count, 6))
-    null_space = np.empty((count, count - 6))
+    basis = np.empty((count, count))
     structure_columns(world, world.platform[:3], middle, load.length, columns)
-    if factored(columns, inverse, null_space) == 0.0:
+    if factored(columns, inverse, basis) == 0.0:
         return False
     changes, weights = np.empty(count), np.empty(count)
     if not column_changes(world, load, middle, radius, changes, weights):

@@ -113,9 +113,9 @@ def piece_held(
     """
     count = len(world.cables)
     columns, inverse = np.empty((count, 6)), np.empty((count, 6))
-    null_space = np.empty((count, count - 6))
+    basis = np.empty((count, count))
     structure_columns(world, rotation, middle, load.length, columns)
-    if factored(columns, inverse, null_space) == 0.0:
+    if factored(columns, inverse, basis) == 0.0:
         return REFUTED
     here, spin = load_at(load, rotation), rotated(rotation, bend)
     heavy = rotated(rotation, (load.lever[0], load.lever[1], load.lever[2]))
@@ -136,7 +136,7 @@ def piece_held(
             return PROVED
     if not thorough:
         return OPEN
-    margin = margin_of(here, inverse, null_space)
+    margin = margin_of(here, inverse, basis)
     if not margin >= reserve:
         return REFUTED
     if not bounded:

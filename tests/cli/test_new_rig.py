@@ -71,7 +71,7 @@ def test_each_question_shows_its_default_and_its_unit(tmp_path: Path) -> None:
         (1, "130 130 -1", "greater than 0"),
         (2, "heavy", "'heavy' is not a number"),
         (2, "nan", "finite number"),
-        (3, "5", "not a whole number from 6 to 64"),
+        (3, "5", "not a whole number from 6 to 24"),
         (21, "0 0 500", "would be outside"),
         (26, "4", "more than the smallest tension, 5 N"),
         (30, "sometimes", "not one of absolute, incremental"),
@@ -173,7 +173,7 @@ def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:
         call("new", tmp_path / "rig.yaml", "--from", table), 2, "column outlet_y_mm is missing"
     )
     few = call("new", tmp_path / "rig.yaml", "--from", cables_csv(tmp_path, 5))
-    one_message(few, 2, "5 cables", "from 6", "one line per cable, 6 or more")
+    one_message(few, 2, "5 cables", "from 6 to 24", "one line per cable, 6 or more")
     assert "begin with the line" not in few.err
 
 

@@ -233,6 +233,18 @@ def test_cables_too_near_each_other_get_no_advice_about_obstacles(gachon, scene_
     assert refusal.value.values["exempt_mm"] == pytest.approx(5.0)
 
 
+def test_more_cables_than_can_be_planned_for_are_refused_at_once(gachon, scene_with) -> None:
+    document = gachon.document.model_copy(deep=True)
+    for i in range(17):
+        document.outlets_mm.append([value - 10.0 * i for value in document.outlets_mm[i % 8]])
+        document.anchors_mm.append(document.anchors_mm[i % 8])
+        document.winches.append(document.winches[0].model_copy(update={"node_id": 9 + i}))
+    with pytest.raises(BadInput, match="25 cables are too many") as refusal:
+        require_usable_ends(rig_from_document(document), scene_with())
+    assert "the largest number is 24" in refusal.value.what
+    assert "53130 such bounds" in refusal.value.why
+
+
 def test_anchors_a_little_inside_the_platforms_box_are_planned_with(gachon, scene_with) -> None:
     rig = with_anchors(gachon, 0.97 * 1e3 * gachon.anchors)
     proved(rig, scene_with(goal={"position_mm": [5.0, 0.0, 445.0]}), QUICK)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from itertools import combinations, product
 
 import numpy as np
@@ -23,7 +24,7 @@ from tests.model.statics.robots import (
 )
 
 seeds = st.integers(0, 2**32 - 1)
-cable_counts = st.sampled_from([6, 7, 8, 10])
+cable_counts = st.sampled_from([6, 7, 8, 9, 10])
 LENGTH = 0.2
 UNITS = np.repeat([1.0, LENGTH], 3)
 
@@ -237,3 +238,17 @@ def test_an_answer_cannot_be_changed():
     for array in (answer.binding_normal, answer.structure_matrix, answer.external.centre):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0.0
+
+
+def test_margins_of_many_poses_and_cables_take_little_memory():
+    """14 cables have 2002 facets: 100 poses at once took 230 MB."""
+    matrices = np.random.default_rng(0).normal(size=(100, 6, 14))
+    tracemalloc.start()
+    try:
+        together = capacity_margin(matrices, 1.0, 100.0, WrenchBox.of_one(np.zeros(6)), LENGTH)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 60e6
+    single = capacity_margin(matrices[7], 1.0, 100.0, WrenchBox.of_one(np.zeros(6)), LENGTH)
+    assert together[7] == pytest.approx(float(single), rel=1e-9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.pose import Array
+from model.kinematics import structure_matrix
+from model.pose import Array, Pose
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene
 from planner.collision.world import build_world
@@ -49,20 +51,21 @@ def smallest_margins(rig: Rig, scene: Scene, starts: Array, ends: Array) -> Arra
 @given(st.integers(0, 2**32 - 1), st.integers(6, 12))
 def test_factors_are_the_pseudo_inverse_and_a_null_space(seed: int, cables: int) -> None:
     columns = np.random.default_rng(seed).normal(size=(cables, 6))
-    inverse, null_space = np.empty((cables, 6)), np.empty((cables, cables - 6))
-    assert factored(columns, inverse, null_space) > 0.0
+    inverse, basis = np.empty((cables, 6)), np.empty((cables, cables))
+    assert factored(columns, inverse, basis) > 0.0
+    null_space = basis[:, 6:]
     assert np.allclose(inverse, np.linalg.pinv(columns.T), rtol=1e-6, atol=1e-9)
     assert np.allclose(columns.T @ null_space, 0.0, rtol=0, atol=1e-12)
-    assert np.allclose(null_space.T @ null_space, np.eye(cables - 6), rtol=0, atol=1e-12)
+    assert np.allclose(basis.T @ basis, np.eye(cables), rtol=0, atol=1e-12)
 
 
 def test_cables_that_leave_a_direction_out_have_no_factors() -> None:
     columns = np.random.default_rng(0).normal(size=(8, 6))
     columns[:, 5] = columns[:, 4]
-    assert factored(columns, np.empty((8, 6)), np.empty((8, 2))) == 0.0
+    assert factored(columns, np.empty((8, 6)), np.empty((8, 8))) == 0.0
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3))
 def test_the_orthogonal_vector_is_orthogonal_and_as_long_as_the_volume(
     seed: int, size: int
 ) -> None:
@@ -73,6 +76,65 @@ def test_the_orthogonal_vector_is_orthogonal_and_as_long_as_the_volume(
     assert np.allclose(used @ found, 0.0, rtol=0, atol=1e-9)
     volume = np.sqrt(np.linalg.det(used @ used.T)) if size > 1 else 1.0
     assert np.linalg.norm(found) == pytest.approx(volume, rel=1e-6)
+
+
+def ring(cables: int) -> Rig:
+    """High and low outlets in turn on a circle, their anchors on a smaller one."""
+    angles = 2.0 * np.pi * np.arange(cables) / cables
+    sense = np.where(np.arange(cables) % 2, 1.0, -1.0)
+
+    def circle(radius: float, turned: Array, low: float, high: float) -> list[list[float]]:
+        height = np.where(sense > 0.0, high, low)
+        points = np.column_stack([radius * np.cos(turned), radius * np.sin(turned), height])
+        return [list(point) for point in points.tolist()]
+
+    winch = GACHON.document.winches[0].model_dump(mode="json")
+    return changed_rig(
+        GACHON,
+        outlets_mm=circle(700.0, angles, 80.0, 860.0),
+        anchors_mm=circle(65.0, angles + 0.35 * sense, -65.0, 65.0),
+        winches=[winch | {"node_id": i + 1} for i in range(cables)],
+    )
+
+
+@pytest.mark.parametrize("cables", [9, 12, 15])
+def test_margins_of_many_cables_are_those_at_every_five_columns(cables: int) -> None:
+    rig, rng = ring(cables), np.random.default_rng(cables)
+    load = build_load(rig, PAPER, np.eye(3))
+    position = rng.uniform(rig.workspace_lower, rig.workspace_upper)
+    scaled = structure_matrix(rig, Pose.level(position))
+    scaled[3:] /= load.length
+    five = np.array(list(combinations(range(cables), 5)))
+    _, sizes, right = np.linalg.svd(np.moveaxis(scaled[:, five], 0, -1))
+    normals = right[sizes[:, -1] > 1e-9, -1]  # dependent columns span no facet
+    gains, middle = normals @ scaled, (load.high + load.low) / 2.0
+    room = np.abs(gains).sum(axis=1) * (load.high - load.low) / 2.0
+    off = np.abs(normals @ load.wrench - middle * gains.sum(axis=1))
+    expected = (room - np.abs(normals) @ load.spread - off).min()
+    found = margins(world_of(rig, PAPER), load, position[None, :])[0]
+    assert found == pytest.approx(expected, rel=0, abs=1e-9 * load.high)
+    statics = capacity_margins(rig, PAPER, position[None, :], np.eye(3))[0]
+    assert statics == pytest.approx(expected, rel=0, abs=1e-9 * load.high)
+
+
+def test_two_cables_in_one_line_span_no_facet() -> None:
+    """As if one cable were twice as strong: the margin follows from the others."""
+    rig, rng = ring(10), np.random.default_rng(5)
+    twice = changed_rig(
+        rig,
+        outlets_mm=[rig.document.outlets_mm[i] for i in [0, *range(9)]],
+        anchors_mm=[rig.document.anchors_mm[i] for i in [0, *range(9)]],
+    )
+    positions = rng.uniform(rig.workspace_lower, rig.workspace_upper, (20, 3))
+    found = margins(world_of(twice, PAPER), build_load(twice, PAPER, np.eye(3)), positions)
+    expected = capacity_margins(twice, PAPER, positions, np.eye(3))
+    assert np.isfinite(expected).any()
+    assert np.allclose(found, expected, rtol=0, atol=1e-9 * rig.max_tension)
+
+
+def test_a_load_on_many_cables_lists_no_facets() -> None:
+    """Of 20 cables there are 15 504, with 15 cables each."""
+    assert build_load(ring(20), PAPER, np.eye(3)).facets.size == 0
 
 
 @BOTH
