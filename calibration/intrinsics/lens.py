@@ -19,6 +19,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calibration.targets.boards import DetectedBoard
 from model.files.camera_file import LensName
@@ -73,13 +74,11 @@ class LensModel:
             camera's, shape (2n, 4 + k).
         """
         if self.fisheye:
-            seen, by = cv2.fisheye.projectPoints(
-                np.ascontiguousarray(points).reshape(-1, 1, 3),
-                turn,
-                translation,
-                matrix,
-                distortion,
-            )
+            depths = points @ cv2.Rodrigues(turn)[0][2] + translation[2]
+            if depths.min() <= 0.0:
+                return _wide_slopes(points, turn, translation, matrix, distortion)
+            flat = np.ascontiguousarray(points).reshape(-1, 1, 3)
+            seen, by = cv2.fisheye.projectPoints(flat, turn, translation, matrix, distortion)
             pose, camera = slice(8, 14), slice(0, 8)
         else:
             seen, by = cv2.projectPoints(points, turn, translation, matrix, distortion)
@@ -87,6 +86,43 @@ class LensModel:
         derivatives = np.asarray(by, dtype=np.float64)
         pixels = np.asarray(seen, dtype=np.float64).reshape(-1, 2)
         return pixels, derivatives[:, pose], derivatives[:, camera]
+
+
+_ODD = np.arange(1, 10, 2)
+"""Powers of the angle in the fisheye's radius."""
+
+
+def _wide_slopes(
+    points: Array, turn: Array, translation: Array, matrix: Array, distortion: Array
+) -> tuple[Array, Array, Array]:
+    """As `LensModel.slopes` of a fisheye, for rays up to 180° off the axis.
+
+    OpenCV divides by the depth: beyond 90° it projects to the opposite side of the image.
+    """
+    rotation, by_vector = cv2.Rodrigues(np.asarray(turn, dtype=np.float64))
+    x, y, depth = (points @ rotation.T + translation).T
+    across = np.hypot(x, y)
+    off_axis = across > 1e-12 * np.abs(depth)
+    outward = np.column_stack([x, y]) / np.where(off_axis, across, np.inf)[:, None]
+    angle, squared = np.arctan2(across, depth), across**2 + depth**2
+    powers = angle[:, None] ** _ODD
+    coefficients = np.array([1.0, *distortion])
+    radius, slope = powers @ coefficients, angle[:, None] ** (_ODD - 1) @ (_ODD * coefficients)
+    share = np.where(off_axis, radius / np.where(off_axis, across, 1.0), 1.0 / depth)
+    along = outward[:, :, None] * outward[:, None, :]
+    by_point = np.empty((len(points), 2, 3))
+    by_point[..., :2] = share[:, None, None] * (np.eye(2) - along)
+    by_point[..., :2] += (slope * depth / squared)[:, None, None] * along
+    by_point[..., 2] = -(slope * across / squared)[:, None] * outward
+    focal = np.array([matrix[0, 0], matrix[1, 1]])
+    by_point *= focal[:, None]
+    by_turn = by_point @ (points @ by_vector.reshape(3, 3, 3).transpose(0, 2, 1)).transpose(1, 2, 0)
+    image = radius[:, None] * outward
+    by_camera = np.zeros((len(points), 2, 8))
+    by_camera[:, [0, 1], [0, 1]], by_camera[:, [0, 1], [2, 3]] = image, 1.0
+    by_camera[..., 4:] = (focal * outward)[..., None] * powers[:, None, 1:]
+    by_pose = np.concatenate([by_turn, by_point], axis=2).reshape(-1, 6)
+    return image * focal + matrix[:2, 2], by_pose, by_camera.reshape(-1, 8)
 
 
 LENSES = {
@@ -115,6 +151,10 @@ NO_WORSE = 0.02
 """Relative excess over the lowest held-out error up to which fewer parameters are preferred."""
 RADIAL = 0.02
 """Share of radial errors from which other models are tried; see `radial_share`."""
+_POOR = 0.5
+"""Median corner error of ``five`` from which other models are tried as well, [px]."""
+_LEAST_DEPTH = 0.05
+"""Of a corner's direction in a camera turned towards the board: about 87° off its axis."""
 _RINGS = 12
 _CLIP = 3.0
 
@@ -252,10 +292,23 @@ def _squares(fit: LensFit, views: Mapping[str, DetectedBoard]) -> float:
 
 
 def _first_pose(lens: LensModel, seen: DetectedBoard, matrix: Array, distortion: Array) -> Array:
-    """Initial rotation vector and translation of a board, from rays; shape (6,)."""
-    rays = rays_of(lens.kind, matrix, distortion, seen.corners)
-    _, turn, translation = cv2.solvePnP(seen.points, rays, np.eye(3), np.zeros(0))
-    return np.concatenate([np.ravel(turn), np.ravel(translation)]).astype(np.float64)
+    """Initial rotation vector and translation of a board, from rays; shape (6,).
+
+    It is found in a camera turned towards the board: near 90° off the axis, rays meet the image
+    plane so far away that a few corners would decide.
+    """
+    rays = np.insert(rays_of(lens.kind, matrix, distortion, seen.corners), 2, 1.0, axis=1)
+    if not np.isfinite(rays).all():
+        raise np.linalg.LinAlgError("the lens has no rays through the corners")
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    middle = rays.mean(axis=0)
+    towards = Rotation.align_vectors([[0.0, 0.0, 1.0]], [middle])[0]
+    turned = towards.apply(rays)
+    plane = turned[:, :2] / np.maximum(turned[:, 2:], _LEAST_DEPTH)
+    _, turn, translation = cv2.solvePnP(seen.points, plane, np.eye(3), np.zeros(0))
+    back = towards.inv()
+    turns = (back * Rotation.from_rotvec(np.ravel(turn))).as_rotvec()
+    return np.concatenate([turns, back.apply(np.ravel(translation))])
 
 
 def held_out_errors(
@@ -296,21 +349,22 @@ def error_of(fit: LensFit, seen: DetectedBoard) -> float:
 def choose_lens(views: Mapping[str, DetectedBoard], size: tuple[int, int]) -> LensFit:
     """The fit of the lens model selected by cross-validation.
 
-    Five coefficients, unless their errors show a radial pattern (`RADIAL`) and another model has
-    held-out errors lower by `GAIN` and by two standard errors, in the geometric mean over the
-    images, so that a few bad images, equally bad for every model, do not hide the others. Of
-    several such models, the one with the fewest parameters whose error is within `NO_WORSE` of the
-    best.
+    Five coefficients, unless their errors show a radial pattern (`RADIAL`) or are large, as of a
+    lens wider than 180°, and another model has held-out errors lower by `GAIN` and by two standard
+    errors, in the geometric mean over the images, so that a few bad images, equally bad for every
+    model, do not hide the others. Of several such models, the one with the fewest parameters whose
+    error is within `NO_WORSE` of the best.
 
     Raises:
         cv2.error: OpenCV finds no solution.
     """
     plain = LENSES["five"]
     first = fit_lens(plain, views, size)
-    rest = [first.residuals(name, seen) for name, seen in views.items()]
+    rest = np.concatenate([first.residuals(name, seen) for name, seen in views.items()])
     shown = np.concatenate([seen.corners for seen in views.values()])
-    pattern = radial_share(shown, np.concatenate(rest), first.matrix)
-    if first.finite and (pattern < RADIAL or len(views) < 2 * FOLDS):
+    poor = float(np.median(np.linalg.norm(rest, axis=1))) > _POOR
+    explained = radial_share(shown, rest, first.matrix) < RADIAL and not poor
+    if first.finite and (explained or len(views) < 2 * FOLDS):
         return first
     errors = {
         name: _log_errors(held_out_errors(lens, views, size)) for name, lens in LENSES.items()

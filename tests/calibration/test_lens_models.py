@@ -274,6 +274,77 @@ def test_the_fisheye_is_kannala_and_brandt(angle: float, around: float, lens: li
     np.testing.assert_allclose((seen - m[:2, 2]) / [m[0, 0], m[1, 1]], expected, atol=1e-9)
 
 
+@given(
+    angle=st.floats(0.0, 2.6),
+    around=st.floats(0.0, 6.28),
+    lens=st.lists(st.floats(-0.01, 0.01), min_size=4, max_size=4),
+)
+@example(angle=0.0, around=0.0, lens=[0.01] * 4)
+@example(angle=math.pi / 2.0, around=1.0, lens=[0.01] * 4)
+@settings(max_examples=40, deadline=None)
+def test_a_fisheye_is_fitted_by_the_angle_also_behind_the_image_plane(
+    angle: float, around: float, lens: list[float]
+) -> None:
+    """Pixels by the radius written out here; derivatives by finite differences."""
+    toward = np.array([math.sin(angle) * math.cos(around), math.sin(angle) * math.sin(around),
+                       math.cos(angle)])  # fmt: skip
+    turn, shift = np.array([0.3, -0.2, 0.5]), np.array([0.02, -0.01, 0.03])
+    rotation = matrix_from_rotation_vector(turn)
+    point = rotation.T @ (0.4 * toward - shift)
+    behind = rotation.T @ (np.array([0.1, 0.05, -0.02]) - shift)  # so that OpenCV's is not used
+    points = np.array([point, behind])
+
+    def seen(x: np.ndarray) -> np.ndarray:
+        matrix = np.array([[x[0], 0.0, x[2]], [0.0, x[1], x[3]], [0.0, 0.0, 1.0]])
+        return LENSES["fisheye"].slopes(points, x[8:11], x[11:], matrix, x[4:8])[0]
+
+    x = np.array([300.0, 301.0, 640.0, 400.0, *lens, *turn, *shift])
+    radius = angle * (1.0 + sum(k * angle ** (2 * n + 2) for n, k in enumerate(lens)))
+    expected = radius * np.array([300.0 * math.cos(around), 301.0 * math.sin(around)])
+    np.testing.assert_allclose(seen(x)[0] - [640.0, 400.0], expected, atol=1e-6)
+    matrix = np.array([[300.0, 0.0, 640.0], [0.0, 301.0, 400.0], [0.0, 0.0, 1.0]])
+    _, by_pose, by_camera = LENSES["fisheye"].slopes(points, turn, shift, matrix, np.array(lens))
+    by = np.column_stack([(seen(x + d) - seen(x - d)).ravel() / 2e-6 for d in 1e-6 * np.eye(14)])
+    np.testing.assert_allclose(np.hstack([by_camera, by_pose]), by, rtol=1e-4, atol=2e-3)
+
+
+WIDE = np.array([300.0, 301.0, 640.0, 400.0, 0.01, -0.005, 0.002, -0.0005])
+"""A fisheye of 200° over 1280 x 800 px."""
+
+
+def wide_views(count: int, noise: float, seed: int) -> dict[str, DetectedBoard]:
+    """A board up to 100° off the axis, projected by Kannala and Brandt's formula."""
+    rng, found = np.random.default_rng(seed), {}
+    while len(found) < count:
+        off, around = rng.uniform(0.0, 1.6), rng.uniform(0.0, 2.0 * math.pi)
+        facing = Rotation.from_rotvec([0.0, 0.0, around]) * Rotation.from_rotvec([0.0, off, 0.0])
+        tilt = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3))
+        points = (facing * tilt).apply(BOARD.points() - BOARD.points().mean(axis=0))
+        points += rng.uniform(0.25, 0.5) * facing.apply([0.0, 0.0, 1.0])
+        across = np.hypot(points[:, 0], points[:, 1])
+        angle = np.arctan2(across, points[:, 2])
+        radius = angle * (1.0 + (angle[:, None] ** [2, 4, 6, 8]) @ WIDE[4:])
+        corners = (radius / across)[:, None] * points[:, :2] * WIDE[:2] + WIDE[2:4]
+        corners += noise * rng.standard_normal(corners.shape)
+        shown = ((corners > 0.0) & (corners < [1279.0, 799.0])).all(axis=1) & (angle < 1.75)
+        if shown.sum() >= 8:
+            found[f"{len(found)}"] = DetectedBoard(BOARD.points()[shown], corners[shown])
+    return found
+
+
+@pytest.mark.parametrize(("lens", "count", "seed"), [("fisheye", 30, 8), ("auto", 9, 5)])
+def test_corners_more_than_90_degrees_off_the_axis_do_not_bend_the_lens(
+    lens: str, count: int, seed: int
+) -> None:
+    """OpenCV projects such a corner to the opposite side of the image."""
+    found = calibrate_from_views(wide_views(count, 0.1, seed), (1280, 800), lens=lens)
+    assert found.lens.name == "fisheye"
+    assert found.unused == {}
+    assert found.error == pytest.approx(0.1 * math.sqrt(2.0), rel=0.1)
+    off = np.array([interval.value for interval in found.intervals.values()]) - WIDE
+    assert np.sum(np.abs(off) <= found.uncertainty.half_widths) >= 7
+
+
 @pytest.mark.parametrize("name", ["rational", "fisheye"])
 def test_a_synthetic_camera_of_any_lens_is_tracked_to_a_millimetre(name: str) -> None:
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
