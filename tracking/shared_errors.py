@@ -84,19 +84,11 @@ class SharedErrors:
         self.operator_error = camera.error if missing else None
         """The operator's value, if it replaces all other errors, cables included, [m]."""
         self._camera, self._tag_error = camera, rig.tag_error or 0.0
+        self._extrinsics, self._extrinsics_by_lens = split_extrinsics(camera)
         count = 4 + camera.distortion.size
-        self._extrinsics = np.zeros((6, 6))
-        self._lens, self._extrinsics_by_lens = np.zeros((count, count)), np.zeros((6, count))
-        if camera.pose_covariance is not None:
-            self._extrinsics = camera.pose_covariance
-        if camera.lens_covariance is None:
-            return
-        self._lens = camera.lens_covariance
-        if camera.pose_by_lens is None:
-            self._extrinsics_by_lens[3:] = implied_rotation(camera)
-        else:
-            by_lens = self._extrinsics_by_lens = camera.pose_by_lens
-            self._extrinsics = _positive(self._extrinsics - by_lens @ self._lens @ by_lens.T)
+        self._lens = np.zeros((count, count))
+        if camera.lens_covariance is not None:
+            self._lens = camera.lens_covariance
 
     def of(self, pose: Pose, views: Sequence[TagView]) -> Array:
         """Covariance of position [m] and rotation vector [rad], world axes, shape (6, 6).
@@ -115,7 +107,11 @@ class SharedErrors:
             views,
             camera_from_body,
             np.concatenate(
-                [self._pixels_by_lens(views), self._pixels_by_tags(views, camera_from_body)], axis=2
+                [
+                    pixels_by_lens(self._camera, views),
+                    self._pixels_by_tags(views, camera_from_body),
+                ],
+                axis=2,
             ),
         )
         steps = np.kron(np.eye(2), world_from_camera.rotation) @ steps
@@ -145,11 +141,6 @@ class SharedErrors:
         left = bundle.misfit(expected_cost(self._camera, views, pose, by_tags))
         return read_only(bundle.covariance * (max(left, 1.0) / misfit))
 
-    def _pixels_by_lens(self, views: Sequence[TagView]) -> Array:
-        """Derivatives of the undistorted corners by the lens parameters, shape (t, 8, n)."""
-        undistorted = np.concatenate([view.seen.corners for view in views])
-        return undistorted_slopes(self._camera, undistorted).reshape(len(views), 8, -1)
-
     def _pixels_by_tags(self, views: Sequence[TagView], camera_from_body: Pose) -> Array:
         """Derivatives of the same by unit errors of each tag's pose, shape (t, 8, 6 t)."""
         matrix = self._camera.matrix
@@ -163,6 +154,31 @@ class SharedErrors:
                 rows = slice(2 * corner, 2 * corner + 2)
                 slopes[k, rows, 6 * k : 6 * k + 6] = by_point @ shifts[corner]
         return slopes
+
+
+def pixels_by_lens(camera: Camera, views: Sequence[TagView]) -> Array:
+    """Derivatives of the undistorted corners by the n lens parameters, shape (t, 8, n)."""
+    undistorted = np.concatenate([view.seen.corners for view in views])
+    return undistorted_slopes(camera, undistorted).reshape(len(views), 8, -1)
+
+
+def split_extrinsics(camera: Camera) -> tuple[Array, Array]:
+    """Errors of a camera's pose that are independent of its lens, and those that follow from it.
+
+    Returns:
+        The covariance of the former, world axes, shape (6, 6), [m, rad]; and the derivatives of the
+        pose by the n lens parameters, shape (6, n). Both are 0 where unknown.
+    """
+    covariance, by_lens = np.zeros((6, 6)), np.zeros((6, 4 + camera.distortion.size))
+    if camera.pose_covariance is not None:
+        covariance = camera.pose_covariance
+    if camera.lens_covariance is None:
+        return covariance, by_lens
+    if camera.pose_by_lens is None:
+        by_lens[3:] = implied_rotation(camera)
+        return covariance, by_lens
+    by_lens = camera.pose_by_lens
+    return _positive(covariance - by_lens @ camera.lens_covariance @ by_lens.T), by_lens
 
 
 def tag_error_slopes(tag: Tag, error: float) -> Array:

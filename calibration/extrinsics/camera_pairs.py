@@ -22,6 +22,7 @@ from calibration.extrinsics.result import (
     extrinsics_page,
     extrinsics_result,
     judge_extrinsics,
+    scaled_to,
     widths_of,
     workspace_corners,
 )
@@ -37,7 +38,12 @@ from calibration.procedures import ExtrinsicsOutcome
 from calibration.results import Calibration, Destination, Issue, data_hash
 from calibration.statistics import duplicate_reason, is_duplicate_view
 from calibration.tag_map.bundle_adjustment import require_tags
-from calibration.tag_map.observations import TagObservations, observe_tags, platform_pose
+from calibration.tag_map.observations import (
+    TagObservations,
+    observe_tags,
+    platform_pose,
+    platform_views,
+)
 from calibration.targets.boards import Board, Charuco, DetectedBoard
 from calibration.targets.grids import TagGrid
 from executor.kernels import ready_to_measure
@@ -46,8 +52,14 @@ from model.errors import BadInput
 from model.pose import Array, Pose, lever_arm_matrix, matrix_from_rotation_vector, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
-from tracking.camera_model import Image, project_undistorted, undistort_pixels
-from tracking.pnp import moved, pose_slopes
+from tracking.camera_model import (
+    Image,
+    project_undistorted,
+    undistort_pixels,
+    undistorted_slopes,
+)
+from tracking.pnp import moved, moved_by_pixels, pose_slopes
+from tracking.shared_errors import pixels_by_lens, split_extrinsics
 
 LEAST_PAIRS = 4
 GOOD_PAIRS = 12
@@ -66,12 +78,15 @@ class BodyObservation:
         covariance: Of position and rotation vector along the camera's axes, shape (6, 6), [m, rad].
         error: RMS of its corners, [px].
         corners: Of each tag or point of it, shape (4, 2) or (2,), [px].
+        by_lens: Derivatives of the pose by the n parameters of the camera's lens, camera axes,
+            shape (6, n); None where their errors are unknown.
     """
 
     camera_from_body: Pose
     covariance: Array
     error: float
     corners: Mapping[Hashable, Array] = field(default_factory=dict)
+    by_lens: Array | None = None
 
     def duplicates(self, before: BodyObservation) -> bool:
         """Whether what is seen of the body in both images did not move."""
@@ -86,19 +101,24 @@ def observe_platform(
     rig: Rig, camera: Camera, observations: TagObservations
 ) -> dict[str, BodyObservation]:
     """The platform in every image in which its tags give a unique pose."""
-    bundles = {
-        n: platform_pose(rig, camera, squares) for n, squares in observations.squares.items()
-    }
-    return {
-        name: BodyObservation(
+    found = {}
+    for name, squares in observations.squares.items():
+        bundle = platform_pose(rig, camera, squares)
+        if bundle is None:
+            continue
+        by_lens = None
+        if camera.lens_covariance is not None:
+            views = platform_views(rig, squares)
+            shifts = pixels_by_lens(camera, views)
+            by_lens = moved_by_pixels(camera, views, bundle.camera_from_body, shifts)
+        found[name] = BodyObservation(
             bundle.camera_from_body,
             bundle.covariance,
             bundle.reprojection,
-            {number: square.corners for number, square in observations.squares[name].items()},
+            {number: square.corners for number, square in squares.items()},
+            by_lens,
         )
-        for name, bundle in bundles.items()
-        if bundle is not None
-    }
+    return found
 
 
 def require_oriented(board: Board) -> None:
@@ -136,7 +156,11 @@ def _board_pose(seen: DetectedBoard, camera: Camera) -> BodyObservation | None:
     error = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
     covariance = np.asarray(scatter * np.linalg.inv(slopes.T @ slopes))
     corners = zip(map(tuple, seen.points.tolist()), seen.corners, strict=True)
-    return BodyObservation(pose, covariance, error, dict(corners))
+    by_lens = None
+    if camera.lens_covariance is not None:
+        shifts = undistorted_slopes(camera, undistorted).reshape(len(slopes), -1)
+        by_lens = read_only(np.linalg.lstsq(slopes, shifts, rcond=None)[0])
+    return BodyObservation(pose, covariance, error, dict(corners), by_lens)
 
 
 def locate_by_pairs(
@@ -174,17 +198,22 @@ def locate_by_pairs(
             " each time",
         )
     observed = list(pairs.values())
-    between, information, scores = _fit(observed)
+    fit = _fit(observed)
     turn = np.kron(np.eye(2), reference.world_from_camera.rotation)
-    relative = turn @ np.linalg.inv(information.sum(axis=0)) @ turn.T
-    whole = information.sum(axis=0)
+    whole = fit.information.sum(axis=0)
+    relative = turn @ np.linalg.inv(whole) @ turn.T
     without = [
         np.asarray(turn @ np.linalg.solve(whole - own, score), dtype=np.float64)
-        for own, score in zip(information, scores, strict=True)
+        for own, score in zip(fit.information, fit.scores, strict=True)
     ]
-    world_from_camera = reference.world_from_camera.compose(between)
-    shared = _reference_covariance(reference, world_from_camera)
-    own_widths = widths_of(relative, without)
+    world_from_camera = reference.world_from_camera.compose(fit.reference_from_camera)
+    covariance = scaled_to(relative, widths_of(relative, without))
+    by_lens, by_reference_lens = (
+        None if by is None else turn @ by for by in fit.by_lenses(observed)
+    )
+    covariance = covariance + _reference_covariance(reference, world_from_camera, by_reference_lens)
+    if by_lens is not None and camera.lens_covariance is not None:
+        covariance = covariance + by_lens @ camera.lens_covariance @ by_lens.T
     issues = []
     if len(pairs) < GOOD_PAIRS:
         what = f"{len(pairs)} pairs of images were used; {GOOD_PAIRS} are required"
@@ -196,9 +225,9 @@ def locate_by_pairs(
     return ExtrinsicCalibration(
         camera=replace(camera, world_from_camera=world_from_camera),
         by="another camera",
-        covariance=read_only(relative + shared),
-        by_lens=None,
-        half_widths=read_only(np.hypot(own_widths, Z_95 * np.sqrt(np.diag(shared)))),
+        covariance=read_only(covariance),
+        by_lens=None if by_lens is None else read_only(by_lens),
+        half_widths=read_only(Z_95 * np.sqrt(np.diag(covariance))),
         points=workspace_corners(rig),
         tag_errors={} if not rig.platform_tags else {rig.platform_tags[0].id: error},
         pictures=len(pairs),
@@ -225,22 +254,55 @@ def _without_duplicates(
     return kept, unused
 
 
-def _reference_covariance(reference: Camera, world_from_camera: Pose) -> Array:
-    """Covariance of a pose from that of the reference camera, (6, 6); 0 if not stated."""
-    if reference.pose_covariance is None:
-        return np.zeros((6, 6))
+def _reference_covariance(
+    reference: Camera, world_from_camera: Pose, by_lens: Array | None
+) -> Array:
+    """Covariance of a pose from the reference camera's pose and lens, (6, 6); 0 if not stated.
+
+    Its lens shifts what it measures and, if its own pose was found with it, that pose too.
+    """
     by_position = lever_arm_matrix(
         world_from_camera.position - reference.world_from_camera.position
     )
-    return np.asarray(by_position @ reference.pose_covariance @ by_position.T)
+    extrinsics, extrinsics_by_lens = split_extrinsics(reference)
+    covariance = by_position @ extrinsics @ by_position.T
+    if by_lens is not None and reference.lens_covariance is not None:
+        by_both = by_lens + by_position @ extrinsics_by_lens
+        covariance = covariance + by_both @ reference.lens_covariance @ by_both.T
+    return np.asarray(covariance)
 
 
-def _fit(observed: Sequence[tuple[BodyObservation, BodyObservation]]) -> tuple[Pose, Array, Array]:
-    """``reference_from_camera``, and the information of each pair.
+@dataclass(frozen=True, slots=True, eq=False)
+class _PairsFit:
+    """The fit to n pairs.
 
-    Returns:
-        The pose; information, shape (n, 6, 6), and half gradient of each pair's squares, (n, 6).
+    Attributes:
+        reference_from_camera: The pose.
+        information: Of each pair, shape (n, 6, 6).
+        scores: Half gradient of each pair's squares, shape (n, 6).
+        gains: Change of the pose with each pair's gap, reference's axes, shape (n, 6, 6).
     """
+
+    reference_from_camera: Pose
+    information: Array
+    scores: Array
+    gains: Array
+
+    def by_lenses(
+        self, observed: Sequence[tuple[BodyObservation, BodyObservation]]
+    ) -> tuple[Array | None, Array | None]:
+        """Derivatives of the pose by either lens, reference's axes, (6, n); None if unknown."""
+        turn = np.kron(np.eye(2), self.reference_from_camera.rotation)
+        own = [near.by_lens for near, _ in observed if near.by_lens is not None]
+        other = [far.by_lens for _, far in observed if far.by_lens is not None]
+        return (
+            np.einsum("nij,njk->ik", self.gains @ turn, own) if own else None,
+            -np.einsum("nij,njk->ik", self.gains, other) if other else None,
+        )
+
+
+def _fit(observed: Sequence[tuple[BodyObservation, BodyObservation]]) -> _PairsFit:
+    """The best ``reference_from_camera``."""
     guesses = [
         far.camera_from_body.compose(near.camera_from_body.inverse()) for near, far in observed
     ]
@@ -268,7 +330,9 @@ def _fit(observed: Sequence[tuple[BodyObservation, BodyObservation]]) -> tuple[P
     weighted = np.swapaxes(slopes * weight[..., None], 1, 2)
     information = weighted @ slopes / scale
     scores = np.einsum("nij,nj->ni", weighted, residuals) / scale
-    return moved(start, found.x), information, scores
+    by_gaps = weighted @ np.array(whitening) / scale
+    gains = -np.linalg.solve(information.sum(axis=0), by_gaps)
+    return _PairsFit(moved(start, found.x), information, scores, gains)
 
 
 def _gap(here: Pose, there: BodyObservation) -> Array:

@@ -18,14 +18,21 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.extrinsics.result import ExtrinsicCalibration, widths_of, workspace_corners
+from calibration.extrinsics.result import (
+    ExtrinsicCalibration,
+    scaled_to,
+    widths_of,
+    workspace_corners,
+)
 from calibration.results import Issue
-from calibration.tag_map.observations import TagObservations, platform_pose
+from calibration.tag_map.observations import TagObservations, platform_pose, platform_views
+from model.cameras import Z_95
 from model.errors import BadInput, InvalidFile, Problem
 from model.files.reading import CsvFile
 from model.pose import Array, Pose, read_only
 from model.rig import Camera, Rig
-from tracking.pnp import moved
+from tracking.pnp import moved, moved_by_pixels
+from tracking.shared_errors import pixels_by_lens
 
 LEAST_POSES = 8
 """Fewer poses do not show how accurate the rig's poses are."""
@@ -50,6 +57,7 @@ class _PoseObservation:
     covariance: Array
     corner_error: float
     numbers: tuple[int, ...]
+    by_lens: Array  # (6, n), of camera_from_tags by the lens's parameters, camera axes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +102,7 @@ class _HandEyeFit:
     platform_from_tags: Pose
     slopes: Array  # (n, 6, 12), whitened and weighted
     errors: Array  # (n, 6), whitened and weighted
+    whitening: Array  # (n, 6, 6), of the gaps, weighted
 
     @property
     def information(self) -> Array:
@@ -108,6 +117,19 @@ class _HandEyeFit:
             np.linalg.solve(whole - slope.T @ slope, slope.T @ error)[:6]
             for slope, error in zip(self.slopes, self.errors, strict=True)
         ]
+
+    def by_tags(self, shifts: Array) -> Array:
+        """Change of the camera's pose with the tags' poses in the camera frame, to first order.
+
+        Args:
+            shifts: Of those poses by each of k causes, camera axes, shape (n, 6, k), [m, rad].
+
+        Returns:
+            Shift and rotation along the world's axes, shape (6, k).
+        """
+        turn = np.kron(np.eye(2), self.world_from_camera.rotation)
+        causes = np.einsum("nji,njk->ik", self.slopes, self.whitening @ turn @ shifts)
+        return np.asarray(np.linalg.solve(self.information, causes)[:6])
 
 
 def locate_by_motion(
@@ -142,13 +164,18 @@ def locate_by_motion(
             next_step="take images at more poses, and list each in the pose file",
         )
     best = _reweighted_fit(samples)
-    covariance: Array = np.asarray(np.linalg.inv(best.information))[:6, :6]
+    scatter = np.asarray(np.linalg.inv(best.information))[:6, :6]
+    covariance = scaled_to(scatter, widths_of(scatter, best.without_each()))
+    by_lens = None
+    if camera.lens_covariance is not None:
+        by_lens = read_only(best.by_tags(np.array([one.by_lens for one in samples])))
+        covariance = covariance + by_lens @ camera.lens_covariance @ by_lens.T
     return ExtrinsicCalibration(
         camera=replace(camera, world_from_camera=best.world_from_camera),
         by="rig motion",
         covariance=read_only(covariance),
-        half_widths=read_only(widths_of(covariance, best.without_each())),
-        by_lens=None,
+        half_widths=read_only(Z_95 * np.sqrt(np.diag(covariance))),
+        by_lens=by_lens,
         points=workspace_corners(rig),
         tag_errors=_tag_errors(samples),
         pictures=len(samples),
@@ -165,8 +192,10 @@ def _observe(
     found = platform_pose(rig, camera, squares)
     if found is None:
         return None
+    seen, views = found.camera_from_body, platform_views(rig, squares)
+    by_lens = moved_by_pixels(camera, views, seen, pixels_by_lens(camera, views))
     return _PoseObservation(
-        pose, found.camera_from_body, found.covariance, found.reprojection, tuple(squares)
+        pose, seen, found.covariance, found.reprojection, tuple(squares), by_lens
     )
 
 
@@ -213,6 +242,7 @@ def _fit(stack: _Stack, start: Pose, noise: tuple[float, float]) -> _HandEyeFit:
         moved(nominal, x[6:]),
         slopes * weight[..., None],
         errors * weight,
+        whitening * weight[..., None],
     )
 
 

@@ -66,15 +66,26 @@ class ExtrinsicCalibration:
     @property
     def stated_covariance(self) -> Array:
         """The covariance scaled to the half widths (1.96 deviations), (6, 6), [m, rad]."""
-        deviations = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance * np.outer(*2 * [self.half_widths / Z_95 / deviations]))
+        return scaled_to(self.covariance, self.half_widths)
 
     @property
     def error(self) -> float:
         """Error of measured points of the work space, 95 %, RMS, [m]."""
+        return self._error_by(self.stated_covariance)
+
+    @property
+    def is_limited_by_lens(self) -> bool:
+        """Whether the camera's lens causes the larger part of the error."""
+        if self.by_lens is None or self.camera.lens_covariance is None:
+            return False
+        by_lens = self._error_by(self.by_lens @ self.camera.lens_covariance @ self.by_lens.T)
+        return by_lens**2 > 0.5 * self.error**2
+
+    def _error_by(self, covariance: Array) -> float:
+        """The error that a covariance of the pose causes, [m]."""
         arms = self.points - self.world_from_camera.position
         slopes = np.concatenate([np.hstack([np.eye(3), -skew(arm)]) for arm in arms])
-        return float(np.sqrt(3.0)) * rms_bound(self.stated_covariance, slopes)  # of all axes
+        return float(np.sqrt(3.0)) * rms_bound(covariance, slopes)  # of all axes
 
 
 def workspace_corners(rig: Rig) -> Array:
@@ -97,6 +108,10 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
             more = "take images at more poses, far apart and rotated up to 20° in every direction"
         if result.by == "another camera":
             more = "take more pairs of images, and calibrate the other camera's extrinsics better"
+        if result.is_limited_by_lens:
+            more = (
+                "calibrate the camera's lens with more images, all over the image: it causes most"
+            )
         what = (
             f"points of the workspace are measured within {error * 1e3:.2g} mm;"
             f" {wanted * 1e3:.2g} mm are required"
@@ -123,6 +138,12 @@ def widths_of(covariance: Array, without: Sequence[Array]) -> Array:
     by_parts = np.sqrt((count - 1) / count * np.sum(spread**2, axis=0))
     quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 1))
     return np.asarray(np.maximum(by_scatter, quantile * by_parts))
+
+
+def scaled_to(covariance: Array, half_widths: Array) -> Array:
+    """A covariance, shape (k, k), scaled to half widths of 95 % intervals, shape (k,)."""
+    scales = half_widths / Z_95 / np.sqrt(np.diag(covariance))
+    return np.asarray(covariance * np.outer(scales, scales))
 
 
 # Result file.

@@ -123,14 +123,19 @@ def platform_pose(rig: Rig, camera: Camera, squares: Mapping[int, RefinedTag]) -
         camera: Its matrix and distortion are taken as known.
         squares: Refined corners in one image, by tag number.
     """
-    tags = {tag.id: tag for tag in rig.platform_tags}
-    found = solve_pnp(camera, [TagView(tags[k], square) for k, square in squares.items()])
+    found = solve_pnp(camera, platform_views(rig, squares))
     if found is None or not np.isfinite(found.covariance).all():
         return None
     margin = found.second_best_cost - found.cost
     if len(squares) == 1 and margin < TrackerSettings().single_tag_margin:
         return None
     return found
+
+
+def platform_views(rig: Rig, squares: Mapping[int, RefinedTag]) -> list[TagView]:
+    """The platform's tags with their corners in one image, by tag number."""
+    tags = {tag.id: tag for tag in rig.platform_tags}
+    return [TagView(tags[number], square) for number, square in squares.items()]
 
 
 def _alike(squares: Mapping[int, RefinedTag], before: Mapping[int, RefinedTag]) -> bool:

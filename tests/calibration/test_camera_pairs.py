@@ -29,7 +29,7 @@ from calibration.targets.boards import Chessboard, DetectedBoard
 from calibration.targets.grids import TagGrid
 from model.errors import BadInput
 from model.files.documents import PoseDocument, content_hash
-from model.pose import Pose, matrix_from_rotation_vector
+from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, load_rig, rig_from_document
 from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
@@ -192,6 +192,61 @@ def test_pairs_of_a_body_at_rest_count_once(two) -> None:
     with pytest.raises(BadInput, match="1 of 4 required") as caught:
         locate_by_pairs(rig, *cameras, resting, {}, "sha256:0")
     assert "duplicates rest 0: nothing moved" in caught.value.why
+
+
+def by_lenses_off(two: tuple[Rig, Pose], own: np.ndarray, other: np.ndarray, scale: float):
+    """The pose of the side camera if the lenses are off by fx, fy, cx, cy [px].
+
+    Args:
+        two: The rig and the camera's true pose.
+        own: Of the side camera.
+        other: Of the front camera.
+        scale: Of the lenses' stated errors; they have deviations ``own`` and ``other``.
+    """
+    rig, truth = two
+    board = TagGrid(4, 3, 0.05, 0.02, "tag36h11")
+    points, rng = board.points_of(range(12)), np.random.default_rng(5)
+    stated, images = [], []
+    for camera, change in zip((rig.cameras[1], rig.cameras[0]), (own, other), strict=True):
+        matrix = np.array(camera.matrix)
+        matrix[[0, 1, 0, 1], [0, 1, 2, 2]] += change
+        off = np.concatenate([change, np.zeros(camera.distortion.size)])
+        by_lens = np.zeros((6, len(off)))
+        lens = {"lens_covariance": scale**2 * np.outer(off, off), "pose_by_lens": by_lens}
+        stated.append(replace(camera, **lens))
+        there = truth if camera.name == "side" else camera.world_from_camera
+        images.append((replace(camera, matrix=matrix), there))
+    pairs = {}
+    for k, pose in enumerate(where_it_goes(rig, 6)):
+        bodies = []
+        for assumed, (camera, there) in zip(stated, images, strict=True):
+            exact = pixels_of(camera, there.inverse().compose(pose).apply(points))
+            noisy = exact + 0.01 * rng.standard_normal(exact.shape)
+            bodies.append(_board_pose(DetectedBoard(points, noisy), assumed))
+        pairs[str(k)] = tuple(bodies)
+    return locate_by_pairs(rig, *stated, pairs, {}, "sha256:0")
+
+
+@pytest.mark.parametrize("which", ["own", "other"])
+@pytest.mark.parametrize("off", [[2.0, 2.0, 0.0, 0.0], [0.0, 0.0, 1.0, -0.5]])
+def test_a_lens_that_is_off_is_in_the_interval_of_the_pose(two, which: str, off: list) -> None:
+    """The lenses of both cameras count; neither shows in the scatter of the pairs."""
+    nothing = np.zeros(4)
+    wrong = (np.array(off), nothing) if which == "own" else (nothing, np.array(off))
+    true, found = by_lenses_off(two, nothing, nothing, 1.0), by_lenses_off(two, *wrong, 1.0)
+    without = by_lenses_off(two, *wrong, 0.0)
+    pose, right = found.world_from_camera, true.world_from_camera
+    turn = rotation_vector_from_matrix(pose.rotation @ right.rotation.T)
+    moved = np.concatenate([pose.position - right.position, turn])
+    stated = found.covariance - without.covariance
+    np.testing.assert_allclose(stated, np.outer(moved, moved), atol=0.1 * np.sum(moved**2))
+    assert not (np.abs(moved) <= without.half_widths).all()
+    assert (np.abs(moved) <= found.half_widths).all()
+    if which == "own":
+        change = np.array([*off, *np.zeros(found.by_lens.shape[1] - 4)])
+        np.testing.assert_allclose(
+            -found.by_lens @ change, moved, atol=0.05 * float(np.linalg.norm(moved))
+        )
 
 
 def by_exact_pairs(

@@ -30,7 +30,13 @@ def shaken(pose: Pose, noise: float, rng: np.random.Generator) -> Pose:
 
 
 def session(
-    rig: Rig, count: int, turn: float, noise: float, seed: int, tags_off: Pose | None = None
+    rig: Rig,
+    count: int,
+    turn: float,
+    noise: float,
+    seed: int,
+    tags_off: Pose | None = None,
+    pixels: float = 0.03,
 ):
     """Images of a platform near its encoder poses: observations and encoder poses."""
     rng = np.random.default_rng(seed)
@@ -41,7 +47,7 @@ def session(
         pose = Pose(position, matrix_from_rotation_vector(rng.uniform(-turn, turn, 3)))
         encoder[f"{k}.png"] = shaken(pose, noise, rng)
         seen[f"{k}.png"] = camera.world_from_camera.inverse().compose(pose).compose(off)
-    return observe(camera, rig.platform_tags, seen, 0.03, rng), encoder
+    return observe(camera, rig.platform_tags, seen, pixels, rng), encoder
 
 
 def unaware(camera: Camera) -> Camera:
@@ -188,3 +194,57 @@ def test_unusable_pose_files_are_refused_with_the_reason(
     with pytest.raises(InvalidFile) as caught:
         read_poses(path)
     assert named in str(caught.value)
+
+
+def by_another_lens(rig: Rig, change: np.ndarray, noise: float = 1e-4, pixels: float = 0.03):
+    """The camera's pose from images that another lens took.
+
+    Args:
+        rig: Its camera has no distortion.
+        change: Of fx, fy, cx, cy from the stated to the true lens, [px].
+        noise: Of the encoder poses, [m].
+        pixels: Noise of the corners, [px].
+    """
+    matrix = np.array(rig.cameras[0].matrix)
+    matrix[[0, 1, 0, 1], [0, 1, 2, 2]] += change
+    true = replace(rig, cameras=(replace(rig.cameras[0], matrix=matrix),))
+    observations, encoder = session(true, 16, 0.3, noise, seed=4, pixels=pixels)
+    return locate_by_motion(rig, rig.cameras[0], observations, encoder)
+
+
+@pytest.fixture(scope="module")
+def calibrated(rig: Rig) -> Rig:
+    """A camera without distortion, whose focal length is known to 0.1 % (1 σ)."""
+    plain = replace(rig.cameras[0], distortion=np.zeros(0))
+    focal = float(plain.matrix[0, 0])
+    lens = np.diag([0.5, 0.5, 0.5, 0.5]) ** 2
+    lens[:2, :2] += (1e-3 * focal) ** 2
+    return replace(rig, cameras=(replace(plain, lens_covariance=lens),))
+
+
+def test_the_pose_follows_the_lens_as_its_derivatives_state(calibrated: Rig) -> None:
+    same = by_another_lens(calibrated, np.zeros(4), 1e-6, 1e-3)
+    for change in 0.02 * np.eye(4):
+        pose = by_another_lens(calibrated, change, 1e-6, 1e-3).world_from_camera
+        rotation = rotation_vector_from_matrix(pose.rotation @ same.world_from_camera.rotation.T)
+        shift = pose.position - same.world_from_camera.position
+        stated = -same.by_lens @ change  # the stated lens is off by the opposite
+        gap = np.concatenate([shift, rotation]) - stated
+        assert np.linalg.norm(gap) < 0.08 * np.linalg.norm(stated)
+
+
+def test_a_focal_length_that_is_off_is_in_the_interval_of_the_pose(calibrated: Rig) -> None:
+    """It shifts all poses alike, so the scatter does not show it."""
+    camera = calibrated.cameras[0]
+    change = np.array([*2 * [1.5e-3 * float(camera.matrix[0, 0])], 0.0, 0.0])
+    found = by_another_lens(calibrated, change)
+    gap = found.world_from_camera.position - camera.world_from_camera.position
+    assert np.linalg.norm(gap) > 1.5e-3
+    assert (np.abs(gap) <= found.half_widths[:3]).all()
+    verdict = judge_extrinsics(found, 1e-3)
+    assert not verdict.good
+    assert "calibrate the camera's lens" in verdict.next_steps[0]
+    unknown = replace(calibrated, cameras=(replace(camera, lens_covariance=None),))
+    scatter = by_another_lens(unknown, change)
+    assert scatter.by_lens is None
+    assert not (np.abs(gap) <= scatter.half_widths[:3]).all()
