@@ -4,7 +4,8 @@ None states uncertainties. All have integer coordinates at pixel centres, as rig
 
 Source: OpenCV, samples/cpp/calibration.cpp (keys); ROS, sensor_msgs/CameraInfo and
 camera_calibration_parsers (keys, models plumb_bob, rational_polynomial, equidistant); Kalibr, wiki
-page "yaml formats" (camchain); mrcal, "Camera model representation in memory and on disk".
+page "yaml formats" (camchain); EuRoC MAV data set, sensor.yaml; mrcal, "Camera model
+representation in memory and on disk".
 """
 
 from __future__ import annotations
@@ -21,15 +22,21 @@ import yaml
 from pydantic import ValidationError
 
 from calibration.intrinsics.result import camera_named, with_camera
+from model.cameras import camera_from
 from model.errors import BadInput
 from model.files.camera_file import FISHEYE, CameraDocument
 from model.files.documents import read_text, read_yaml, write_atomic
-from model.files.rig_file import RigDocument
-from model.pose import rotation_vector_from_matrix
+from model.pose import Array, rotation_vector_from_matrix
+from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
 
 _ROS_MODELS = {"plumb_bob": ("pinhole", 5), "rational_polynomial": ("pinhole", 8)}
 _ROS_FISHEYE = ("equidistant", "fisheye")
+_MODELS = {
+    **dict.fromkeys(("plumb_bob", "rational_polynomial", "radial-tangential", "radtan"), "pinhole"),
+    **dict.fromkeys(_ROS_FISHEYE, FISHEYE),
+}
+"""Our lens by the `distortion_model` of ROS's and EuRoC's files."""
 _KALIBR_MODELS = {"radtan": ("pinhole", 4), "equidistant": ("fisheye", 4), "none": ("pinhole", 0)}
 _MRCAL_MODELS = {
     "LENSMODEL_PINHOLE": 0,
@@ -40,8 +47,18 @@ _MRCAL_MODELS = {
 }
 _SMALL, _TEXT_LIMIT = 1_000_000, 32_000_000
 """Largest files in characters, OpenCV's and any; mrcal's may include all corners."""
-_BAD_NUMBERS = (TypeError, ValueError, OverflowError, AttributeError)
-"""Exceptions from values that are not numbers."""
+_BAD_NUMBERS = (TypeError, ValueError, OverflowError, RecursionError, AttributeError)
+"""Exceptions from values that are not numbers, and from PyYAML's constructors."""
+_MATRIX, _LIST = "nine numbers, or rows, cols and data", "a list of numbers, or rows, cols and data"
+_FORMS = {
+    **dict.fromkeys(("image_width", "image_height", "width", "height"), "a number of pixels"),
+    **dict.fromkeys(("camera_matrix", "k"), _MATRIX),
+    **dict.fromkeys(("distortion_coefficients", "distortion_coeffs", "d"), _LIST),
+    **dict.fromkeys(("resolution", "imagersize"), "width and height"),
+    "intrinsics": "fx, fy, cx, cy",
+    "fisheye_model": "0 or 1",
+}
+"""What is expected of each key."""
 _KEYS = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens")
 
 
@@ -51,7 +68,7 @@ def opencv_text(camera: CameraDocument) -> str:
     storage.write("image_width", camera.width_px)
     storage.write("image_height", camera.height_px)
     storage.write("fisheye_model", int(camera.lens == FISHEYE))
-    storage.write("camera_matrix", _matrix(camera))
+    storage.write("camera_matrix", np.array(camera_from(camera).matrix))
     lens = camera.distortion or [0.0] * 5
     storage.write("distortion_coefficients", np.array(lens, dtype=np.float64).reshape(-1, 1))
     return str(storage.releaseAndGetString())
@@ -74,7 +91,7 @@ def ros_text(camera: CameraDocument) -> str:
             where=f"camera {camera.name}",
             next_step="calibrate it with --lens rational or fisheye, or use --to opencv",
         )
-    matrix = _matrix(camera)
+    matrix = np.array(camera_from(camera).matrix)
     return yaml.safe_dump(
         {
             "image_width": camera.width_px,
@@ -163,7 +180,8 @@ FORMATS: dict[FormatName, Callable[[CameraDocument], str]] = {
 def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None) -> CameraDocument:
     """A camera with the parameters of a file in one of `FORMATS`, detected by content.
 
-    Such files state no uncertainties: that of the lens, and of a pose found with it, is unknown.
+    Such files state no uncertainties: that of the lens, of a pose found with another lens, and of
+    what is measured with both, is unknown.
 
     Args:
         path: The file.
@@ -173,8 +191,10 @@ def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None
     Raises:
         BadInput: The file cannot be read, has an unknown format, or values out of range.
     """
-    unknown = dict.fromkeys(("lens_covariance", "pose_by_lens", "pose_covariance"))
-    plain = camera.model_dump(mode="json") | unknown | _found(path, entry)
+    errors = ("lens_covariance", "pose_by_lens", "pose_covariance", "error_mm")
+    kept = {k: v for k, v in camera.model_dump(mode="json").items() if k not in errors}
+    found = _found(path, entry)
+    plain = kept | {key: found[key] for key in _KEYS}
     try:
         return CameraDocument.model_validate(plain)
     except ValidationError as error:
@@ -183,42 +203,71 @@ def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None
         raise _unusable(path, f"{key}: {first['msg']}") from None
 
 
+def import_remarks(path: Path, camera: CameraDocument, entry: str | None = None) -> list[str]:
+    """What `imported_camera` assumes about a file, and what remains to be done after it.
+
+    Raises:
+        BadInput: As in `imported_camera`.
+    """
+    remarks = []
+    if _found(path, entry)["assumed"]:
+        remarks.append(f"{path.name} states no distortion_model; plumb_bob is assumed, as by ROS")
+    what = f"the pose of camera {camera.name!r} was found with another lens"
+    remarks.append(f"{what}; calibrate it with `cdpr calibrate extrinsics`")
+    if camera.error_mm is not None:
+        what = f"error_mm, {camera.error_mm:g}, was stated for another lens and is left out"
+        remarks.append(f"{what}; state it again before clearance is measured")
+    return remarks
+
+
 def _found(path: Path, entry: str | None) -> dict[str, Any]:
-    """Keys of the rig file's ``cameras``, from a file."""
+    """Keys of the rig file's ``cameras``, from a file, and whether the lens model is assumed."""
     text = read_text(path, _TEXT_LIMIT)
     if "lensmodel" in text and _without_comments(text).startswith("{"):
         found = _from_mrcal(text, path)
-    elif text.lstrip().startswith(("%YAML", "<?xml")):
-        found = _from_opencv(text, path)
     else:
-        plain = read_yaml(path).data
-        if isinstance(plain, Mapping) and any(_is_entry(key) for key in plain):
+        plain, is_opencv = _content(text, path)
+        if any(_is_entry(key) for key in plain):
             return _from_kalibr(plain, path, entry)
-        found = _from_ros(plain, path)
+        keys = {str(key).lower(): value for key, value in plain.items()}
+        found = _from_keys(keys, path, is_opencv)
     if entry is not None:
         raise _unusable(path, f"it has one camera, so {entry!r} does not exist")
     return found
 
 
-def with_imported_camera(rig: Rig, name: str, path: Path, entry: str | None = None) -> RigDocument:
-    """A rig file's content with the parameters of another program's file for one camera.
-
-    Raises:
-        BadInput: As in `imported_camera`, or the rig has no such camera.
-    """
-    own = camera_named(rig.document, name)
-    document = with_camera(rig.document, imported_camera(path, own, entry))
-    rig_from_document(document)
-    return document
+def _content(text: str, path: Path) -> tuple[Mapping[Any, Any], bool]:
+    """The keys of a YAML, JSON or XML file, and whether OpenCV has written it."""
+    if not text.lstrip().startswith(("%YAML", "<?xml")) and "!!opencv-matrix" not in text:
+        plain = read_yaml(path).data
+        if not isinstance(plain, Mapping):
+            raise _unusable(path, "it has no keys")
+        matrix = plain.get("camera_matrix")
+        return plain, isinstance(matrix, Mapping) and "type_id" in matrix
+    if len(text) > _SMALL:
+        raise _unusable(path, f"it is longer than {_SMALL} characters")
+    try:
+        return (_opencv_xml(text) if text.lstrip().startswith("<") else _opencv_yaml(text)), True
+    except (*_BAD_NUMBERS, LookupError, yaml.YAMLError, ElementTree.ParseError) as error:
+        what = " ".join(str(error).split())
+        raise _unusable(path, f"it is damaged: {what}"[:200]) from None
 
 
 def write_rig_with_camera(
-    output: Path, rig: Rig, name: str, path: Path, entry: str | None = None
+    output: Path,
+    rig: Rig,
+    name: str,
+    path: Path,
+    entry: str | None = None,
+    listener: Listener = SILENT,
 ) -> CameraDocument:
     """Writes a new rig file with the camera of another program's file; returns the camera.
 
+    What is assumed and what remains to be done is reported to the listener and in the file.
+
     Raises:
-        BadInput: As in `with_imported_camera`, or ``output`` exists or cannot be written.
+        BadInput: As in `imported_camera`, the rig has no such camera, or ``output`` exists or
+            cannot be written.
     """
     if output.exists():
         raise BadInput(
@@ -227,22 +276,18 @@ def write_rig_with_camera(
             why="an import never replaces a rig file",
             next_step="choose a name that does not exist yet",
         )
-    document = with_imported_camera(rig, name, path, entry)
+    own = camera_named(rig.document, name)
+    document = with_camera(rig.document, imported_camera(path, own, entry))
+    rig_from_document(document)
     plain = document.model_dump(mode="json", exclude_unset=True)
     body = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None)
-    head = f"# {rig.name} with camera {name} of {path.name}; written by `cdpr calibrate import`"
-    write_atomic(output, f"{head}\n{body}")
+    head = [f"{rig.name} with camera {name} of {path.name}; written by `cdpr calibrate import`"]
+    remarks = import_remarks(path, own, entry)
+    comments = "".join(f"# {line}\n" for line in head + remarks)
+    write_atomic(output, f"{comments}{body}")
+    for remark in remarks:
+        listener.remark(remark)
     return camera_named(document, name)
-
-
-def _matrix(camera: CameraDocument) -> np.ndarray[Any, Any]:
-    return np.array(
-        [
-            [camera.fx_px, 0.0, camera.cx_px],
-            [0.0, camera.fy_px, camera.cy_px],
-            [0.0, 0.0, 1.0],
-        ]
-    )
 
 
 def _ros_matrix(values: np.ndarray[Any, Any]) -> dict[str, Any]:
@@ -250,27 +295,10 @@ def _ros_matrix(values: np.ndarray[Any, Any]) -> dict[str, Any]:
     return {"rows": rows, "cols": columns, "data": [float(x) for x in values.ravel()]}
 
 
-def _from_opencv(text: str, path: Path) -> dict[str, Any]:
-    """Parses without OpenCV, whose own reader crashes on damaged files."""
-    if len(text) > _SMALL:
-        raise _unusable(path, f"it is longer than {_SMALL} characters")
-    try:
-        plain = _opencv_xml(text) if text.lstrip().startswith("<") else _opencv_yaml(text)
-        width, height = int(plain["image_width"]), int(plain["image_height"])
-        matrix, lens = (
-            np.array(plain[key]["data"], dtype=np.float64)
-            for key in ("camera_matrix", "distortion_coefficients")
-        )
-        is_fisheye = int(plain.get("fisheye_model", 0)) == 1
-    except KeyError as error:
-        raise _unusable(path, f"{error} is missing") from None
-    except (*_BAD_NUMBERS, yaml.YAMLError, ElementTree.ParseError, RecursionError) as error:
-        raise _unusable(path, f"{type(error).__name__}: {error}"[:200]) from None
-    return _numbers(path, width, height, matrix, lens, "fisheye" if is_fisheye else "pinhole")
-
-
 def _opencv_yaml(text: str) -> Mapping[str, Any]:
-    body = text.lstrip().partition("\n")[2].replace("!!opencv-matrix", "")
+    """Parses without OpenCV, whose own reader crashes on damaged files."""
+    body = text.lstrip().replace("!!opencv-matrix", "")
+    body = body.partition("\n")[2] if body.startswith("%") else body
     plain = yaml.safe_load(body)
     if not isinstance(plain, Mapping):
         raise ValueError("it has no keys")
@@ -285,31 +313,66 @@ def _opencv_xml(text: str) -> Mapping[str, Any]:
     return found
 
 
-def _from_ros(plain: object, path: Path) -> dict[str, Any]:
-    if not isinstance(plain, Mapping):
-        raise _unusable(path, "it is not a file of OpenCV, ROS, Kalibr or mrcal")
+def _from_keys(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> dict[str, Any]:
+    """The camera of OpenCV, ROS or EuRoC; the keys are in lower case."""
+    if "camera_matrix" in keys:  # of OpenCV, or of ROS's camera_calibration_parsers
+        size = np.concatenate([_at(keys, f"image_{axis}", path) for axis in ("width", "height")])
+        matrix, lens = _at(keys, "camera_matrix", path), "distortion_coefficients"
+    elif "k" in keys:  # a message of ROS; ROS 1 names its fields K and D
+        size = np.concatenate([_at(keys, axis, path) for axis in ("width", "height")])
+        matrix, lens = _at(keys, "k", path), "d"
+        _require_whole_image(keys, path)
+    elif "intrinsics" in keys:
+        size, matrix = (_at(keys, key, path) for key in ("resolution", "intrinsics"))
+        lens = "distortion_coefficients"
+        if (model := keys.get("camera_model", "pinhole")) != "pinhole":
+            raise _unusable(path, f"its camera_model is {model!r}; pinhole can be read")
+    else:
+        raise _unusable(path, "it has none of the keys camera_matrix, K, intrinsics, cam0")
+    kind, is_assumed = _lens_of(keys, path, is_opencv)
+    return _numbers(path, size, matrix, _at(keys, lens, path), kind) | {"assumed": is_assumed}
+
+
+def _lens_of(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> tuple[str, bool]:
+    """Our name of the lens, and whether it is assumed.
+
+    OpenCV's sample has ``fisheye_model`` or nothing; ROS's reader assumes plumb_bob where a file
+    states no model. Source: camera_calibration_parsers, parse_yml.cpp.
+    """
+    stated = keys.get("distortion_model")
+    model = _MODELS.get(str(stated).strip())
+    if stated is not None and model is None:
+        known = ", ".join(_MODELS)
+        raise _unusable(path, f"its distortion_model is {stated!r}; {known} can be read")
+    if "fisheye_model" in keys:
+        own = FISHEYE if _at(keys, "fisheye_model", path).any() else "pinhole"
+        if model not in (None, own):
+            raise _unusable(path, f"distortion_model {stated!r} contradicts its fisheye_model")
+        return own, False
+    if model is None and "camera_matrix" not in keys:
+        raise _unusable(path, f"distortion_model is missing: one of {', '.join(_MODELS)}")
+    return model or "pinhole", model is None and not is_opencv
+
+
+def _at(keys: Mapping[Any, Any], key: str, path: Path, where: str = "") -> Array:
+    """The numbers of a key: one, a list, or the data of a matrix, shape (n,)."""
+    if key not in keys:
+        raise _unusable(path, f"{where}{key} is missing: {_FORMS[key]}")
+    node = keys[key]
+    if isinstance(node, Mapping):
+        node = node.get("data")
     try:
-        model = plain["distortion_model"]
-        if "camera_matrix" in plain:  # a file of camera_calibration_parsers
-            matrix = plain["camera_matrix"]["data"]
-            lens = plain["distortion_coefficients"]["data"]
-            width, height = plain["image_width"], plain["image_height"]
-        else:  # a message; ROS 2 names its fields k and d
-            matrix, lens = (plain[key if key in plain else key.lower()] for key in "KD")
-            width, height = plain["width"], plain["height"]
-            _require_whole_image(plain, path)
-        matrix, lens = (np.array(each, dtype=np.float64) for each in (matrix, lens))
-    except (KeyError, *_BAD_NUMBERS) as error:
-        raise _unusable(path, f"{type(error).__name__}: {error}") from None
-    if str(model) not in (*_ROS_MODELS, *_ROS_FISHEYE):
-        raise _unusable(path, f"its distortion_model {model!r} is unknown")
-    kind = "fisheye" if model in _ROS_FISHEYE else "pinhole"
-    return _numbers(path, width, height, matrix, lens, kind)
+        numbers = np.ravel(np.asarray(node, np.float64))
+    except _BAD_NUMBERS:
+        numbers = np.full(1, np.nan)
+    if not np.isfinite(numbers).all():
+        raise _unusable(path, f"{where}{key} is not {_FORMS[key]}")
+    return numbers
 
 
 def _require_whole_image(message: Mapping[Any, Any], path: Path) -> None:
     """Refuses a message for binned images, or for a part of the image."""
-    roi = message.get("roi") or {}
+    roi = message["roi"] if isinstance(message.get("roi"), Mapping) else {}
     binned = any(message.get(key, 0) not in (0, 1) for key in ("binning_x", "binning_y"))
     if binned or roi.get("x_offset") or roi.get("y_offset"):
         raise _unusable(path, "its images are binned, or a part of the sensor's")
@@ -328,36 +391,34 @@ def _from_kalibr(plain: Mapping[Any, Any], path: Path, entry: str | None) -> dic
     name = entry or names[0]
     if name not in names:
         raise _unusable(path, f"it has {', '.join(names)}, but not {name!r}")
-    try:
-        own = plain[name]
-        kind, model = own["camera_model"], own["distortion_model"]
-        lens, numbers = list(own["distortion_coeffs"]), list(own["intrinsics"])
-        width, height = own["resolution"]
-    except (KeyError, *_BAD_NUMBERS) as error:
-        raise _unusable(path, f"{name}: {type(error).__name__}: {error}") from None
-    if kind != "pinhole" or str(model) not in _KALIBR_MODELS:
+    own, where = plain[name] if isinstance(plain[name], Mapping) else {}, f"{name}: "
+    kind, model = str(own.get("camera_model")), str(own.get("distortion_model"))
+    if kind != "pinhole" or model not in _KALIBR_MODELS:
         why = f"{name} is {kind}-{model}; pinhole-radtan and pinhole-equi(distant) can be read"
         raise _unusable(path, why)
     ours, count = _KALIBR_MODELS[model]
-    if len(lens) != count or len(numbers) != 4:
-        raise _unusable(path, f"{name}: {model} has {count} coefficients and 4 intrinsics")
-    return _numbers(path, width, height, _matrix_of(path, numbers), lens, ours)
+    lens = _at(own, "distortion_coeffs", path, where)
+    if len(lens) != count:
+        raise _unusable(path, f"{name}: {model} has {count} coefficients, not {len(lens)}")
+    size, matrix = (_at(own, key, path, where) for key in ("resolution", "intrinsics"))
+    return _numbers(path, size, matrix, lens, ours)
 
 
 def _from_mrcal(text: str, path: Path) -> dict[str, Any]:
     try:
         plain = ast.literal_eval(_without_comments(text))
-        model, numbers = plain["lensmodel"], list(plain["intrinsics"])
-        width, height = plain["imagersize"]
-    except (KeyError, *_BAD_NUMBERS, SyntaxError, RecursionError, MemoryError) as error:
-        raise _unusable(path, f"{type(error).__name__}: {error}"[:200]) from None
-    if str(model) not in _MRCAL_MODELS:
+    except (*_BAD_NUMBERS, SyntaxError, MemoryError) as error:
+        raise _unusable(path, f"it is damaged: {error}"[:200]) from None
+    plain = plain if isinstance(plain, Mapping) else {}
+    model = str(plain.get("lensmodel"))
+    if model not in _MRCAL_MODELS:
         known = ", ".join(_MRCAL_MODELS)
         why = f"its lensmodel is {model!r}; mrcal-convert-lensmodel converts it to one of {known}"
         raise _unusable(path, why)
+    numbers = _at(plain, "intrinsics", path)
     if len(numbers) != 4 + _MRCAL_MODELS[model]:
         raise _unusable(path, f"{model} has {4 + _MRCAL_MODELS[model]} intrinsics")
-    return _numbers(path, width, height, _matrix_of(path, numbers), numbers[4:], "pinhole")
+    return _numbers(path, _at(plain, "imagersize", path), numbers[:4], numbers[4:], "pinhole")
 
 
 def _without_comments(text: str) -> str:
@@ -365,34 +426,18 @@ def _without_comments(text: str) -> str:
     return "\n".join(lines).strip()
 
 
-def _matrix_of(path: Path, numbers: list[Any]) -> np.ndarray[Any, Any]:
-    try:
-        fx, fy, cx, cy = (float(number) for number in numbers[:4])
-    except _BAD_NUMBERS as error:
-        raise _unusable(path, f"intrinsics: {error}") from None
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def _numbers(
-    path: Path, width: object, height: object, matrix: object, lens: object, kind: str
-) -> dict[str, Any]:
-    """Keys of the rig file's ``cameras``, from parsed values."""
-    try:
-        numbers = np.asarray(matrix, np.float64)
-        coefficients = np.ravel(np.asarray(lens, np.float64))
-    except _BAD_NUMBERS as error:
-        raise _unusable(path, f"distortion: {error}") from None
-    if numbers.size != 9:
-        raise _unusable(path, "camera_matrix is not 3 x 3")
-    flat = numbers.ravel()
-    if abs(flat[1]) > 1e-9:
-        raise _unusable(path, "camera_matrix has a skew, which rig files do not support")
-    values = (width, height, flat[0], flat[4], flat[2], flat[5], coefficients.tolist(), kind)
-    return dict(zip(_KEYS, (_plain(value) for value in values), strict=True))
-
-
-def _plain(value: Any) -> Any:
-    return float(value) if isinstance(value, np.floating) else value
+def _numbers(path: Path, size: Array, matrix: Array, lens: Array, kind: str) -> dict[str, Any]:
+    """Keys of the rig file's ``cameras``; ``matrix`` has nine numbers, or fx, fy, cx, cy."""
+    if len(size) != 2 or len(matrix) not in (4, 9):
+        shape = f"{len(size)} numbers for the image's size and {len(matrix)} for the matrix"
+        raise _unusable(path, f"it has {shape}, not 2 and 9 (3 x 3), or fx, fy, cx, cy")
+    if len(matrix) == 9:
+        if abs(matrix[1]) > 1e-9:
+            raise _unusable(path, "camera_matrix has a skew, which rig files do not support")
+        matrix = matrix[[0, 4, 2, 5]]
+    pixels = [int(side) if side.is_integer() else side for side in size.tolist()]
+    values = (*pixels, *matrix.tolist(), lens.tolist(), kind)
+    return dict(zip(_KEYS, values, strict=True)) | {"assumed": False}
 
 
 def _unusable(path: Path, why: str) -> BadInput:
@@ -400,6 +445,6 @@ def _unusable(path: Path, why: str) -> BadInput:
         "no camera can be read from this file",
         where=str(path),
         why=why,
-        next_step="pass a camera file of OpenCV (YAML, XML), ROS (camera_info), Kalibr (camchain)"
-        " or mrcal (.cameramodel)",
+        next_step="pass a camera file of OpenCV (YAML, XML, JSON), ROS (camera_info), Kalibr"
+        " (camchain), EuRoC (sensor.yaml) or mrcal (.cameramodel)",
     )

@@ -1,0 +1,173 @@
+"""Camera files of OpenCV, ROS, Kalibr and EuRoC in the forms in which they are met."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from calibration.intrinsics.exchange import (
+    import_remarks,
+    imported_camera,
+    write_rig_with_camera,
+)
+from model.errors import BadInput
+from model.files.camera_file import CameraDocument
+from model.progress import Listener
+from model.rig import Rig, load_rig
+from tracking.shared_errors import require_stated_errors
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(CONFIGS / "gachon_8_6.yaml")
+
+
+@dataclass
+class Remarks(Listener):
+    """Collects remarks."""
+
+    texts: list[str]
+
+    def remark(self, text: str) -> None:
+        self.texts.append(text)
+
+
+def numbers_of(camera: CameraDocument) -> tuple:
+    focal = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
+    return camera.lens, (camera.width_px, camera.height_px), focal, tuple(camera.distortion)
+
+
+FOCAL = (461.5, 460.25, 362.5, 246.0)
+FOUR, FIVE = (-0.28, 0.07, 0.0002, 0.00002), (-0.28, 0.07, 0.0002, 0.00002, 0.5)
+CAMERA = """image_width: 752
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 4.615e+002, 0., 3.625e+002, 0., 4.6025e+002, 2.46e+002, 0., 0., 1. ]
+distortion_model: MODEL
+distortion_coefficients: !!opencv-matrix
+   rows: 4
+   cols: 1
+   dt: d
+   data: [ -0.28, 0.07, 0.0002, 2e-5 ]
+"""
+OLD = CAMERA.replace("distortion_model: MODEL\n", "").replace("2e-5", "2e-5, 0.5")
+OLD = OLD.replace("image_width", "image_Width").replace("image_height", "image_Height")
+OLD = OLD.replace("camera_matrix", "Camera_Matrix")
+OLD = OLD.replace("distortion_coefficients", "Distortion_Coefficients")
+PLAIN = """image_width: 752
+image_height: 480
+camera_matrix: {rows: 3, cols: 3, data: [461.5, 0, 362.5, 0, 460.25, 246.0, 0, 0, 1]}
+distortion_coefficients: [-0.28, 0.07, 0.0002, 0.00002, 0.5]
+"""
+JSON = """{
+    "image_width": 752,
+    "image_height": 480,
+    "camera_matrix": {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "dt": "d",
+        "data": [461.5, 0.0, 362.5, 0.0, 460.25, 246.0, 0.0, 0.0, 1.0]},
+    "distortion_coefficients": {"type_id": "opencv-matrix", "rows": 5, "cols": 1, "dt": "d",
+        "data": [-0.28, 0.07, 0.0002, 0.00002, 0.5]}
+}
+"""
+EUROC = """sensor_type: camera
+T_BS: {cols: 4, rows: 4, data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
+rate_hz: 20
+resolution: [752, 480]
+camera_model: pinhole
+intrinsics: [461.5, 460.25, 362.5, 246.0] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28, 0.07, 0.0002, 0.00002]
+"""
+OPENVINS = """%YAML:1.0 # need to specify the file type at the top!
+
+cam0:
+  T_imu_cam:
+    - [1.0, 0.0, 0.0, 0.0]
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.28, 0.07, 0.0002, 0.00002]
+  distortion_model: radtan
+  intrinsics: [461.5, 460.25, 362.5, 246.0] #fu, fv, cu, cv
+  resolution: [752, 480]
+"""
+ROS_OLD = PLAIN.replace(
+    "[-0.28, 0.07, 0.0002, 0.00002, 0.5]",
+    "{rows: 1, cols: 5, data: [-0.28, 0.07, 0.0002, 0.00002, 0.5]}",
+)
+FOREIGN = {
+    "equidistant": ("%YAML:1.0\n---\n" + CAMERA.replace("MODEL", "equidistant"), "fisheye", FOUR),
+    "fisheye": ("%YAML:1.0\n---\n" + CAMERA.replace("MODEL", "fisheye"), "fisheye", FOUR),
+    "plumb_bob": ("%YAML:1.0\n---\n" + CAMERA.replace("MODEL", "plumb_bob"), "pinhole", FOUR),
+    "without a first line": (CAMERA.replace("MODEL", "equidistant"), "fisheye", FOUR),
+    "OpenCV's earlier keys": ("%YAML:1.0\n" + OLD, "pinhole", FIVE),
+    "OpenCV's JSON": (JSON, "pinhole", FIVE),
+    "OpenVINS": (OPENVINS, "pinhole", FOUR),
+    "ROS without a model": (ROS_OLD, "pinhole", FIVE),
+    "a flat list": (PLAIN + "distortion_model: plumb_bob\n", "pinhole", FIVE),
+    "EuRoC": (EUROC, "pinhole", FOUR),
+}
+"""Files as other programs write them, with our lens and its coefficients."""
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_files_are_read_as_other_programs_write_them(rig, tmp_path, name: str) -> None:
+    text, lens, coefficients = FOREIGN[name]
+    file = tmp_path / "camera"
+    file.write_text(text)
+    found = imported_camera(file, rig.document.cameras[0])
+    assert numbers_of(found) == (lens, (752, 480), FOCAL, coefficients)
+    assumed = "plumb_bob is assumed" in import_remarks(file, rig.document.cameras[0])[0]
+    assert assumed == (name == "ROS without a model")
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (CAMERA.replace("MODEL", "omnidirectional"), "its distortion_model is 'omnidirectional'; "),
+        (CAMERA.replace("MODEL", "plumb_bob") + "fisheye_model: 1\n", "contradicts its fisheye_"),
+        (PLAIN.replace("distortion_co", "co"), "distortion_coefficients is missing: a list of num"),
+        (PLAIN.replace("[-0.28, 0.07", "[a, b"), "distortion_coefficients is not a list of num"),
+        (PLAIN.replace("data", "date"), "camera_matrix is not nine numbers, or rows, cols"),
+        (PLAIN.replace("752", "wide"), "image_width is not a number of pixels"),
+        (EUROC.replace("[752, 480]", "752"), "1 numbers for the image's size"),
+        (EUROC.replace("pinhole", "omni"), "its camera_model is 'omni'; pinhole can be read"),
+        (EUROC.replace("distortion_model", "model"), "distortion_model is missing: one of plumb_"),
+        (OPENVINS.replace("intrinsics", "k"), "cam0: intrinsics is missing: fx, fy, cx, cy"),
+        ("K: {data: 3}\nwidth: 3\nheight: 4\nroi: [1]\nd: []", "distortion_model is missing"),
+        ("sensor_type: imu\n", "it has none of the keys camera_matrix, K, intrinsics, cam0"),
+        ("{'lensmodel': 'LENSMODEL_PINHOLE', 'imagersize': [9, 9]}", "intrinsics is missing: fx"),
+    ],
+)  # fmt: skip
+def test_the_message_names_the_key_and_what_is_expected(rig, tmp_path, text, why) -> None:
+    file = tmp_path / "camera"
+    file.write_text(text)
+    with pytest.raises(BadInput) as caught:
+        imported_camera(file, rig.document.cameras[0])
+    assert why in str(caught.value.why)
+
+
+def test_an_import_leaves_out_the_error_of_measurements_and_states_the_next_step(
+    rig, tmp_path
+) -> None:
+    """The operator's error_mm was stated for the former lens."""
+    file, new, remarks = tmp_path / "camera.yaml", tmp_path / "new.yaml", Remarks([])
+    file.write_text(ROS_OLD)
+    assert rig.cameras[0].error is not None
+    write_rig_with_camera(new, rig, rig.cameras[0].name, file, listener=remarks)
+    camera = load_rig(new).cameras[0]
+    assert camera.error is None
+    with pytest.raises(BadInput, match="measuring error of camera 'front' is unknown"):
+        require_stated_errors(load_rig(new), [camera])
+    assert [f"# {text}" for text in remarks.texts] == new.read_text().splitlines()[1:4]
+    for text, part in zip(
+        remarks.texts,
+        ("plumb_bob is assumed", "cdpr calibrate extrinsics", "error_mm, 0.5, was stated"),
+        strict=True,
+    ):
+        assert part in text
