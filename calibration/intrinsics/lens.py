@@ -154,7 +154,7 @@ RADIAL = 0.02
 _POOR = 0.5
 """Median corner error of ``five`` from which other models are tried as well, [px]."""
 _LEAST_DEPTH = 0.05
-"""Of a corner's direction in a camera turned towards the board: about 87° off its axis."""
+"""Of a corner's direction in a camera rotated towards the board: about 87° off its axis."""
 _RINGS = 12
 _CLIP = 3.0
 
@@ -294,7 +294,7 @@ def _squares(fit: LensFit, views: Mapping[str, DetectedBoard]) -> float:
 def _first_pose(lens: LensModel, seen: DetectedBoard, matrix: Array, distortion: Array) -> Array:
     """Initial rotation vector and translation of a board, from rays; shape (6,).
 
-    It is found in a camera turned towards the board: near 90° off the axis, rays meet the image
+    It is found in a camera rotated towards the board: near 90° off the axis, rays meet the image
     plane so far away that a few corners would decide.
     """
     rays = np.insert(rays_of(lens.kind, matrix, distortion, seen.corners), 2, 1.0, axis=1)
@@ -303,8 +303,8 @@ def _first_pose(lens: LensModel, seen: DetectedBoard, matrix: Array, distortion:
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     middle = rays.mean(axis=0)
     towards = Rotation.align_vectors([[0.0, 0.0, 1.0]], [middle])[0]
-    turned = towards.apply(rays)
-    plane = turned[:, :2] / np.maximum(turned[:, 2:], _LEAST_DEPTH)
+    facing = towards.apply(rays)
+    plane = facing[:, :2] / np.maximum(facing[:, 2:], _LEAST_DEPTH)
     _, turn, translation = cv2.solvePnP(seen.points, plane, np.eye(3), np.zeros(0))
     back = towards.inv()
     turns = (back * Rotation.from_rotvec(np.ravel(turn))).as_rotvec()
