@@ -78,9 +78,7 @@ class RigOptions:
     stiffness_n: float | None = option("axial stiffness of a cable")
     min_tension_n: float | None = option("smallest allowed tension of a cable")
     max_tension_n: float | None = option("largest tension of a cable")
-    drum_radius_mm: float | None = option(
-        "radius of the bare drums; the cable's radius is added"
-    )
+    drum_radius_mm: float | None = option("radius of the bare drums; the cable's radius is added")
     gear_ratio: float | None = option("motor turns per drum turn")
     counts_per_rev: int | None = option("encoder counts per motor turn")
     encoder: str | None = option("absolute or incremental")

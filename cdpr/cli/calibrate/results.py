@@ -162,7 +162,8 @@ def import_(
       cdpr calibrate import rig.yaml camera_info.yaml --camera front -o rig_with_lens.yaml
     """
     loaded = load_rig(rig)
-    found = write_rig_with_camera(output, loaded, loaded.camera(camera).name, file, entry)
+    name, listener = loaded.camera(camera).name, Terminal(quiet=as_json)
+    found = write_rig_with_camera(output, loaded, name, file, entry, listener=listener)
     lens = f"{found.lens}, {len(found.distortion)} coefficients"
     size = f"{found.width_px} x {found.height_px} px, fx {found.fx_px:.6g} px"
     document = {"rig": str(output), "camera": found.name, "lens": found.lens}
