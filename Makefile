@@ -56,11 +56,13 @@ install:  ## Create .venv and install everything into it, pinned (once)
 demo: install  ## Plan, prove, run and report the paper's first environment on simulated drives
 	"$(BIN)/cdpr" demo
 
-# Kernels that the installation did not run are compiled first, by one process each: the tests' own
-# processes would compile them twice.
+# Kernels that the installation did not run, or that changed since, are compiled first, by one process each: the tests'
+# own processes would compile them twice.
 test: install  ## Run the whole test suite on two cores
 	@"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml --planner adaptive \
 	  -o "$(VENV)/paper-plan.json" --force --json >/dev/null & paper=$$!; \
+	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml \
+	  -o "$(VENV)/first-plan.json" --force --json >/dev/null && \
 	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/turn.yaml --free-rotation --rounds 1 \
 	  -o "$(VENV)/turning-plan.json" --force --json >/dev/null && \
 	"$(BIN)/python" -c '$(COMPILE_REST)' && \
