@@ -184,7 +184,9 @@ def _clearance_error(name: str, near: Nearest, needed: float, key: str, rig: Rig
         "pair": _pair(near),
     }
     if key == "self_mm":
-        next_step = f"move the {name}, or reduce clearance.self_mm in the scene"
+        reduced = ", or reduce clearance.self_mm in the scene" if near.distance > 0.0 else ""
+        order = "if two outlets or anchors are interchanged, correct the rig file"
+        next_step = f"move the {name}{reduced}; {order}"
         if near.second == PLATFORM:
             box = "correct the anchor or the platform's box in the rig file"
             next_step = f"move the {name}, {box}, or reduce the clearance"

@@ -6,7 +6,8 @@ Random edges of 40 mm: on the paper's rig around the pillar of environment 1 and
 number of small boxes; and around the pillar alone on robots whose 6 to 16 cables leave two rings of
 outlets. A plan is 30 rounds of the search between the free positions nearest to the scene's start
 and goal, the median of five seeds. Written as a table and a plot; the slope is that of the last
-half of the log-log curve (1 is linear growth). Processor time of this process.
+half of the log-log curve (1 is linear growth). Last, the capacity margin at one position, by the
+planner and by the check, on such robots with up to 24 cables. Processor time of this process.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import argparse
 import csv
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -25,15 +26,22 @@ from pictures import growth_figure
 from rich.progress import track
 
 from model.files.scene_file import SceneDocument
+from model.kinematics import structure_matrix
 from model.pose import Array, Pose, read_only
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene, scene_from_document
+from model.statics.feasibility import capacity_margin
+from model.statics.wrench_sets import rms_anchor_radius
 from planner.collision.edges import edges_free
 from planner.collision.world import build_world
+from planner.costs import external_wrenches
+from planner.kernels.scene_arrays import World
+from planner.wrench.capacity import build_load, margins
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 OBSTACLES = (1, 2, 5, 10, 20, 50, 100)
 CABLES = (6, 7, 8, 10, 12, 14, 16)
+MANY_CABLES = (8, 10, 12, 14, 16, 20, 24)
 EDGES = 20000
 EDGE = 0.040
 ROUNDS = 30
@@ -83,17 +91,56 @@ def main() -> None:
                   f"  {c.open_comparisons:4d}")  # fmt: skip
         for what in ("free_edge_us", "any_edge_us", "world_us", "plan_us"):
             print(f"  slope of {what}: {slope(costs, what):.2f}")
+    print("capacity margin at one position, by cables: planner [µs], check of a path [ms]")
+    for m in track(MANY_CABLES, "margins", disable=not show):
+        planner_us, check_ms = margin_times(with_cables(rig, m), base, random, options.repeats)
+        print(f"  {m:4d}  {planner_us:8.1f}  {check_ms:8.2f}")
     if options.output:
         write(options.output, tables)
 
 
-def cost(rig: Rig, scene: Scene, random: np.random.Generator, size: int, repeats: int) -> Cost:
-    """Measures one world, the best of some repetitions."""
-    built = []
+def margin_times(
+    rig: Rig, scene: Scene, random: np.random.Generator, repeats: int
+) -> tuple[float, float]:
+    """Processor time of a capacity margin, the best of some repetitions.
+
+    Returns:
+        By the planner's compiled code, [µs], and by the check's, [ms].
+    """
+    rotation = rig.home.rotation
+    world = build_world(rig, scene, rotation, scene.obstacle_clearance)
+    load = build_load(rig, scene, rotation)
+    points = random.uniform(rig.workspace_lower, rig.workspace_upper, (200, 3))
+    wrenches = external_wrenches(rig, scene, rotation)
+    length = rms_anchor_radius(rig.anchors)
+    matrices = [structure_matrix(rig, Pose(point, rotation)) for point in points[:5]]
+
+    def by_check() -> None:
+        for matrix in matrices:
+            capacity_margin(matrix, rig.min_tension, rig.max_tension, wrenches, length)
+
+    margins(world, load, points[:1])  # compiles
+    fast = _best(lambda: margins(world, load, points), repeats) / len(points)
+    return fast * 1e6, _best(by_check, repeats) / len(matrices) * 1e3
+
+
+def _best(work: Callable[[], object], repeats: int) -> float:
+    """Least processor time, [s]."""
+    spent = []
     for _ in range(repeats):
         begin = time.process_time()
-        world = build_world(rig, scene, rig.home.rotation, scene.obstacle_clearance)
-        built.append(time.process_time() - begin)
+        work()
+        spent.append(time.process_time() - begin)
+    return min(spent)
+
+
+def cost(rig: Rig, scene: Scene, random: np.random.Generator, size: int, repeats: int) -> Cost:
+    """Measures one world, the best of some repetitions."""
+
+    def build() -> World:
+        return build_world(rig, scene, rig.home.rotation, scene.obstacle_clearance)
+
+    built, world = _best(build, repeats), build()
     starts = random.uniform(rig.workspace_lower, rig.workspace_upper, (EDGES, 3))
     directions = random.normal(size=(EDGES, 3))
     ends = starts + EDGE * directions / np.linalg.norm(directions, axis=1)[:, None]
@@ -107,7 +154,7 @@ def cost(rig: Rig, scene: Scene, random: np.random.Generator, size: int, repeats
     level = [Pose(position, rig.home.rotation) for position in ends]
     contestant = ours.Contestant(rig, scene.changed(start=level[0], goal=level[1]))
     plan = float(np.median([contestant.rounds_us(ROUNDS, seed) for seed in range(SEEDS)]))
-    return Cost(size, float(free.mean()), free_edge, any_edge, min(built) * 1e6, plan,
+    return Cost(size, float(free.mean()), free_edge, any_edge, built * 1e6, plan,
                 contestant.open_comparisons)  # fmt: skip
 
 
@@ -116,14 +163,11 @@ def _nearest(points: Array, wanted: Array) -> Array:
     return nearest
 
 
-def _time(world: object, starts: Array, ends: Array, repeats: int) -> float:
+def _time(world: World, starts: Array, ends: Array, repeats: int) -> float:
     """Processor time of one edge, [µs]."""
-    spent = []
-    for _ in range(repeats):
-        begin = time.process_time()
-        edges_free(world, starts, ends)
-        spent.append(time.process_time() - begin)
-    return min(spent) / len(starts) * 1e6 if len(starts) else float("nan")
+    if not len(starts):
+        return float("nan")
+    return _best(lambda: edges_free(world, starts, ends), repeats) / len(starts) * 1e6
 
 
 def crowded(base: Scene, count: int, random: np.random.Generator) -> Scene:

@@ -220,7 +220,14 @@ def test_cables_too_near_each_other_get_no_advice_about_obstacles(gachon, scene_
     with pytest.raises(BadInput, match=r"cable \d is .* mm from cable \d") as refusal:
         require_usable_ends(gachon, crossing)
     assert "share" not in refusal.value.why
-    assert refusal.value.next_step == "move the start, or reduce clearance.self_mm in the scene"
+    assert refusal.value.next_step.startswith("move the start, or reduce clearance.self_mm")
+    document = gachon.document.model_copy(deep=True)
+    document.outlets_mm[:2] = document.outlets_mm[1::-1]
+    thick = replace(rig_from_document(document), cable_radius=0.003)
+    with pytest.raises(BadInput, match=r"cable 1 touches cable 2") as refusal:
+        require_usable_ends(thick, scene_with())
+    assert "reduce" not in refusal.value.next_step
+    assert refusal.value.next_step.endswith("are interchanged, correct the rig file")
     document = gachon.document.model_copy(deep=True)
     document.platform.size_mm[2] = 20.0
     document.anchors_mm[1] = document.anchors_mm[0]
