@@ -225,8 +225,9 @@ def fill_everything(found: Visit) -> None:
     expect(found.page.locator("#poses li")).to_have_count(1)
     found.view("operate")
     found.run()
+    slow = {"stop": False, "hold": False, "speed_percent": 1}  # the run outlasts every test
     found.fake.ask(
-        set={"latched": "slack: cable 3"},
+        set={"latched": "slack: cable 3", "wished": slow},
         state={"tensions_n": [20, 20, 1.8, 20, 20, 20, 104.2, 20]},
     )
     found.fake.ask(
