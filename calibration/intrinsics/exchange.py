@@ -191,9 +191,12 @@ def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None
     Raises:
         BadInput: The file cannot be read, has an unknown format, or values out of range.
     """
+    return _with_lens(camera, _found(path, entry), path)
+
+
+def _with_lens(camera: CameraDocument, found: Mapping[str, Any], path: Path) -> CameraDocument:
     errors = ("lens_covariance", "pose_by_lens", "pose_covariance", "error_mm")
     kept = {k: v for k, v in camera.model_dump(mode="json").items() if k not in errors}
-    found = _found(path, entry)
     plain = kept | {key: found[key] for key in _KEYS}
     try:
         return CameraDocument.model_validate(plain)
@@ -203,14 +206,10 @@ def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None
         raise _unusable(path, f"{key}: {first['msg']}") from None
 
 
-def import_remarks(path: Path, camera: CameraDocument, entry: str | None = None) -> list[str]:
-    """What `imported_camera` assumes about a file, and what remains to be done after it.
-
-    Raises:
-        BadInput: As in `imported_camera`.
-    """
+def _remarks(camera: CameraDocument, found: Mapping[str, Any], path: Path) -> list[str]:
+    """What is assumed about a file, and what remains to be done after its import."""
     remarks = []
-    if _found(path, entry)["assumed"]:
+    if found["assumed"]:
         remarks.append(f"{path.name} states no distortion_model; plumb_bob is assumed, as by ROS")
     what = f"the pose of camera {camera.name!r} was found with another lens"
     remarks.append(f"{what}; calibrate it with `cdpr calibrate extrinsics`")
@@ -276,13 +275,13 @@ def write_rig_with_camera(
             why="an import never replaces a rig file",
             next_step="choose a name that does not exist yet",
         )
-    own = camera_named(rig.document, name)
-    document = with_camera(rig.document, imported_camera(path, own, entry))
+    own, found = camera_named(rig.document, name), _found(path, entry)
+    document = with_camera(rig.document, _with_lens(own, found, path))
     rig_from_document(document)
     plain = document.model_dump(mode="json", exclude_unset=True)
     body = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None)
     head = [f"{rig.name} with camera {name} of {path.name}; written by `cdpr calibrate import`"]
-    remarks = import_remarks(path, own, entry)
+    remarks = _remarks(own, found, path)
     comments = "".join(f"# {line}\n" for line in head + remarks)
     write_atomic(output, f"{comments}{body}")
     for remark in remarks:

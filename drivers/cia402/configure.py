@@ -122,7 +122,7 @@ def configure_drives(
     entries: list[int] = []
     for drive, node in enumerate(nodes):
         refusals.note(require_idle, network, node, to_reset)
-        _note_objects(rig, network, drive, settings[drive], max_tension, refusals)
+        _note_objects(rig, network, winch_map, drive, settings[drive], max_tension, refusals)
         refusals.note(count_heartbeats, network, node, profile, entries)
     refusals.raise_any(UNCHANGED)
     _refuse_duplicates(network)
@@ -160,6 +160,7 @@ def configure_drives(
 def _note_objects(
     rig: Rig,
     network: SetupNetwork,
+    winch_map: WinchMap,
     drive: int,
     settings: Sequence[Setting],
     max_tension: float | None,
@@ -171,7 +172,7 @@ def _note_objects(
         refusals.note(require_expected, network, node, expected)
     for setting in settings:
         refusals.note(require_there, network, node, setting)
-    for setting in stated_absent(rig, drive, WinchMap(rig), max_tension):
+    for setting in stated_absent(rig, drive, winch_map, max_tension):
         refusals.note(require_absent, network, node, setting)
     refusals.note(require_no_wrap, network, node, settings)
 
@@ -196,7 +197,7 @@ def require_objects(
         for index, name, size in others:
             refusals.note(client.read, index, 0, name, size)
         settings = settings_for(rig, drive, winch_map, None)
-        _note_objects(rig, network, drive, settings, None, refusals)
+        _note_objects(rig, network, winch_map, drive, settings, None, refusals)
     refusals.raise_any(UNCHANGED)
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from calibration.intrinsics.exchange import (
-    import_remarks,
     imported_camera,
     write_rig_with_camera,
 )
@@ -122,7 +121,9 @@ def test_files_are_read_as_other_programs_write_them(rig, tmp_path, name: str) -
     file.write_text(text)
     found = imported_camera(file, rig.document.cameras[0])
     assert numbers_of(found) == (lens, (752, 480), FOCAL, coefficients)
-    assumed = "plumb_bob is assumed" in import_remarks(file, rig.document.cameras[0])[0]
+    remarks = Remarks([])
+    write_rig_with_camera(tmp_path / "rig.yaml", rig, rig.cameras[0].name, file, listener=remarks)
+    assumed = "plumb_bob is assumed" in remarks.texts[0]
     assert assumed == (name == "ROS without a model")
 
 
