@@ -64,7 +64,12 @@ def read_bytes(path: Path, limit: int = TEXT_LIMIT) -> bytes:
     try:
         with os.fdopen(handle, "rb") as stream:
             _require_regular(path, os.fstat(handle), limit)
-            return stream.read(limit + 1)
+            # Piece by piece: reading up to the limit at once would first claim that much memory.
+            pieces, size = [], 0
+            while size <= limit and (piece := stream.read(MEGABYTE)):
+                pieces.append(piece)
+                size += len(piece)
+            return b"".join(pieces)
     except OSError as error:
         raise unreadable(path, error) from None
 

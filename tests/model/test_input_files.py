@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -151,6 +152,26 @@ def test_a_hull_with_a_point_of_two_numbers_is_reported_with_its_position(tmp_pa
         load_yaml(scene, SceneDocument)
     assert "points_mm[1]" in str(caught.value)
     assert "needs 3 entries" in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [0, 1, 999_999, 1_000_000, 2_500_000])
+def test_a_file_needs_memory_for_its_size_and_not_for_the_limit(size: int, tmp_path: Path) -> None:
+    content = bytes(range(250)) * (size // 250 + 1)
+    (tmp_path / "table.csv").write_bytes(content[:size])
+    tracemalloc.start()
+    try:
+        data = read_bytes(tmp_path / "table.csv", 10**9)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert data == content[:size]
+    assert peak < 2 * size + 2_000_000
+
+
+def test_a_file_without_a_size_of_its_own_is_read_whole_and_bounded() -> None:
+    process = Path("/proc/self")
+    assert read_bytes(process / "cmdline") == (process / "cmdline").read_bytes()
+    assert len(read_bytes(process / "pagemap", 2_500_000)) <= 3_000_000
 
 
 @pytest.mark.parametrize("gigabytes", [1, 4, 16, 64])
