@@ -373,14 +373,14 @@ def _require_whole_image(message: Mapping[Any, Any], path: Path) -> None:
     """Refuses a message for binned images, or for a part of the image."""
     roi = message["roi"] if isinstance(message.get("roi"), Mapping) else {}
     binned = any(message.get(key, 0) not in (0, 1) for key in ("binning_x", "binning_y"))
-    if binned or roi.get("x_offset") or roi.get("y_offset"):
+    cut = any(roi.get(side) not in (None, 0, message[side]) for side in ("width", "height"))
+    if binned or cut or roi.get("x_offset") or roi.get("y_offset"):
         raise _unusable(path, "its images are binned, or a part of the sensor's")
 
 
 def _is_entry(key: object) -> bool:
     """Whether a YAML key is that of a Kalibr camera, such as ``cam0``."""
-    text = str(key)
-    return text.startswith("cam") and text[3:].isdecimal()
+    return (text := str(key)).startswith("cam") and text[3:].isdecimal()
 
 
 def _from_kalibr(plain: Mapping[Any, Any], path: Path, entry: str | None) -> dict[str, Any]:
@@ -434,6 +434,7 @@ def _numbers(path: Path, size: Array, matrix: Array, lens: Array, kind: str) -> 
         if abs(matrix[1]) > 1e-9:
             raise _unusable(path, "camera_matrix has a skew, which rig files do not support")
         matrix = matrix[[0, 4, 2, 5]]
+    lens = lens if kind != FISHEYE or lens[4:].any() else lens[:4]  # ROS's T265 adds a 0
     pixels = [int(side) if side.is_integer() else side for side in size.tolist()]
     values = (*pixels, *matrix.tolist(), lens.tolist(), kind)
     return dict(zip(_KEYS, values, strict=True)) | {"assumed": False}

@@ -99,6 +99,7 @@ ROS_OLD = PLAIN.replace(
     "[-0.28, 0.07, 0.0002, 0.00002, 0.5]",
     "{rows: 1, cols: 5, data: [-0.28, 0.07, 0.0002, 0.00002, 0.5]}",
 )
+T265 = ROS_OLD.replace("0.5]", "0.0]") + "distortion_model: equidistant\n"
 FOREIGN = {
     "equidistant": ("%YAML:1.0\n---\n" + CAMERA.replace("MODEL", "equidistant"), "fisheye", FOUR),
     "fisheye": ("%YAML:1.0\n---\n" + CAMERA.replace("MODEL", "fisheye"), "fisheye", FOUR),
@@ -108,6 +109,7 @@ FOREIGN = {
     "OpenCV's JSON": (JSON, "pinhole", FIVE),
     "OpenVINS": (OPENVINS, "pinhole", FOUR),
     "ROS without a model": (ROS_OLD, "pinhole", FIVE),
+    "a fisheye with a fifth 0": (T265, "fisheye", FOUR),
     "a flat list": (PLAIN + "distortion_model: plumb_bob\n", "pinhole", FIVE),
     "EuRoC": (EUROC, "pinhole", FOUR),
 }

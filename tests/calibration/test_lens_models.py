@@ -458,7 +458,10 @@ roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
 ROS_2 = MESSAGE.replace("D:", "d:").replace("K:", "k:") + "---\n"
 
 
-@pytest.mark.parametrize("text", [MESSAGE, ROS_2])
+WHOLE = MESSAGE.replace("height: 0, width: 0", "height: 720, width: 1280")
+
+
+@pytest.mark.parametrize("text", [MESSAGE, ROS_2, WHOLE])
 def test_a_message_of_ros_as_it_is_printed_can_be_read(rig, tmp_path, text: str) -> None:
     file = tmp_path / "message.yaml"
     file.write_text(text)
@@ -468,7 +471,13 @@ def test_a_message_of_ros_as_it_is_printed_can_be_read(rig, tmp_path, text: str)
 
 
 @pytest.mark.parametrize(
-    ("old", "new"), [("binning_x: 0", "binning_x: 2"), ("x_offset: 0", "x_offset: 8")]
+    ("old", "new"),
+    [
+        ("binning_x: 0", "binning_x: 2"),
+        ("x_offset: 0", "x_offset: 8"),
+        ("height: 0, width: 0", "height: 720, width: 640"),
+        ("height: 0, width: 0", "height: 480, width: 1280"),
+    ],
 )
 def test_a_message_of_ros_for_a_part_of_the_pixels_is_refused(rig, tmp_path, old, new) -> None:
     file = tmp_path / "message.yaml"
