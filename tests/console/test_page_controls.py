@@ -286,8 +286,11 @@ def test_everything_has_a_name_and_is_reached_by_keyboard(desk: Visit) -> None:
         reached: set[str] = set()
         desk.page.evaluate("() => document.activeElement.blur()")
         for _ in range(90):
+            if wanted <= reached:
+                break
             desk.page.keyboard.press("Tab")
             reached |= set(desk.audit("nameOf", "document.activeElement"))
+            wanted &= set(desk.audit("tabbable"))  # a notice is shown for some seconds only
         assert wanted - reached == set(), view
         assert desk.audit("unnamed") == [], view
 
