@@ -11,12 +11,11 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import t as student
 
 from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, page_of, table_of
 from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
-from calibration.statistics import CONFIDENCE, Interval, rms_bound
+from calibration.statistics import Interval, rms_bound, student_factor
 from model.cameras import Z_95
 from model.files.camera_file import PoseCovariance, PoseSlopes
 from model.files.documents import AnyNonNegative, PoseDocument, Vector
@@ -136,7 +135,7 @@ def widths_of(covariance: Array, without: Sequence[Array]) -> Array:
         return np.asarray(by_scatter)
     spread = np.array(without) - np.mean(without, axis=0)
     by_parts = np.sqrt((count - 1) / count * np.sum(spread**2, axis=0))
-    quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 1))
+    quantile = student_factor(count - 1)
     return np.asarray(np.maximum(by_scatter, quantile * by_parts))
 
 

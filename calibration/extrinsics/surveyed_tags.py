@@ -11,11 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import chi2
 
 from calibration.extrinsics.result import ExtrinsicCalibration, workspace_corners
 from calibration.results import Issue
-from calibration.statistics import CONFIDENCE, widened
+from calibration.statistics import chi_squared_bound, widened
 from calibration.tag_map.observations import TagObservations
 from model.cameras import Z_95
 from model.errors import BadInput
@@ -288,7 +287,7 @@ def _by_lens(camera: Camera, tags: Sequence[_SeenTag], best: Pose, slopes: Array
 def _covariance(camera: Camera, tags: Sequence[_SeenTag], best: Pose, slopes: Array) -> Array:
     """Covariance of ``world_from_camera``, (6, 6); wider if scatter contradicts the survey."""
     misfit, free = _misfit(camera, tags, best), 8 * len(tags) - 6
-    scale = misfit if misfit > chi2.ppf(CONFIDENCE, free) / free else 1.0
+    scale = misfit if misfit > chi_squared_bound(free) / free else 1.0
     covariance = scale * np.linalg.inv(slopes.T @ slopes)
     change = change_of_inverse(best)
     return np.asarray(change @ covariance @ change.T)

@@ -10,12 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
 
 from calibration.geometry.fit import RigFit, RigFitter
 from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.parameters import AXES, Parameters
-from calibration.statistics import CONFIDENCE
+from calibration.statistics import student_factor
 from model.pose import Array, read_only, skew
 
 LEAST_INFORMATION = 1.0
@@ -253,5 +252,5 @@ def uncertainty_of_rig(
         for inner in (scatter * np.linalg.inv(whole), jackknifed)
     )
     by_scatter, by_jackknife = (read_only(inner * np.outer(spread, spread)) for inner in of_all)
-    quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 1))
+    quantile = student_factor(count - 1)
     return RigUncertainty(by_scatter, by_jackknife, scatter, quantile)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calibration.geometry.calibrate import RigCalibration
 from calibration.geometry.model import RigModel
@@ -108,7 +108,7 @@ def estimate_cable_compliances(result: RigCalibration) -> CableCompliances | Non
         return None
     information, pull = found
     change = -np.asarray(np.linalg.solve(information, pull))
-    chance = float(chi2.sf(-pull @ change, cables))
+    chance = float(chdtrc(cables, -pull @ change))
     estimated: Array = (_nominal_compliance(result) + change) / result.rig.cable_stiffness
     return CableCompliances(estimated, chance)
 

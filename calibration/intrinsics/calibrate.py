@@ -18,12 +18,10 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from scipy.stats import t as student
 
 from calibration.intrinsics.lens import AUTO, LENSES, LensFit, LensModel, choose_lens, fit_lens
 from calibration.results import data_hash
 from calibration.statistics import (
-    CONFIDENCE,
     EvenSample,
     Interval,
     duplicate_reason,
@@ -31,6 +29,7 @@ from calibration.statistics import (
     jackknife,
     leverage_factor,
     rms_bound,
+    student_factor,
     widened,
 )
 from calibration.targets.boards import Board, DetectedBoard, is_mirrored
@@ -146,7 +145,7 @@ def _half(parts: Sequence[Array], scores: Sequence[Array], which: int) -> Array:
 
 def _quantile(count: int) -> float:
     """Two-sided quantile of Student's t for a number of images."""
-    return float(student.ppf(0.5 + CONFIDENCE / 2.0, max(count - 1, 1)))
+    return student_factor(max(count - 1, 1))
 
 
 # The fit.

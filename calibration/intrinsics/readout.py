@@ -17,12 +17,11 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 from scipy.optimize import minimize_scalar
-from scipy.stats import t as student
 
 from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, interval_rows, page_of, table_of
 from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
-from calibration.statistics import CONFIDENCE, Interval
+from calibration.statistics import Interval, student_factor
 from calibration.tag_map.observations import TagObservations
 from model.errors import BadInput
 from model.files.camera_file import Readout
@@ -194,7 +193,7 @@ def _half_width(bends: Array, slopes: Array, cost: float, freedom: int) -> float
     steps = slopes / np.where(rest > 0.0, rest, np.nan)
     spread = steps - np.nanmean(steps)
     by_images = (count - 1) / count * float(np.nansum(spread**2))
-    quantile = float(student.ppf(0.5 + CONFIDENCE / 2.0, count - 1))
+    quantile = student_factor(count - 1)
     return quantile * float(np.sqrt(max(by_scatter, by_images)))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig
@@ -71,7 +71,7 @@ def test_two_cameras_give_a_better_pose_than_each_alone(
                 values.append(error @ np.linalg.solve(one.covariance, error))
     rms = {name: np.sqrt(np.mean(values)) for name, values in squares.items()}
     assert rms["both"] < 0.8 * min(rms["front"], rms["side"])
-    low, high = chi2.ppf([0.0005, 0.9995], 6 * len(values)) / len(values)
+    low, high = chdtri(6 * len(values), [0.9995, 0.0005]) / len(values)
     assert 0.5 * low < np.mean(values) < high
 
 
@@ -126,7 +126,7 @@ def test_the_covariance_includes_the_extrapolation() -> None:
         assert later is not None
         error = later.pose.position - [0, 0, 0.4]
         errors.append(error @ np.linalg.solve(later.covariance[:3, :3], error))
-    low, high = chi2.ppf([0.0005, 0.9995], 3 * len(errors)) / len(errors)
+    low, high = chdtri(3 * len(errors), [0.9995, 0.0005]) / len(errors)
     assert low < np.mean(errors) < high
 
 
