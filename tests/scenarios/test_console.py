@@ -263,8 +263,7 @@ def console_killed(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         assert stop_runs().stopped
         rows: list[str] = []
         record = folder / "runs" / "jog-session"
-        while find_any():
-            pass
+        until_nothing_is_active()
         rows = (record / "winches.csv").read_text().splitlines()
         events = (record / "events.jsonl").read_text()
         assert '"code": "held"' in events
@@ -282,16 +281,18 @@ def console_ended(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         me.until(lambda state: state["jog"]["ready"])
         process.send_signal(signal.SIGINT)
         assert process.wait() == 0
-        while find_any():
-            pass
+        until_nothing_is_active()
     events = (folder / "runs" / "jog-session" / "events.jsonl").read_text()
     assert "stop" not in events
 
 
-def find_any() -> bool:
-    """Whether a motion is active; each check waits for the answer of the system."""
-    with find_runs() as runs:
-        return bool(runs)
+def until_nothing_is_active() -> None:
+    """Waits until no motion is there any longer."""
+    while True:
+        with find_runs() as runs:
+            if not runs:
+                return
+        signal.sigtimedwait([], 0.02)
 
 
 def test_one_cable_moves_in_service_mode_as_long_as_a_page_holds_it(
@@ -323,8 +324,7 @@ def one_cable(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         process.send_signal(signal.SIGKILL)
         process.wait()
         assert stop_runs().stopped
-        while find_any():
-            pass
+        until_nothing_is_active()
     for name, cable in (("jog-cables", 3), ("jog-cables-2", 5)):
         rows = (folder / "runs" / name / "winches.csv").read_text().splitlines()[1:]
         moving = [row.split(",") for row in rows if row.split(",")[2] in ("moving", "stopping")]
