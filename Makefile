@@ -56,8 +56,8 @@ install:  ## Create .venv and install everything into it, pinned (once)
 demo: install  ## Plan, prove, run and report the paper's first environment on simulated drives
 	"$(BIN)/cdpr" demo
 
-# Kernels that the installation did not run, or that changed since, are compiled first, by one process each: the tests'
-# own processes would compile them twice.
+# Kernels that the installation did not run, or that changed since, are compiled first, by one process each, and the
+# tests' own modules by one: the tests' own processes would compile them several times.
 test: install  ## Run the whole test suite on two cores
 	@"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml --planner adaptive \
 	  -o "$(VENV)/paper-plan.json" --force --json >/dev/null & paper=$$!; \
@@ -66,6 +66,7 @@ test: install  ## Run the whole test suite on two cores
 	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/turn.yaml --free-rotation --rounds 1 \
 	  -o "$(VENV)/turning-plan.json" --force --json >/dev/null && \
 	"$(BIN)/python" -c '$(COMPILE_REST)' && \
+	"$(BIN)/python" -m pytest --collect-only -q >/dev/null; \
 	wait $$paper
 	"$(BIN)/python" -m pytest -n 5 --dist loadfile --no-loadscope-reorder
 
