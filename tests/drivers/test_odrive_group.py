@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -349,6 +351,7 @@ def test_endpoints_of_another_firmware_are_refused(tmp_path: Path) -> None:
         "[]",
         '{"fw_version": "0.6.11", "endpoints": {}}',
         '{"fw_version": "9e99.6.11", "endpoints": {}}',
+        '{"fw_version": "0.6", "endpoints": {}}',
         '{"fw_version": "0.6.11", "endpoints": {"axis0.config.watchdog_timeout": 3}}',
         *(
             '{"fw_version": "0.6.11", "endpoints": {"axis0.config.watchdog_timeout":'
@@ -361,7 +364,34 @@ def test_a_file_that_holds_no_endpoints_is_refused(tmp_path: Path, text: str) ->
     document: Any = odrive_rig().document.drives
     path = tmp_path / "endpoints.json"
     path.write_text(text)
-    with pytest.raises(BadInput, match=r"lacks required endpoints|not valid JSON|finite"):
+    with pytest.raises(BadInput, match=r"lacks required endpoints|not valid JSON|finite") as caught:
+        read_endpoints(path, document)
+    assert "Error(" not in str(caught.value), "no error of a library"
+
+
+@pytest.mark.parametrize("lacking", range(9))
+def test_a_firmware_without_a_required_setting_is_refused_by_both_names(
+    tmp_path: Path, lacking: int
+) -> None:
+    document: Any = odrive_rig().document.drives
+    path = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig(), "0.6.3-1")
+    content = json.loads(path.read_text())
+    name = wanted_settings(document)[lacking].name
+    del content["endpoints"][name]
+    path.write_text(json.dumps(content))
+    with pytest.raises(BadInput) as caught:
+        read_endpoints(path, document)
+    assert caught.value.what == f"the file lacks required endpoints: {name}"
+    assert "firmware 0.6.3-1" in caught.value.why
+    assert "leave out drives.endpoints" in caught.value.next_step
+
+
+def test_an_endpoint_of_an_unknown_type_is_named(tmp_path: Path) -> None:
+    document: Any = odrive_rig().document.drives
+    path = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    path.write_text(path.read_text().replace('"bool"', '"endpoint_ref"'))
+    words = "axis0.config.enable_watchdog has the type 'endpoint_ref'"
+    with pytest.raises(BadInput, match=words):
         read_endpoints(path, document)
 
 
