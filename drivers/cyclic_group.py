@@ -62,6 +62,7 @@ class CyclicBus:
         bus: can.BusABC,
         commanding: frozenset[int],
         foreign_master_message: Callable[[int], str],
+        is_command: Callable[[int, bytes | bytearray], bool] = lambda _id, _data: True,
     ) -> None:
         """Takes an open bus.
 
@@ -69,10 +70,12 @@ class CyclicBus:
             bus: Owned by the caller.
             commanding: Identifiers that only a master sends.
             foreign_master_message: Message about another master, by identifier of its frame.
+            is_command: Whether a frame with one of the identifiers commands, by its data; drives
+                and harmless requests may share an identifier with a command.
         """
         self._bus, self._where = bus, bus_name(bus)
         self._own = EchoFilter(commanding, echoes_own_frames=echoes_own_frames(bus))
-        self._foreign_master_message = foreign_master_message
+        self._foreign_master_message, self._is_command = foreign_master_message, is_command
         self._errors = ErrorFrames(bus)
         self._lost = lost_frames(bus)
         self._found: list[BusFault] = []
@@ -93,7 +96,8 @@ class CyclicBus:
         for message in messages:
             try:
                 transmit(self._bus, message)
-                self._own.sent(message.arbitration_id)
+                if self._is_command(message.arbitration_id, message.data):
+                    self._own.sent(message.arbitration_id)
             except BusFault as error:
                 failure = failure or error
         if failure is not None:
@@ -172,12 +176,16 @@ class CyclicBus:
             self._find(self._errors.take(message))
         elif message.is_extended_id or message.is_remote_frame:
             return
-        elif self._own.is_foreign(message.arbitration_id):
+        elif self._is_foreign_command(message):
             self._find(
                 ForeignMaster(self._foreign_master_message(message.arbitration_id), self._where)
             )
         else:
             listener.take(message.arbitration_id, message.data, stale=stale)
+
+    def _is_foreign_command(self, message: can.Message) -> bool:
+        identifier = message.arbitration_id
+        return self._is_command(identifier, message.data) and self._own.is_foreign(identifier)
 
 
 class GroupMonitor(ReplyListener, Protocol):

@@ -37,7 +37,10 @@ from drivers.odrive.messages import (
     Layout,
     Layouts,
     can_id,
+    commanding_ids,
     error_text,
+    foreign_master_message,
+    is_command,
     node_and_command,
 )
 from drivers.plausibility import position_limits
@@ -61,17 +64,6 @@ PUMPED = 0.01
 """Time counted for each step of simulated drives, [s]."""
 
 
-def commanding_ids(layouts: Layouts, nodes: Sequence[int]) -> frozenset[int]:
-    """Identifiers sent only by a master that moves these drives."""
-    moving = (layouts.set_input_pos, layouts.set_axis_state, layouts.clear_errors, layouts.estop)
-    return frozenset(can_id(node, layout.command) for node in nodes for layout in moving)
-
-
-def foreign_master_message(identifier: int) -> str:
-    """Message about another program that sends a frame with one of these identifiers."""
-    return f"another program commands drive {node_and_command(identifier)[0]}"
-
-
 class SetupLink:
     """The bus during configuration."""
 
@@ -80,17 +72,21 @@ class SetupLink:
     ) -> None:
         """Takes an open bus, ``pump`` as for `drivers.factory.make_drive_group`, the drives."""
         self._bus, self._pump, self._layouts = bus, pump, layouts
-        self._own = EchoFilter(
-            commanding_ids(layouts, nodes), echoes_own_frames=echoes_own_frames(bus)
-        )
+        self._own = EchoFilter(commanding_ids(nodes), echoes_own_frames=echoes_own_frames(bus))
 
     def send(self, node: int, layout: Layout, *values: float) -> None:
         """Sends a message to one drive."""
         self._send(node, layout.command, layout.pack(*values))
 
     def ask(self, node: int, layout: Layout) -> None:
-        """Requests a message from one drive, by the same message without data."""
-        self._send(node, layout.command, b"")
+        """Requests a message from one drive, by a remote frame.
+
+        ODrives also answer a data frame without data, but two nodes that send data frames of one
+        identifier at the same time disturb each other. Source: ODrive, "CAN Protocol", overview.
+        """
+        identifier = can_id(node, layout.command)
+        request = can.Message(arbitration_id=identifier, is_remote_frame=True, is_extended_id=False)
+        transmit(self._bus, request)
 
     def read(self, node: int, endpoint: int) -> None:
         """Requests the value of an endpoint."""
@@ -121,7 +117,8 @@ class SetupLink:
 
     def _send(self, node: int, command: int, data: bytes) -> None:
         identifier = can_id(node, command)
-        self._own.sent(identifier)
+        if is_command(identifier, data):
+            self._own.sent(identifier)
         transmit(self._bus, SentFrame(identifier, data))
 
     def _frames(self, timeout: float) -> Iterator[can.Message]:
@@ -132,8 +129,9 @@ class SetupLink:
                     if fault is not None:
                         raise fault
                 elif not (message.is_extended_id or message.is_remote_frame):
-                    if self._own.is_foreign(message.arbitration_id):
-                        text = foreign_master_message(message.arbitration_id)
+                    identifier = message.arbitration_id
+                    if is_command(identifier, message.data) and self._own.is_foreign(identifier):
+                        text = foreign_master_message(identifier)
                         raise ForeignMaster(text, bus_name(self._bus))
                     yield message
                 if left > 0.0:
@@ -248,10 +246,12 @@ def _answers(
         if len(received) == len(nodes):
             return received
     silent = ", ".join(str(node) for node in nodes if node not in received)
+    adapter = ", or an adapter without remote frames" if asked else ""
     raise HardwareMissing(
         f"drive{'s' if ',' in silent else ''} {silent}: no {layout.name}",
         where=SETTING_UP,
-        why="no power, a broken cable, a wrong bit rate or node id, or the message is disabled",
+        why="no power, a broken cable, a wrong bit rate or node id, the message is disabled"
+        + adapter,
         next_step="check power and wiring, and node id, bit rate and message periods with"
         " odrivetool",
         values={"nodes": silent},

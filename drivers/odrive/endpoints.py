@@ -6,6 +6,7 @@ name in the API reference.
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,12 +134,14 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
         BadInput: The file cannot be read, has another format, or lacks a required endpoint.
     """
     content = read_json(path, _OTHER_FILE)
+    names = [wanted.name for wanted in wanted_settings(document)]
     try:
         file = _EndpointsFile.model_validate(content)
-        major, minor, revision = map(int, file.fw_version.partition("-")[0].split("."))
-        found = {w.name: _endpoint(w.name, file) for w in wanted_settings(document)}
-    except (ValidationError, ValueError, KeyError) as error:
-        why = f"{error!r}"
+        firmware = _firmware(file.fw_version)
+        missing = [name for name in names if name not in file.endpoints]
+        found = {name: _endpoint(name, file) for name in names if name not in missing}
+    except ValueError as error:  # also of pydantic
+        why = str(error)
         if isinstance(error, ValidationError):
             first = error.errors(include_url=False)[0]
             why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
@@ -147,9 +150,28 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
             where=str(path),
             next_step=_OTHER_FILE,
         ) from error
-    return Endpoints((major, minor, revision), found)
+    if missing:
+        raise BadInput(
+            f"the file lacks required endpoints: {', '.join(missing)}",
+            where=str(path),
+            why=f"it describes firmware {file.fw_version}, which may be older than these settings",
+            next_step="update the drives' firmware and use its flat_endpoints.json, or leave out"
+            " drives.endpoints",
+        )
+    return Endpoints(firmware, found)
+
+
+def _firmware(text: str) -> tuple[int, int, int]:
+    """Major, minor and revision of a version such as ``0.6.11-1``."""
+    matched = re.match(r"(\d{1,5})\.(\d{1,5})\.(\d{1,5})(?:-|$)", text, re.ASCII)
+    if matched is None:
+        raise ValueError(f"fw_version is {text!r}, not a version such as 0.6.11")
+    major, minor, revision = map(int, matched.groups())
+    return major, minor, revision
 
 
 def _endpoint(name: str, file: _EndpointsFile) -> Endpoint:
     entry = _EndpointEntry.model_validate(file.endpoints[name])
+    if entry.type not in _FORMS:
+        raise ValueError(f"{name} has the type {entry.type[:40]!r}, not {' or '.join(_FORMS)}")
     return Endpoint(name, entry.id, _FORMS[entry.type])

@@ -29,12 +29,15 @@ from drivers.drive_group import (
     Pace,
     Pump,
 )
-from drivers.odrive.configure import commanding_ids, configure_drives, foreign_master_message
+from drivers.odrive.configure import configure_drives
 from drivers.odrive.messages import (
     OWN_DBC,
     RESULT_TEXTS,
     AxisState,
     OdriveFrames,
+    commanding_ids,
+    foreign_master_message,
+    is_command,
     read_layouts,
     state_text,
 )
@@ -87,14 +90,15 @@ class OdriveGroup(CyclicGroup):
         self._reset_memory()
 
     def _reset_memory(self) -> None:
-        ids = commanding_ids(self._layouts, self._nodes)
-        self._cyclic = CyclicBus(self._bus, ids, foreign_master_message)
+        ids = commanding_ids(self._nodes)
+        self._cyclic = CyclicBus(self._bus, ids, foreign_master_message, is_command)
         self._watch = OdriveMonitor(self._rig, self._document, self._layouts, self._max_steps)
         self._recent: deque[list[int]] = deque(maxlen=self._watch.window)
         self._stop = _Stop.NONE
         self._waited = 0
         self._releasing = False
         self._all_hold = False  # all drives were enabled when the stop began
+        self._armed: set[int] = set()  # drives seen under torque since enabling began, by index
         self._resetting = 0
         self._faults = []
 
@@ -205,8 +209,8 @@ class OdriveGroup(CyclicGroup):
             self._cyclic.send(self._frames.axis_states(AxisState.IDLE))
             return
         self._cyclic.send(self._frames.set_points(now, before))
-        if self._state is GroupState.ENABLING and self._waited == 1:
-            self._cyclic.send(self._frames.axis_states(AxisState.CLOSED_LOOP_CONTROL))
+        if self._state is GroupState.ENABLING:
+            self._arm()
 
     def command(self, command: GroupCommand) -> None:
         """Sets the goal of the group; see `DriveGroup.command`."""
@@ -246,6 +250,21 @@ class OdriveGroup(CyclicGroup):
         """Reads positions and states again; see `DriveGroup.read_state`."""
         return self.read_positions(pace)
 
+    def _arm(self) -> None:
+        """Arms all drives once, and again those whose watchdog expired before they were fed.
+
+        ODrive does not document whether the watchdog runs while an axis is idle; in firmware 0.5
+        it does. Source: ODrive, Firmware/MotorControl/main.cpp, control_loop_cb.
+        """
+        expired = self._watch.take_expired(self._at_rest())
+        arming = self._at_rest() if self._waited == 1 else expired
+        self._cyclic.send(self._frames.clear_errors(expired))
+        self._cyclic.send(self._frames.axis_states(AxisState.CLOSED_LOOP_CONTROL, arming))
+
+    def _at_rest(self) -> list[int]:
+        """Drives not seen under torque since enabling began, by index."""
+        return [drive for drive in range(len(self._nodes)) if drive not in self._armed]
+
     def _last(self) -> list[int]:
         return self._recent[-1] if self._recent else list(self._watch.positions)
 
@@ -256,7 +275,13 @@ class OdriveGroup(CyclicGroup):
         holding = self._stop is _Stop.HOLDING
         enabled = self._state is GroupState.ENABLED or (holding and self._all_hold)
         powered = enabled or holding or self._state is GroupState.ENABLING
-        self._latch(self._watch.faults(powered=powered, enabled=enabled))
+        if not powered:
+            self._armed.clear()
+        elif self._state is GroupState.ENABLING:
+            states = enumerate(self._watch.states)
+            self._armed |= {n for n, state in states if state == AxisState.CLOSED_LOOP_CONTROL}
+        at_rest = self._at_rest()
+        self._latch(self._watch.faults(powered=powered, enabled=enabled, at_rest=at_rest))
 
     def _latch(self, found: list[tuple[int, str]]) -> None:
         self._faults += [fault for fault in found if fault not in self._faults]
@@ -338,6 +363,7 @@ class OdriveGroup(CyclicGroup):
         self._cyclic.forget_waiting()  # the drives kept sending meanwhile
         self._state, self._stop, self._waited = GroupState.ENABLING, _Stop.NONE, 0
         self._all_hold = False
+        self._armed.clear()
         self._recent.clear()
 
     def _reset_fault(self) -> None:
@@ -369,7 +395,7 @@ def read_axes(
     """State, position and torque of every axis; see `drivers.factory.read_drives`."""
     layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
     nodes = [winch.node_id for winch in rig.winches]
-    cyclic = CyclicBus(bus, commanding_ids(layouts, nodes), foreign_master_message)
+    cyclic = CyclicBus(bus, commanding_ids(nodes), foreign_master_message, is_command)
     watch = OdriveMonitor(rig, document, layouts, largest_steps(rig, rig.cycle))
     cyclic.forget_waiting()
     for _ in range(ATTEMPTS):

@@ -6,7 +6,7 @@ Source: ODrive documentation, "CAN Protocol" and "API Reference" of firmware 0.6
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from pathlib import Path
@@ -195,6 +195,34 @@ def _unfit(path: Path, what: str) -> BadInput:
 
 COMMAND_BITS = 5
 
+BROADCAST = 0x3F
+"""Node id by which every ODrive is addressed, from firmware 0.6.9. Source: ODrive's changelog."""
+
+RXSDO, ADDRESS = 0x04, 0x06
+
+COMMANDS: dict[int, str] = {
+    0x02: "Estop",
+    RXSDO: "RxSdo",
+    ADDRESS: "Address",
+    0x07: "Set_Axis_State",
+    0x0B: "Set_Controller_Mode",
+    0x0C: "Set_Input_Pos",
+    0x0D: "Set_Input_Vel",
+    0x0E: "Set_Input_Torque",
+    0x0F: "Set_Limits",
+    0x10: "Start_Anticogging",  # up to firmware 0.5
+    0x11: "Set_Traj_Vel_Limit",
+    0x12: "Set_Traj_Accel_Limits",
+    0x13: "Set_Traj_Inertia",
+    0x16: "Reboot",
+    0x18: "Clear_Errors",
+    0x19: "Set_Absolute_Position",
+    0x1A: "Set_Pos_Gain",
+    0x1B: "Set_Vel_Gains",
+    0x1F: "Enter_DFU_Mode",
+}
+"""Every message by which a master changes a drive; also those that cdpr never sends."""
+
 
 class AxisState(IntEnum):
     """Axis states in use; in the others the axis calibrates or searches."""
@@ -270,6 +298,32 @@ def node_and_command(identifier: int) -> tuple[int, int]:
     return identifier >> COMMAND_BITS, identifier & (1 << COMMAND_BITS) - 1
 
 
+def commanding_ids(nodes: Iterable[int]) -> frozenset[int]:
+    """Identifiers of the `COMMANDS` to these drives; see `is_command`."""
+    return frozenset(can_id(node, command) for node in (*nodes, BROADCAST) for command in COMMANDS)
+
+
+def is_command(identifier: int, data: bytes | bytearray) -> bool:
+    """Whether a frame with one of the `commanding_ids` changes a drive.
+
+    RxSdo also reads. Address also asks for the drives on the bus, and is their answer: the sender's
+    own node id, where a master writes a new one.
+    """
+    node, command = node_and_command(identifier)
+    if command == RXSDO:
+        return data[:1] != b"\0"
+    if command == ADDRESS:
+        return data[:1] not in (b"", bytes([node]))
+    return True
+
+
+def foreign_master_message(identifier: int) -> str:
+    """Message about another program that sends a frame with one of the `commanding_ids`."""
+    node, command = node_and_command(identifier)
+    drives = "all drives" if node == BROADCAST else f"drive {node}"
+    return f"another program commands {drives} ({COMMANDS[command]})"
+
+
 def error_text(errors: int) -> str:
     """Text of an axis error."""
     known = [text for bit, text in ERROR_TEXTS.items() if errors & bit]
@@ -322,13 +376,18 @@ class OdriveFrames:
             )
         ]
 
-    def axis_states(self, state: AxisState) -> list[can.Message]:
-        """Requests a state of every drive."""
-        return [self._frame(node, self._layouts.set_axis_state, state) for node in self._nodes]
+    def axis_states(
+        self, state: AxisState, drives: Iterable[int] | None = None
+    ) -> list[can.Message]:
+        """Requests a state of every drive, or of some by index."""
+        return [self._frame(n, self._layouts.set_axis_state, state) for n in self._of(drives)]
 
-    def clear_errors(self) -> list[can.Message]:
-        """Clears the errors of every drive."""
-        return [self._frame(node, self._layouts.clear_errors, 0) for node in self._nodes]
+    def clear_errors(self, drives: Iterable[int] | None = None) -> list[can.Message]:
+        """Clears the errors of every drive, or of some by index."""
+        return [self._frame(n, self._layouts.clear_errors, 0) for n in self._of(drives)]
+
+    def _of(self, drives: Iterable[int] | None) -> Sequence[int]:
+        return self._nodes if drives is None else [self._nodes[drive] for drive in drives]
 
     def _frame(self, node: int, layout: Layout, *values: float) -> can.Message:
         return SentFrame(can_id(node, layout.command), layout.pack(*values))

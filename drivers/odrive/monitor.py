@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 
 from drivers.can_load import HEARTBEATS_WAITED
-from drivers.odrive.messages import AxisState, Layout, Layouts, can_id, error_text, status_word
+from drivers.odrive.messages import (
+    AxisError,
+    AxisState,
+    Layout,
+    Layouts,
+    can_id,
+    error_text,
+    status_word,
+)
 from drivers.plausibility import ReplyCheck
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig
@@ -132,18 +140,37 @@ class OdriveMonitor:
         """Whether an axis follows set-points."""
         return AxisState.CLOSED_LOOP_CONTROL in self.states
 
-    def faults(self, *, powered: bool, enabled: bool) -> list[tuple[int, str]]:
+    def take_expired(self, drives: Container[int]) -> list[int]:
+        """Those of the drives whose only error is their watchdog; forgets it until reported again.
+
+        Args:
+            drives: By index.
+        """
+        expired = [
+            drive
+            for drive, errors in enumerate(self.errors)
+            if drive in drives and errors == AxisError.WATCHDOG_TIMER_EXPIRED
+        ]
+        for drive in expired:
+            self.errors[drive] = 0
+        return expired
+
+    def faults(
+        self, *, powered: bool, enabled: bool, at_rest: Container[int] = ()
+    ) -> list[tuple[int, str]]:
         """Present faults of the drives, by node.
 
         Args:
             powered: The group is under power or being enabled, so that silence is a fault.
             enabled: Every axis must be enabled.
+            at_rest: Drives, by index, whose axis was not armed. Their brakes hold, so an expired
+                watchdog is no fault; `take_expired` finds those to clear before arming.
         """
-        found = [
-            (node, f"{self._names[node]}: {error_text(errors)}")
-            for node, errors in zip(self.nodes, self.errors, strict=True)
-            if errors
-        ]
+        found = []
+        for drive, (node, errors) in enumerate(zip(self.nodes, self.errors, strict=True)):
+            excused = AxisError.WATCHDOG_TIMER_EXPIRED if drive in at_rest else 0
+            if errors & ~excused:
+                found.append((node, f"{self._names[node]}: {error_text(errors)}"))
         if enabled:
             found += [
                 (

@@ -1,11 +1,14 @@
 """EDS files: a drive's objects with access, ranges and defaults.
 
 Source: CiA 306. Common deviations of manufacturers' files are accepted: hexadecimal limits of
-signed types, `$NODEID` before or after the sum, other encodings than ASCII.
+signed types, `$NODEID` anywhere in a sum, suffixes of C, a decimal comma, limits that are none, an
+empty access type, blanks in headers, comments behind a value and by ``#`` or ``//``, free text
+outside of objects, other encodings than ASCII, and the end-of-file character of DOS.
 """
 
 from __future__ import annotations
 
+import codecs
 import configparser
 import re
 import struct
@@ -24,7 +27,11 @@ EDS_FOLDER = Path(__file__).parent / "eds"
 EDS_LIMIT = 4 * MEGABYTE
 """Largest size of a file, [bytes]; manufacturers' files have a tenth of it."""
 
-_SECTION = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
+_HEADER = re.compile(r"\[\s*([^]]*?)\s*\]")
+_SECTION = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2})|value|name)?$", re.IGNORECASE)
+_NUMBER = re.compile(r"(-?(?:0X[0-9A-F]{1,32}|[0-9]{1,32}))U?L{0,2}$", re.ASCII)
+_END = " \t\r\n\0\x1a"
+_NO_LIMIT = ("", "-", "N/A", "NONE")
 _RECORD, _ARRAY = 0x8, 0x9
 _REALS = {0x08: "<f", 0x11: "<d"}
 _SIGNED = {0x02: 1, 0x03: 2, 0x04: 4, 0x10: 3, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8}
@@ -117,30 +124,41 @@ def read_eds(path: Path) -> Eds:
         BadInput: The file cannot be read, has no objects, or contains an invalid line.
     """
     parser = configparser.ConfigParser(
-        interpolation=None, strict=False, delimiters=("=",), comment_prefixes=(";",)
+        interpolation=None,
+        strict=False,
+        delimiters=("=",),
+        comment_prefixes=(";",),
+        inline_comment_prefixes=(";",),
     )
     try:
-        parser.read_string(_text(path))
+        parser.read_string(_cleaned(_text(path)))
     except (OSError, configparser.Error) as error:
         raise BadInput(
             f"cannot be read as an EDS file: {_fault_of(error)}",
             where=str(path),
             next_step="pass an electronic data sheet (.eds) of CiA 306",
         ) from error
+    sections: dict[str, Mapping[str, str]] = {
+        name.lower(): parser[name] for name in parser.sections()
+    }
     objects: dict[Key, ObjectDescription] = {}
-    for section in parser.sections():
-        matched = _SECTION.match(section)
-        if matched:
-            where = f"{path}: [{section}]"
+    for name, section in sections.items():
+        matched = _SECTION.match(name)
+        if matched and not name.endswith(("value", "name")):
+            where = f"{path}: [{name}]"
             index, sub = int(matched[1], 16), int(matched[2] or "0", 16)
-            objects |= _described(index, sub, parser[section], where)
+            own = {
+                "defaultvalue": sections.get(f"{name}value", {}),
+                "parametername": sections.get(f"{name}name", {}),
+            }
+            objects |= _described(index, sub, section, own, where)
     if not any(index >= 0x6000 for index, _ in objects):
         raise BadInput(
             "has no object of a drive profile (6000h and above)",
             where=str(path),
             next_step="pass the EDS file of a CiA 402 drive",
         )
-    used = parser["DummyUsage"] if parser.has_section("DummyUsage") else {}
+    used = sections.get("dummyusage", {})
     dummies = {
         int(name[5:], 16)
         for name, value in used.items()
@@ -153,10 +171,26 @@ def read_eds(path: Path) -> Eds:
 
 def _text(path: Path) -> str:
     data = read_bytes(path, EDS_LIMIT)
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", "replace")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
+
+
+def _cleaned(text: str) -> str:
+    """The text without what only people read; every line keeps its number."""
+    lines, kept = [], True
+    for raw in text.rstrip(_END).replace("\r\n", "\n").replace("\r", "\n").split("\n"):
+        line = raw.strip()
+        header = _HEADER.match(line)
+        if header:
+            kept, line = bool(_SECTION.match(header[1])), f"[{header[1]}]"
+        elif line.startswith(("#", "//")) or not (kept or "=" in line or line.startswith("[")):
+            line = ""
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def _fault_of(error: OSError | configparser.Error) -> str:
@@ -168,13 +202,25 @@ def _fault_of(error: OSError | configparser.Error) -> str:
 
 
 def _described(
-    index: int, sub: int, section: Mapping[str, str], where: str
+    index: int,
+    sub: int,
+    section: Mapping[str, str],
+    own: Mapping[str, Mapping[str, str]],
+    where: str,
 ) -> dict[Key, ObjectDescription]:
-    """Objects of one section: a variable, or a compact array."""
+    """Objects of one section: a variable, or a compact array.
+
+    Args:
+        index: Of the section.
+        sub: Of the section.
+        section: Its keys and values.
+        own: Of a compact array: keys that differ between sub-objects, by key and sub-index.
+        where: The section, for messages.
+    """
     kind = _number(section.get("objecttype", ""), where)[0] or 0x7
     compact = _number(section.get("compactsubobj", ""), where)[0] or 0
     if not 0 <= compact <= 254:
-        raise BadInput(f"CompactSubObj {compact}: an object has 254 sub-objects", where=where)
+        raise _unfit(f"CompactSubObj {compact}: an object has 254 sub-objects", where)
     if kind in (_RECORD, _ARRAY) and not compact:
         return {}
     one = _variable(section, where)
@@ -184,20 +230,26 @@ def _described(
         "Highest sub-index supported", 1, False, True, False, False, False, compact, False, None,
         None,
     )  # fmt: skip
-    return {(index, 0): count} | {(index, number): one for number in range(1, compact + 1)}
+    found = {(index, 0): count} | {(index, number): one for number in range(1, compact + 1)}
+    for number in {entry for entries in own.values() for entry in entries if entry.isdecimal()}:
+        if not 1 <= int(number[:9]) <= compact:
+            raise _unfit(f"CompactSubObj {compact}: there is no sub-object {number[:40]}", where)
+        changes = {key: entries[number] for key, entries in own.items() if number in entries}
+        found[index, int(number)] = _variable({**section, **changes}, where)
+    return found
 
 
 def _variable(section: Mapping[str, str], where: str) -> ObjectDescription:
     kind = _number(section.get("datatype", ""), where)[0] or _UNSIGNED_8
-    access = section.get("accesstype", "rw").strip().lower()
+    access = section.get("accesstype", "").strip().lower() or "rw"
     if access not in ("ro", "wo", "rw", "rwr", "rww", "const"):
-        raise BadInput(f"the access type {access!r} does not exist", where=where)
+        raise _unfit(f"the access type {access[:40]!r} does not exist", where)
     length, signed = _SIGNED.get(kind) or _UNSIGNED.get(kind, 0), kind in _SIGNED
     default, of_node = _default(section.get("defaultvalue", ""), kind, length, where)
-    mappable = section.get("pdomapping", "0").strip() == "1"
+    mappable = bool(_number(section.get("pdomapping", ""), where)[0])
     readable, writable = access != "wo", access not in ("ro", "const")
     limits = [
-        _limit(section.get(name, ""), length, signed, where) for name in ("lowlimit", "highlimit")
+        _limit(section.get(name, ""), kind, length, where) for name in ("lowlimit", "highlimit")
     ]
     return ObjectDescription(
         section.get("parametername", ""),
@@ -207,47 +259,58 @@ def _variable(section: Mapping[str, str], where: str) -> ObjectDescription:
         writable,
         mappable and writable and access != "rwr",
         mappable and readable and access != "rww",
-        _wrapped(default, length, signed) if isinstance(default, int) else default,
+        default,
         of_node,
         *limits,
     )
 
 
 def _default(text: str, kind: int, length: int, where: str) -> tuple[int | bytes, bool]:
+    """The default, and whether the node id is added."""
     if not length:
         return text.strip().encode("latin-1", "replace"), False
     if kind in _REALS and text.strip() and not text.strip().lower().startswith("0x"):
-        return int.from_bytes(struct.pack(_REALS[kind], float(text)), "little"), False
+        try:
+            data = struct.pack(_REALS[kind], float(text.replace(",", ".", 1)))
+        except (ValueError, OverflowError):
+            raise _unfit(f"{text.strip()[:40]!r} is not a real number", where) from None
+        return int.from_bytes(data, "little"), False
     value, of_node = _number(text, where)
-    return value or 0, of_node
+    value, size = value or 0, 1 << 8 * length
+    if not -(size >> 1) <= value < size:
+        raise _unfit(f"the default {text.strip()[:40]} needs more than {length} bytes", where)
+    return _wrapped(value % size, length, kind in _SIGNED), of_node
 
 
-def _limit(text: str, length: int, signed: bool, where: str) -> int | None:
-    if not length:
+def _limit(text: str, kind: int, length: int, where: str) -> int | None:
+    if not length or kind in _REALS or text.strip().upper() in _NO_LIMIT:
         return None
     try:
-        value = _number(text, where)[0]
+        value, of_node = _number(text, where)
     except BadInput:
         if "." in text:  # a real number
             return None
         raise
-    return None if value is None else _wrapped(value, length, signed)
+    return None if value is None or of_node else _wrapped(value, length, kind in _SIGNED)
 
 
 def _number(text: str, where: str) -> tuple[int | None, bool]:
-    """The value, None if empty; and whether the node id is added."""
-    plain = text.strip().upper().replace(" ", "")
-    of_node = "$NODEID" in plain
-    plain = plain.replace("$NODEID", "").strip("+")
-    if not plain:
-        return (0 if of_node else None), of_node
-    try:
-        return int(plain, 16 if plain.startswith(("0X", "-0X")) else 10), of_node
-    except ValueError:
-        raise BadInput(f"{text.strip()!r} is not a number", where=where) from None
+    """The value of a sum, None if empty; and whether the node id is added."""
+    terms = [term for term in re.sub(r"[\s()]", "", text.upper()).split("+") if term]
+    numbers = [_NUMBER.match(term) for term in terms if term != "$NODEID"]
+    value = 0
+    for matched in numbers:
+        if matched is None:
+            raise _unfit(f"{text.strip()[:40]!r} is not a number", where)
+        value += int(matched[1], 16 if "X" in matched[1] else 10)
+    return value if terms else None, len(numbers) < len(terms)
 
 
 def _wrapped(value: int, length: int, signed: bool) -> int:
     """Value as a signed integer; 0xFF of a signed byte is −1."""
     bits = 8 * length
     return value - (1 << bits) if signed and value >= 1 << (bits - 1) else value
+
+
+def _unfit(what: str, where: str) -> BadInput:
+    return BadInput(what, where=where, next_step="correct it in a copy, and pass that with --eds")

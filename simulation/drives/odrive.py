@@ -5,7 +5,8 @@ the axis is disarmed, by the master, its watchdog or an error, the torque is rem
 closes.
 
 Source: ODrive documentation, "CAN Protocol" (firmware 0.6). Assumptions where it is not specific:
-the watchdog runs while the axis is enabled; errors prevent enabling.
+the watchdog runs while the axis is enabled (`OdriveSettings.watchdog_at_rest` changes that); errors
+prevent enabling.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from drivers.can_bus import receive_frame
 from drivers.odrive.endpoints import read_endpoints
 from drivers.odrive.messages import (
+    BROADCAST,
     OWN_DBC,
     AxisError,
     AxisState,
@@ -58,6 +60,7 @@ class OdriveSettings:
         heartbeat: Period, [s].
         estimates: Period, [s].
         torques: Period, [s].
+        watchdog_at_rest: The watchdog also runs while the axis is idle, as in firmware 0.5.
         firmware: Major, minor, revision.
         values: Other endpoints by number, as four raw bytes.
         stuck: Endpoints that ignore writes (set by tests).
@@ -67,6 +70,7 @@ class OdriveSettings:
     heartbeat: float
     estimates: float
     torques: float
+    watchdog_at_rest: bool = False
     firmware: tuple[int, int, int] = (0, 6, 11)
     values: dict[int, int] = field(default_factory=dict)
     stuck: set[int] = field(default_factory=set)
@@ -155,6 +159,7 @@ class SimulatedOdrive:
             return
         if self.torque_on:
             self.motor.follow(self._target, 0.0, elapsed, self._limited_direction())
+        if self.torque_on or self.settings.watchdog_at_rest:
             self._unfed += elapsed
             watchdog = self.settings.watchdog
             if watchdog is not None and self._unfed > watchdog + 1e-9:
@@ -224,7 +229,7 @@ class SimulatedOdrive:
         self.fail(AxisError.ESTOP_REQUESTED)
 
     def _answer(self, command: int) -> None:
-        """Answers a request, which is a message without data."""
+        """Answers a request, which is a remote frame or a data frame without data."""
         if command == self._layouts.estop.command:  # the only command without data
             self._estop()
         elif command == self._layouts.get_version.command:
@@ -319,11 +324,14 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
             self._begin_torque_update()
 
     def _handle(self, message: can.Message) -> None:
-        if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
+        if message.is_extended_id or message.is_error_frame:
             return
         node, command = node_and_command(message.arbitration_id)
-        drive = self._by_node.get(node)
-        if drive is not None:
+        if node == BROADCAST:
+            addressed = self.drives
+        else:
+            addressed = (self._by_node[node],) if node in self._by_node else ()
+        for drive in addressed:
             drive.receive(command, message.data)
 
 

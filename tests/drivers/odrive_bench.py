@@ -12,7 +12,7 @@ from typing import Any
 
 import can
 
-from drivers.can_bus import BusSettings, open_bus
+from drivers.can_bus import BusSettings, InProcessBus, open_bus
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.odrive.endpoints import wanted_settings
 from drivers.odrive.group import OdriveGroup
@@ -87,11 +87,12 @@ class OdriveBench:
 
 
 @contextmanager
-def odrive_bench(rig: Rig | None = None) -> Iterator[OdriveBench]:
-    """Drives at home, not configured."""
+def odrive_bench(rig: Rig | None = None, echo: bool = False) -> Iterator[OdriveBench]:
+    """Drives at home, not configured; with ``echo`` the master receives its own frames."""
     rig = rig or odrive_rig()
     settings = BusSettings("virtual", f"odrive-{next(_CHANNELS)}")
-    with open_bus(settings) as master, open_bus(settings) as far, open_bus(settings) as ear:
+    own = InProcessBus(settings.channel, receive_own_messages=echo)
+    with own as master, open_bus(settings) as far, open_bus(settings) as ear:
         rehearsal = SimulatedOdriveRig(rig, far, rig.home)
         yield OdriveBench(
             rig, OdriveGroup(rig, master, rehearsal.pump, max_tension=None), rehearsal, ear

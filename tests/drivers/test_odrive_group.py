@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,8 +12,10 @@ import can
 import numpy as np
 import pytest
 
+from drivers import cyclic_group
 from drivers.drive_group import GroupCommand, GroupState
 from drivers.factory import drive_states, read_drives
+from drivers.odrive import configure
 from drivers.odrive.configure import check_resolution
 from drivers.odrive.endpoints import read_endpoints, wanted_settings
 from drivers.odrive.messages import AxisError, AxisState, can_id, node_and_command
@@ -219,15 +223,158 @@ def test_messages_at_other_periods_than_the_cycle_are_not_missing() -> None:
             assert status.state is GroupState.ENABLED, status.faults
 
 
-def test_another_program_that_commands_a_drive_is_a_fault_of_the_bus(bench: OdriveBench) -> None:
-    bench.enable()
-    bench.ear.send(can.Message(arbitration_id=can_id(3, SET_INPUT_POS), data=bytes(8)))
+READ, WRITE = b"\0", b"\1"
+COMMANDED: dict[str, tuple[int, bytes]] = {
+    # ODrive, "CAN Protocol": every message from host to drive, by number
+    "Estop": (0x02, b""),
+    "RxSdo": (0x04, WRITE + bytes(7)),
+    "Address": (0x06, b"\x09" + bytes(6)),
+    "Set_Axis_State": (0x07, struct.pack("<I", 1)),
+    "Set_Controller_Mode": (0x0B, struct.pack("<II", 2, 1)),
+    "Set_Input_Pos": (0x0C, bytes(8)),
+    "Set_Input_Vel": (0x0D, struct.pack("<ff", 0.2, 0.0)),
+    "Set_Input_Torque": (0x0E, bytes(4)),
+    "Set_Limits": (0x0F, struct.pack("<ff", 1000.0, 100.0)),
+    "Set_Traj_Vel_Limit": (0x11, bytes(4)),
+    "Set_Traj_Accel_Limits": (0x12, bytes(8)),
+    "Set_Traj_Inertia": (0x13, bytes(4)),
+    "Reboot": (0x16, b""),
+    "Clear_Errors": (0x18, b"\0"),
+    "Set_Absolute_Position": (0x19, bytes(4)),
+    "Set_Pos_Gain": (0x1A, bytes(4)),
+    "Set_Vel_Gains": (0x1B, bytes(8)),
+    "Enter_DFU_Mode": (0x1F, b""),
+}
+HARMLESS: dict[str, tuple[int, bytes, bool]] = {
+    "asking by remote frame": (0x09, b"", True),
+    "asking by an empty frame": (0x1C, b"", False),
+    "reading a setting": (0x04, READ + bytes(3), False),
+    "asking who is there": (0x06, b"", True),
+    "asking who is there without a remote frame": (0x06, b"", False),
+}
+
+
+def other_program(bench: OdriveBench, node: int, command: int, data: bytes, **more: bool) -> None:
     bench.ear.send(
-        can.Message(arbitration_id=can_id(3, SET_INPUT_POS), data=bytes(8), is_extended_id=False)
+        can.Message(arbitration_id=can_id(node, command), data=data, is_extended_id=False, **more)
     )
-    with pytest.raises(Fault, match="another program commands drive 3"):
+
+
+@pytest.mark.parametrize("node", [3, 0x3F], ids=["one", "all"])
+@pytest.mark.parametrize("name", COMMANDED)
+def test_another_program_that_commands_drives_is_a_fault_of_the_bus_at_once(
+    bench: OdriveBench, name: str, node: int
+) -> None:
+    bench.enable()
+    command, data = COMMANDED[name]
+    bench.ear.send(can.Message(arbitration_id=can_id(node, command), data=data))  # another 29 bits
+    bench.cycle()
+    other_program(bench, node, command, data)
+    drives = "all drives" if node == 0x3F else "drive 3"
+    with pytest.raises(Fault) as caught:
         bench.cycle()
+    assert caught.value.code == "foreign_master"
+    assert caught.value.what == f"another program commands {drives} ({name})"
     assert bench.group.state is GroupState.FAULT
+
+
+@pytest.mark.parametrize("node", [3, 0x3F], ids=["one", "all"])
+@pytest.mark.parametrize("name", HARMLESS)
+def test_another_program_that_only_reads_is_no_fault(
+    bench: OdriveBench, name: str, node: int
+) -> None:
+    bench.enable()
+    command, data, remote = HARMLESS[name]
+    other_program(bench, node, command, data, is_remote_frame=remote)
+    other_program(bench, node, 0x06, bytes([node]) + bytes(6))  # a drive tells its own node id
+    assert bench.cycles(20).state is GroupState.ENABLED
+
+
+@pytest.mark.parametrize("name", COMMANDED)
+def test_another_program_that_commands_during_configuration_is_a_fault(
+    bench: OdriveBench, name: str
+) -> None:
+    other_program(bench, 0x3F, *COMMANDED[name])
+    with pytest.raises(Fault, match=rf"another program commands all drives \({name}\)"):
+        bench.group.configure()
+
+
+def test_where_the_master_hears_itself_its_own_frames_are_not_anothers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As over UDP multicast; each echo excuses one frame and no more."""
+    for module in (cyclic_group, configure):
+        monkeypatch.setattr(module, "echoes_own_frames", lambda _bus: True)
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    with odrive_bench(odrive_rig(endpoints=str(file)), echo=True) as bench:
+        bench.drives[2].errors = AxisError.WATCHDOG_TIMER_EXPIRED
+        assert bench.enable().state is GroupState.ENABLED
+        other_program(bench, 3, 0x04, READ + bytes(3))
+        assert bench.cycles(5).state is GroupState.ENABLED
+        other_program(bench, 3, *COMMANDED["Set_Input_Pos"])
+        with pytest.raises(Fault, match="another program commands drive 3"):
+            bench.cycle()
+
+
+def test_requests_are_remote_frames(bench: OdriveBench) -> None:
+    """A data frame of the identifier that a drive sends could collide with its own."""
+    bench.group.configure()
+    asked = [m for m in bench.frames() if m.is_remote_frame or not m.data]
+    assert all(m.is_remote_frame and not m.is_extended_id for m in asked)
+    assert {node_and_command(m.arbitration_id) for m in asked} == {
+        (winch.node_id, command) for winch in bench.rig.winches for command in (0x00, 0x17)
+    }
+
+
+@pytest.mark.parametrize("waits", [0, 3, 30, 200])
+def test_a_watchdog_that_runs_at_rest_is_cleared_before_arming(
+    bench: OdriveBench, waits: int
+) -> None:
+    """As in firmware 0.5; the brakes hold all cables."""
+    for drive in bench.drives:
+        drive.settings.watchdog_at_rest = True
+    bench.rehearsal.advance(1.0)
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.rehearsal.advance(waits * 0.001)  # the operator thinks
+    bench.group.command(GroupCommand.ENABLE)
+    for _ in range(30):
+        status = bench.cycle()
+    assert status.state is GroupState.ENABLED
+    assert status.faults == ()
+    bench.group.command(GroupCommand.QUICK_STOP)
+    status = bench.cycles(60)
+    assert status.stopped
+    assert status.faults == ()
+    assert bench.enable().state is GroupState.ENABLED, "and again"
+    bench.rehearsal.advance(0.2)  # the master is late
+    status = bench.cycles(2)
+    assert status.state is GroupState.FAULT
+    assert "watchdog" in status.faults[0][1]
+
+
+def test_a_watchdog_that_stays_expired_is_a_drive_that_is_not_enabled(
+    bench: OdriveBench,
+) -> None:
+    bench.drives[5].settings.watchdog_at_rest = True
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    bench.drives[5].fail(AxisError.WATCHDOG_TIMER_EXPIRED)
+    del bench.drives[5]._commands[0x18]  # Clear_Errors
+    status = bench.cycles(105)
+    assert status.state is GroupState.FAULT
+    assert status.faults[0][1].startswith("cable 6 (drive 6) stays idle instead of closed loop")
+
+
+def test_another_error_is_neither_cleared_nor_excused_before_arming(bench: OdriveBench) -> None:
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.drives[5].fail(AxisError.WATCHDOG_TIMER_EXPIRED | 0x2000)
+    bench.group.command(GroupCommand.ENABLE)
+    status = bench.cycles(8)
+    assert status.state is GroupState.FAULT
+    assert bench.drives[5].errors == AxisError.WATCHDOG_TIMER_EXPIRED | 0x2000
 
 
 def test_a_drive_that_is_not_calibrated_is_named_and_no_other_stays_enabled(
@@ -349,6 +496,7 @@ def test_endpoints_of_another_firmware_are_refused(tmp_path: Path) -> None:
         "[]",
         '{"fw_version": "0.6.11", "endpoints": {}}',
         '{"fw_version": "9e99.6.11", "endpoints": {}}',
+        '{"fw_version": "0.6", "endpoints": {}}',
         '{"fw_version": "0.6.11", "endpoints": {"axis0.config.watchdog_timeout": 3}}',
         *(
             '{"fw_version": "0.6.11", "endpoints": {"axis0.config.watchdog_timeout":'
@@ -361,7 +509,34 @@ def test_a_file_that_holds_no_endpoints_is_refused(tmp_path: Path, text: str) ->
     document: Any = odrive_rig().document.drives
     path = tmp_path / "endpoints.json"
     path.write_text(text)
-    with pytest.raises(BadInput, match=r"lacks required endpoints|not valid JSON|finite"):
+    with pytest.raises(BadInput, match=r"lacks required endpoints|not valid JSON|finite") as caught:
+        read_endpoints(path, document)
+    assert "Error(" not in str(caught.value), "no error of a library"
+
+
+@pytest.mark.parametrize("lacking", range(9))
+def test_a_firmware_without_a_required_setting_is_refused_by_both_names(
+    tmp_path: Path, lacking: int
+) -> None:
+    document: Any = odrive_rig().document.drives
+    path = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig(), "0.6.3-1")
+    content = json.loads(path.read_text())
+    name = wanted_settings(document)[lacking].name
+    del content["endpoints"][name]
+    path.write_text(json.dumps(content))
+    with pytest.raises(BadInput) as caught:
+        read_endpoints(path, document)
+    assert caught.value.what == f"the file lacks required endpoints: {name}"
+    assert "firmware 0.6.3-1" in caught.value.why
+    assert "leave out drives.endpoints" in caught.value.next_step
+
+
+def test_an_endpoint_of_an_unknown_type_is_named(tmp_path: Path) -> None:
+    document: Any = odrive_rig().document.drives
+    path = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    path.write_text(path.read_text().replace('"bool"', '"endpoint_ref"'))
+    words = "axis0.config.enable_watchdog has the type 'endpoint_ref'"
+    with pytest.raises(BadInput, match=words):
         read_endpoints(path, document)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import canopen
@@ -144,6 +145,99 @@ def test_a_makers_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
     assert eds.dummies == {5}
 
 
+PLAIN = """[FileInfo]
+FileName=maker.eds
+[Comments]
+Lines=1
+Line1=made by hand
+[6040]
+ParameterName=Controlword
+ObjectType=0x7
+DataType=0x0006
+AccessType=rww
+DefaultValue=0x0F
+PDOMapping=1
+[6085]
+ParameterName=Quick stop
+DataType=0x0007
+AccessType=rw
+LowLimit=
+HighLimit=0xFFFFFFFF
+DefaultValue=6000
+[1400sub1]
+DataType=0x0007
+AccessType=rw
+DefaultValue=$NODEID+0x40000200
+"""
+"""A file as CiA 306 has it."""
+
+DEVIATIONS: dict[str, Callable[[str], str]] = {
+    "end of file of DOS": lambda t: t + "\x1a\n",
+    "lines of DOS": lambda t: t.replace("\n", "\r\n"),
+    "lines of old Macs": lambda t: t.replace("\n", "\r"),
+    "free text in remarks": lambda t: t.replace("[6040]", "see the manual\n[6040]"),
+    "free text in the head": lambda t: t.replace("[Comments]", "version of May\n[Comments]"),
+    "comment of a shell": lambda t: "# generated\n" + t.replace("[6085]", "# next\n[6085]"),
+    "comment of C": lambda t: "// generated\n" + t.replace("AccessType", "// who\nAccessType"),
+    "comment behind a value": lambda t: t.replace("=0x0006", "=0x0006 ; U16"),
+    "comment behind a header": lambda t: t.replace("[6085]", "[6085] ; deceleration"),
+    "blanks in a header": lambda t: t.replace("[6085]", "[ 6085 ]").replace("sub1]", "sub1\t]"),
+    "blanks about keys": lambda t: t.replace("=", " =\t"),
+    "capitals": lambda t: t.replace("sub1", "SUB1").replace("rww", "RWW").replace("0xF", "0XF"),
+    "indented": lambda t: t.replace("DataType", "\t\tDataType").replace("Access", "    Access"),
+    "node id in brackets": lambda t: t.replace("$NODEID+0x40000200", "($NODEID + 0x40000200)"),
+    "node id last": lambda t: t.replace("$NODEID+0x40000200", "0x40000200 + $NodeId"),
+    "node id between": lambda t: t.replace("$NODEID+0x40000200", "0x200+$NODEID+0x40000000"),
+    "suffixes of C": lambda t: t.replace("FFFFF\n", "FFFFFUL\n").replace("=6000", "=6000L"),
+    "a limit that is none": lambda t: t.replace("LowLimit=", "LowLimit=-"),
+    "a limit not applicable": lambda t: t.replace("LowLimit=", "LowLimit=n/a"),
+    "no access type": lambda t: t.replace("AccessType=rw\n", "AccessType=\n"),
+    "repeated": lambda t: t + t[t.index("[6040]") :],
+}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+@pytest.mark.parametrize("name", DEVIATIONS)
+def test_a_deviation_changes_nothing(tmp_path: Path, name: str, encoding: str) -> None:
+    plain, other = tmp_path / "plain.eds", tmp_path / "other.eds"
+    plain.write_text(PLAIN)
+    text = DEVIATIONS[name](PLAIN)
+    assert text != PLAIN
+    other.write_bytes(text.replace("made by hand", "de Müller").encode(encoding))
+    expected = read_eds(plain).objects
+    assert expected.keys() == {(0x6040, 0), (0x6085, 0), (0x1400, 1)}
+    assert read_eds(other).objects == expected
+
+
+def test_sub_objects_of_a_compact_array_have_values_and_names_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "compact.eds"
+    path.write_text(
+        PLAIN
+        + "[1016]\nParameterName=Heartbeat\nObjectType=8\nDataType=7\nAccessType=rw\n"
+        + "DefaultValue=1\nCompactSubObj=12\n"
+        + "[1016Value]\nNrOfEntries=2\n2=0x7F0064\n12=$NODEID+5\n"
+        + "[1016NAME]\nNrOfEntries=1\n2=Of the master\n"
+    )
+    drive, objects = DriveObjects(read_eds(path), 9), read_eds(path).objects
+    values = [drive[0x1016, sub] for sub in range(13)]
+    assert values == [12, 1, 0x7F0064, 1, 1, 1, 1, 1, 1, 1, 1, 1, 14]
+    assert [objects[0x1016, sub].name for sub in (1, 2)] == ["Heartbeat", "Of the master"]
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1.5", 1.5), ("1,5", 1.5), ("-2", -2.0), ("1e3", 1000.0), ("0x3FC00000", 1.5), ("", 0.0)],
+)
+def test_defaults_of_real_numbers(tmp_path: Path, text: str, value: float) -> None:
+    path = tmp_path / "real.eds"
+    path.write_text(
+        PLAIN + f"[2000]\nDataType=8\nDefaultValue={text}\nLowLimit=0,1\nHighLimit=10\n"
+    )
+    described = read_eds(path).objects[0x2000, 0]
+    assert described.default == int.from_bytes(struct.pack("<f", value), "little")
+    assert (described.low, described.high) == (None, None)
+
+
 @pytest.mark.parametrize(
     ("unit", "counts"),
     [
@@ -199,6 +293,19 @@ def test_it_says_that_it_is_simulated_whatever_the_file_says(tmp_path: Path) -> 
         ("[6040]\nDataType=0x6\nAccessType=never\n", "access type"),
         ("[6040]\nDataType=0x6\nDefaultValue=many\n", "not a number"),
         ("[6040]\nDataType=sixteen\n", "not a number"),
+        ("[6040]\nDataType=0x6\nDefaultValue=1000h\n", r"\[6040\]: '1000h' is not a number"),
+        ("[6040]\nDataType=0x6\nDefaultValue=2*$NODEID\n", "not a number"),
+        ("[6040]\nDataType=0x6\nDefaultValue=65536\n", "65536 needs more than 2 bytes"),
+        ("[6040]\nDataType=0x6\nDefaultValue=-32769\n", "-32769 needs more than 2 bytes"),
+        ("[6040]\nDataType=0x6\nHighLimit=large\n", "'large' is not a number"),
+        ("[6040]\nDataType=0x6\nPDOMapping=perhaps\n", "'perhaps' is not a number"),
+        ("[6040]\nDataType=0x8\nDefaultValue=1.234,5\n", "'1.234,5' is not a real number"),
+        ("[6040]\nDataType=0x8\nDefaultValue=1e300\n", "'1e300' is not a real number"),
+        ("[Comments]\n[6040\nDataType=0x6\n", "EDS file: .*line 2\n"),
+        (
+            "[6040]\nObjectType=8\nCompactSubObj=2\nDataType=7\n[6040Value]\n3=1\n",
+            "CompactSubObj 2: there is no sub-object 3",
+        ),
     ],
 )
 def test_a_file_that_cannot_be_used_says_why(tmp_path: Path, text: str, says: str) -> None:
