@@ -6,16 +6,14 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import can
-
-from drivers.can_errors import in_fault, moved_by_another, wrong_setting
+from drivers.can_errors import SETTING_UP, in_fault, moved_by_another, wrong_setting
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
+from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.profile import load_profile, profile_names
-from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent
+from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent, silent
 from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
-from drivers.drive_group import Pump
-from model.errors import CdprError, Refused
+from model.errors import HardwareMissing, Refused
 from model.files.drive_profile_file import (
     NEEDED,
     OBJECTS,
@@ -157,7 +155,50 @@ def how_without(index: int, sub: int) -> str:
     return own + known
 
 
-# Checks of one drive before anything is written.
+# Checks of the drives before anything is written.
+
+
+def require_answers(network: SetupNetwork, nodes: Sequence[int], *, revive: bool = False) -> None:
+    """Contacts all drives at once, and reports all silent ones together.
+
+    Args:
+        network: The bus.
+        nodes: The drives.
+        revive: Takes drives that are in NMT *stopped* to *pre-operational*.
+
+    Raises:
+        HardwareMissing: Drives do not answer.
+        Refused: Drives are in NMT *stopped*, or the single silent drive gives a wrong answer.
+    """
+    nothing = network.silent_nodes(nodes)
+    stopped = [node for node in nothing if network.is_stopped(node)]
+    if stopped and revive:
+        for node in stopped:
+            network.command(NmtCommand.PRE_OPERATIONAL, node)
+        nothing = network.silent_nodes(nothing)
+    elif stopped:
+        names = ", ".join(str(node) for node in stopped)
+        raise Refused(
+            f"drive {names}: in the NMT state 'stopped', by its heartbeat",
+            where=SETTING_UP,
+            why="another program, or the drive's own reaction to a communication error (1029h),"
+            " stopped its communication",
+            next_step="end other programs, then run `cdpr reset RIG`",
+            values={"nodes": names},
+        )
+    if len(nothing) == 1:
+        where = f"drive {nothing[0]}, object 1000h:00 device type"
+        raise network.client(nothing[0]).no_answer(where)
+    if nothing:
+        names = ", ".join(str(node) for node in nothing)
+        first = silent(nothing[0], SETTING_UP)
+        raise HardwareMissing(
+            f"drives {names} do not answer",
+            where=SETTING_UP,
+            why=first.why,
+            next_step=first.next_step,
+            values={"nodes": names},
+        )
 
 
 def require_expected(network: SetupNetwork, node: int, expected: Expectation) -> None:
@@ -319,23 +360,23 @@ def wrong_value(node: int, name: str, found: str, wanted: str, why: str) -> Refu
 SIMULATED = b"cdpr simulated drive"
 
 
-def are_simulated(bus: can.BusABC, pump: Pump | None, nodes: Sequence[int]) -> bool:
+def are_simulated(network: SetupNetwork, nodes: Sequence[int]) -> bool:
     """Whether every drive has the device name of a simulated one.
 
-    Reads the drives in turn up to the first real one. A drive that does not answer counts as real;
-    the following configuration reports what is wrong.
+    Reads the drives in turn up to the first real one. A drive that does not answer counts as real.
 
-    Args:
-        bus: An open bus.
-        pump: As for `drivers.factory.make_drive_group`.
-        nodes: All drives.
+    Raises:
+        Refused: Another master is active, or a drive restarted.
+        Fault: The bus failed.
     """
-    network = SetupNetwork(bus, pump, nodes)
-    network.discard_waiting()
     try:
         return all(
             network.client(node).read_if_there(0x1008, 0, "manufacturer device name") == SIMULATED
             for node in nodes
         )
-    except CdprError:
+    except HardwareMissing:
+        return False
+    except Refused as error:
+        if "node" not in error.values:
+            raise
         return False

@@ -10,7 +10,6 @@ import numpy as np
 from drivers.can_bus import SentFrame
 from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.configure import configure_drives
-from drivers.cia402.expected_objects import are_simulated
 from drivers.cia402.monitor import DriveMonitor
 from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_message
 from drivers.cia402.profile import profile_of
@@ -158,8 +157,9 @@ class Cia402Group(CyclicGroup):
             to_reset=to_reset,
             on_restarted=take,
         )
-        self._heartbeats = done.heartbeats
-        self._simulated = are_simulated(self._bus, self._pump, self._nodes)
+        self._heartbeats, self._simulated = done.heartbeats, done.simulated
+        for can_id, data in done.emergencies.items():  # they may explain a state
+            self._watch.take(can_id, data)
         self._state = GroupState.CONFIGURED
         return done.remarks
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import can
 import numpy as np
 
-from drivers.cia402.configure import is_still_set_up, require_answers, require_objects
+from drivers.cia402.configure import is_still_set_up, require_objects
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
     BY_MAKERS_TOOL,
@@ -23,6 +23,7 @@ from drivers.cia402.expected_objects import (
     how_to_set,
     how_without,
     position_range,
+    require_answers,
 )
 from drivers.cia402.object_dictionary import (
     HEARTBEAT_CONSUMERS,

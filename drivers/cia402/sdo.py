@@ -18,9 +18,16 @@ from math import ceil
 import can
 
 from drivers.can_bus import echoes_own_frames, receive_frame, transmit
-from drivers.can_errors import SETTING_UP, EchoFilter, ForeignMaster, error_frame_fault
+from drivers.can_errors import (
+    SETTING_UP,
+    DriveRestarted,
+    EchoFilter,
+    ForeignMaster,
+    error_frame_fault,
+)
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import (
+    EMCY_BASE,
     HEARTBEAT_BASE,
     MASTER_NODE,
     NMT_ID,
@@ -77,7 +84,11 @@ class _NoAnswer(Exception):
 
 
 class SetupNetwork:
-    """The bus during configuration: sends NMT and SDO frames and receives the replies."""
+    """The bus during configuration: sends NMT and SDO frames and receives the replies.
+
+    Attributes:
+        emergencies: Data of the last EMCY of each drive, by identifier.
+    """
 
     def __init__(
         self,
@@ -101,6 +112,8 @@ class SetupNetwork:
         self.timeout, self.clock = timeout, clock
         self._clients: dict[int, Client] = {}
         self._states: dict[int, int | None] = {}
+        self._nodes, self._refuses_restarts = frozenset(nodes), False
+        self.emergencies: dict[int, bytes] = {}
         self._own = EchoFilter(
             set_up_ids(nodes), echoes_own_frames=echoes_own_frames(bus), batch=len(nodes)
         )
@@ -114,6 +127,10 @@ class SetupNetwork:
     def is_stopped(self, node: int) -> bool:
         """Whether the node's last heartbeat says NMT *stopped*, where it answers no SDO."""
         return self._states.get(node) == NmtState.STOPPED
+
+    def refuse_restarts(self) -> None:
+        """From now on a drive's boot-up is a `DriveRestarted`; until now it merely started."""
+        self._refuses_restarts = True
 
     def command(self, command: NmtCommand, node: int) -> None:
         """Sends an NMT command to one node."""
@@ -171,7 +188,7 @@ class SetupNetwork:
         """Processes one frame; False if none arrives within the time [s].
 
         Raises:
-            Refused: The frame is another master's.
+            Refused: The frame is another master's, or a drive's that restarted.
             BusFault: The bus failed.
         """
         if self._pump is not None:
@@ -188,7 +205,11 @@ class SetupNetwork:
             self._refuse_foreign(message.arbitration_id)
             node = message.arbitration_id - HEARTBEAT_BASE
             if 0 < node < MASTER_NODE:
-                self._states[node] = parse_heartbeat(message.data)
+                state = self._states[node] = parse_heartbeat(message.data)
+                if state == NmtState.BOOT_UP and self._refuses_restarts and node in self._nodes:
+                    raise DriveRestarted(node)
+            if message.arbitration_id - EMCY_BASE in self._nodes:
+                self.emergencies[message.arbitration_id] = bytes(message.data)
             client = self._clients.get(message.arbitration_id - SDO_REPLY_BASE)
             if client is not None:
                 client.take(bytes(message.data))

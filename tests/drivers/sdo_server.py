@@ -75,7 +75,8 @@ class ScriptedDrive:
             return struct.pack("<BHBI", 0x80, index, sub, code)
         if command != 0x40:
             return struct.pack("<BHBI", 0x60, index, sub, 0)
-        data = struct.pack(self.form(key), self._value(key))
+        is_text = self.objects[key].data_type == canopen.objectdictionary.VISIBLE_STRING
+        data = b"EDS" if is_text else struct.pack(self.form(key), self._value(key))
         return struct.pack("<BHB", 0x43 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0")
 
     def _value(self, key: Key) -> int:

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.cia402.object_dictionary import PDO_NO_RTR, Setting, settings_for
-from drivers.cia402.pdo import NmtState
+from drivers.cia402.pdo import NmtCommand, NmtState
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import GroupCommand, GroupState
@@ -211,6 +211,96 @@ def test_a_drive_power_cycled_since_its_configuration_is_reported(bench: Bench) 
     bench.drives[4].power_on()
     bench.group.configure()
     assert bench.group.restarted == (5,)
+
+
+def restart(drive: SimulatedDrive) -> None:
+    """With its process data and mode stored by the maker's tool, so that it answers SYNC."""
+    kept = {
+        key: value
+        for key, value in drive.objects.values().items()
+        if (0x1400 <= key[0] < 0x1C00 or key == (0x6060, 0)) and isinstance(value, int)
+    }
+    drive.power_on()
+    for key, value in kept.items():
+        drive.objects[key] = value
+
+
+def restarts_after(drive: SimulatedDrive, writes: int) -> None:
+    """It restarts once, after this many downloads, or after START with 0."""
+    take, command, left = drive.on_sdo, drive.on_nmt, [writes or -1]
+
+    def on_sdo(data: bytes) -> None:
+        take(data)
+        if data[0] & 0xE0 == 0x20 and left[0] > 0:
+            left[0] -= 1
+            if not left[0]:
+                restart(drive)
+
+    def on_nmt(code: int, node: int) -> None:
+        command(code, node)
+        if code == NmtCommand.START and node == drive.node and left[0] < 0:
+            left[0] = 0
+            restart(drive)
+            command(code, node)  # a drive that starts itself (1F80h)
+
+    drive.on_sdo, drive.on_nmt = on_sdo, on_nmt  # type: ignore[method-assign,assignment]
+
+
+@pytest.mark.parametrize("writes", [0, 1, 15, 22, 30, 31, 36, 40])
+@pytest.mark.parametrize("node", [3, 8])
+def test_a_drive_that_restarts_during_its_set_up_is_refused(
+    bench: Bench, node: int, writes: int
+) -> None:
+    """It was enabled without abort option, quick stop option and supervision."""
+    reported: list[tuple[int, ...]] = []
+    bench.group.configure()
+    restarts_after(bench.drives[node - 1], writes)
+    with pytest.raises(Refused, match=f"drive {node} restarted during set-up"):
+        bench.group.configure(on_restarted=reported.append)
+    assert reported == [(), (node,)], "an incremental encoder has lost its reference"
+    assert bench.group.restarted == (node,)
+    with pytest.raises(Refused, match="not configured"):
+        bench.group.command(GroupCommand.ENABLE)
+    bench.control_words()
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    bench.until(GroupState.ENABLED)
+    assert bench.drives[node - 1].objects[0x6007, 0] == 3
+
+
+def test_a_restart_after_start_shows_without_its_boot_up_too(bench: Bench) -> None:
+    drive = bench.drives[4]
+    send = drive._bus_send
+    drive._bus_send = lambda i, data: None if i == 0x705 else send(i, data)
+    restarts_after(drive, 0)
+    with pytest.raises(Refused, match="drive 5 restarted during set-up"):
+        bench.group.configure()
+
+
+def test_a_restart_after_the_set_up_latches_before_anything_is_enabled(bench: Bench) -> None:
+    """The frames that came after START were discarded."""
+    bench.group.configure()
+    restart(bench.drives[4])
+    bench.drives[4].on_nmt(NmtCommand.START, 5)
+    bench.group.read_positions()
+    with pytest.raises(Refused, match="restarted: its configuration and position are lost"):
+        bench.group.command(GroupCommand.ENABLE)
+
+
+def test_an_emergency_during_the_set_up_explains_the_fault(bench: Bench) -> None:
+    command, drive = bench.drives[4].on_nmt, bench.drives[4]
+
+    def on_nmt(code: int, node: int) -> None:
+        command(code, node)
+        if code == NmtCommand.START and node == 5:
+            drive.fail(0x3210)
+
+    drive.on_nmt = on_nmt  # type: ignore[method-assign]
+    bench.group.configure()
+    ((node, text),) = bench.group.read_positions().faults
+    assert node == 5
+    assert "DC link over-voltage (error 3210h)" in text
 
 
 def test_what_cannot_be_noted_is_not_wiped_out(bench: Bench) -> None:
