@@ -26,7 +26,6 @@ from drivers.cia402.sdo_jobs import (
     time_to_end,
 )
 from drivers.cia402.state_machine import (
-    FAULTED,
     HOLDS,
     WITHOUT_TORQUE,
     ControlWord,
@@ -98,7 +97,9 @@ class Cia402Group(CyclicGroup):
         self._faults = []
         self._cycle = 0
         self._cycles_to_goal = 0
-        self._left_stop = False  # "enable operation" was commanded since the last release began
+        self._enables = False  # "enable operation" was sent for this goal
+        self._is_new_goal = False  # no complete replies yet to the last words of the former one
+        self._former = self._goal, self._enables
         self._known = False
         self._monitoring_off: SdoJobs | None = None
         self._modes: ModeCheck | None = None
@@ -198,10 +199,12 @@ class Cia402Group(CyclicGroup):
             self._latch(self._new_messages())
         following = self._state is GroupState.ENABLED
         words = next_words(self._goal, self._watch.states, self._stop_commanded)
-        if self._goal in (Goal.ENABLE, Goal.RELEASE) and self._watch.is_unjudged:
-            words = self._words  # no further step until it is known whether a drive is in fault
-        if ControlWord.ENABLE_OPERATION in words:
-            self._left_stop = True
+        steps = self._goal in (Goal.ENABLE, Goal.RELEASE)
+        if steps and (self._is_new_goal or self._watch.is_unjudged):
+            # No further step until every drive has shown the effect of the last words, and whether
+            # it is in fault.
+            words = self._words
+        self._enables |= ControlWord.ENABLE_OPERATION in words
         self._demands = self._targets if self._known else list(self._watch.positions)
         if following:
             self._targets = [int(target) for target in targets]
@@ -311,7 +314,10 @@ class Cia402Group(CyclicGroup):
         powered = self._goal in (Goal.ENABLE, Goal.RELEASE)
         warnings = self._watch.warnings()
         self._warnings = warnings if powered else ()
-        found = [*self._new_messages(), *self._autonomous_stops()]
+        # Replies show the effect of earlier words, at first those of the former goal.
+        goal, enables = self._former if self._is_new_goal else (self._goal, self._enables)
+        own = self._watch.changes_on_their_own(goal, enables=enables)
+        found = [*self._new_messages(), *own]
         known = {text for _, text in (*self._faults, *found)}
         found += self._watch.state_faults(known, powered=powered)
         if self._goal is not Goal.RESET_FAULT:
@@ -325,21 +331,6 @@ class Cia402Group(CyclicGroup):
         # An emergency of a drive at rest only explains its state.
         return [(node, text) for node, text in found if node in self._watch.restarted]
 
-    def _autonomous_stops(self) -> list[tuple[int, str]]:
-        """Drives that left a state without a command, except those in fault.
-
-        During a release they change to SWITCHED ON; one that returned to quick stop after it was
-        enabled must not be enabled again.
-        """
-        dropped, torque_lost = self._watch.dropped(), self._watch.torque_lost()
-        states = dict(zip(self._nodes, self._watch.states, strict=True))
-        if self._goal is Goal.ENABLE:
-            return [fault for fault in dropped if states[fault[0]] not in FAULTED]
-        if self._goal is Goal.RELEASE and self._left_stop:
-            back = DriveState.QUICK_STOP_ACTIVE
-            return [fault for fault in dropped if states[fault[0]] is back]
-        return torque_lost if self._goal in (Goal.STOP, Goal.IDLE) else []
-
     def _latch(self, found: list[tuple[int, str]]) -> None:
         for fault in found:
             if fault not in self._faults:
@@ -351,12 +342,14 @@ class Cia402Group(CyclicGroup):
         """Checks whether the goal is reached or overdue."""
         states = self._watch.states
         self._cycles_to_goal += 1
+        self._is_new_goal &= not self._watch.complete
         if self._goal is Goal.RESET_FAULT:
             if self._cycles_to_goal > self._reset_cycles or DriveState.FAULT not in states:
                 self._goal = Goal.IDLE
         elif self._state is GroupState.ENABLING:
             idle = self._ignoring_targets() if self._profile.follows_bit else []
-            if all(state is DriveState.OPERATION_ENABLED for state in states) and not idle:
+            follow = set(self._words) == {ControlWord.ENABLE_OPERATION}
+            if follow and set(states) == {DriveState.OPERATION_ENABLED} and not idle:
                 self._check_modes()
             elif self._cycles_to_goal > self._patience:
                 self._latch(self._late(self._patience) or idle)
@@ -424,8 +417,13 @@ class Cia402Group(CyclicGroup):
         if self._state is GroupState.ENABLED:
             return
         self._refuse_latched("enable the drives")
-        self._goal, self._state, self._cycles_to_goal = Goal.ENABLE, GroupState.ENABLING, 0
-        self._modes = None
+        self._begin(Goal.ENABLE)
+        self._state, self._modes = GroupState.ENABLING, None
+
+    def _begin(self, goal: Goal) -> None:
+        self._former = self._goal, self._enables
+        self._goal, self._cycles_to_goal = goal, 0
+        self._enables, self._is_new_goal = False, True
 
     def require_releasable(self) -> None:
         """Checks whether the drives may be released; see `DriveGroup.require_releasable`."""
@@ -434,7 +432,7 @@ class Cia402Group(CyclicGroup):
 
     def _begin_release(self) -> None:
         self.require_releasable()
-        self._goal, self._cycles_to_goal, self._left_stop = Goal.RELEASE, 0, False
+        self._begin(Goal.RELEASE)
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             self._state = GroupState.QUICK_STOP  # set-points are no longer followed
 

@@ -17,7 +17,14 @@ from drivers.cia402.pdo import (
     parse_reply,
 )
 from drivers.cia402.sdo_jobs import STATE_REQUESTS, SdoRequest
-from drivers.cia402.state_machine import FAULTED, HOLDS, TORQUE_ON, DriveState, state_of
+from drivers.cia402.state_machine import (
+    FAULTED,
+    TORQUE_ON,
+    DriveState,
+    Goal,
+    change_on_its_own,
+    state_of,
+)
 from drivers.drive_group import DriveWarning
 from drivers.plausibility import ReplyCheck
 from model.errors import Refused
@@ -63,8 +70,7 @@ class DriveMonitor:
         self._to_judge: list[DriveWarning] = []  # the drive's next reply says whether it stopped
         self._warnings: list[DriveWarning] = []
         self._new_messages: list[tuple[int, str]] = []
-        self._dropped: list[tuple[int, str]] = []
-        self._torque_lost: list[tuple[int, str]] = []
+        self._changes: list[tuple[int, DriveState, DriveState]] = []
         self._emergencies: dict[int, str] = {}
         self._over: set[int] = set()
         self._replies = {TPDO1_BASE + node: i for i, node in enumerate(nodes)}
@@ -127,16 +133,8 @@ class DriveMonitor:
         state, before = state_of(reply.status_word), self.states[drive]
         self.states[drive] = state
         self._judge(self.nodes[drive], state)
-        if before is DriveState.OPERATION_ENABLED and state is not before:
-            self._dropped.append(self._with_cause(drive, f"stopped on its own: {state.value}"))
-        if before in HOLDS and state not in TORQUE_ON and state not in FAULTED:
-            self._torque_lost.append(self._with_cause(drive, f"lost its torque: {state.value}"))
-
-    def _with_cause(self, drive: int, what: str) -> tuple[int, str]:
-        node = self.nodes[drive]
-        cause = None if node in self._over else self._emergencies.get(node)
-        text = f"{self._names[node]} {what}"
-        return node, f"{text}; {cause}" if cause else text
+        if state is not before:
+            self._changes.append((self.nodes[drive], before, state))
 
     def _judge(self, node: int, state: DriveState) -> None:
         """An emergency before this SYNC is a warning if the drive is still enabled.
@@ -153,7 +151,7 @@ class DriveMonitor:
         """Emergencies since the last call that did not stop the drive by the next SYNC.
 
         An enabled drive keeps following its set-points. One that stops has left the state by then,
-        which is a fault (`dropped`, `state_faults`).
+        which is a fault (`changes_on_their_own`, `state_faults`).
         """
         warnings, self._warnings = tuple(self._warnings), []
         return warnings
@@ -170,15 +168,20 @@ class DriveMonitor:
         news, self._new_messages = self._new_messages, []
         return news
 
-    def dropped(self) -> list[tuple[int, str]]:
-        """Drives that left OPERATION ENABLED since the last call, by node."""
-        dropped, self._dropped = self._dropped, []
-        return dropped
+    def changes_on_their_own(self, goal: Goal, *, enables: bool) -> list[tuple[int, str]]:
+        """Drives that changed their state without a command since the last call, by node.
 
-    def torque_lost(self) -> list[tuple[int, str]]:
-        """Drives that lost their holding torque without a fault, since the last call."""
-        torque_lost, self._torque_lost = self._torque_lost, []
-        return torque_lost
+        Arguments as for `drivers.cia402.state_machine.change_on_its_own`.
+        """
+        changes, self._changes = self._changes, []
+        found: list[tuple[int, str]] = []
+        for node, before, state in changes:
+            what = change_on_its_own(goal, enables, before, state)
+            if what is not None:
+                cause = None if node in self._over else self._emergencies.get(node)
+                text = f"{self._names[node]} {what}"
+                found.append((node, f"{text}; {cause}" if cause else text))
+        return found
 
     @property
     def is_unjudged(self) -> bool:

@@ -560,6 +560,89 @@ def test_a_drive_that_stopped_by_itself_stops_all_at_the_next_sync(bench: Bench)
     bench.until(GroupState.ENABLED)
 
 
+def stops_when_enabled(drive: SimulatedDrive, times: int) -> list[int]:
+    """Its limit switch is hit: quick stop in the SYNC that enables it, without an emergency."""
+    enable, enabled = drive._command_enable, [0]
+
+    def command_enable() -> None:
+        enable()
+        enabled[0] += 1
+        if enabled[0] <= times:
+            drive._quick_stop()
+
+    drive._command_enable = command_enable  # type: ignore[method-assign]
+    return enabled
+
+
+@pytest.mark.parametrize("times", [1, 2, 99])
+@pytest.mark.parametrize("held", [False, True])
+def test_a_drive_that_stops_in_the_cycle_that_enables_it_is_named_alone(
+    bench: Bench, times: int, held: bool
+) -> None:
+    """The seven others were blamed, and it was enabled three times while its switch was hit."""
+    bench.group.configure()
+    if held:  # the others hold the platform; it comes from the state SWITCHED ON
+        for drive in bench.drives:
+            drive.state = DriveState.SWITCHED_ON if drive.node == 3 else HOLDING
+    bench.group.read_positions()
+    enabled = stops_when_enabled(bench.drives[2], times)
+    bench.group.command(GroupCommand.ENABLE)
+    for _ in range(20):
+        bench.cycle()
+        assert bench.group.state is not GroupState.ENABLED
+    assert bench.status is not None
+    assert bench.status.faults == ((3, "cable 3 (drive 3) stopped on its own: quick stop active"),)
+    assert enabled[0] == 2, "once more by the frames that were sent before its reply"
+    assert {drive.state for drive in bench.drives} == {HOLDING}
+    words = bench.control_words()
+    first = words.index(0x0F)
+    assert set(words[first : first + 16]) == {0x0F}
+    assert set(words[first + 16 :]) == {0x02}
+
+
+def test_a_drive_that_falls_back_while_the_others_are_enabled_stops_them_once(
+    bench: Bench,
+) -> None:
+    """Its mains failed after 0Fh: the others were stopped and enabled again without a fault."""
+    bench.group.configure()
+    bench.group.read_positions()
+    drive = bench.drives[5]
+    drive._command_enable = lambda: None  # type: ignore[method-assign]
+    bench.group.command(GroupCommand.ENABLE)
+    for _ in range(8):
+        bench.cycle()
+    assert [d.state for d in bench.drives].count(DriveState.OPERATION_ENABLED) == 7
+    drive.state = DriveState.SWITCH_ON_DISABLED
+    for _ in range(8):
+        bench.cycle()
+    assert bench.status is not None
+    text = "cable 6 (drive 6) left switched on on its own: switch on disabled"
+    assert bench.status.faults == ((6, text),)
+    assert [d.state for d in bench.drives].count(HOLDING) == 7
+
+
+@pytest.mark.parametrize("command", [GroupCommand.ENABLE, GroupCommand.RELEASE])
+@pytest.mark.parametrize("cycles", [0, 1, 2, 3])
+@pytest.mark.parametrize("enabling", [0, 3, 4, 5, 10])
+def test_a_command_right_after_a_stop_finds_no_fault(
+    bench: Bench, enabling: int, cycles: int, command: GroupCommand
+) -> None:
+    """The replies still showed drives enabled that had been commanded to stop."""
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    for _ in range(enabling):
+        bench.cycle()
+    bench.group.quick_stop_now()
+    bench.group.receive(0.0)
+    for _ in range(cycles):
+        bench.cycle()
+    bench.group.command(command)
+    bench.until(
+        GroupState.ENABLED if command is GroupCommand.ENABLE else GroupState.RELEASED, limit=40
+    )
+
+
 def test_a_cycle_that_may_not_enable_becomes_a_stop_of_all(bench: Bench) -> None:
     """Asked just before SYNC, when the drives hold set-points that would enable them again."""
     bench.enable()
@@ -793,6 +876,7 @@ COMMANDS = st.one_of(
     st.just(("stop now", None)),
     st.integers(1, 8).map(lambda cycles: ("cycles", cycles)),
     st.integers(0, 7).map(lambda drive: ("fault", drive)),
+    st.integers(0, 7).map(lambda drive: ("stops", drive)),
     st.integers(1, 6).map(lambda cycles: ("pause", cycles)),
 )
 
@@ -800,12 +884,13 @@ COMMANDS = st.one_of(
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(script=st.lists(COMMANDS, max_size=12))
 def test_no_script_frees_a_cable_or_enables_some(bench: Bench, script: list) -> None:
-    """Random commands, faults and pauses: control words and states stay within the rules."""
+    """Random commands, faults, stops of drives and pauses: words and states keep the rules."""
     for drive in bench.drives:
         drive.power_on()
     bench.group.close()
     bench.group.configure()
     bench.group.read_positions()
+    words: list[int] = []
     for what, value in script:
         if what == "command":
             try:
@@ -816,13 +901,21 @@ def test_no_script_frees_a_cable_or_enables_some(bench: Bench, script: list) -> 
             bench.group.quick_stop_now()
         elif what == "fault":
             bench.drives[value].fail(0x7121)
+        elif what == "stops":
+            if bench.drives[value].state is DriveState.OPERATION_ENABLED:
+                bench.drives[value]._quick_stop()
         elif what == "pause":
             bench.rehearsal.advance(0.01 * value)
         else:
             for _ in range(value):
                 before = [d.torque_on for d in bench.drives]
                 enabled_before = [d.state is DriveState.OPERATION_ENABLED for d in bench.drives]
+                words += bench.control_words()
                 bench.cycle()
+                sent = bench.control_words()
+                words += sent
+                if bench.group.state is GroupState.ENABLED:
+                    assert sent == [0x0F] * 8
                 enabled = [d.state is DriveState.OPERATION_ENABLED for d in bench.drives]
                 if any(new and not old for new, old in zip(enabled, enabled_before, strict=True)):
                     assert all(enabled)
@@ -833,4 +926,4 @@ def test_no_script_frees_a_cable_or_enables_some(bench: Bench, script: list) -> 
                         if held and not d.torque_on and d.state is not DriveState.FAULT
                     ]
                     assert not lost
-    assert all(word & 0x02 for word in bench.control_words())
+    assert all(word & 0x02 for word in [*words, *bench.control_words()])
