@@ -61,18 +61,20 @@ class CyclicBus:
         self,
         bus: can.BusABC,
         commanding: frozenset[int],
-        foreign_master_message: Callable[[int], str],
+        foreign_master_message: Callable[[int, bytes | bytearray], str],
+        is_command: Callable[[int, bytes | bytearray], bool] = lambda _id, _data: True,
     ) -> None:
         """Takes an open bus.
 
         Args:
             bus: Owned by the caller.
             commanding: Identifiers that only a master sends.
-            foreign_master_message: Message about another master, by identifier of its frame.
+            foreign_master_message: Message about another master, by its frame.
+            is_command: Whether a frame with such an identifier is a master's.
         """
         self._bus, self._where = bus, bus_name(bus)
         self._own = EchoFilter(commanding, echoes_own_frames=echoes_own_frames(bus))
-        self._foreign_master_message = foreign_master_message
+        self._foreign_master_message, self._is_command = foreign_master_message, is_command
         self._errors = ErrorFrames(bus)
         self._lost = lost_frames(bus)
         self._found: list[BusFault] = []
@@ -93,7 +95,8 @@ class CyclicBus:
         for message in messages:
             try:
                 transmit(self._bus, message)
-                self._own.sent(message.arbitration_id)
+                if self._is_command(message.arbitration_id, message.data):
+                    self._own.sent(message.arbitration_id)
             except BusFault as error:
                 failure = failure or error
         if failure is not None:
@@ -170,14 +173,14 @@ class CyclicBus:
     def _process(self, message: can.Message, listener: ReplyListener, *, stale: bool) -> None:
         if message.is_error_frame:
             self._find(self._errors.take(message))
-        elif message.is_extended_id or message.is_remote_frame:
             return
-        elif self._own.is_foreign(message.arbitration_id):
-            self._find(
-                ForeignMaster(self._foreign_master_message(message.arbitration_id), self._where)
-            )
+        if message.is_extended_id or message.is_remote_frame:
+            return
+        can_id, data = message.arbitration_id, message.data
+        if self._is_command(can_id, data) and self._own.is_foreign(can_id):
+            self._find(ForeignMaster(self._foreign_master_message(can_id, data), self._where))
         else:
-            listener.take(message.arbitration_id, message.data, stale=stale)
+            listener.take(can_id, data, stale=stale)
 
 
 class GroupMonitor(ReplyListener, Protocol):

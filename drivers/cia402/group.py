@@ -11,7 +11,7 @@ from drivers.can_bus import SentFrame
 from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.monitor import DriveMonitor
-from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_message
+from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_message, is_command
 from drivers.cia402.profile import profile_of
 from drivers.cia402.sdo_jobs import (
     ASKED_AGAIN_AFTER,
@@ -84,7 +84,8 @@ class Cia402Group(CyclicGroup):
 
     def _reset_memory(self) -> None:
         count = len(self._nodes)
-        self._cyclic = CyclicBus(self._bus, commanding_ids(self._nodes), foreign_master_message)
+        commanding = commanding_ids(self._nodes)
+        self._cyclic = CyclicBus(self._bus, commanding, foreign_master_message, is_command)
         self._frames = CyclicFrames(self._nodes)
         is_warning = self._profile.is_warning
         self._watch = DriveMonitor(self._rig.drive_names, self._max_steps, is_warning)

@@ -35,10 +35,10 @@ from drivers.cia402.pdo import (
     SDO_REQUEST_BASE,
     NmtCommand,
     NmtState,
+    commanding_ids,
     foreign_master_message,
     make_nmt,
     parse_heartbeat,
-    set_up_ids,
 )
 from drivers.drive_group import Pump
 from model.errors import CdprError, Fault, HardwareMissing, Refused
@@ -115,7 +115,7 @@ class SetupNetwork:
         self._nodes, self._refuses_restarts = frozenset(nodes), False
         self.emergencies: dict[int, bytes] = {}
         self._own = EchoFilter(
-            set_up_ids(nodes), echoes_own_frames=echoes_own_frames(bus), batch=len(nodes)
+            commanding_ids(nodes), echoes_own_frames=echoes_own_frames(bus), batch=len(nodes)
         )
 
     def client(self, node: int) -> Client:
@@ -202,7 +202,7 @@ class SetupNetwork:
             if fault is not None:
                 raise fault
         elif not (message.is_remote_frame or message.is_extended_id):
-            self._refuse_foreign(message.arbitration_id)
+            self._refuse_foreign(message)
             node = message.arbitration_id - HEARTBEAT_BASE
             if 0 < node < MASTER_NODE:
                 state = self._states[node] = parse_heartbeat(message.data)
@@ -222,10 +222,10 @@ class SetupNetwork:
             if not self.process_frame(left) and self._pump is not None:
                 return
 
-    def _refuse_foreign(self, can_id: int) -> None:
-        if self._own.is_foreign(can_id):
+    def _refuse_foreign(self, message: can.Message) -> None:
+        if self._own.is_foreign(message.arbitration_id):
             raise Refused(
-                foreign_master_message(can_id),
+                foreign_master_message(message.arbitration_id, message.data),
                 where=SETTING_UP,
                 why=ForeignMaster.cause,
                 next_step=ForeignMaster.remedy,

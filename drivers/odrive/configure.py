@@ -67,7 +67,7 @@ def commanding_ids(layouts: Layouts, nodes: Sequence[int]) -> frozenset[int]:
     return frozenset(can_id(node, layout.command) for node in nodes for layout in moving)
 
 
-def foreign_master_message(identifier: int) -> str:
+def foreign_master_message(identifier: int, _data: bytes | bytearray) -> str:
     """Message about another program that sends a frame with one of these identifiers."""
     return f"another program commands drive {node_and_command(identifier)[0]}"
 
@@ -133,7 +133,7 @@ class SetupLink:
                         raise fault
                 elif not (message.is_extended_id or message.is_remote_frame):
                     if self._own.is_foreign(message.arbitration_id):
-                        text = foreign_master_message(message.arbitration_id)
+                        text = foreign_master_message(message.arbitration_id, message.data)
                         raise ForeignMaster(text, bus_name(self._bus))
                     yield message
                 if left > 0.0:
