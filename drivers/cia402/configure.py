@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import can
 
@@ -54,6 +54,9 @@ MODE_ASKED = 10
 
 READ_ONLY = frozenset({0x06010000, 0x06010002})
 """Abort codes of a read-only object, whose fixed value may be the required one."""
+
+OUT_OF_RANGE = frozenset({0x06090030, 0x06090031, 0x06090032})
+"""Abort codes of a value outside an object's range, too high, too low."""
 
 UNCHANGED = "the drives were not changed"
 UNFINISHED = (
@@ -332,6 +335,9 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
         client.write(setting.index, setting.sub, setting.data(), setting.name)
     except Refused as error:
         code = error.values.get("abort_code")
+        if code in OUT_OF_RANGE and setting.equivalent and setting.value != setting.equivalent[0]:
+            _write(network, node, replace(setting, value=setting.equivalent[0]), remarks)
+            return
         if code in NOT_NOW or not (setting.optional or code in READ_ONLY):
             raise
         if setting.transient and code in READ_ONLY:

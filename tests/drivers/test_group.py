@@ -341,7 +341,7 @@ def test_every_object_that_is_not_kept_refuses_to_arm(bench: Bench) -> None:
         if key in ((0x1400, 1), (0x1800, 1), (0x1600, 0), (0x1A00, 0)):
             continue  # a PDO that stays switched on refuses its mapping; the next test
         drive.power_on()
-        drive.objects[key] = 0 if value else 1
+        drive.objects[key] = 0xFF if key == (0x1400, 2) else 0 if value else 1
         drive.objects.stuck.add(key)
         with pytest.raises(Refused) as caught:
             bench.group.configure()
@@ -352,6 +352,33 @@ def test_every_object_that_is_not_kept_refuses_to_arm(bench: Bench) -> None:
 
 def stuck_mode(drive: SimulatedDrive) -> None:
     drive.objects.measured(0x6061, 0, lambda: 0)
+
+
+@pytest.mark.parametrize("kept", [0, 2, 240, 241, 254, 255])
+@pytest.mark.parametrize("refuses", [True, False])
+def test_any_synchronous_type_of_an_rpdo_is_one(bench: Bench, kept: int, refuses: bool) -> None:
+    """Trinamic's PD42-1140 takes 0, 254 and 255; the drives may also keep another."""
+    for drive in bench.drives:
+        if refuses:
+            drive.behaviour = replace(STRICT, ranges={(0x1400, 2): (kept, kept)})
+            drive.power_on()
+        else:
+            drive.objects[0x1400, 2] = kept
+            drive.objects.stuck.add((0x1400, 2))
+    if kept > (0 if refuses else 240):
+        with pytest.raises(Refused, match="1400h:02 PDO transmission type"):
+            bench.group.configure()
+        return
+    bench.enable()
+    assert {drive.objects[0x1400, 2] for drive in bench.drives} == {kept}
+
+
+def test_a_reply_must_follow_every_sync(bench: Bench) -> None:
+    for drive in bench.drives:
+        drive.objects[0x1800, 2] = 0
+        drive.objects.stuck.add((0x1800, 2))
+    with pytest.raises(Refused, match="1800h:02 PDO transmission type"):
+        bench.group.configure()
 
 
 def clamped_ramp(drive: SimulatedDrive) -> None:
