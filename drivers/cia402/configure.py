@@ -14,7 +14,7 @@ from drivers.cia402.expected_objects import (
     are_simulated,
     count_heartbeats,
     expectations,
-    number_text,
+    found_text,
     require_absent,
     require_answers,
     require_expected,
@@ -356,8 +356,8 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
         return
     kept = client.read(setting.index, setting.sub, setting.name, setting.size)
     if not setting.is_kept(kept):
-        found = number_text(kept, setting.form)
-        raise wrong_value(node, str(setting), found, str(setting.value), setting.why)
+        found, wanted = found_text(kept, setting), setting.text(setting.value)
+        raise wrong_value(node, str(setting), found, wanted, setting.why)
 
 
 def _fixed_value(network: SetupNetwork, node: int, setting: Setting) -> bytes | None:

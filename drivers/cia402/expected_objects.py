@@ -297,10 +297,10 @@ def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
             raise
         return
     if not setting.is_kept(data):
-        found = number_text(data, setting.form)
+        found = found_text(data, setting)
         raise Refused(
             f"the profile declares it absent; the drive has it with {found},"
-            f" {setting.value} is required",
+            f" {setting.text(setting.value)} is required",
             where=f"drive {node}, object {setting}",
             next_step="remove the object from `absent` in the drive profile",
             values={"node": node, "object": str(setting), "found": found},
@@ -343,11 +343,11 @@ def count_heartbeats(
     entries.append(count if most is None else min(count, most))
 
 
-def number_text(data: bytes, form: str) -> str:
-    """A value as text by its `struct` format, or the bytes if the length is wrong."""
-    if len(data) != struct.calcsize(form):
+def found_text(data: bytes, setting: Setting) -> str:
+    """A value read as text, or the bytes if the length is wrong."""
+    if len(data) != setting.size:
         return f"{len(data)} bytes ({data.hex()})"
-    return str(struct.unpack(form, data)[0])
+    return setting.text(struct.unpack(setting.form, data)[0])
 
 
 def wrong_value(node: int, name: str, found: str, wanted: str, why: str) -> Refused:

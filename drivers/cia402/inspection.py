@@ -185,15 +185,9 @@ def _last_of_each(settings: Iterable[Setting]) -> list[Setting]:
     return list({(s.index, s.sub): s for s in settings if not s.transient}.values())
 
 
-def _number(setting: Setting, value: int) -> str:
-    """A value as text; PDO mappings and identifiers in hexadecimal, as in manuals."""
-    is_entry = 0x1400 <= setting.index < 0x1C00 and setting.size == 4
-    return f"{value:08X}h" if is_entry else str(value)
-
-
 def _needed(setting: Setting) -> str:
     if setting.per_mille_of is None:
-        return f"{_number(setting, setting.value)}, written at configuration"
+        return f"{setting.text(setting.value)}, written at configuration"
     rated = object_name(*setting.per_mille_of)
     return f"{setting.value} per mille of {rated}, written at configuration"
 
@@ -316,7 +310,7 @@ class _Reader:
             text = f"{len(data)} bytes, not {setting.size}"
             row.note(self._node, text, "wrong", "compare with the drive's manual")
         else:
-            row.note(self._node, _number(setting, struct.unpack(setting.form, data)[0]))
+            row.note(self._node, setting.text(struct.unpack(setting.form, data)[0]))
         if setting.per_mille_of is not None:
             rated = self._row(*setting.per_mille_of, "rated value of the limit", "more than 0")
             found = self._read(*setting.per_mille_of, rated, optional=False)
@@ -327,12 +321,12 @@ class _Reader:
 
     def at_absent(self, setting: Setting) -> None:
         """An object that the profile declares absent; if it exists, its value is checked."""
-        needed = f"absent as in the profile, or {_number(setting, setting.value)}"
+        needed = f"absent as in the profile, or {setting.text(setting.value)}"
         row = self._row(setting.index, setting.sub, str(setting), needed)
         row.meaning = setting.why
         data = self._read(setting.index, setting.sub, row, optional=True, size=setting.size)
         if data is not None:
-            text = _number(setting, int.from_bytes(data, "little"))
+            text = setting.text(int.from_bytes(data, "little"))
             good = setting.is_kept(data)
             change = "" if good else "remove it from `absent` in the drive profile"
             row.note(self._node, text, "ok" if good else "wrong", change)

@@ -98,6 +98,11 @@ class Setting:
         """The setting with its value in the unit of ``per_mille_of``, whose value is ``rated``."""
         return replace(self, value=math.ceil(self.value * rated / 1000.0), per_mille_of=None)
 
+    def text(self, value: int) -> str:
+        """A value as text; identifiers, mappings and 1016h in hexadecimal, as in manuals."""
+        is_code = self.size == 4 and (0x1400 <= self.index < 0x1C00 or self.index == 0x1016)
+        return f"{value:08X}h" if is_code else str(value)
+
     def __str__(self) -> str:
         """Index, sub-index and name."""
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"

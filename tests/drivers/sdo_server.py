@@ -52,6 +52,7 @@ class ScriptedDrive:
                 self.objects |= {(index, sub): entry[sub] for sub in entry.subindices}
         self.values: dict[Key, int] = {key: od.default or 0 for key, od in self.objects.items()}
         self.aborts: dict[Key, int] = {}
+        self.keeps: dict[Key, int] = {}  # kept whatever is written
         self.values[0x6041, 0] = 0x0240
         self.mode_late = 0  # times that 6061h still shows the old mode
 
@@ -98,7 +99,7 @@ class ScriptedDrive:
             return TOO_LOW
         if key in ((0x1400, 1), (0x1800, 1)):
             value &= ~(1 << 30)  # a drive may keep bit 30 or not
-        self.values[key] = value
+        self.values[key] = self.keeps.get(key, value)
         return 0
 
 

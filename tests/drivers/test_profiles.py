@@ -810,6 +810,24 @@ def test_doctor_names_what_a_profile_of_ones_own_says(rig: Rig) -> None:
     assert "no profile" in change["6007h:00"]
 
 
+@pytest.mark.parametrize(
+    ("key", "kept", "said"),
+    [
+        ((0x1400, 1), 0x208, "the drive has 00000208h; 80000201h is required"),
+        ((0x1600, 1), 0x60410010, "the drive has 60410010h; 60400010h is required"),
+        ((0x1016, 1), 0x7F0065, "the drive has 007F0065h; 007F0064h is required"),
+        ((0x1017, 0), 31, "the drive has 31; 30 is required"),
+    ],
+)
+def test_refusals_print_identifiers_as_manuals_do(
+    rig: Rig, key: tuple[int, int], kept: int, said: str
+) -> None:
+    bus = eight_of("cia402")
+    bus.drives[1].keeps[key] = kept
+    with pytest.raises(Refused, match=said):
+        set_up(rig, bus)
+
+
 def test_doctor_prints_mappings_as_manuals_do(rig: Rig) -> None:
     (row,) = (row for row in examined(rig, eight_of("cia402")).rows if row.object[:8] == "1600h:02")
     assert row.needed == "607A0020h, written at configuration"
