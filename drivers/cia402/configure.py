@@ -77,12 +77,14 @@ class SetUp:
         heartbeats: Number of entries of 1016h written in each drive: the master's, then peers'.
         simulated: Whether all drives identify themselves as simulated.
         emergencies: Data of the last EMCY of each drive, by identifier.
+        errors: Stored error codes of the drives in fault, by node.
     """
 
     remarks: tuple[str, ...]
     heartbeats: tuple[int, ...]
     simulated: bool
     emergencies: Mapping[int, bytes]
+    errors: Mapping[int, int]
 
 
 def configure_drives(
@@ -126,8 +128,9 @@ def configure_drives(
     _refuse_duplicates(network)
     refusals = Refusals()
     entries: list[int] = []
+    errors: dict[int, int] = {}
     for drive, node in enumerate(nodes):
-        refusals.note(require_idle, network, node, to_reset)
+        refusals.note(require_idle, network, node, to_reset, errors)
         _note_objects(rig, network, winch_map, drive, settings[drive], max_tension, refusals)
         refusals.note(count_heartbeats, network, node, profile, entries)
     refusals.raise_any(UNCHANGED)
@@ -147,7 +150,7 @@ def configure_drives(
     watched = (
         min(count, rig.cable_count) if profile.watches_heartbeats else 0 for count in entries
     )
-    return SetUp(remarks, tuple(watched), simulated, network.emergencies)
+    return SetUp(remarks, tuple(watched), simulated, network.emergencies, errors)
 
 
 def _write_settings(

@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from drivers.can_errors import SETTING_UP, in_fault, moved_by_another, wrong_setting
+from drivers.cia402.error_codes import emergency_text
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
 from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.profile import load_profile, profile_names
 from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent, silent
-from drivers.cia402.sdo_jobs import CSP_MODE
+from drivers.cia402.sdo_jobs import CSP_MODE, ERROR_REQUESTS
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
 from model.errors import HardwareMissing, Refused
 from model.files.drive_profile_file import (
@@ -310,17 +311,40 @@ def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
 _STATUS_WORD = "object 6041h:00 status word"
 
 
-def require_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
+def stored_error(network: SetupNetwork, node: int) -> int:
+    """The error code that a drive stores for its fault (`ERROR_REQUESTS`); 0 if it has none."""
+    for job in ERROR_REQUESTS:
+        try:
+            data = network.client(node).read_if_there(job.index, job.sub, "error code", job.size)
+        except Refused as error:
+            if "node" not in error.values:
+                raise
+            continue
+        if code := int.from_bytes((data or b"")[:2], "little"):
+            return code
+    return 0
+
+
+def require_idle(network: SetupNetwork, node: int, to_reset: bool, errors: dict[int, int]) -> None:
     """Refuses an enabled drive, which another master controls; quick stop is accepted.
+
+    Args:
+        network: The bus.
+        node: The drive.
+        to_reset: Accepts a drive in fault.
+        errors: Gets the error code of one in fault, by node.
 
     Raises:
         Refused: It is enabled, or in fault without ``to_reset``.
     """
     data = network.client(node).read(0x6041, 0, "status word", 2)
     state = state_of(int.from_bytes(data, "little"))
-    if state in FAULTED and not to_reset:
-        why = "it stopped itself; its display or the manufacturer's tool shows the cause"
-        raise in_fault(node, "", _STATUS_WORD, why)
+    if state in FAULTED:
+        errors[node] = code = stored_error(network, node)
+        if not to_reset:
+            why = "it stopped itself; its display or the manufacturer's tool shows the cause"
+            known = f": {emergency_text(code)}" if code else ""
+            raise in_fault(node, known, _STATUS_WORD, why)
     if state is DriveState.OPERATION_ENABLED:
         raise moved_by_another(node, "enabled already", _STATUS_WORD)
 

@@ -15,6 +15,7 @@ from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_mess
 from drivers.cia402.profile import profile_of
 from drivers.cia402.sdo_jobs import (
     ASKED_AGAIN_AFTER,
+    ERROR_REQUESTS,
     MODE_WAIT,
     REQUESTS_A_CYCLE,
     STATE_REQUESTS,
@@ -98,12 +99,13 @@ class Cia402Group(CyclicGroup):
         self._faults = []
         self._cycle = 0
         self._cycles_to_goal = 0
-        self._enables = False  # "enable operation" was sent for this goal
-        self._is_new_goal = False  # no complete replies yet to the last words of the former one
+        # "Enable operation" was sent for this goal; replies to the former one's words are awaited.
+        self._enables, self._is_new_goal = False, False
         self._former = self._goal, self._enables
         self._known = False
         self._monitoring_off: SdoJobs | None = None
         self._modes: ModeCheck | None = None
+        self._errors = SdoJobs({}, 1)
 
     @property
     def capabilities(self) -> Capabilities:
@@ -162,6 +164,7 @@ class Cia402Group(CyclicGroup):
         self._heartbeats, self._simulated = done.heartbeats, done.simulated
         for can_id, data in done.emergencies.items():  # they may explain a state
             self._watch.take(can_id, data)
+        self._watch.note_errors(done.errors)
         self._state = GroupState.CONFIGURED
         return done.remarks
 
@@ -218,7 +221,7 @@ class Cia402Group(CyclicGroup):
         self._cycle += 1
         if self._cycle % self._heartbeat_cycles == 0:
             self._cyclic.send((self._frames.heartbeat,))
-        for jobs in (self._modes, self._monitoring_off):
+        for jobs in (self._modes, self._monitoring_off, self._errors):
             if jobs is not None:
                 self._ask(jobs, REQUESTS_A_CYCLE)
 
@@ -286,13 +289,15 @@ class Cia402Group(CyclicGroup):
             raise Refused("enabled drives must monitor this program", where="drive group")
         off = (monitoring_off(count, self._profile.rpdo) for count in self._heartbeats)
         self._monitoring_off = SdoJobs(dict(zip(self._nodes, off, strict=True)), self._again_after)
-        self._modes = None
+        self._modes, self._errors = None, SdoJobs({}, 1)
         self._watch.on_answer = self._monitoring_off.take
 
     def _send(self, words: tuple[ControlWord, ...], may_send: Callable[[bool], bool]) -> None:
         """Sends one cycle's frames; the words are remembered even if the bus fails."""
         self._words = words
-        self._note_stop_commanded()
+        held, stop = DriveState.QUICK_STOP_ACTIVE, ControlWord.QUICK_STOP
+        columns = zip(self._watch.states, words, self._stop_commanded, strict=True)
+        self._stop_commanded = [s is held and (w is stop or was) for s, w, was in columns]
         self._watch.begin_cycle()
         try:
             self._cyclic.send(self._frames.set_points(words, self._targets))
@@ -303,13 +308,6 @@ class Cia402Group(CyclicGroup):
                 self._cyclic.send(self._frames.set_points(self._words, self._targets))
         finally:  # a frame that failed must not keep a stop from the other drives
             self._cyclic.send((self._frames.sync,))
-
-    def _note_stop_commanded(self) -> None:
-        for drive, (state, word) in enumerate(zip(self._watch.states, self._words, strict=True)):
-            if state is not DriveState.QUICK_STOP_ACTIVE:
-                self._stop_commanded[drive] = False
-            elif word is ControlWord.QUICK_STOP:
-                self._stop_commanded[drive] = True
 
     def _look_for_faults(self) -> None:
         powered = self._goal in (Goal.ENABLE, Goal.RELEASE)
@@ -345,6 +343,7 @@ class Cia402Group(CyclicGroup):
         self._cycles_to_goal += 1
         self._is_new_goal &= not self._watch.complete
         if self._goal is Goal.RESET_FAULT:
+            self._watch.take_errors(self._errors.values)
             if self._cycles_to_goal > self._reset_cycles or DriveState.FAULT not in states:
                 self._goal = Goal.IDLE
         elif self._state is GroupState.ENABLING:
@@ -366,8 +365,7 @@ class Cia402Group(CyclicGroup):
             self._state = GroupState.ENABLED
             return
         if self._modes is None:
-            wait = MODE_WAIT + self._answer_time
-            cycles = len(self._nodes) + round(wait / self._cycle_s)
+            cycles = len(self._nodes) + round((MODE_WAIT + self._answer_time) / self._cycle_s)
             self._modes = ModeCheck(self._nodes, cycles, self._again_after)
             self._watch.on_answer = self._modes.take
         wrong = self._modes.wrong()
@@ -382,8 +380,8 @@ class Cia402Group(CyclicGroup):
         return ignoring_drives(self._rig.drive_names, self._watch.status_words, seconds)
 
     def _late(self, cycles: int) -> list[tuple[int, str]]:
-        words, seconds = self._watch.status_words, cycles * self._cycle_s
-        return late_drives(self._rig.drive_names, words, self._words, self._goal, seconds)
+        names, words = self._rig.drive_names, self._watch.status_words
+        return late_drives(names, words, self._words, self._goal, cycles * self._cycle_s)
 
     def _status(self) -> CycleStatus:
         watch = self._watch
@@ -419,11 +417,12 @@ class Cia402Group(CyclicGroup):
             return
         self._refuse_latched("enable the drives")
         self._begin(Goal.ENABLE)
-        self._state, self._modes = GroupState.ENABLING, None
+        self._state = GroupState.ENABLING
 
     def _begin(self, goal: Goal) -> None:
         self._former = self._goal, self._enables
         self._goal, self._cycles_to_goal = goal, 0
+        self._modes, self._errors = None, SdoJobs({}, 1)
         self._enables, self._is_new_goal = False, True
 
     def require_releasable(self) -> None:
@@ -440,6 +439,8 @@ class Cia402Group(CyclicGroup):
     def _reset_fault(self) -> None:
         """Clears the faults; resets drives in fault only if no other holds the platform."""
         faulted = self._watch.require_resettable()
+        self._errors = SdoJobs(dict.fromkeys(faulted, ERROR_REQUESTS), self._again_after)
+        self._watch.on_answer = self._errors.take
         self._cycles_to_goal = 0
         self._faults.clear()
         self._watch.forget_emergencies()

@@ -11,7 +11,7 @@ import can
 import numpy as np
 
 from drivers.cia402.configure import is_still_set_up, require_objects
-from drivers.cia402.error_codes import abort_text
+from drivers.cia402.error_codes import abort_text, emergency_text
 from drivers.cia402.expected_objects import (
     BY_MAKERS_TOOL,
     MODE_DISPLAY,
@@ -24,6 +24,7 @@ from drivers.cia402.expected_objects import (
     how_without,
     position_range,
     require_answers,
+    stored_error,
 )
 from drivers.cia402.object_dictionary import (
     HEARTBEAT_CONSUMERS,
@@ -163,7 +164,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         reader = _Reader(network, node, rows)
         for expected in expectations(rig, profile, node):
             reader.at_expected(expected)
-        reader.at_state()
+        reader.at_state(network)
         for index, form, name, why in _PROCESS_DATA:
             reader.at_setting(Setting(index, 0, form, 0, name, why), "readable")
         reader.at_scale(rig.document.winches[drive].counts_per_rev)
@@ -212,8 +213,8 @@ class _Reader:
         change = "" if good else how_to_set(expected)
         row.note(self._node, f"{value:X}h", "ok" if good else "wrong", change)
 
-    def at_state(self) -> None:
-        """State of the drive's state machine."""
+    def at_state(self, network: SetupNetwork) -> None:
+        """State of the drive's state machine, with the error of one in fault."""
         row = self._row(0x6041, 0, "6041h:00 statusword", "not enabled, no fault")
         row.meaning = "only drives at rest are configured"
         data = self._read(0x6041, 0, row, optional=False)
@@ -222,9 +223,9 @@ class _Reader:
         word = int.from_bytes(data, "little")
         state = state_of(word)
         if state in FAULTED:
-            row.note(
-                self._node, state.value, "wrong", "remove the cause, then run `cdpr reset RIG`"
-            )
+            code = stored_error(network, self._node)
+            text = f"{state.value}: {emergency_text(code)}" if code else state.value
+            row.note(self._node, text, "wrong", "remove the cause, then run `cdpr reset RIG`")
         elif state is DriveState.OPERATION_ENABLED:
             row.note(self._node, state.value, "remark", "another program moves it; end it first")
         elif shown := without_power(word):
@@ -418,9 +419,15 @@ def read_states(
     except Refused:
         require_objects(rig, network, _STATE)  # names all missing ones, not only the first
         raise
+    is_faulted = [state_of(word & 0xFFFF) in FAULTED for word in words]
+    codes = [
+        stored_error(network, node) if faulted else 0
+        for node, faulted in zip(nodes, is_faulted, strict=True)
+    ]
     return DriveSnapshot(
         positions=np.array(positions, dtype=np.int64),
         torques=np.array(torques, dtype=np.int64) * winding_signs(rig),
         status_words=np.array(words, dtype=np.int64) & 0xFFFF,
         restarted=restarted,
+        errors=tuple(emergency_text(code) if code else "" for code in codes),
     )

@@ -16,7 +16,7 @@ from drivers.cia402.pdo import (
     parse_heartbeat,
     parse_reply,
 )
-from drivers.cia402.sdo_jobs import STATE_REQUESTS, SdoRequest
+from drivers.cia402.sdo_jobs import ERROR_REQUESTS, STATE_REQUESTS, SdoRequest
 from drivers.cia402.state_machine import (
     FAULTED,
     TORQUE_ON,
@@ -72,6 +72,7 @@ class DriveMonitor:
         self._new_messages: list[tuple[int, str]] = []
         self._changes: list[tuple[int, DriveState, DriveState]] = []
         self._emergencies: dict[int, str] = {}
+        self._stored: dict[int, str] = {}  # errors from before a reset, or read from the drives
         self._over: set[int] = set()
         self._replies = {TPDO1_BASE + node: i for i, node in enumerate(nodes)}
         self._others = {EMCY_BASE + node: self._emergency for node in nodes}
@@ -203,7 +204,8 @@ class DriveMonitor:
             if state not in FAULTED:
                 continue
             name = self._names[node]
-            cause = self._emergencies.get(node, "no emergency message received")
+            stored = self._stored.get(node, "no emergency message received")
+            cause = self._emergencies.get(node, stored)
             if f"{name}: {cause}" not in known:
                 since = ", reported as over since" if node in self._over else ""
                 found.append((node, f"{name} is in {state.value}: {cause}{since}"))
@@ -233,8 +235,22 @@ class DriveMonitor:
             )
         return faulted
 
+    def note_errors(self, codes: Mapping[int, int]) -> None:
+        """Takes the error codes that drives in fault store, by node; 0 for none."""
+        self._stored |= {
+            node: f"{emergency_text(code)}, as stored in the drive"
+            for node, code in codes.items()
+            if code
+        }
+
+    def take_errors(self, values: Mapping[tuple[int, SdoRequest], int]) -> None:
+        """Takes the answers to `ERROR_REQUESTS`; the first one that states an error counts."""
+        for job in reversed(ERROR_REQUESTS):
+            self.note_errors({n: v & 0xFFFF for (n, asked), v in values.items() if asked == job})
+
     def forget_emergencies(self) -> None:
-        """Clears all emergencies after a reset by the operator."""
+        """Clears all emergencies after a reset by the operator; they explain a fault that stays."""
+        self._stored |= {node: f"earlier: {text}" for node, text in self._emergencies.items()}
         self._emergencies.clear()
         self._over.clear()
         self._new_messages.clear()

@@ -499,6 +499,43 @@ def test_a_fault_is_latched_until_it_is_reset(bench: Bench) -> None:
     bench.until(GroupState.ENABLED)
 
 
+@pytest.mark.parametrize("stores", [True, False])
+@pytest.mark.parametrize("set_up_again", [True, False])
+def test_a_reset_that_fails_states_the_cause(
+    bench: Bench, stores: bool, set_up_again: bool
+) -> None:
+    """No emergency was said to have been received: the reset had deleted it."""
+    bench.enable()
+    drive, take = bench.drives[2], bench.drives[2]._take_control_word
+    drive._take_control_word = lambda word: take(word & ~0x80)  # type: ignore[method-assign]
+    if not stores:
+        drive.objects.refusals[0x603F, 0] = 0x06020000
+    drive.fail(0x3210)
+    for _ in range(3):
+        bench.cycle()
+    for each in bench.drives:  # the operator's emergency stop takes the torque off
+        if each.state is HOLDING:
+            each.state = DriveState.SWITCH_ON_DISABLED
+    bench.cycle()
+    if set_up_again:
+        bench.group.close()
+        bench.group.configure(to_reset=True)
+        bench.group.read_positions()
+    bench.group.command(GroupCommand.RESET_FAULT)
+    for _ in range(120):
+        bench.cycle()
+    assert bench.status is not None
+    ((node, text),) = bench.status.faults
+    assert node == 3
+    over_voltage = "DC link over-voltage (error 3210h)"
+    if stores:
+        assert text == f"cable 3 (drive 3) is in fault: {over_voltage}, as stored in the drive"
+    elif set_up_again:
+        assert text.endswith("no emergency message received")
+    else:
+        assert text == f"cable 3 (drive 3) is in fault: earlier: {over_voltage}"
+
+
 def test_a_silent_drive_is_reported_every_cycle_and_left_to_the_executor(bench: Bench) -> None:
     bench.enable()
     bench.drives[7].silent = True

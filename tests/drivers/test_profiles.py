@@ -844,6 +844,41 @@ def test_doctor_says_what_keeps_a_drive_from_being_enabled(rig: Rig, word: int, 
     assert said in row.change
 
 
+def errors_of(bus: ScriptedBus, code: int | None, history: int | None) -> None:
+    """Drive 5 is in fault, with 603Fh and 1003h:01, or without either."""
+    drive = bus.drives[5]
+    drive.values[0x6041, 0] = 0x0218
+    drive.objects[0x1003, 1] = drive.objects[0x1006, 0]
+    for key, value in (((0x603F, 0), code), ((0x1003, 1), history)):
+        drive.values[key] = value or 0
+        if value is None:
+            drive.aborts[key] = 0x06020000
+
+
+STORED = [
+    (0x3210, 0x12344310, "DC link over-voltage (error 3210h)"),
+    (0, 0x12344310, "drive temperature too high (error 4310h)"),
+    (None, 0x12344310, "drive temperature too high (error 4310h)"),
+    (0x3210, None, "DC link over-voltage (error 3210h)"),
+    (None, None, ""),
+]
+
+
+@pytest.mark.parametrize(("code", "history", "said"), STORED)
+def test_a_fault_is_explained_by_what_the_drive_stores(
+    rig: Rig, code: int | None, history: int | None, said: str
+) -> None:
+    bus = eight_of("cia402")
+    errors_of(bus, code, history)
+    (row,) = (row for row in examined(rig, bus).rows if row.object.startswith("6041h"))
+    assert row.found[f"fault: {said}" if said else "fault"] == [5]
+    assert examine.read_states(rig, bus, None).errors == ("",) * 4 + (said,) + ("",) * 3  # type: ignore[arg-type]
+    with pytest.raises(Refused) as caught:
+        set_up(rig, bus)
+    assert caught.value.what == "drive 5 is in fault" + (f": {said}" if said else "")
+    set_up(rig, bus, to_reset=True)
+
+
 def test_every_profile_names_its_sources() -> None:
     for name in profile_names():
         assert load_profile(name).sources, name
