@@ -10,17 +10,20 @@ import can
 from drivers.can_errors import DriveRestarted, Refusals, answers_twice
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
+    HOW_SCALED,
     MODE_DISPLAY,
     are_simulated,
     count_heartbeats,
     expectations,
     found_text,
+    refuse_scale,
     require_absent,
     require_answers,
     require_expected,
     require_idle,
     require_no_wrap,
     require_there,
+    wrong_scales_of,
     wrong_value,
 )
 from drivers.cia402.object_dictionary import (
@@ -133,6 +136,9 @@ def configure_drives(
         refusals.note(require_idle, network, node, to_reset, errors)
         _note_objects(rig, network, winch_map, drive, settings[drive], max_tension, refusals)
         refusals.note(count_heartbeats, network, node, profile, entries)
+    scales = wrong_scales_of(rig, network, nodes)
+    for wrong in scales:
+        refusals.note(refuse_scale, nodes[wrong.drive], wrong)
     refusals.raise_any(UNCHANGED)
     _refuse_duplicates(network)
     restarted = _restarted(network, nodes, settings)
@@ -144,6 +150,8 @@ def configure_drives(
     except DriveRestarted as error:
         on_restarted(tuple(sorted({*restarted, error.node})))
         raise
+    for wrong in scales:
+        absent.setdefault(f"{wrong}: {HOW_SCALED}", []).append(nodes[wrong.drive])
     for remark in left_out(profile):
         absent.setdefault(remark, []).extend(nodes)
     remarks = (*_absent(absent), *_unwatched_peers(nodes, entries, profile))

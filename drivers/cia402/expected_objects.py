@@ -7,13 +7,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from drivers.can_errors import SETTING_UP, in_fault, moved_by_another, wrong_setting
-from drivers.cia402.error_codes import emergency_text
+from drivers.cia402.error_codes import emergency_text, stored_error
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
 from drivers.cia402.pdo import NmtCommand
-from drivers.cia402.profile import load_profile, profile_names
+from drivers.cia402.profile import load_profile, profile_names, profile_of
 from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent, silent
-from drivers.cia402.sdo_jobs import CSP_MODE, ERROR_REQUESTS
+from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
+from drivers.plausibility import WrongScale, wrong_scales
 from model.errors import HardwareMissing, Refused
 from model.files.drive_profile_file import (
     NEEDED,
@@ -243,6 +244,58 @@ def position_range(
 _ENDS = ((1, "min"), (2, "max"))
 
 
+def position_scales(
+    read: Callable[[int, int, str], bytes | None],
+) -> dict[str, float]:
+    """Position counts per motor turn that a drive states, by object, the one that counts first.
+
+    A factor group scales positions; where it is not set (1 per turn) the encoder does. Objects
+    that are missing, zero or refused state nothing. Source: CiA 402-2, factor group.
+
+    Args:
+        read: As for `position_range`.
+    """
+    feed, gear, encoder = (_quotient(read, index) for index in (0x6092, 0x6091, 0x608F))
+    scales = {"6092h/6091h": feed / (gear or 1.0)} if feed else {}
+    return scales | ({"608Fh": encoder} if encoder else {})
+
+
+def _quotient(read: Callable[[int, int, str], bytes | None], index: int) -> float | None:
+    """Sub-index 1 divided by sub-index 2; None if the object is missing or zero."""
+    try:
+        data = [read(index, sub, "position scale") for sub in (1, 2)]
+    except Refused as error:
+        if "abort_code" not in error.values:
+            raise
+        return None
+    above, below = (int.from_bytes(each or b"", "little") for each in data)
+    return above / below if above and below else None
+
+
+SCALE = "position counts per motor turn"
+HOW_SCALED = (
+    "compare 6064h over one motor turn, then correct the drive or winches[].counts_per_rev;"
+    " if 6092h, 6091h and 608Fh do not describe 6064h, set states_scale: false in the profile"
+)
+
+
+def wrong_scales_of(rig: Rig, network: SetupNetwork, nodes: Sequence[int]) -> list[WrongScale]:
+    """Drives whose stated position scale contradicts the rig file, as indices of ``nodes``."""
+    states_scale = profile_of(rig).states_scale
+    if states_scale is False:
+        return []
+    counts = {w.node_id: w.counts_per_rev for w in rig.document.winches}
+    scales = [position_scales(network.client(node).read_if_there) for node in nodes]
+    return wrong_scales([counts[node] for node in nodes], scales, known=bool(states_scale))
+
+
+def refuse_scale(node: int, wrong: WrongScale) -> None:
+    """Raises `Refused` for a drive whose position scale is certainly another than the rig's."""
+    if wrong.certain:
+        found, wanted = f"{wrong.stated:.10g} by {wrong.source}", str(wrong.counts)
+        raise wrong_setting(node, SCALE, found, wanted, "counts_per_rev of the winch", HOW_SCALED)
+
+
 def holds_limits(wraps: tuple[int, int] | None, settings: Sequence[Setting]) -> bool:
     """Whether positions do not wrap around within the software limits 607Dh of the settings."""
     limits = [setting.value for setting in settings if setting.index == SOFTWARE_LIMITS]
@@ -311,20 +364,6 @@ def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
 _STATUS_WORD = "object 6041h:00 status word"
 
 
-def stored_error(network: SetupNetwork, node: int) -> int:
-    """The error code that a drive stores for its fault (`ERROR_REQUESTS`); 0 if it has none."""
-    for job in ERROR_REQUESTS:
-        try:
-            data = network.client(node).read_if_there(job.index, job.sub, "error code", job.size)
-        except Refused as error:
-            if "node" not in error.values:
-                raise
-            continue
-        if code := int.from_bytes((data or b"")[:2], "little"):
-            return code
-    return 0
-
-
 def require_idle(network: SetupNetwork, node: int, to_reset: bool, errors: dict[int, int]) -> None:
     """Refuses an enabled drive, which another master controls; quick stop is accepted.
 
@@ -340,7 +379,7 @@ def require_idle(network: SetupNetwork, node: int, to_reset: bool, errors: dict[
     data = network.client(node).read(0x6041, 0, "status word", 2)
     state = state_of(int.from_bytes(data, "little"))
     if state in FAULTED:
-        errors[node] = code = stored_error(network, node)
+        errors[node] = code = stored_error(network.client(node).read_if_there)
         if not to_reset:
             why = "it stopped itself; its display or the manufacturer's tool shows the cause"
             known = f": {emergency_text(code)}" if code else ""

@@ -506,6 +506,60 @@ def test_doctor_holds_the_drives_scale_against_the_rig_s(
     assert bool(row.change) == (verdict == "remark")
 
 
+def keyed(rig: Rig, tmp_path: Path, key: str) -> Rig:
+    return with_profile(rig, lab_profile(tmp_path, key))
+
+
+@pytest.mark.parametrize(
+    ("others", "of_five", "key", "named"),
+    [
+        ({}, {0x6092: (360_000, 1)}, "", None),  # no drive shows that its make means 6064h
+        ({0x608F: (TURN, 1)}, {0x6092: (360_000, 1)}, "", "360000 by 6092h/6091h"),
+        (
+            {0x6092: (TURN, 1)},
+            {0x608F: (4096, 1)},
+            "",
+            "4096 by 608Fh",
+        ),  # replaced, at its defaults
+        ({0x6092: (TURN, 1)}, {}, "", ""),
+        ({}, {0x6092: (360_000, 1)}, "states_scale: true", "360000 by 6092h/6091h"),
+        ({0x608F: (TURN, 1)}, {0x6092: (360_000, 1)}, "states_scale: false", ""),
+        ({0x608F: (TURN, 1)}, {0x608F: (TURN, 1), 0x6092: (1, 1)}, "", ""),  # not set
+        ({0x608F: (TURN, 1)}, {0x608F: (4096, 1), 0x6092: (TURN, 1)}, "", ""),  # another encoder
+    ],
+)
+def test_a_drive_with_another_scale_than_the_rig_file_does_not_move_unannounced(
+    rig: Rig,
+    tmp_path: Path,
+    others: dict[int, tuple[int, int]],
+    of_five: dict[int, tuple[int, int]],
+    key: str,
+    named: str | None,
+) -> None:
+    """Refused where its make is known to state the scale, or another drive shows it."""
+    bus = with_scale(others)
+    five = with_scale(of_five).drives[5]
+    bus.drives[5] = five
+    theirs = keyed(rig, tmp_path, key)
+    found = examined(theirs, bus)
+    if named:
+        assert not found.good
+        with pytest.raises(Refused, match=f"the drive has {named}; {TURN} is required") as caught:
+            set_up(theirs, bus)
+        assert "drive 5, position counts per motor turn" in caught.value.where
+        assert "states_scale: false" in caught.value.next_step
+        assert "the drives were not changed" in caught.value.next_step
+        return
+    assert found.good
+    said = [remark for remark in set_up(theirs, bus) if "counts per motor turn" in remark]
+    if named == "":
+        assert said == []
+    else:
+        (remark,) = said
+        stated = "360000 position counts per motor turn by 6092h/6091h"
+        assert remark.startswith(f"drive 5: {stated}, and {TURN} by the rig file: compare 6064h")
+
+
 def test_doctor_reads_the_mode_that_a_set_up_waits_for(rig: Rig) -> None:
     bus = eight_of("cia402")
     bus.drives[5].aborts[0x6061, 0] = 0x06020000
