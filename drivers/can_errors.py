@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntFlag
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import can
 from can.interfaces.socketcan import SocketcanBus
@@ -247,6 +247,26 @@ class ErrorFrames:
 SETTING_UP = "configuring the drives"
 
 
+class DriveRestarted(Refused):
+    """A drive restarted while it was configured.
+
+    Attributes:
+        node: Of the drive.
+    """
+
+    def __init__(self, node: int) -> None:
+        """Takes the node; no ``node`` in the values, so that the set-up ends at once."""
+        super().__init__(
+            f"drive {node} restarted during set-up",
+            where=SETTING_UP,
+            why="its power failed or another program reset it: what was written to it is lost",
+            next_step="check its power supply, end other programs, then repeat the command; no"
+            " drive is enabled",
+            values={"nodes": str(node)},
+        )
+        self.node = node
+
+
 def answers_twice(node: int) -> Refused:
     """Two devices have the same node id."""
     return Refused(
@@ -330,3 +350,34 @@ def combined_refusal(refusals: Sequence[Refused], left: str) -> Refused:
         f" and drives.profile of the rig file describes the drives; {left}",
         values={"nodes": ", ".join(sorted(drives)), "count": len(nodes)},
     )
+
+
+class Refusals:
+    """Collects refusals of drives, so that one message reports all."""
+
+    def __init__(self) -> None:
+        """Starts empty."""
+        self._found: list[Refused] = []
+
+    def note(self, action: Callable[..., object], *arguments: Any) -> bool:
+        """Calls an action; records a refusal of the drive and returns False."""
+        try:
+            action(*arguments)
+        except Refused as error:
+            if "node" not in error.values:  # as another master: the other drives do not matter
+                raise
+            self._found.append(error)
+            return False
+        return True
+
+    def raise_any(self, left: str) -> None:
+        """Raises if a refusal was recorded.
+
+        Args:
+            left: The state that the drives are left in.
+
+        Raises:
+            Refused: With all recorded refusals.
+        """
+        if self._found:
+            raise combined_refusal(self._found, left)

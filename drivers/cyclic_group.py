@@ -61,7 +61,7 @@ class CyclicBus:
         self,
         bus: can.BusABC,
         commanding: frozenset[int],
-        foreign_master_message: Callable[[int], str],
+        foreign_master_message: Callable[[int, bytes | bytearray], str],
         is_command: Callable[[int, bytes | bytearray], bool] = lambda _id, _data: True,
     ) -> None:
         """Takes an open bus.
@@ -69,7 +69,7 @@ class CyclicBus:
         Args:
             bus: Owned by the caller.
             commanding: Identifiers that only a master sends.
-            foreign_master_message: Message about another master, by identifier of its frame.
+            foreign_master_message: Message about another master, by its frame.
             is_command: Whether a frame with one of the identifiers commands, by its data; drives
                 and harmless requests may share an identifier with a command.
         """
@@ -174,18 +174,14 @@ class CyclicBus:
     def _process(self, message: can.Message, listener: ReplyListener, *, stale: bool) -> None:
         if message.is_error_frame:
             self._find(self._errors.take(message))
-        elif message.is_extended_id or message.is_remote_frame:
             return
-        elif self._is_foreign_command(message):
-            self._find(
-                ForeignMaster(self._foreign_master_message(message.arbitration_id), self._where)
-            )
+        if message.is_extended_id or message.is_remote_frame:
+            return
+        can_id, data = message.arbitration_id, message.data
+        if self._is_command(can_id, data) and self._own.is_foreign(can_id):
+            self._find(ForeignMaster(self._foreign_master_message(can_id, data), self._where))
         else:
-            listener.take(message.arbitration_id, message.data, stale=stale)
-
-    def _is_foreign_command(self, message: can.Message) -> bool:
-        identifier = message.arbitration_id
-        return self._is_command(identifier, message.data) and self._own.is_foreign(identifier)
+            listener.take(can_id, data, stale=stale)
 
 
 class GroupMonitor(ReplyListener, Protocol):

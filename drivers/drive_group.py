@@ -155,12 +155,15 @@ class DriveSnapshot:
         status_words: Shape (m,); see `drive_states`.
         restarted: Nodes without this program's configuration: power-cycled, or never configured.
             For drives with non-volatile settings, all without an absolute encoder.
+        errors: The error that each drive in fault stores, as text; empty without one, and for
+            drives that show it in their state.
     """
 
     positions: Counts
     torques: Counts
     status_words: Counts
     restarted: tuple[int, ...]
+    errors: tuple[str, ...]
 
 
 class DriveGroup(Protocol):

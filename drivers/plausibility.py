@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,56 @@ def largest_steps(rig: Rig, cycle: float) -> tuple[float, ...]:
     """Largest change of each drive's position in a cycle [s], [counts]."""
     fastest = [w.max_speed * cycle * abs(w.counts_per_metre) for w in rig.winches]
     return tuple(max(JUMP_COUNTS, JUMP_RESERVE * step) for step in fastest)
+
+
+@dataclass(frozen=True, slots=True)
+class WrongScale:
+    """A drive states other position counts per motor turn than the rig file.
+
+    Attributes:
+        drive: Index of the drive.
+        source: What states it.
+        stated: Stated counts per motor turn.
+        counts: ``counts_per_rev`` of the winch.
+        certain: What it states is the scale of its positions.
+    """
+
+    drive: int
+    source: str
+    stated: float
+    counts: int
+    certain: bool
+
+    def __str__(self) -> str:
+        """The contradiction, without the drive."""
+        stated = f"{self.stated:.10g} position counts per motor turn by {self.source}"
+        return f"{stated}, and {self.counts} by the rig file"
+
+
+def wrong_scales(
+    counts: Sequence[int], stated: Sequence[Mapping[str, float]], *, known: bool
+) -> list[WrongScale]:
+    """Drives whose stated scale contradicts the rig file.
+
+    A scale of 1 is not set: the next one of the drive counts. Where no drive agrees with the rig
+    file, these objects may mean something else in drives of this make.
+
+    Args:
+        counts: ``counts_per_rev`` of each winch.
+        stated: Counts per motor turn that each drive states, by source, the first one first.
+        known: The drives of this make state the scale of their positions.
+    """
+    found, certain = [], known
+    for drive, (own, scales) in enumerate(zip(counts, stated, strict=True)):
+        for source, scale in scales.items():
+            if scale == 1.0:
+                continue
+            if math.isclose(scale, own, rel_tol=1e-9):
+                certain = True
+            else:
+                found.append((drive, source, scale, own))
+            break
+    return [WrongScale(*each, certain) for each in found]
 
 
 class ReplyCheck:

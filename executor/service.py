@@ -59,6 +59,7 @@ class DriveStatus:
         position: Of its encoder, [counts].
         tension: Of its cable, from the drive's torque, [N].
         set_up: It has the configuration for this rig: no power cycle or other cycle time since.
+        error: The error that a drive in fault stores; empty if it has none.
     """
 
     node: int
@@ -66,6 +67,7 @@ class DriveStatus:
     position: int
     tension: float
     set_up: bool
+    error: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,6 +146,7 @@ class StatusResult:
             f"{names[drive.node]:<19} {drive.state:<24} {drive.position:>11} counts"
             f" {drive.tension:8.2f} N"
             f"{'' if drive.set_up else '  not set up, or for another cycle'}"
+            f"{f'  {drive.error}' if drive.error else ''}"
             for drive in self.drives or ()
         ]
 
@@ -161,6 +164,7 @@ class StatusResult:
                 "position_counts": drive.position,
                 "tension_n": round(drive.tension, 2),
                 "set_up": drive.set_up,
+                "error": drive.error or None,
             }
             for drive in self.drives or ()
         ]
@@ -242,11 +246,12 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
         drive_states(rig, seen.status_words.tolist()),
         positions,
         rig.tensions_by(seen.torques).tolist(),
+        seen.errors,
         strict=True,
     )
     drives = tuple(
-        DriveStatus(w.node_id, state, position, tension, w.node_id not in seen.restarted)
-        for w, state, position, tension in columns
+        DriveStatus(w.node_id, state, position, tension, w.node_id not in seen.restarted, error)
+        for w, state, position, tension, error in columns
     )
     read = replace(known, reference=reference, drives=drives)
     if not reference.counts:

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import can
 
-from drivers.can_errors import (
-    SETTING_UP,
-    answers_twice,
-    combined_refusal,
-)
+from drivers.can_errors import DriveRestarted, Refusals, answers_twice
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
+    HOW_SCALED,
     MODE_DISPLAY,
+    are_simulated,
     count_heartbeats,
     expectations,
-    number_text,
+    found_text,
+    refuse_scale,
     require_absent,
+    require_answers,
     require_expected,
     require_idle,
     require_no_wrap,
     require_there,
+    wrong_scales_of,
     wrong_value,
 )
 from drivers.cia402.object_dictionary import (
@@ -37,10 +37,10 @@ from drivers.cia402.object_dictionary import (
 )
 from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.profile import for_unused_pdos, profile_of, used_pdos
-from drivers.cia402.sdo import NOT_NOW, SetupNetwork, means_absent, silent
+from drivers.cia402.sdo import NOT_NOW, SetupNetwork, means_absent
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.drive_group import OnRestarted, Pump
-from model.errors import HardwareMissing, Refused
+from model.errors import Refused
 from model.files.drive_profile_file import ProfileDocument
 from model.rig import Rig
 from model.winches import WinchMap
@@ -57,6 +57,9 @@ MODE_ASKED = 10
 
 READ_ONLY = frozenset({0x06010000, 0x06010002})
 """Abort codes of a read-only object, whose fixed value may be the required one."""
+
+OUT_OF_RANGE = frozenset({0x06090030, 0x06090031, 0x06090032})
+"""Abort codes of a value outside an object's range, too high, too low."""
 
 UNCHANGED = "the drives were not changed"
 UNFINISHED = (
@@ -75,10 +78,16 @@ class SetUp:
     Attributes:
         remarks: Functions that drives lack although a run would use them.
         heartbeats: Number of entries of 1016h written in each drive: the master's, then peers'.
+        simulated: Whether all drives identify themselves as simulated.
+        emergencies: Data of the last EMCY of each drive, by identifier.
+        errors: Stored error codes of the drives in fault, by node.
     """
 
     remarks: tuple[str, ...]
     heartbeats: tuple[int, ...]
+    simulated: bool
+    emergencies: Mapping[int, bytes]
+    errors: Mapping[int, int]
 
 
 def configure_drives(
@@ -99,13 +108,14 @@ def configure_drives(
         max_tension: Tension that sets the torque limit, [N]; the rig's if None.
         to_reset: Accepts drives in fault too, which will be reset.
         on_restarted: Called, before anything is written, with the nodes that lost the
-            configuration or never had it.
+            configuration or never had it; once more if a drive restarts during the set-up.
 
     Returns:
         What was configured, with remarks.
 
     Raises:
         HardwareMissing: Drives do not answer; with all their nodes.
+        DriveRestarted: A drive restarted meanwhile.
         Refused: A drive is not a CiA 402 drive, is already enabled, or refuses or changes an
             object; two devices have one node id; or another master is active on this bus.
         BadInput: A value of the rig does not fit its object.
@@ -117,18 +127,48 @@ def configure_drives(
     network = SetupNetwork(bus, pump, nodes, timeout=profile.sdo_timeout_ms / 1000.0)
     network.discard_waiting()
     require_answers(network, nodes, revive=to_reset)
+    network.refuse_restarts()
     _refuse_duplicates(network)
     refusals = Refusals()
     entries: list[int] = []
+    errors: dict[int, int] = {}
     for drive, node in enumerate(nodes):
-        refusals.note(require_idle, network, node, to_reset)
+        refusals.note(require_idle, network, node, to_reset, errors)
         _note_objects(rig, network, winch_map, drive, settings[drive], max_tension, refusals)
         refusals.note(count_heartbeats, network, node, profile, entries)
+    scales = wrong_scales_of(rig, network, nodes)
+    for wrong in scales:
+        refusals.note(refuse_scale, nodes[wrong.drive], wrong)
     refusals.raise_any(UNCHANGED)
     _refuse_duplicates(network)
-    on_restarted(
-        tuple(n for n, s in zip(nodes, settings, strict=True) if not is_still_set_up(network, n, s))
+    restarted = _restarted(network, nodes, settings)
+    on_restarted(restarted)
+    try:
+        absent = _write_settings(rig, network, settings, entries)
+        simulated = are_simulated(network, nodes)
+        _start(network, nodes, settings)
+    except DriveRestarted as error:
+        on_restarted(tuple(sorted({*restarted, error.node})))
+        raise
+    for wrong in scales:
+        absent.setdefault(f"{wrong}: {HOW_SCALED}", []).append(nodes[wrong.drive])
+    for remark in left_out(profile):
+        absent.setdefault(remark, []).extend(nodes)
+    remarks = (*_absent(absent), *_unwatched_peers(nodes, entries, profile))
+    watched = (
+        min(count, rig.cable_count) if profile.watches_heartbeats else 0 for count in entries
     )
+    return SetUp(remarks, tuple(watched), simulated, network.emergencies, errors)
+
+
+def _write_settings(
+    rig: Rig,
+    network: SetupNetwork,
+    settings: Sequence[Sequence[Setting]],
+    entries: Sequence[int],
+) -> dict[str, list[int]]:
+    """Writes all settings of all drives; returns nodes by remark on a missing object."""
+    profile, nodes, refusals = profile_of(rig), [w.node_id for w in rig.winches], Refusals()
     absent: dict[str, list[int]] = {}
     for drive, node in enumerate(nodes):
         network.command(NmtCommand.PRE_OPERATIONAL, node)
@@ -145,16 +185,22 @@ def configure_drives(
         for node in nodes:
             refusals.note(_await_mode, network, node)
     refusals.raise_any(UNFINISHED)
+    return absent
+
+
+def _start(
+    network: SetupNetwork, nodes: Sequence[int], settings: Sequence[Sequence[Setting]]
+) -> None:
+    """Starts the process data; a drive that has lost its settings by then is refused.
+
+    Raises:
+        DriveRestarted: A boot-up came, or volatile settings are at their defaults.
+    """
     for node in nodes:
         network.command(NmtCommand.START, node)
     network.process_waiting()
-    for remark in left_out(profile):
-        absent.setdefault(remark, []).extend(nodes)
-    remarks = (*_absent(absent), *_unwatched_peers(nodes, entries, profile))
-    watched = (
-        min(count, rig.cable_count) if profile.watches_heartbeats else 0 for count in entries
-    )
-    return SetUp(remarks, tuple(watched))
+    for node in _restarted(network, nodes, settings):  # its boot-up was lost
+        raise DriveRestarted(node)
 
 
 def _note_objects(
@@ -201,37 +247,11 @@ def require_objects(
     refusals.raise_any(UNCHANGED)
 
 
-class Refusals:
-    """Collects refusals of drives, so that one message reports all."""
-
-    def __init__(self) -> None:
-        """Starts empty."""
-        self._found: list[Refused] = []
-
-    def note(self, action: Callable[..., object], *arguments: Any) -> bool:
-        """Calls an action; records a refusal of the drive and returns False."""
-        try:
-            action(*arguments)
-        except Refused as error:
-            if (
-                "node" not in error.values
-            ):  # another master is active: the other drives do not matter
-                raise
-            self._found.append(error)
-            return False
-        return True
-
-    def raise_any(self, left: str) -> None:
-        """Raises if a refusal was recorded.
-
-        Args:
-            left: The state that the drives are left in.
-
-        Raises:
-            Refused: With all recorded refusals.
-        """
-        if self._found:
-            raise combined_refusal(self._found, left)
+def _restarted(
+    network: SetupNetwork, nodes: Sequence[int], settings: Sequence[Sequence[Setting]]
+) -> tuple[int, ...]:
+    each = zip(nodes, settings, strict=True)
+    return tuple(node for node, own in each if not is_still_set_up(network, node, own))
 
 
 def is_still_set_up(network: SetupNetwork, node: int, settings: Sequence[Setting]) -> bool:
@@ -285,49 +305,6 @@ def _unwatched_peers(
         )
 
 
-def require_answers(network: SetupNetwork, nodes: Sequence[int], *, revive: bool = False) -> None:
-    """Contacts all drives at once, and reports all silent ones together.
-
-    Args:
-        network: The bus.
-        nodes: The drives.
-        revive: Takes drives that are in NMT *stopped* to *pre-operational*.
-
-    Raises:
-        HardwareMissing: Drives do not answer.
-        Refused: Drives are in NMT *stopped*, or the single silent drive gives a wrong answer.
-    """
-    nothing = network.silent_nodes(nodes)
-    stopped = [node for node in nothing if network.is_stopped(node)]
-    if stopped and revive:
-        for node in stopped:
-            network.command(NmtCommand.PRE_OPERATIONAL, node)
-        nothing = network.silent_nodes(nothing)
-    elif stopped:
-        names = ", ".join(str(node) for node in stopped)
-        raise Refused(
-            f"drive {names}: in the NMT state 'stopped', by its heartbeat",
-            where=SETTING_UP,
-            why="another program, or the drive's own reaction to a communication error (1029h),"
-            " stopped its communication",
-            next_step="end other programs, then run `cdpr reset RIG`",
-            values={"nodes": names},
-        )
-    if len(nothing) == 1:
-        where = f"drive {nothing[0]}, object 1000h:00 device type"
-        raise network.client(nothing[0]).no_answer(where)
-    if nothing:
-        names = ", ".join(str(node) for node in nothing)
-        first = silent(nothing[0], SETTING_UP)
-        raise HardwareMissing(
-            f"drives {names} do not answer",
-            where=SETTING_UP,
-            why=first.why,
-            next_step=first.next_step,
-            values={"nodes": names},
-        )
-
-
 def _await_mode(network: SetupNetwork, node: int) -> None:
     """Waits up to `MODE_WAIT` until the drive shows the mode that was written."""
     deadline = network.clock() + MODE_WAIT
@@ -369,6 +346,9 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
         client.write(setting.index, setting.sub, setting.data(), setting.name)
     except Refused as error:
         code = error.values.get("abort_code")
+        if code in OUT_OF_RANGE and setting.equivalent and setting.value != setting.equivalent[0]:
+            _write(network, node, replace(setting, value=setting.equivalent[0]), remarks)
+            return
         if code in NOT_NOW or not (setting.optional or code in READ_ONLY):
             raise
         if setting.transient and code in READ_ONLY:
@@ -387,8 +367,8 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
         return
     kept = client.read(setting.index, setting.sub, setting.name, setting.size)
     if not setting.is_kept(kept):
-        found = number_text(kept, setting.form)
-        raise wrong_value(node, str(setting), found, str(setting.value), setting.why)
+        found, wanted = found_text(kept, setting), setting.text(setting.value)
+        raise wrong_value(node, str(setting), found, wanted, setting.why)
 
 
 def _fixed_value(network: SetupNetwork, node: int, setting: Setting) -> bytes | None:

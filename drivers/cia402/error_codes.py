@@ -1,8 +1,13 @@
-"""Texts of EMCY error codes and SDO abort codes."""
+"""Error codes of drives: texts of EMCY and SDO abort codes, and the stored error."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from canopen import SdoAbortedError
+
+from drivers.cia402.sdo_jobs import ERROR_REQUESTS
+from model.errors import Refused
 
 EMCY_TEXTS: dict[int, str] = {
     0x1000: "generic error",
@@ -74,3 +79,23 @@ def abort_text(code: int) -> str:
     """Text of an SDO abort code."""
     text = SdoAbortedError.CODES.get(code, "")
     return f"{text} (abort {code:08X}h)" if text else f"abort {code:08X}h"
+
+
+def stored_error(read: Callable[[int, int, str, int], bytes | None]) -> int:
+    """The error code that a drive stores for its fault; 0 if it has none.
+
+    Reads `ERROR_REQUESTS`; the first one that states an error counts.
+
+    Args:
+        read: Reads an optional object by index, sub-index, name and size.
+    """
+    for job in ERROR_REQUESTS:
+        try:
+            data = read(job.index, job.sub, "error code", job.size)
+        except Refused as error:
+            if "node" not in error.values:  # as another master
+                raise
+            continue
+        if code := int.from_bytes((data or b"")[:2], "little"):
+            return code
+    return 0

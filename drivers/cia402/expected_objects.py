@@ -6,16 +6,16 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import can
-
-from drivers.can_errors import in_fault, moved_by_another, wrong_setting
+from drivers.can_errors import SETTING_UP, in_fault, moved_by_another, wrong_setting
+from drivers.cia402.error_codes import emergency_text, stored_error
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
-from drivers.cia402.profile import load_profile, profile_names
-from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent
+from drivers.cia402.pdo import NmtCommand
+from drivers.cia402.profile import load_profile, profile_names, profile_of
+from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent, silent
 from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of
-from drivers.drive_group import Pump
-from model.errors import CdprError, Refused
+from drivers.plausibility import WrongScale, wrong_scales
+from model.errors import HardwareMissing, Refused
 from model.files.drive_profile_file import (
     NEEDED,
     OBJECTS,
@@ -157,7 +157,50 @@ def how_without(index: int, sub: int) -> str:
     return own + known
 
 
-# Checks of one drive before anything is written.
+# Checks of the drives before anything is written.
+
+
+def require_answers(network: SetupNetwork, nodes: Sequence[int], *, revive: bool = False) -> None:
+    """Contacts all drives at once, and reports all silent ones together.
+
+    Args:
+        network: The bus.
+        nodes: The drives.
+        revive: Takes drives that are in NMT *stopped* to *pre-operational*.
+
+    Raises:
+        HardwareMissing: Drives do not answer.
+        Refused: Drives are in NMT *stopped*, or the single silent drive gives a wrong answer.
+    """
+    nothing = network.silent_nodes(nodes)
+    stopped = [node for node in nothing if network.is_stopped(node)]
+    if stopped and revive:
+        for node in stopped:
+            network.command(NmtCommand.PRE_OPERATIONAL, node)
+        nothing = network.silent_nodes(nothing)
+    elif stopped:
+        names = ", ".join(str(node) for node in stopped)
+        raise Refused(
+            f"drive {names}: in the NMT state 'stopped', by its heartbeat",
+            where=SETTING_UP,
+            why="another program, or the drive's own reaction to a communication error (1029h),"
+            " stopped its communication",
+            next_step="end other programs, then run `cdpr reset RIG`",
+            values={"nodes": names},
+        )
+    if len(nothing) == 1:
+        where = f"drive {nothing[0]}, object 1000h:00 device type"
+        raise network.client(nothing[0]).no_answer(where)
+    if nothing:
+        names = ", ".join(str(node) for node in nothing)
+        first = silent(nothing[0], SETTING_UP)
+        raise HardwareMissing(
+            f"drives {names} do not answer",
+            where=SETTING_UP,
+            why=first.why,
+            next_step=first.next_step,
+            values={"nodes": names},
+        )
 
 
 def require_expected(network: SetupNetwork, node: int, expected: Expectation) -> None:
@@ -199,6 +242,58 @@ def position_range(
 
 
 _ENDS = ((1, "min"), (2, "max"))
+
+
+def position_scales(
+    read: Callable[[int, int, str], bytes | None],
+) -> dict[str, float]:
+    """Position counts per motor turn that a drive states, by object, the one that counts first.
+
+    A factor group scales positions; where it is not set (1 per turn) the encoder does. Objects
+    that are missing, zero or refused state nothing. Source: CiA 402-2, factor group.
+
+    Args:
+        read: As for `position_range`.
+    """
+    feed, gear, encoder = (_quotient(read, index) for index in (0x6092, 0x6091, 0x608F))
+    scales = {"6092h/6091h": feed / (gear or 1.0)} if feed else {}
+    return scales | ({"608Fh": encoder} if encoder else {})
+
+
+def _quotient(read: Callable[[int, int, str], bytes | None], index: int) -> float | None:
+    """Sub-index 1 divided by sub-index 2; None if the object is missing or zero."""
+    try:
+        data = [read(index, sub, "position scale") for sub in (1, 2)]
+    except Refused as error:
+        if "abort_code" not in error.values:
+            raise
+        return None
+    above, below = (int.from_bytes(each or b"", "little") for each in data)
+    return above / below if above and below else None
+
+
+SCALE = "position counts per motor turn"
+HOW_SCALED = (
+    "compare 6064h over one motor turn, then correct the drive or winches[].counts_per_rev;"
+    " if 6092h, 6091h and 608Fh do not describe 6064h, set states_scale: false in the profile"
+)
+
+
+def wrong_scales_of(rig: Rig, network: SetupNetwork, nodes: Sequence[int]) -> list[WrongScale]:
+    """Drives whose stated position scale contradicts the rig file, as indices of ``nodes``."""
+    states_scale = profile_of(rig).states_scale
+    if states_scale is False:
+        return []
+    counts = {w.node_id: w.counts_per_rev for w in rig.document.winches}
+    scales = [position_scales(network.client(node).read_if_there) for node in nodes]
+    return wrong_scales([counts[node] for node in nodes], scales, known=bool(states_scale))
+
+
+def refuse_scale(node: int, wrong: WrongScale) -> None:
+    """Raises `Refused` for a drive whose position scale is certainly another than the rig's."""
+    if wrong.certain:
+        found, wanted = f"{wrong.stated:.10g} by {wrong.source}", str(wrong.counts)
+        raise wrong_setting(node, SCALE, found, wanted, "counts_per_rev of the winch", HOW_SCALED)
 
 
 def holds_limits(wraps: tuple[int, int] | None, settings: Sequence[Setting]) -> bool:
@@ -256,10 +351,10 @@ def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
             raise
         return
     if not setting.is_kept(data):
-        found = number_text(data, setting.form)
+        found = found_text(data, setting)
         raise Refused(
             f"the profile declares it absent; the drive has it with {found},"
-            f" {setting.value} is required",
+            f" {setting.text(setting.value)} is required",
             where=f"drive {node}, object {setting}",
             next_step="remove the object from `absent` in the drive profile",
             values={"node": node, "object": str(setting), "found": found},
@@ -269,17 +364,26 @@ def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
 _STATUS_WORD = "object 6041h:00 status word"
 
 
-def require_idle(network: SetupNetwork, node: int, to_reset: bool) -> None:
+def require_idle(network: SetupNetwork, node: int, to_reset: bool, errors: dict[int, int]) -> None:
     """Refuses an enabled drive, which another master controls; quick stop is accepted.
+
+    Args:
+        network: The bus.
+        node: The drive.
+        to_reset: Accepts a drive in fault.
+        errors: Gets the error code of one in fault, by node.
 
     Raises:
         Refused: It is enabled, or in fault without ``to_reset``.
     """
     data = network.client(node).read(0x6041, 0, "status word", 2)
     state = state_of(int.from_bytes(data, "little"))
-    if state in FAULTED and not to_reset:
-        why = "it stopped itself; its display or the manufacturer's tool shows the cause"
-        raise in_fault(node, "", _STATUS_WORD, why)
+    if state in FAULTED:
+        errors[node] = code = stored_error(network.client(node).read_if_there)
+        if not to_reset:
+            why = "it stopped itself; its display or the manufacturer's tool shows the cause"
+            known = f": {emergency_text(code)}" if code else ""
+            raise in_fault(node, known, _STATUS_WORD, why)
     if state is DriveState.OPERATION_ENABLED:
         raise moved_by_another(node, "enabled already", _STATUS_WORD)
 
@@ -302,11 +406,11 @@ def count_heartbeats(
     entries.append(count if most is None else min(count, most))
 
 
-def number_text(data: bytes, form: str) -> str:
-    """A value as text by its `struct` format, or the bytes if the length is wrong."""
-    if len(data) != struct.calcsize(form):
+def found_text(data: bytes, setting: Setting) -> str:
+    """A value read as text, or the bytes if the length is wrong."""
+    if len(data) != setting.size:
         return f"{len(data)} bytes ({data.hex()})"
-    return str(struct.unpack(form, data)[0])
+    return setting.text(struct.unpack(setting.form, data)[0])
 
 
 def wrong_value(node: int, name: str, found: str, wanted: str, why: str) -> Refused:
@@ -319,23 +423,23 @@ def wrong_value(node: int, name: str, found: str, wanted: str, why: str) -> Refu
 SIMULATED = b"cdpr simulated drive"
 
 
-def are_simulated(bus: can.BusABC, pump: Pump | None, nodes: Sequence[int]) -> bool:
+def are_simulated(network: SetupNetwork, nodes: Sequence[int]) -> bool:
     """Whether every drive has the device name of a simulated one.
 
-    Reads the drives in turn up to the first real one. A drive that does not answer counts as real;
-    the following configuration reports what is wrong.
+    Reads the drives in turn up to the first real one. A drive that does not answer counts as real.
 
-    Args:
-        bus: An open bus.
-        pump: As for `drivers.factory.make_drive_group`.
-        nodes: All drives.
+    Raises:
+        Refused: Another master is active, or a drive restarted.
+        Fault: The bus failed.
     """
-    network = SetupNetwork(bus, pump, nodes)
-    network.discard_waiting()
     try:
         return all(
             network.client(node).read_if_there(0x1008, 0, "manufacturer device name") == SIMULATED
             for node in nodes
         )
-    except CdprError:
+    except HardwareMissing:
+        return False
+    except Refused as error:
+        if "node" not in error.values:
+            raise
         return False

@@ -10,12 +10,12 @@ import numpy as np
 from drivers.can_bus import SentFrame
 from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.configure import configure_drives
-from drivers.cia402.expected_objects import are_simulated
 from drivers.cia402.monitor import DriveMonitor
-from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_message
+from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_message, is_command
 from drivers.cia402.profile import profile_of
 from drivers.cia402.sdo_jobs import (
     ASKED_AGAIN_AFTER,
+    ERROR_REQUESTS,
     MODE_WAIT,
     REQUESTS_A_CYCLE,
     STATE_REQUESTS,
@@ -27,7 +27,6 @@ from drivers.cia402.sdo_jobs import (
     time_to_end,
 )
 from drivers.cia402.state_machine import (
-    FAULTED,
     HOLDS,
     WITHOUT_TORQUE,
     ControlWord,
@@ -86,7 +85,8 @@ class Cia402Group(CyclicGroup):
 
     def _reset_memory(self) -> None:
         count = len(self._nodes)
-        self._cyclic = CyclicBus(self._bus, commanding_ids(self._nodes), foreign_master_message)
+        commanding = commanding_ids(self._nodes)
+        self._cyclic = CyclicBus(self._bus, commanding, foreign_master_message, is_command)
         self._frames = CyclicFrames(self._nodes)
         is_warning = self._profile.is_warning
         self._watch = DriveMonitor(self._rig.drive_names, self._max_steps, is_warning)
@@ -99,10 +99,13 @@ class Cia402Group(CyclicGroup):
         self._faults = []
         self._cycle = 0
         self._cycles_to_goal = 0
-        self._left_stop = False  # "enable operation" was commanded since the last release began
+        # "Enable operation" was sent for this goal; replies to the former one's words are awaited.
+        self._enables, self._is_new_goal = False, False
+        self._former = self._goal, self._enables
         self._known = False
         self._monitoring_off: SdoJobs | None = None
         self._modes: ModeCheck | None = None
+        self._errors = SdoJobs({}, 1)
 
     @property
     def capabilities(self) -> Capabilities:
@@ -158,8 +161,10 @@ class Cia402Group(CyclicGroup):
             to_reset=to_reset,
             on_restarted=take,
         )
-        self._heartbeats = done.heartbeats
-        self._simulated = are_simulated(self._bus, self._pump, self._nodes)
+        self._heartbeats, self._simulated = done.heartbeats, done.simulated
+        for can_id, data in done.emergencies.items():  # they may explain a state
+            self._watch.take(can_id, data)
+        self._watch.note_errors(done.errors)
         self._state = GroupState.CONFIGURED
         return done.remarks
 
@@ -198,10 +203,12 @@ class Cia402Group(CyclicGroup):
             self._latch(self._new_messages())
         following = self._state is GroupState.ENABLED
         words = next_words(self._goal, self._watch.states, self._stop_commanded)
-        if self._goal in (Goal.ENABLE, Goal.RELEASE) and self._watch.is_unjudged:
-            words = self._words  # no further step until it is known whether a drive is in fault
-        if ControlWord.ENABLE_OPERATION in words:
-            self._left_stop = True
+        steps = self._goal in (Goal.ENABLE, Goal.RELEASE)
+        if steps and (self._is_new_goal or self._watch.is_unjudged):
+            # No further step until every drive has shown the effect of the last words, and whether
+            # it is in fault.
+            words = self._words
+        self._enables |= ControlWord.ENABLE_OPERATION in words
         self._demands = self._targets if self._known else list(self._watch.positions)
         if following:
             self._targets = [int(target) for target in targets]
@@ -214,7 +221,7 @@ class Cia402Group(CyclicGroup):
         self._cycle += 1
         if self._cycle % self._heartbeat_cycles == 0:
             self._cyclic.send((self._frames.heartbeat,))
-        for jobs in (self._modes, self._monitoring_off):
+        for jobs in (self._modes, self._monitoring_off, self._errors):
             if jobs is not None:
                 self._ask(jobs, REQUESTS_A_CYCLE)
 
@@ -282,13 +289,15 @@ class Cia402Group(CyclicGroup):
             raise Refused("enabled drives must monitor this program", where="drive group")
         off = (monitoring_off(count, self._profile.rpdo) for count in self._heartbeats)
         self._monitoring_off = SdoJobs(dict(zip(self._nodes, off, strict=True)), self._again_after)
-        self._modes = None
+        self._modes, self._errors = None, SdoJobs({}, 1)
         self._watch.on_answer = self._monitoring_off.take
 
     def _send(self, words: tuple[ControlWord, ...], may_send: Callable[[bool], bool]) -> None:
         """Sends one cycle's frames; the words are remembered even if the bus fails."""
         self._words = words
-        self._note_stop_commanded()
+        held, stop = DriveState.QUICK_STOP_ACTIVE, ControlWord.QUICK_STOP
+        columns = zip(self._watch.states, words, self._stop_commanded, strict=True)
+        self._stop_commanded = [s is held and (w is stop or was) for s, w, was in columns]
         self._watch.begin_cycle()
         try:
             self._cyclic.send(self._frames.set_points(words, self._targets))
@@ -300,18 +309,14 @@ class Cia402Group(CyclicGroup):
         finally:  # a frame that failed must not keep a stop from the other drives
             self._cyclic.send((self._frames.sync,))
 
-    def _note_stop_commanded(self) -> None:
-        for drive, (state, word) in enumerate(zip(self._watch.states, self._words, strict=True)):
-            if state is not DriveState.QUICK_STOP_ACTIVE:
-                self._stop_commanded[drive] = False
-            elif word is ControlWord.QUICK_STOP:
-                self._stop_commanded[drive] = True
-
     def _look_for_faults(self) -> None:
         powered = self._goal in (Goal.ENABLE, Goal.RELEASE)
         warnings = self._watch.warnings()
         self._warnings = warnings if powered else ()
-        found = [*self._new_messages(), *self._autonomous_stops()]
+        # Replies show the effect of earlier words, at first those of the former goal.
+        goal, enables = self._former if self._is_new_goal else (self._goal, self._enables)
+        own = self._watch.changes_on_their_own(goal, enables=enables)
+        found = [*self._new_messages(), *own]
         known = {text for _, text in (*self._faults, *found)}
         found += self._watch.state_faults(known, powered=powered)
         if self._goal is not Goal.RESET_FAULT:
@@ -325,21 +330,6 @@ class Cia402Group(CyclicGroup):
         # An emergency of a drive at rest only explains its state.
         return [(node, text) for node, text in found if node in self._watch.restarted]
 
-    def _autonomous_stops(self) -> list[tuple[int, str]]:
-        """Drives that left a state without a command, except those in fault.
-
-        During a release they change to SWITCHED ON; one that returned to quick stop after it was
-        enabled must not be enabled again.
-        """
-        dropped, torque_lost = self._watch.dropped(), self._watch.torque_lost()
-        states = dict(zip(self._nodes, self._watch.states, strict=True))
-        if self._goal is Goal.ENABLE:
-            return [fault for fault in dropped if states[fault[0]] not in FAULTED]
-        if self._goal is Goal.RELEASE and self._left_stop:
-            back = DriveState.QUICK_STOP_ACTIVE
-            return [fault for fault in dropped if states[fault[0]] is back]
-        return torque_lost if self._goal in (Goal.STOP, Goal.IDLE) else []
-
     def _latch(self, found: list[tuple[int, str]]) -> None:
         for fault in found:
             if fault not in self._faults:
@@ -351,12 +341,15 @@ class Cia402Group(CyclicGroup):
         """Checks whether the goal is reached or overdue."""
         states = self._watch.states
         self._cycles_to_goal += 1
+        self._is_new_goal &= not self._watch.complete
         if self._goal is Goal.RESET_FAULT:
+            self._watch.take_errors(self._errors.values)
             if self._cycles_to_goal > self._reset_cycles or DriveState.FAULT not in states:
                 self._goal = Goal.IDLE
         elif self._state is GroupState.ENABLING:
             idle = self._ignoring_targets() if self._profile.follows_bit else []
-            if all(state is DriveState.OPERATION_ENABLED for state in states) and not idle:
+            follow = set(self._words) == {ControlWord.ENABLE_OPERATION}
+            if follow and set(states) == {DriveState.OPERATION_ENABLED} and not idle:
                 self._check_modes()
             elif self._cycles_to_goal > self._patience:
                 self._latch(self._late(self._patience) or idle)
@@ -372,8 +365,7 @@ class Cia402Group(CyclicGroup):
             self._state = GroupState.ENABLED
             return
         if self._modes is None:
-            wait = MODE_WAIT + self._answer_time
-            cycles = len(self._nodes) + round(wait / self._cycle_s)
+            cycles = len(self._nodes) + round((MODE_WAIT + self._answer_time) / self._cycle_s)
             self._modes = ModeCheck(self._nodes, cycles, self._again_after)
             self._watch.on_answer = self._modes.take
         wrong = self._modes.wrong()
@@ -388,8 +380,8 @@ class Cia402Group(CyclicGroup):
         return ignoring_drives(self._rig.drive_names, self._watch.status_words, seconds)
 
     def _late(self, cycles: int) -> list[tuple[int, str]]:
-        words, seconds = self._watch.status_words, cycles * self._cycle_s
-        return late_drives(self._rig.drive_names, words, self._words, self._goal, seconds)
+        names, words = self._rig.drive_names, self._watch.status_words
+        return late_drives(names, words, self._words, self._goal, cycles * self._cycle_s)
 
     def _status(self) -> CycleStatus:
         watch = self._watch
@@ -424,8 +416,14 @@ class Cia402Group(CyclicGroup):
         if self._state is GroupState.ENABLED:
             return
         self._refuse_latched("enable the drives")
-        self._goal, self._state, self._cycles_to_goal = Goal.ENABLE, GroupState.ENABLING, 0
-        self._modes = None
+        self._begin(Goal.ENABLE)
+        self._state = GroupState.ENABLING
+
+    def _begin(self, goal: Goal) -> None:
+        self._former = self._goal, self._enables
+        self._goal, self._cycles_to_goal = goal, 0
+        self._modes, self._errors = None, SdoJobs({}, 1)
+        self._enables, self._is_new_goal = False, True
 
     def require_releasable(self) -> None:
         """Checks whether the drives may be released; see `DriveGroup.require_releasable`."""
@@ -434,13 +432,15 @@ class Cia402Group(CyclicGroup):
 
     def _begin_release(self) -> None:
         self.require_releasable()
-        self._goal, self._cycles_to_goal, self._left_stop = Goal.RELEASE, 0, False
+        self._begin(Goal.RELEASE)
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             self._state = GroupState.QUICK_STOP  # set-points are no longer followed
 
     def _reset_fault(self) -> None:
         """Clears the faults; resets drives in fault only if no other holds the platform."""
         faulted = self._watch.require_resettable()
+        self._errors = SdoJobs(dict.fromkeys(faulted, ERROR_REQUESTS), self._again_after)
+        self._watch.on_answer = self._errors.take
         self._cycles_to_goal = 0
         self._faults.clear()
         self._watch.forget_emergencies()

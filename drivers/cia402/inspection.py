@@ -10,10 +10,11 @@ from typing import Any, Literal
 import can
 import numpy as np
 
-from drivers.cia402.configure import is_still_set_up, require_answers, require_objects
-from drivers.cia402.error_codes import abort_text
+from drivers.cia402.configure import is_still_set_up, require_objects
+from drivers.cia402.error_codes import abort_text, emergency_text, stored_error
 from drivers.cia402.expected_objects import (
     BY_MAKERS_TOOL,
+    HOW_SCALED,
     MODE_DISPLAY,
     NO_WRAP,
     POSITION_RANGE,
@@ -23,6 +24,9 @@ from drivers.cia402.expected_objects import (
     how_to_set,
     how_without,
     position_range,
+    position_scales,
+    require_answers,
+    wrong_scales_of,
 )
 from drivers.cia402.object_dictionary import (
     HEARTBEAT_CONSUMERS,
@@ -35,7 +39,7 @@ from drivers.cia402.sdo import WRITE_ONLY, SetupNetwork
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power
 from drivers.drive_group import DriveSnapshot, Pump
-from drivers.plausibility import winding_signs
+from drivers.plausibility import WrongScale, winding_signs
 from model.errors import Refused
 from model.files.drive_profile_file import ProfileDocument, object_name
 from model.rig import Rig
@@ -155,6 +159,8 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
     network = SetupNetwork(bus, pump, all_nodes, timeout=profile.sdo_timeout_ms / 1000.0)
     network.discard_waiting()
     silent = network.silent_nodes(all_nodes)
+    answered = tuple(node for node in all_nodes if node not in silent)
+    scaled = {answered[w.drive]: w for w in wrong_scales_of(rig, network, answered)}
     rows: dict[tuple[int, int], ObjectRow] = {}
     for drive, node in enumerate(all_nodes):
         if node in silent:
@@ -165,7 +171,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         reader.at_state()
         for index, form, name, why in _PROCESS_DATA:
             reader.at_setting(Setting(index, 0, form, 0, name, why), "readable")
-        reader.at_scale(rig.document.winches[drive].counts_per_rev)
+        reader.at_scale(rig.document.winches[drive].counts_per_rev, scaled.get(node))
         reader.at_heartbeats(profile, rig.cable_count)
         settings = settings_for(rig, drive, winch_map, None)
         for setting in _last_of_each(settings):
@@ -174,7 +180,6 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
             reader.at_absent(setting)
         reader.at_position_range(settings)
         for_unused_pdos(profile, reader.at_unused)
-    answered = tuple(node for node in all_nodes if node not in silent)
     stopped = tuple(filter(network.is_stopped, silent))
     return Examined(answered, tuple(silent), tuple(rows.values()), stopped)
 
@@ -184,15 +189,9 @@ def _last_of_each(settings: Iterable[Setting]) -> list[Setting]:
     return list({(s.index, s.sub): s for s in settings if not s.transient}.values())
 
 
-def _number(setting: Setting, value: int) -> str:
-    """A value as text; PDO mappings and identifiers in hexadecimal, as in manuals."""
-    is_entry = 0x1400 <= setting.index < 0x1C00 and setting.size == 4
-    return f"{value:08X}h" if is_entry else str(value)
-
-
 def _needed(setting: Setting) -> str:
     if setting.per_mille_of is None:
-        return f"{_number(setting, setting.value)}, written at configuration"
+        return f"{setting.text(setting.value)}, written at configuration"
     rated = object_name(*setting.per_mille_of)
     return f"{setting.value} per mille of {rated}, written at configuration"
 
@@ -218,7 +217,7 @@ class _Reader:
         row.note(self._node, f"{value:X}h", "ok" if good else "wrong", change)
 
     def at_state(self) -> None:
-        """State of the drive's state machine."""
+        """State of the drive's state machine, with the error of one in fault."""
         row = self._row(0x6041, 0, "6041h:00 statusword", "not enabled, no fault")
         row.meaning = "only drives at rest are configured"
         data = self._read(0x6041, 0, row, optional=False)
@@ -227,9 +226,9 @@ class _Reader:
         word = int.from_bytes(data, "little")
         state = state_of(word)
         if state in FAULTED:
-            row.note(
-                self._node, state.value, "wrong", "remove the cause, then run `cdpr reset RIG`"
-            )
+            code = stored_error(self._client.read_if_there)
+            text = f"{state.value}: {emergency_text(code)}" if code else state.value
+            row.note(self._node, text, "wrong", "remove the cause, then run `cdpr reset RIG`")
         elif state is DriveState.OPERATION_ENABLED:
             row.note(self._node, state.value, "remark", "another program moves it; end it first")
         elif shown := without_power(word):
@@ -267,22 +266,17 @@ class _Reader:
         else:
             row.note(self._node, str(count))
 
-    def at_scale(self, counts_per_turn: int) -> None:
-        """Counts per motor turn that the drive reports; CiA 402-2, factor group."""
+    def at_scale(self, counts_per_turn: int, wrong: WrongScale | None) -> None:
+        """Counts per motor turn that the drive reports, and whether they are wrong."""
         row = self._row(0x6092, 1, "feed constant, 6091h gear ratio, 608Fh encoder resolution", "")
         row.meaning = "position counts per motor turn: winches[].counts_per_rev"
         row.needed = row.needed or f"{counts_per_turn} per turn, if the drive has them"
-        feed, gear, encoder = (self._quotient(index) for index in (0x6092, 0x6091, 0x608F))
-        ratios = {"6092h/6091h": feed / (gear or 1.0)} if feed else {}
-        if encoder:
-            ratios["608Fh"] = encoder
-        text = ", ".join(f"{value:.10g} from {name}" for name, value in ratios.items()) or "absent"
-        # A factor group scales positions; where it is not set (1 per turn) the encoder does.
-        scales = [value for value in ratios.values() if value != 1.0]
-        if not scales or scales[0] == counts_per_turn:
+        scales = position_scales(self._client.read_if_there)
+        text = ", ".join(f"{value:.10g} from {name}" for name, value in scales.items()) or "absent"
+        if wrong is None:
             row.note(self._node, text)
         else:
-            row.note(self._node, text, "remark", "compare with 6064h over one motor turn")
+            row.note(self._node, text, "wrong" if wrong.certain else "remark", HOW_SCALED)
 
     def at_position_range(self, settings: Sequence[Setting]) -> None:
         """Where positions wrap around, if anywhere."""
@@ -315,7 +309,7 @@ class _Reader:
             text = f"{len(data)} bytes, not {setting.size}"
             row.note(self._node, text, "wrong", "compare with the drive's manual")
         else:
-            row.note(self._node, _number(setting, struct.unpack(setting.form, data)[0]))
+            row.note(self._node, setting.text(struct.unpack(setting.form, data)[0]))
         if setting.per_mille_of is not None:
             rated = self._row(*setting.per_mille_of, "rated value of the limit", "more than 0")
             found = self._read(*setting.per_mille_of, rated, optional=False)
@@ -326,12 +320,12 @@ class _Reader:
 
     def at_absent(self, setting: Setting) -> None:
         """An object that the profile declares absent; if it exists, its value is checked."""
-        needed = f"absent as in the profile, or {_number(setting, setting.value)}"
+        needed = f"absent as in the profile, or {setting.text(setting.value)}"
         row = self._row(setting.index, setting.sub, str(setting), needed)
         row.meaning = setting.why
         data = self._read(setting.index, setting.sub, row, optional=True, size=setting.size)
         if data is not None:
-            text = _number(setting, int.from_bytes(data, "little"))
+            text = setting.text(int.from_bytes(data, "little"))
             good = setting.is_kept(data)
             change = "" if good else "remove it from `absent` in the drive profile"
             row.note(self._node, text, "ok" if good else "wrong", change)
@@ -344,17 +338,6 @@ class _Reader:
         if data is not None:
             row.note(self._node, f"{int.from_bytes(data, 'little'):X}h")
         return data is not None
-
-    def _quotient(self, index: int) -> float | None:
-        """Sub-index 1 divided by sub-index 2; None if the object is missing or zero."""
-        try:
-            data = [self._client.read_if_there(index, sub, "position scale") for sub in (1, 2)]
-        except Refused as error:
-            if "abort_code" not in error.values:
-                raise
-            return None
-        above, below = (int.from_bytes(each or b"", "little") for each in data)
-        return above / below if above and below else None
 
     def _row(self, index: int, sub: int, name: str, needed: str) -> ObjectRow:
         text = name if name.startswith(f"{index:04X}h") else f"{object_name(index, sub)} {name}"
@@ -423,9 +406,15 @@ def read_states(
     except Refused:
         require_objects(rig, network, _STATE)  # names all missing ones, not only the first
         raise
+    is_faulted = [state_of(word & 0xFFFF) in FAULTED for word in words]
+    codes = [
+        stored_error(network.client(node).read_if_there) if faulted else 0
+        for node, faulted in zip(nodes, is_faulted, strict=True)
+    ]
     return DriveSnapshot(
         positions=np.array(positions, dtype=np.int64),
         torques=np.array(torques, dtype=np.int64) * winding_signs(rig),
         status_words=np.array(words, dtype=np.int64) & 0xFFFF,
         restarted=restarted,
+        errors=tuple(emergency_text(code) if code else "" for code in codes),
     )

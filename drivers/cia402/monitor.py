@@ -16,8 +16,15 @@ from drivers.cia402.pdo import (
     parse_heartbeat,
     parse_reply,
 )
-from drivers.cia402.sdo_jobs import STATE_REQUESTS, SdoRequest
-from drivers.cia402.state_machine import FAULTED, HOLDS, TORQUE_ON, DriveState, state_of
+from drivers.cia402.sdo_jobs import ERROR_REQUESTS, STATE_REQUESTS, SdoRequest
+from drivers.cia402.state_machine import (
+    FAULTED,
+    TORQUE_ON,
+    DriveState,
+    Goal,
+    change_on_its_own,
+    state_of,
+)
 from drivers.drive_group import DriveWarning
 from drivers.plausibility import ReplyCheck
 from model.errors import Refused
@@ -63,9 +70,9 @@ class DriveMonitor:
         self._to_judge: list[DriveWarning] = []  # the drive's next reply says whether it stopped
         self._warnings: list[DriveWarning] = []
         self._new_messages: list[tuple[int, str]] = []
-        self._dropped: list[tuple[int, str]] = []
-        self._torque_lost: list[tuple[int, str]] = []
+        self._changes: list[tuple[int, DriveState, DriveState]] = []
         self._emergencies: dict[int, str] = {}
+        self._stored: dict[int, str] = {}  # errors from before a reset, or read from the drives
         self._over: set[int] = set()
         self._replies = {TPDO1_BASE + node: i for i, node in enumerate(nodes)}
         self._others = {EMCY_BASE + node: self._emergency for node in nodes}
@@ -127,16 +134,8 @@ class DriveMonitor:
         state, before = state_of(reply.status_word), self.states[drive]
         self.states[drive] = state
         self._judge(self.nodes[drive], state)
-        if before is DriveState.OPERATION_ENABLED and state is not before:
-            self._dropped.append(self._with_cause(drive, f"stopped on its own: {state.value}"))
-        if before in HOLDS and state not in TORQUE_ON and state not in FAULTED:
-            self._torque_lost.append(self._with_cause(drive, f"lost its torque: {state.value}"))
-
-    def _with_cause(self, drive: int, what: str) -> tuple[int, str]:
-        node = self.nodes[drive]
-        cause = None if node in self._over else self._emergencies.get(node)
-        text = f"{self._names[node]} {what}"
-        return node, f"{text}; {cause}" if cause else text
+        if state is not before:
+            self._changes.append((self.nodes[drive], before, state))
 
     def _judge(self, node: int, state: DriveState) -> None:
         """An emergency before this SYNC is a warning if the drive is still enabled.
@@ -153,7 +152,7 @@ class DriveMonitor:
         """Emergencies since the last call that did not stop the drive by the next SYNC.
 
         An enabled drive keeps following its set-points. One that stops has left the state by then,
-        which is a fault (`dropped`, `state_faults`).
+        which is a fault (`changes_on_their_own`, `state_faults`).
         """
         warnings, self._warnings = tuple(self._warnings), []
         return warnings
@@ -170,15 +169,20 @@ class DriveMonitor:
         news, self._new_messages = self._new_messages, []
         return news
 
-    def dropped(self) -> list[tuple[int, str]]:
-        """Drives that left OPERATION ENABLED since the last call, by node."""
-        dropped, self._dropped = self._dropped, []
-        return dropped
+    def changes_on_their_own(self, goal: Goal, *, enables: bool) -> list[tuple[int, str]]:
+        """Drives that changed their state without a command since the last call, by node.
 
-    def torque_lost(self) -> list[tuple[int, str]]:
-        """Drives that lost their holding torque without a fault, since the last call."""
-        torque_lost, self._torque_lost = self._torque_lost, []
-        return torque_lost
+        Arguments as for `drivers.cia402.state_machine.change_on_its_own`.
+        """
+        changes, self._changes = self._changes, []
+        found: list[tuple[int, str]] = []
+        for node, before, state in changes:
+            what = change_on_its_own(goal, enables, before, state)
+            if what is not None:
+                cause = None if node in self._over else self._emergencies.get(node)
+                text = f"{self._names[node]} {what}"
+                found.append((node, f"{text}; {cause}" if cause else text))
+        return found
 
     @property
     def is_unjudged(self) -> bool:
@@ -200,7 +204,8 @@ class DriveMonitor:
             if state not in FAULTED:
                 continue
             name = self._names[node]
-            cause = self._emergencies.get(node, "no emergency message received")
+            stored = self._stored.get(node, "no emergency message received")
+            cause = self._emergencies.get(node, stored)
             if f"{name}: {cause}" not in known:
                 since = ", reported as over since" if node in self._over else ""
                 found.append((node, f"{name} is in {state.value}: {cause}{since}"))
@@ -230,8 +235,22 @@ class DriveMonitor:
             )
         return faulted
 
+    def note_errors(self, codes: Mapping[int, int]) -> None:
+        """Takes the error codes that drives in fault store, by node; 0 for none."""
+        self._stored |= {
+            node: f"{emergency_text(code)}, as stored in the drive"
+            for node, code in codes.items()
+            if code
+        }
+
+    def take_errors(self, values: Mapping[tuple[int, SdoRequest], int]) -> None:
+        """Takes the answers to `ERROR_REQUESTS`; the first one that states an error counts."""
+        for job in reversed(ERROR_REQUESTS):
+            self.note_errors({n: v & 0xFFFF for (n, asked), v in values.items() if asked == job})
+
     def forget_emergencies(self) -> None:
-        """Clears all emergencies after a reset by the operator."""
+        """Clears all emergencies after a reset by the operator; they explain a fault that stays."""
+        self._stored |= {node: f"earlier: {text}" for node, text in self._emergencies.items()}
         self._emergencies.clear()
         self._over.clear()
         self._new_messages.clear()

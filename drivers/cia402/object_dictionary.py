@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from drivers.can_load import HEARTBEATS_WAITED, heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.pdo import MASTER_NODE, RPDO1_BASE, TPDO1_BASE
-from drivers.cia402.profile import profile_of, used_pdos
+from drivers.cia402.profile import interpolation_time, profile_of, used_pdos
 from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.plausibility import position_limits
 from model.errors import BadInput
@@ -22,6 +22,9 @@ PDO_NO_RTR = 1 << 30
 PDO_IDENTIFIER = 0xA0000000 | 0x7FF
 """Bits of a COB-ID that are compared: valid, frame format, identifier. Drives may change bit 30 (no
 RTR); the others are reserved. Source: CiA 301, 7.5.2.35."""
+
+SYNCHRONOUS = range(241)
+"""Transmission types of an RPDO that takes effect at SYNC. Source: CiA 301, 7.5.2.36."""
 
 TORQUE_RESERVE = 1.2
 """Torque limit relative to the largest tension: the following-error monitor must trip first."""
@@ -44,6 +47,8 @@ class Setting:
         optional: The object may be absent.
         instead: Consequence of its absence; empty if there is none.
         mask: Bits compared when it is read back; 0 for all.
+        equivalent: Values with the same effect, all accepted; the first one is written where the
+            drive refuses ``value`` as out of its range.
         per_mille_of: The value is in per mille of this object's value.
     """
 
@@ -57,6 +62,7 @@ class Setting:
     optional: bool = False
     instead: str = ""
     mask: int = 0
+    equivalent: range = range(0)
     per_mille_of: tuple[int, int] | None = None
 
     def data(self) -> bytes:
@@ -81,7 +87,9 @@ class Setting:
         return struct.calcsize(self.form)
 
     def is_kept(self, data: bytes) -> bool:
-        """Whether the drive holds the value."""
+        """Whether the drive holds the value, or one with the same effect."""
+        if len(data) == self.size and int.from_bytes(data, "little") in self.equivalent:
+            return True
         if len(data) != struct.calcsize(self.form) or not self.mask:
             return data == self.data()
         return not (int.from_bytes(data, "little") ^ self.value) & self.mask
@@ -89,6 +97,11 @@ class Setting:
     def of_rated(self, rated: int) -> Setting:
         """The setting with its value in the unit of ``per_mille_of``, whose value is ``rated``."""
         return replace(self, value=math.ceil(self.value * rated / 1000.0), per_mille_of=None)
+
+    def text(self, value: int) -> str:
+        """A value as text; identifiers, mappings and 1016h in hexadecimal, as in manuals."""
+        is_code = self.size == 4 and (0x1400 <= self.index < 0x1C00 or self.index == 0x1016)
+        return f"{value:08X}h" if is_code else str(value)
 
     def __str__(self) -> str:
         """Index, sub-index and name."""
@@ -240,34 +253,6 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
     )
 
 
-def interpolation_time(
-    cycle: float, values: Range | None = None, exponents: Range | None = None
-) -> tuple[int, int]:
-    """Value and power of ten of 60C2h for a cycle [s].
-
-    Args:
-        cycle: [s].
-        values: Range of 60C2h:01; 1 to 255 if None.
-        exponents: Range of 60C2h:02; -6 to -3 if None.
-
-    Raises:
-        BadInput: The object cannot hold this cycle.
-    """
-    most = 0xFF if values is None else min(values.high, 0xFF)
-    for exponent in (-3, -4, -5, -6):
-        value = cycle * 10.0**-exponent
-        taken = exponents is None or exponents.holds(exponent)
-        if taken and 0 < round(value) <= most and abs(value - round(value)) < 1e-6:
-            return round(value), exponent
-    raise BadInput(
-        f"the drives cannot interpolate over a cycle of {1000 * cycle:g} ms",
-        where="bus.cycle_ms",
-        why=f"object 60C2h holds an integer up to {most} times a power of ten"
-        + ("" if exponents is None else f" from {exponents.low} to {exponents.high}"),
-        next_step="use a rounder number, such as 10, 8 or 4",
-    )
-
-
 def _process_data(node: int, profile: ProfileDocument) -> tuple[Setting, ...]:
     """The two PDOs in use, on the identifiers of RPDO1 and TPDO1."""
     received = (0x60400010, 0x607A0020)
@@ -309,7 +294,10 @@ def _mapped(parameters: int, identifier: int, objects: tuple[int, ...]) -> tuple
             for sub, entry in enumerate(objects, start=1)
         ),
         Setting(mapping, 0, "<B", len(objects), "PDO mapping", "all objects"),
-        Setting(parameters, 2, "<B", 1, "PDO transmission type", "one SYNC for all drives"),
+        Setting(
+            *(parameters, 2, "<B", 1, "PDO transmission type", "one SYNC for all drives"),
+            equivalent=SYNCHRONOUS if parameters < 0x1800 else range(0),
+        ),
     )
 
 

@@ -161,22 +161,30 @@ class CyclicFrames:
 # Identifiers that only a CiA 402 master sends, and messages about another master.
 
 
+READS = frozenset({0x40, 0x60, 0x80, 0xA0})
+"""SDO requests that change no object: upload and its segments, abort, block upload.
+
+Source: CiA 301, 7.2.4.3, client command specifiers (upper three bits of the first byte).
+"""
+
+
 def commanding_ids(nodes: Iterable[int]) -> frozenset[int]:
-    """Identifiers sent only by a master that moves these drives.
+    """Identifiers sent only by a master of these drives; SDO requests also by a reading tool."""
+    own = {base + node for node in nodes for base in (RPDO1_BASE, SDO_REQUEST_BASE)}
+    return frozenset({NMT_ID, SYNC_ID, HEARTBEAT_BASE + MASTER_NODE} | own)
 
-    A tool that only reads objects is allowed on the bus.
+
+def is_command(can_id: int, data: bytes | bytearray) -> bool:
+    """Whether a frame with one of `commanding_ids` commands a drive or may change an object.
+
+    A tool that only reads objects is allowed on the bus, except during configuration.
     """
-    set_points = {RPDO1_BASE + node for node in nodes}
-    return frozenset({NMT_ID, SYNC_ID, HEARTBEAT_BASE + MASTER_NODE} | set_points)
+    is_request = SDO_REQUEST_BASE < can_id < HEARTBEAT_BASE
+    return not is_request or (bool(data) and data[0] & 0xE0 not in READS)
 
 
-def set_up_ids(nodes: Sequence[int]) -> frozenset[int]:
-    """As `commanding_ids`, plus SDO requests: none from elsewhere during configuration."""
-    return commanding_ids(nodes) | {SDO_REQUEST_BASE + node for node in nodes}
-
-
-def foreign_master_message(can_id: int) -> str:
-    """Message about another program that sends a frame with one of these identifiers."""
+def foreign_master_message(can_id: int, data: bytes | bytearray) -> str:
+    """Message about another program that sends a frame with one of `commanding_ids`."""
     node = can_id & 0x7F
     if can_id == SYNC_ID:
         return "another program sends SYNC on this bus"
@@ -185,5 +193,6 @@ def foreign_master_message(can_id: int) -> str:
     if can_id == HEARTBEAT_BASE + MASTER_NODE:
         return "another program sends the master's heartbeat on this bus"
     if can_id > SDO_REQUEST_BASE:
-        return f"another program reads or writes objects of drive {node}"
+        does = "writes" if is_command(can_id, data) else "reads"
+        return f"another program {does} objects of drive {node}"
     return f"another program sends set-points to drive {node}"

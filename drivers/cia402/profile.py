@@ -12,7 +12,7 @@ from pathlib import Path
 
 from model.errors import BadInput
 from model.files.documents import load_yaml
-from model.files.drive_profile_file import ProfileDocument
+from model.files.drive_profile_file import ProfileDocument, Range
 from model.files.rig_file import Cia402Document
 from model.rig import Rig
 
@@ -110,3 +110,31 @@ def for_unused_pdos(profile: ProfileDocument, is_there: Callable[[int], bool]) -
         for index in indices:
             if not is_there(index) and index >= first + STANDARD_PDOS:
                 break
+
+
+def interpolation_time(
+    cycle: float, values: Range | None = None, exponents: Range | None = None
+) -> tuple[int, int]:
+    """Value and power of ten of 60C2h for a cycle [s].
+
+    Args:
+        cycle: [s].
+        values: Range of 60C2h:01; 1 to 255 if None.
+        exponents: Range of 60C2h:02; -6 to -3 if None.
+
+    Raises:
+        BadInput: The object cannot hold this cycle.
+    """
+    most = 0xFF if values is None else min(values.high, 0xFF)
+    for exponent in (-3, -4, -5, -6):
+        value = cycle * 10.0**-exponent
+        taken = exponents is None or exponents.holds(exponent)
+        if taken and 0 < round(value) <= most and abs(value - round(value)) < 1e-6:
+            return round(value), exponent
+    raise BadInput(
+        f"the drives cannot interpolate over a cycle of {1000 * cycle:g} ms",
+        where="bus.cycle_ms",
+        why=f"object 60C2h holds an integer up to {most} times a power of ten"
+        + ("" if exponents is None else f" from {exponents.low} to {exponents.high}"),
+        next_step="use a rounder number, such as 10, 8 or 4",
+    )

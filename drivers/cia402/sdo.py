@@ -18,9 +18,16 @@ from math import ceil
 import can
 
 from drivers.can_bus import echoes_own_frames, receive_frame, transmit
-from drivers.can_errors import SETTING_UP, EchoFilter, ForeignMaster, error_frame_fault
+from drivers.can_errors import (
+    SETTING_UP,
+    DriveRestarted,
+    EchoFilter,
+    ForeignMaster,
+    error_frame_fault,
+)
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import (
+    EMCY_BASE,
     HEARTBEAT_BASE,
     MASTER_NODE,
     NMT_ID,
@@ -28,10 +35,10 @@ from drivers.cia402.pdo import (
     SDO_REQUEST_BASE,
     NmtCommand,
     NmtState,
+    commanding_ids,
     foreign_master_message,
     make_nmt,
     parse_heartbeat,
-    set_up_ids,
 )
 from drivers.drive_group import Pump
 from model.errors import CdprError, Fault, HardwareMissing, Refused
@@ -77,7 +84,11 @@ class _NoAnswer(Exception):
 
 
 class SetupNetwork:
-    """The bus during configuration: sends NMT and SDO frames and receives the replies."""
+    """The bus during configuration: sends NMT and SDO frames and receives the replies.
+
+    Attributes:
+        emergencies: Data of the last EMCY of each drive, by identifier.
+    """
 
     def __init__(
         self,
@@ -101,8 +112,10 @@ class SetupNetwork:
         self.timeout, self.clock = timeout, clock
         self._clients: dict[int, Client] = {}
         self._states: dict[int, int | None] = {}
+        self._nodes, self._refuses_restarts = frozenset(nodes), False
+        self.emergencies: dict[int, bytes] = {}
         self._own = EchoFilter(
-            set_up_ids(nodes), echoes_own_frames=echoes_own_frames(bus), batch=len(nodes)
+            commanding_ids(nodes), echoes_own_frames=echoes_own_frames(bus), batch=len(nodes)
         )
 
     def client(self, node: int) -> Client:
@@ -114,6 +127,10 @@ class SetupNetwork:
     def is_stopped(self, node: int) -> bool:
         """Whether the node's last heartbeat says NMT *stopped*, where it answers no SDO."""
         return self._states.get(node) == NmtState.STOPPED
+
+    def refuse_restarts(self) -> None:
+        """From now on a drive's boot-up is a `DriveRestarted`; until now it merely started."""
+        self._refuses_restarts = True
 
     def command(self, command: NmtCommand, node: int) -> None:
         """Sends an NMT command to one node."""
@@ -171,7 +188,7 @@ class SetupNetwork:
         """Processes one frame; False if none arrives within the time [s].
 
         Raises:
-            Refused: The frame is another master's.
+            Refused: The frame is another master's, or a drive's that restarted.
             BusFault: The bus failed.
         """
         if self._pump is not None:
@@ -185,10 +202,14 @@ class SetupNetwork:
             if fault is not None:
                 raise fault
         elif not (message.is_remote_frame or message.is_extended_id):
-            self._refuse_foreign(message.arbitration_id)
+            self._refuse_foreign(message)
             node = message.arbitration_id - HEARTBEAT_BASE
             if 0 < node < MASTER_NODE:
-                self._states[node] = parse_heartbeat(message.data)
+                state = self._states[node] = parse_heartbeat(message.data)
+                if state == NmtState.BOOT_UP and self._refuses_restarts and node in self._nodes:
+                    raise DriveRestarted(node)
+            if message.arbitration_id - EMCY_BASE in self._nodes:
+                self.emergencies[message.arbitration_id] = bytes(message.data)
             client = self._clients.get(message.arbitration_id - SDO_REPLY_BASE)
             if client is not None:
                 client.take(bytes(message.data))
@@ -201,10 +222,10 @@ class SetupNetwork:
             if not self.process_frame(left) and self._pump is not None:
                 return
 
-    def _refuse_foreign(self, can_id: int) -> None:
-        if self._own.is_foreign(can_id):
+    def _refuse_foreign(self, message: can.Message) -> None:
+        if self._own.is_foreign(message.arbitration_id):
             raise Refused(
-                foreign_master_message(can_id),
+                foreign_master_message(message.arbitration_id, message.data),
                 where=SETTING_UP,
                 why=ForeignMaster.cause,
                 next_step=ForeignMaster.remedy,

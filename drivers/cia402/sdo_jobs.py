@@ -68,6 +68,10 @@ STATE_REQUESTS = (
     SdoRequest(0x6077, 0, size=2),
 )
 
+#: Code of the last error, and the newest entry of the error history, whose lower half is the code.
+#: Source: CiA 402-2, object 603Fh; CiA 301, 7.5.2.4.
+ERROR_REQUESTS = (SdoRequest(0x603F, 0, size=2), SdoRequest(0x1003, 1))
+
 
 def time_to_end(heartbeats: Iterable[int], cycle: float, answer: float) -> float:
     """Longest time to end all monitoring, [s].

@@ -101,8 +101,8 @@ _NO_VOLTAGE = (
 _LOCAL = "its bit 9 (remote) is 0: its commissioning tool, panel or enable input has control"
 _INTERLOCKED = "check mains power, safe torque off (STO) and the enable input"
 _STAYS_STOPPED = (
-    "it does not accept 0Fh there (transition 16), so only a power cycle ends its quick stop:"
-    " support the platform first"
+    "it does not accept 0Fh there (transition 16), so that only a power cycle ends its quick stop,"
+    " or it stops again at once, as at a limit switch: support the platform first"
 )
 
 
@@ -178,6 +178,38 @@ class Goal(Enum):
     STOP = auto()
     RELEASE = auto()
     RESET_FAULT = auto()
+
+
+def change_on_its_own(
+    goal: Goal, enables: bool, before: DriveState, state: DriveState
+) -> str | None:
+    """What a drive did without a command, from two successive states; None if it was commanded.
+
+    Faults have their own message. A drive in quick stop that follows "enable operation" only in
+    passing, between two replies, looks like one that has not followed it yet: it is late.
+
+    Args:
+        goal: Of the group.
+        enables: "Enable operation" was sent for this goal. Before that a drive is only commanded to
+            hold, or one without torque to approach SWITCHED ON; from then on all have the same
+            command.
+        before: State in the reply before.
+        state: State in the last reply.
+    """
+    if state is before or state in FAULTED:
+        return None
+    stops = f"stopped on its own: {state.value}"
+    if goal is Goal.ENABLE and enables:
+        if state is DriveState.OPERATION_ENABLED:
+            return None
+        may_stop = before in HOLDS or state is DriveState.QUICK_STOP_ACTIVE
+        return stops if may_stop else f"left {before.value} on its own: {state.value}"
+    if goal is Goal.RELEASE and enables and state is DriveState.QUICK_STOP_ACTIVE:
+        return stops
+    released = goal is Goal.RELEASE and before is not DriveState.QUICK_STOP_ACTIVE
+    if before in HOLDS and state not in TORQUE_ON and not released:
+        return f"lost its torque: {state.value}"
+    return None
 
 
 _MAY_HOLD = TORQUE_ON | {DriveState.NOT_READY}

@@ -131,7 +131,7 @@ class SetupLink:
                 elif not (message.is_extended_id or message.is_remote_frame):
                     identifier = message.arbitration_id
                     if is_command(identifier, message.data) and self._own.is_foreign(identifier):
-                        text = foreign_master_message(identifier)
+                        text = foreign_master_message(identifier, message.data)
                         raise ForeignMaster(text, bus_name(self._bus))
                     yield message
                 if left > 0.0:

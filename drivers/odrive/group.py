@@ -424,4 +424,5 @@ def read_axes(
         status_words=np.array(watch.status_words, dtype=np.int64),
         # Their settings are non-volatile, so a loss of power leaves no trace.
         restarted=tuple(winch.node_id for winch in rig.winches if not winch.absolute),
+        errors=("",) * rig.cable_count,
     )

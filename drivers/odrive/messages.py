@@ -317,7 +317,7 @@ def is_command(identifier: int, data: bytes | bytearray) -> bool:
     return True
 
 
-def foreign_master_message(identifier: int) -> str:
+def foreign_master_message(identifier: int, _data: bytes | bytearray) -> str:
     """Message about another program that sends a frame with one of the `commanding_ids`."""
     node, command = node_and_command(identifier)
     drives = "all drives" if node == BROADCAST else f"drive {node}"

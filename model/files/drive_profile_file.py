@@ -173,6 +173,12 @@ class ProfileDocument(Document):
         description="the drive has cyclic synchronous position, although 6502h is absent or its"
         " bit 7 is 0; 6061h = 8 shows it",
     )
+    states_scale: bool | None = Field(
+        default=None,
+        description="6092h and 6091h, or 608Fh, are the counts of 6064h per motor turn; true: a"
+        " drive where they contradict counts_per_rev is refused; false: they are not read; left"
+        " out: it is refused where another drive agrees with counts_per_rev, else reported",
+    )
     mode_display_when_enabled: bool = Field(
         default=False, description="6061h shows the mode only once the drive is enabled"
     )

@@ -141,6 +141,15 @@ def test_a_drive_set_up_for_another_cycle_is_not_said_to_have_lost_power() -> No
     assert line.endswith(" N")
 
 
+def test_status_states_the_error_of_a_drive_in_fault() -> None:
+    over_voltage = "DC link over-voltage (error 3210h)"
+    drive = DriveStatus(1, "fault", position=0, tension=5.0, set_up=True, error=over_voltage)
+    shown = replace(STANDING, drives=(drive,))
+    (line,) = shown.drive_lines({1: "cable 1 (drive 1)"})
+    assert line.endswith(over_voltage)
+    assert shown.as_dict()["drives"][0]["error"] == over_voltage
+
+
 def test_monitor_calls_itself_by_its_name() -> None:
     with pytest.raises(Fault, match="no active run") as caught:
         request("status", None, verb="monitor")

@@ -52,6 +52,7 @@ class ScriptedDrive:
                 self.objects |= {(index, sub): entry[sub] for sub in entry.subindices}
         self.values: dict[Key, int] = {key: od.default or 0 for key, od in self.objects.items()}
         self.aborts: dict[Key, int] = {}
+        self.keeps: dict[Key, int] = {}  # kept whatever is written
         self.values[0x6041, 0] = 0x0240
         self.mode_late = 0  # times that 6061h still shows the old mode
 
@@ -75,7 +76,8 @@ class ScriptedDrive:
             return struct.pack("<BHBI", 0x80, index, sub, code)
         if command != 0x40:
             return struct.pack("<BHBI", 0x60, index, sub, 0)
-        data = struct.pack(self.form(key), self._value(key))
+        is_text = self.objects[key].data_type == canopen.objectdictionary.VISIBLE_STRING
+        data = b"EDS" if is_text else struct.pack(self.form(key), self._value(key))
         return struct.pack("<BHB", 0x43 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0")
 
     def _value(self, key: Key) -> int:
@@ -97,7 +99,7 @@ class ScriptedDrive:
             return TOO_LOW
         if key in ((0x1400, 1), (0x1800, 1)):
             value &= ~(1 << 30)  # a drive may keep bit 30 or not
-        self.values[key] = value
+        self.values[key] = self.keeps.get(key, value)
         return 0
 
 

@@ -16,7 +16,7 @@ from can.interfaces.virtual import VirtualBus
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.can_bus import BusSettings, lost_frames, open_bus
+from drivers.can_bus import BusSettings, SentFrame, lost_frames, open_bus
 from drivers.can_errors import (
     ERROR_CYCLES,
     WITH_CLASSES,
@@ -34,8 +34,9 @@ from drivers.can_errors import (
     bus_fault,
     error_frame_fault,
 )
-from drivers.cia402.pdo import commanding_ids
+from drivers.cia402.pdo import commanding_ids, foreign_master_message, is_command
 from drivers.cia402.state_machine import DriveState
+from drivers.cyclic_group import CyclicBus
 from drivers.drive_group import WHOLE_BUS, GroupCommand, GroupState
 from drivers.factory import make_drive_group
 from drivers.plausibility import ReplyCheck
@@ -201,6 +202,9 @@ def say(bench: Bench, can_id: int, data: bytes = b"", *, error: bool = False) ->
         (lambda b: say(b, 0x000, b"\x02\x00"), ForeignMaster),
         (lambda b: say(b, 0x77F, b"\x05"), ForeignMaster),
         (lambda b: say(b, 0x203, bytes(8)), ForeignMaster),
+        # 1006h = 0, so that a lost SYNC would not stop the drive; the same in segments.
+        (lambda b: say(b, 0x603, bytes.fromhex("2306100000000000")), ForeignMaster),
+        (lambda b: say(b, 0x603, bytes.fromhex("2106100004000000")), ForeignMaster),
     ],
 )
 def test_it_stops_the_drives_and_is_latched(
@@ -227,7 +231,8 @@ def test_frames_of_others_that_command_nothing_are_let_be(bench: Bench) -> None:
     """Another device's data, a tool that reads an object, an extended and a remote frame."""
     bench.enable()
     say(bench, 0x1B0, bytes(8))
-    say(bench, 0x603, bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)))
+    for first in (0x40, 0x60, 0x70, 0x80, 0xA0):
+        say(bench, 0x603, bytes((first, 0x41, 0x60, 0, 0, 0, 0, 0)))
     bench._ear.send(can.Message(arbitration_id=0x080, is_extended_id=True))
     bench._ear.send(can.Message(arbitration_id=0x080, is_extended_id=False, is_remote_frame=True))
     status = bench.cycle()
@@ -413,6 +418,38 @@ def test_where_a_sender_hears_itself_only_what_was_not_sent_is_foreign(script: l
             assert not own.is_foreign(0x080)
         elif what == "foreign" and not waiting:
             assert own.is_foreign(0x080)
+
+
+class Nobody:
+    """Listens to frames until the time is over."""
+
+    complete = False
+
+    def take(self, can_id: int, data: bytes, *, stale: bool = False) -> None:
+        """Nothing is of interest."""
+
+
+@pytest.mark.parametrize("kind", ["virtual", "udp_multicast"])
+def test_only_another_programs_write_is_foreign_where_echoes_return(kind: str) -> None:
+    """Own reads and writes come back over multicast; own reads excuse no write of another."""
+    read, write = bytes.fromhex("4061600000000000"), bytes.fromhex("2306100000000000")
+    channel = free_udp_channel() if kind == "udp_multicast" else "echoes"
+    own, other = (open_bus(BusSettings(kind, channel)) for _ in range(2))
+    cyclic = CyclicBus(own, commanding_ids(NODES), foreign_master_message, is_command)
+    try:
+        cyclic.send(SentFrame(0x600 + node, data) for node in NODES for data in (read, write))
+        cyclic.take_replies(Nobody(), 0.0)
+        cyclic.end_cycle()
+        other.send(SentFrame(0x603, read))
+        cyclic.take_replies(Nobody(), 0.0)
+        cyclic.end_cycle()
+        other.send(SentFrame(0x603, write))
+        cyclic.take_replies(Nobody(), 0.0)
+        with pytest.raises(ForeignMaster, match="another program writes objects of drive 3"):
+            cyclic.end_cycle()
+    finally:
+        own.shutdown()
+        other.shutdown()
 
 
 @pytest.mark.parametrize("count", [4, 12, 40])

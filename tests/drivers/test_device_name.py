@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import can
 import pytest
 
-from drivers.cia402 import expected_objects
+from drivers.can_errors import DriveRestarted
 from drivers.cia402.expected_objects import SIMULATED, are_simulated
 from model.errors import HardwareMissing, Refused
 
@@ -19,9 +18,6 @@ class Network:
 
     def __init__(self, answers: list[Answer]) -> None:
         self.answers, self.asked = answers, 0
-
-    def discard_waiting(self) -> None:
-        """Nothing waits."""
 
     def client(self, node: int) -> Any:
         self.asked, answer = self.asked + 1, self.answers[node - 1]
@@ -42,15 +38,20 @@ class Network:
         ([SIMULATED] * 8, True, 8),
         ([SIMULATED] * 7 + [b"EPOS4"], False, 8),
         ([None, *[SIMULATED] * 7], False, 1),
-        ([Refused("no")] * 8, False, 1),
+        ([Refused("no", values={"node": 1})] * 8, False, 1),
         ([SIMULATED, HardwareMissing("silent")], False, 2),
     ],
 )
 def test_only_drives_that_all_say_so_are_simulated(
-    monkeypatch: pytest.MonkeyPatch, answers: list[Answer], simulated: bool, asked: int
+    answers: list[Answer], simulated: bool, asked: int
 ) -> None:
-    network = Network(answers)
-    monkeypatch.setattr(expected_objects, "SetupNetwork", lambda *_: network)
-    bus: Any = can.BusABC
-    assert are_simulated(bus, None, range(1, len(answers) + 1)) is simulated
+    network: Any = Network(answers)
+    assert are_simulated(network, range(1, len(answers) + 1)) is simulated
     assert network.asked == asked
+
+
+@pytest.mark.parametrize("seen", [Refused("another program sends SYNC"), DriveRestarted(2)])
+def test_what_ends_a_set_up_is_not_taken_for_a_real_drive(seen: Refused) -> None:
+    network: Any = Network([SIMULATED, seen])
+    with pytest.raises(type(seen)):
+        are_simulated(network, [1, 2])

@@ -15,6 +15,7 @@ from drivers.cia402.pdo import (
     NmtState,
     commanding_ids,
     foreign_master_message,
+    is_command,
     make_emergency,
     make_heartbeat,
     make_nmt,
@@ -25,7 +26,6 @@ from drivers.cia402.pdo import (
     parse_heartbeat,
     parse_reply,
     parse_set_point,
-    set_up_ids,
 )
 from drivers.cia402.state_machine import ControlWord
 
@@ -127,22 +127,29 @@ def test_the_frames_of_a_cycle_are_those_of_the_standard() -> None:
     ]
 
 
-#: What another program does that sends each of these, beside a rig with drives 1 and 8.
+#: What another program does that sends each of these, with a first byte, beside drives 1 and 8.
 OF_ANOTHER_MASTER = {
-    0x000: "sends NMT commands on this bus",
-    0x080: "sends SYNC on this bus",
-    0x77F: "sends the master's heartbeat on this bus",
-    0x201: "sends set-points to drive 1",
-    0x208: "sends set-points to drive 8",
+    (0x000, 0x01): "sends NMT commands on this bus",
+    (0x080, None): "sends SYNC on this bus",
+    (0x77F, 0x05): "sends the master's heartbeat on this bus",
+    (0x201, 0x0F): "sends set-points to drive 1",
+    (0x208, 0x40): "sends set-points to drive 8",
+    (0x601, 0x2F): "writes objects of drive 1",  # download
+    (0x608, 0x00): "writes objects of drive 8",  # segment of a download
+    (0x608, 0xC6): "writes objects of drive 8",  # block download
+    (0x608, 0xE0): "writes objects of drive 8",  # of no known meaning
 }
-OF_ANOTHER_TOOL = {
-    0x601: "reads or writes objects of drive 1",
-    0x608: "reads or writes objects of drive 8",
+OF_A_READING_TOOL = {
+    (0x601, 0x40): "reads objects of drive 1",  # upload
+    (0x608, 0x70): "reads objects of drive 8",  # segment of an upload
+    (0x608, 0xA4): "reads objects of drive 8",  # block upload
+    (0x608, 0x80): "reads objects of drive 8",  # abort of its own transfer
 }
 
 
 def test_identifiers_of_a_master_are_described_by_what_it_does() -> None:
-    assert commanding_ids([1, 8]) == OF_ANOTHER_MASTER.keys()
-    assert set_up_ids([1, 8]) == OF_ANOTHER_MASTER.keys() | OF_ANOTHER_TOOL.keys()
-    for can_id, action in (OF_ANOTHER_MASTER | OF_ANOTHER_TOOL).items():
-        assert foreign_master_message(can_id) == f"another program {action}"
+    assert commanding_ids([1, 8]) == {can_id for can_id, _ in OF_ANOTHER_MASTER}
+    for (can_id, first), action in (OF_ANOTHER_MASTER | OF_A_READING_TOOL).items():
+        data = b"" if first is None else bytes((first,)).ljust(8, b"\0")
+        assert foreign_master_message(can_id, data) == f"another program {action}"
+        assert is_command(can_id, data) == ((can_id, first) in OF_ANOTHER_MASTER)

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.cia402.object_dictionary import PDO_NO_RTR, Setting, settings_for
-from drivers.cia402.pdo import NmtState
+from drivers.cia402.pdo import NmtCommand, NmtState
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import GroupCommand, GroupState
@@ -213,6 +213,96 @@ def test_a_drive_power_cycled_since_its_configuration_is_reported(bench: Bench) 
     assert bench.group.restarted == (5,)
 
 
+def restart(drive: SimulatedDrive) -> None:
+    """With its process data and mode stored by the maker's tool, so that it answers SYNC."""
+    kept = {
+        key: value
+        for key, value in drive.objects.values().items()
+        if (0x1400 <= key[0] < 0x1C00 or key == (0x6060, 0)) and isinstance(value, int)
+    }
+    drive.power_on()
+    for key, value in kept.items():
+        drive.objects[key] = value
+
+
+def restarts_after(drive: SimulatedDrive, writes: int) -> None:
+    """It restarts once, after this many downloads, or after START with 0."""
+    take, command, left = drive.on_sdo, drive.on_nmt, [writes or -1]
+
+    def on_sdo(data: bytes) -> None:
+        take(data)
+        if data[0] & 0xE0 == 0x20 and left[0] > 0:
+            left[0] -= 1
+            if not left[0]:
+                restart(drive)
+
+    def on_nmt(code: int, node: int) -> None:
+        command(code, node)
+        if code == NmtCommand.START and node == drive.node and left[0] < 0:
+            left[0] = 0
+            restart(drive)
+            command(code, node)  # a drive that starts itself (1F80h)
+
+    drive.on_sdo, drive.on_nmt = on_sdo, on_nmt  # type: ignore[method-assign,assignment]
+
+
+@pytest.mark.parametrize("writes", [0, 1, 15, 22, 30, 31, 36, 40])
+@pytest.mark.parametrize("node", [3, 8])
+def test_a_drive_that_restarts_during_its_set_up_is_refused(
+    bench: Bench, node: int, writes: int
+) -> None:
+    """It was enabled without abort option, quick stop option and supervision."""
+    reported: list[tuple[int, ...]] = []
+    bench.group.configure()
+    restarts_after(bench.drives[node - 1], writes)
+    with pytest.raises(Refused, match=f"drive {node} restarted during set-up"):
+        bench.group.configure(on_restarted=reported.append)
+    assert reported == [(), (node,)], "an incremental encoder has lost its reference"
+    assert bench.group.restarted == (node,)
+    with pytest.raises(Refused, match="not configured"):
+        bench.group.command(GroupCommand.ENABLE)
+    bench.control_words()
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    bench.until(GroupState.ENABLED)
+    assert bench.drives[node - 1].objects[0x6007, 0] == 3
+
+
+def test_a_restart_after_start_shows_without_its_boot_up_too(bench: Bench) -> None:
+    drive = bench.drives[4]
+    send = drive._bus_send
+    drive._bus_send = lambda i, data: None if i == 0x705 else send(i, data)
+    restarts_after(drive, 0)
+    with pytest.raises(Refused, match="drive 5 restarted during set-up"):
+        bench.group.configure()
+
+
+def test_a_restart_after_the_set_up_latches_before_anything_is_enabled(bench: Bench) -> None:
+    """The frames that came after START were discarded."""
+    bench.group.configure()
+    restart(bench.drives[4])
+    bench.drives[4].on_nmt(NmtCommand.START, 5)
+    bench.group.read_positions()
+    with pytest.raises(Refused, match="restarted: its configuration and position are lost"):
+        bench.group.command(GroupCommand.ENABLE)
+
+
+def test_an_emergency_during_the_set_up_explains_the_fault(bench: Bench) -> None:
+    command, drive = bench.drives[4].on_nmt, bench.drives[4]
+
+    def on_nmt(code: int, node: int) -> None:
+        command(code, node)
+        if code == NmtCommand.START and node == 5:
+            drive.fail(0x3210)
+
+    drive.on_nmt = on_nmt  # type: ignore[method-assign]
+    bench.group.configure()
+    ((node, text),) = bench.group.read_positions().faults
+    assert node == 5
+    assert "DC link over-voltage (error 3210h)" in text
+
+
 def test_what_cannot_be_noted_is_not_wiped_out(bench: Bench) -> None:
     """Only the missing configuration shows that drives restarted."""
     reported: list[tuple[int, ...]] = []
@@ -251,7 +341,7 @@ def test_every_object_that_is_not_kept_refuses_to_arm(bench: Bench) -> None:
         if key in ((0x1400, 1), (0x1800, 1), (0x1600, 0), (0x1A00, 0)):
             continue  # a PDO that stays switched on refuses its mapping; the next test
         drive.power_on()
-        drive.objects[key] = 0 if value else 1
+        drive.objects[key] = 0xFF if key == (0x1400, 2) else 0 if value else 1
         drive.objects.stuck.add(key)
         with pytest.raises(Refused) as caught:
             bench.group.configure()
@@ -262,6 +352,33 @@ def test_every_object_that_is_not_kept_refuses_to_arm(bench: Bench) -> None:
 
 def stuck_mode(drive: SimulatedDrive) -> None:
     drive.objects.measured(0x6061, 0, lambda: 0)
+
+
+@pytest.mark.parametrize("kept", [0, 2, 240, 241, 254, 255])
+@pytest.mark.parametrize("refuses", [True, False])
+def test_any_synchronous_type_of_an_rpdo_is_one(bench: Bench, kept: int, refuses: bool) -> None:
+    """Trinamic's PD42-1140 takes 0, 254 and 255; the drives may also keep another."""
+    for drive in bench.drives:
+        if refuses:
+            drive.behaviour = replace(STRICT, ranges={(0x1400, 2): (kept, kept)})
+            drive.power_on()
+        else:
+            drive.objects[0x1400, 2] = kept
+            drive.objects.stuck.add((0x1400, 2))
+    if kept > (0 if refuses else 240):
+        with pytest.raises(Refused, match="1400h:02 PDO transmission type"):
+            bench.group.configure()
+        return
+    bench.enable()
+    assert {drive.objects[0x1400, 2] for drive in bench.drives} == {kept}
+
+
+def test_a_reply_must_follow_every_sync(bench: Bench) -> None:
+    for drive in bench.drives:
+        drive.objects[0x1800, 2] = 0
+        drive.objects.stuck.add((0x1800, 2))
+    with pytest.raises(Refused, match="1800h:02 PDO transmission type"):
+        bench.group.configure()
 
 
 def clamped_ramp(drive: SimulatedDrive) -> None:
@@ -382,6 +499,43 @@ def test_a_fault_is_latched_until_it_is_reset(bench: Bench) -> None:
     bench.until(GroupState.ENABLED)
 
 
+@pytest.mark.parametrize("stores", [True, False])
+@pytest.mark.parametrize("set_up_again", [True, False])
+def test_a_reset_that_fails_states_the_cause(
+    bench: Bench, stores: bool, set_up_again: bool
+) -> None:
+    """No emergency was said to have been received: the reset had deleted it."""
+    bench.enable()
+    drive, take = bench.drives[2], bench.drives[2]._take_control_word
+    drive._take_control_word = lambda word: take(word & ~0x80)  # type: ignore[method-assign]
+    if not stores:
+        drive.objects.refusals[0x603F, 0] = 0x06020000
+    drive.fail(0x3210)
+    for _ in range(3):
+        bench.cycle()
+    for each in bench.drives:  # the operator's emergency stop takes the torque off
+        if each.state is HOLDING:
+            each.state = DriveState.SWITCH_ON_DISABLED
+    bench.cycle()
+    if set_up_again:
+        bench.group.close()
+        bench.group.configure(to_reset=True)
+        bench.group.read_positions()
+    bench.group.command(GroupCommand.RESET_FAULT)
+    for _ in range(120):
+        bench.cycle()
+    assert bench.status is not None
+    ((node, text),) = bench.status.faults
+    assert node == 3
+    over_voltage = "DC link over-voltage (error 3210h)"
+    if stores:
+        assert text == f"cable 3 (drive 3) is in fault: {over_voltage}, as stored in the drive"
+    elif set_up_again:
+        assert text.endswith("no emergency message received")
+    else:
+        assert text == f"cable 3 (drive 3) is in fault: earlier: {over_voltage}"
+
+
 def test_a_silent_drive_is_reported_every_cycle_and_left_to_the_executor(bench: Bench) -> None:
     bench.enable()
     bench.drives[7].silent = True
@@ -468,6 +622,89 @@ def test_a_drive_that_stopped_by_itself_stops_all_at_the_next_sync(bench: Bench)
     assert bench.group.state is GroupState.QUICK_STOP
     bench.group.command(GroupCommand.ENABLE)
     bench.until(GroupState.ENABLED)
+
+
+def stops_when_enabled(drive: SimulatedDrive, times: int) -> list[int]:
+    """Its limit switch is hit: quick stop in the SYNC that enables it, without an emergency."""
+    enable, enabled = drive._command_enable, [0]
+
+    def command_enable() -> None:
+        enable()
+        enabled[0] += 1
+        if enabled[0] <= times:
+            drive._quick_stop()
+
+    drive._command_enable = command_enable  # type: ignore[method-assign]
+    return enabled
+
+
+@pytest.mark.parametrize("times", [1, 2, 99])
+@pytest.mark.parametrize("held", [False, True])
+def test_a_drive_that_stops_in_the_cycle_that_enables_it_is_named_alone(
+    bench: Bench, times: int, held: bool
+) -> None:
+    """The seven others were blamed, and it was enabled three times while its switch was hit."""
+    bench.group.configure()
+    if held:  # the others hold the platform; it comes from the state SWITCHED ON
+        for drive in bench.drives:
+            drive.state = DriveState.SWITCHED_ON if drive.node == 3 else HOLDING
+    bench.group.read_positions()
+    enabled = stops_when_enabled(bench.drives[2], times)
+    bench.group.command(GroupCommand.ENABLE)
+    for _ in range(20):
+        bench.cycle()
+        assert bench.group.state is not GroupState.ENABLED
+    assert bench.status is not None
+    assert bench.status.faults == ((3, "cable 3 (drive 3) stopped on its own: quick stop active"),)
+    assert enabled[0] == 2, "once more by the frames that were sent before its reply"
+    assert {drive.state for drive in bench.drives} == {HOLDING}
+    words = bench.control_words()
+    first = words.index(0x0F)
+    assert set(words[first : first + 16]) == {0x0F}
+    assert set(words[first + 16 :]) == {0x02}
+
+
+def test_a_drive_that_falls_back_while_the_others_are_enabled_stops_them_once(
+    bench: Bench,
+) -> None:
+    """Its mains failed after 0Fh: the others were stopped and enabled again without a fault."""
+    bench.group.configure()
+    bench.group.read_positions()
+    drive = bench.drives[5]
+    drive._command_enable = lambda: None  # type: ignore[method-assign]
+    bench.group.command(GroupCommand.ENABLE)
+    for _ in range(8):
+        bench.cycle()
+    assert [d.state for d in bench.drives].count(DriveState.OPERATION_ENABLED) == 7
+    drive.state = DriveState.SWITCH_ON_DISABLED
+    for _ in range(8):
+        bench.cycle()
+    assert bench.status is not None
+    text = "cable 6 (drive 6) left switched on on its own: switch on disabled"
+    assert bench.status.faults == ((6, text),)
+    assert [d.state for d in bench.drives].count(HOLDING) == 7
+
+
+@pytest.mark.parametrize("command", [GroupCommand.ENABLE, GroupCommand.RELEASE])
+@pytest.mark.parametrize("cycles", [0, 1, 2, 3])
+@pytest.mark.parametrize("enabling", [0, 3, 4, 5, 10])
+def test_a_command_right_after_a_stop_finds_no_fault(
+    bench: Bench, enabling: int, cycles: int, command: GroupCommand
+) -> None:
+    """The replies still showed drives enabled that had been commanded to stop."""
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    for _ in range(enabling):
+        bench.cycle()
+    bench.group.quick_stop_now()
+    bench.group.receive(0.0)
+    for _ in range(cycles):
+        bench.cycle()
+    bench.group.command(command)
+    bench.until(
+        GroupState.ENABLED if command is GroupCommand.ENABLE else GroupState.RELEASED, limit=40
+    )
 
 
 def test_a_cycle_that_may_not_enable_becomes_a_stop_of_all(bench: Bench) -> None:
@@ -703,6 +940,7 @@ COMMANDS = st.one_of(
     st.just(("stop now", None)),
     st.integers(1, 8).map(lambda cycles: ("cycles", cycles)),
     st.integers(0, 7).map(lambda drive: ("fault", drive)),
+    st.integers(0, 7).map(lambda drive: ("stops", drive)),
     st.integers(1, 6).map(lambda cycles: ("pause", cycles)),
 )
 
@@ -710,12 +948,13 @@ COMMANDS = st.one_of(
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(script=st.lists(COMMANDS, max_size=12))
 def test_no_script_frees_a_cable_or_enables_some(bench: Bench, script: list) -> None:
-    """Random commands, faults and pauses: control words and states stay within the rules."""
+    """Random commands, faults, stops of drives and pauses: words and states keep the rules."""
     for drive in bench.drives:
         drive.power_on()
     bench.group.close()
     bench.group.configure()
     bench.group.read_positions()
+    words: list[int] = []
     for what, value in script:
         if what == "command":
             try:
@@ -726,13 +965,21 @@ def test_no_script_frees_a_cable_or_enables_some(bench: Bench, script: list) -> 
             bench.group.quick_stop_now()
         elif what == "fault":
             bench.drives[value].fail(0x7121)
+        elif what == "stops":
+            if bench.drives[value].state is DriveState.OPERATION_ENABLED:
+                bench.drives[value]._quick_stop()
         elif what == "pause":
             bench.rehearsal.advance(0.01 * value)
         else:
             for _ in range(value):
                 before = [d.torque_on for d in bench.drives]
                 enabled_before = [d.state is DriveState.OPERATION_ENABLED for d in bench.drives]
+                words += bench.control_words()
                 bench.cycle()
+                sent = bench.control_words()
+                words += sent
+                if bench.group.state is GroupState.ENABLED:
+                    assert sent == [0x0F] * 8
                 enabled = [d.state is DriveState.OPERATION_ENABLED for d in bench.drives]
                 if any(new and not old for new, old in zip(enabled, enabled_before, strict=True)):
                     assert all(enabled)
@@ -743,4 +990,4 @@ def test_no_script_frees_a_cable_or_enables_some(bench: Bench, script: list) -> 
                         if held and not d.torque_on and d.state is not DriveState.FAULT
                     ]
                     assert not lost
-    assert all(word & 0x02 for word in bench.control_words())
+    assert all(word & 0x02 for word in [*words, *bench.control_words()])

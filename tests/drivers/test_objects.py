@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cia402.object_dictionary import heartbeat_consumers, interpolation_time, settings_for
+from drivers.cia402.object_dictionary import heartbeat_consumers, settings_for
+from drivers.cia402.profile import interpolation_time
 from drivers.plausibility import position_limits
 from model.errors import BadInput
 from model.kinematics import cable_lengths

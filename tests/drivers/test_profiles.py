@@ -506,6 +506,60 @@ def test_doctor_holds_the_drives_scale_against_the_rig_s(
     assert bool(row.change) == (verdict == "remark")
 
 
+def keyed(rig: Rig, tmp_path: Path, key: str) -> Rig:
+    return with_profile(rig, lab_profile(tmp_path, key))
+
+
+@pytest.mark.parametrize(
+    ("others", "of_five", "key", "named"),
+    [
+        ({}, {0x6092: (360_000, 1)}, "", None),  # no drive shows that its make means 6064h
+        ({0x608F: (TURN, 1)}, {0x6092: (360_000, 1)}, "", "360000 by 6092h/6091h"),
+        (
+            {0x6092: (TURN, 1)},
+            {0x608F: (4096, 1)},
+            "",
+            "4096 by 608Fh",
+        ),  # replaced, at its defaults
+        ({0x6092: (TURN, 1)}, {}, "", ""),
+        ({}, {0x6092: (360_000, 1)}, "states_scale: true", "360000 by 6092h/6091h"),
+        ({0x608F: (TURN, 1)}, {0x6092: (360_000, 1)}, "states_scale: false", ""),
+        ({0x608F: (TURN, 1)}, {0x608F: (TURN, 1), 0x6092: (1, 1)}, "", ""),  # not set
+        ({0x608F: (TURN, 1)}, {0x608F: (4096, 1), 0x6092: (TURN, 1)}, "", ""),  # another encoder
+    ],
+)
+def test_a_drive_with_another_scale_than_the_rig_file_does_not_move_unannounced(
+    rig: Rig,
+    tmp_path: Path,
+    others: dict[int, tuple[int, int]],
+    of_five: dict[int, tuple[int, int]],
+    key: str,
+    named: str | None,
+) -> None:
+    """Refused where its make is known to state the scale, or another drive shows it."""
+    bus = with_scale(others)
+    five = with_scale(of_five).drives[5]
+    bus.drives[5] = five
+    theirs = keyed(rig, tmp_path, key)
+    found = examined(theirs, bus)
+    if named:
+        assert not found.good
+        with pytest.raises(Refused, match=f"the drive has {named}; {TURN} is required") as caught:
+            set_up(theirs, bus)
+        assert "drive 5, position counts per motor turn" in caught.value.where
+        assert "states_scale: false" in caught.value.next_step
+        assert "the drives were not changed" in caught.value.next_step
+        return
+    assert found.good
+    said = [remark for remark in set_up(theirs, bus) if "counts per motor turn" in remark]
+    if named == "":
+        assert said == []
+    else:
+        (remark,) = said
+        stated = "360000 position counts per motor turn by 6092h/6091h"
+        assert remark.startswith(f"drive 5: {stated}, and {TURN} by the rig file: compare 6064h")
+
+
 def test_doctor_reads_the_mode_that_a_set_up_waits_for(rig: Rig) -> None:
     bus = eight_of("cia402")
     bus.drives[5].aborts[0x6061, 0] = 0x06020000
@@ -810,6 +864,24 @@ def test_doctor_names_what_a_profile_of_ones_own_says(rig: Rig) -> None:
     assert "no profile" in change["6007h:00"]
 
 
+@pytest.mark.parametrize(
+    ("key", "kept", "said"),
+    [
+        ((0x1400, 1), 0x208, "the drive has 00000208h; 80000201h is required"),
+        ((0x1600, 1), 0x60410010, "the drive has 60410010h; 60400010h is required"),
+        ((0x1016, 1), 0x7F0065, "the drive has 007F0065h; 007F0064h is required"),
+        ((0x1017, 0), 31, "the drive has 31; 30 is required"),
+    ],
+)
+def test_refusals_print_identifiers_as_manuals_do(
+    rig: Rig, key: tuple[int, int], kept: int, said: str
+) -> None:
+    bus = eight_of("cia402")
+    bus.drives[1].keeps[key] = kept
+    with pytest.raises(Refused, match=said):
+        set_up(rig, bus)
+
+
 def test_doctor_prints_mappings_as_manuals_do(rig: Rig) -> None:
     (row,) = (row for row in examined(rig, eight_of("cia402")).rows if row.object[:8] == "1600h:02")
     assert row.needed == "607A0020h, written at configuration"
@@ -824,6 +896,41 @@ def test_doctor_says_what_keeps_a_drive_from_being_enabled(rig: Rig, word: int, 
     (row,) = (row for row in examined(rig, bus).rows if row.object.startswith("6041h"))
     assert row.verdict == "remark"
     assert said in row.change
+
+
+def errors_of(bus: ScriptedBus, code: int | None, history: int | None) -> None:
+    """Drive 5 is in fault, with 603Fh and 1003h:01, or without either."""
+    drive = bus.drives[5]
+    drive.values[0x6041, 0] = 0x0218
+    drive.objects[0x1003, 1] = drive.objects[0x1006, 0]
+    for key, value in (((0x603F, 0), code), ((0x1003, 1), history)):
+        drive.values[key] = value or 0
+        if value is None:
+            drive.aborts[key] = 0x06020000
+
+
+STORED = [
+    (0x3210, 0x12344310, "DC link over-voltage (error 3210h)"),
+    (0, 0x12344310, "drive temperature too high (error 4310h)"),
+    (None, 0x12344310, "drive temperature too high (error 4310h)"),
+    (0x3210, None, "DC link over-voltage (error 3210h)"),
+    (None, None, ""),
+]
+
+
+@pytest.mark.parametrize(("code", "history", "said"), STORED)
+def test_a_fault_is_explained_by_what_the_drive_stores(
+    rig: Rig, code: int | None, history: int | None, said: str
+) -> None:
+    bus = eight_of("cia402")
+    errors_of(bus, code, history)
+    (row,) = (row for row in examined(rig, bus).rows if row.object.startswith("6041h"))
+    assert row.found[f"fault: {said}" if said else "fault"] == [5]
+    assert examine.read_states(rig, bus, None).errors == ("",) * 4 + (said,) + ("",) * 3  # type: ignore[arg-type]
+    with pytest.raises(Refused) as caught:
+        set_up(rig, bus)
+    assert caught.value.what == "drive 5 is in fault" + (f": {said}" if said else "")
+    set_up(rig, bus, to_reset=True)
 
 
 def test_every_profile_names_its_sources() -> None:

@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cia402.state_machine import ControlWord, DriveState, Goal, next_words
+from drivers.cia402.state_machine import (
+    FAULTED,
+    TORQUE_ON,
+    ControlWord,
+    DriveState,
+    Goal,
+    change_on_its_own,
+    next_words,
+)
 
 STATES = st.sampled_from(DriveState)
 READY = {
@@ -125,6 +133,49 @@ def test_only_faulted_drives_get_a_reset() -> None:
 def test_unknown_drives_are_stop_commanded() -> None:
     """A drive not heard yet may be holding the platform from an earlier run."""
     assert next_words(Goal.IDLE, [DriveState.NOT_READY], [False]) == (ControlWord.QUICK_STOP,)
+
+
+@given(
+    goal=st.sampled_from(Goal),
+    before=STATES,
+    word=st.sampled_from(ControlWord),
+    enables=st.booleans(),
+)
+def test_what_was_commanded_is_not_taken_for_a_change_of_its_own(
+    goal: Goal, before: DriveState, word: ControlWord, enables: bool
+) -> None:
+    """Words that a goal sends to a drive in this state: all alike once "enable operation" was."""
+    if goal is Goal.ENABLE and enables:
+        word = ControlWord.ENABLE_OPERATION
+    elif word not in {*next_words(goal, [before], [True]), *next_words(goal, [before], [False])}:
+        return
+    assert change_on_its_own(goal, enables, before, after(before, word)) is None
+
+
+@pytest.mark.parametrize("goal", [Goal.ENABLE, Goal.RELEASE])
+@pytest.mark.parametrize("before", sorted(READY - {DriveState.QUICK_STOP_ACTIVE}, key=str))
+def test_a_quick_stop_after_enable_operation_is_the_drives_own(
+    goal: Goal, before: DriveState
+) -> None:
+    """It was sent 02h, with all healthy drives, and enabled again."""
+    found = change_on_its_own(goal, True, before, DriveState.QUICK_STOP_ACTIVE)
+    assert found == "stopped on its own: quick stop active"
+
+
+@given(before=st.sampled_from(sorted(READY, key=str)), state=STATES)
+def test_a_drive_that_was_sent_enable_operation_may_only_stay_or_be_enabled(
+    before: DriveState, state: DriveState
+) -> None:
+    allowed = state in (before, DriveState.OPERATION_ENABLED) or state in FAULTED
+    assert (change_on_its_own(Goal.ENABLE, True, before, state) is None) == allowed
+
+
+@given(goal=st.sampled_from(Goal), state=STATES)
+def test_a_held_cable_that_loses_its_torque_is_noticed_before_anything_is_enabled(
+    goal: Goal, state: DriveState
+) -> None:
+    found = change_on_its_own(goal, False, DriveState.QUICK_STOP_ACTIVE, state)
+    assert (found == f"lost its torque: {state.value}") == (state not in TORQUE_ON | FAULTED)
 
 
 ENABLING = {

@@ -11,6 +11,7 @@ from drivers.cia402.pdo import (
     HEARTBEAT_BASE,
     MASTER_NODE,
     RPDO1_BASE,
+    SDO_REQUEST_BASE,
     SYNC_ID,
     TPDO1_BASE,
     make_reply,
@@ -365,6 +366,10 @@ TABLE: dict[str, Fault] = {
     ),
     "F13 another master's heartbeat": Fault(
         then(comes(HEARTBEAT_BASE + MASTER_NODE, b"\x05")), words=("master's heartbeat",)
+    ),
+    "F13 another program writes an object": Fault(  # 1006h = 0: drive 4 would not miss SYNC
+        then(comes(SDO_REQUEST_BASE + 4, bytes.fromhex("2306100000000000"))),
+        words=("another program writes objects of drive 4",),
     ),
     "F17 a winch jams": Fault(
         broken(1, by=jam),
