@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from model.kinematics import cables_at, structure_matrix_of
-from model.pose import Array, Pose, read_only
+from model.pose import Array, Pose, ReadOnly, read_only
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PosedRig:
+class PosedRig(ReadOnly):
     """Kinematics and statics of a rig at one pose; the arrays are read-only.
 
     Attributes:

@@ -16,7 +16,7 @@ from model.errors import BadInput, require_types
 from model.files.documents import document_hash, key_path, load_yaml, millimetres
 from model.files.rig_file import MotionDocument, RigDocument, WinchDocument
 from model.pages.page import html_table
-from model.pose import Array, Pose, read_only
+from model.pose import Array, Pose, ReadOnly, read_only
 from model.posed_rig import PosedRig, posed_rig
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class CalibrationResult(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Rig:
+class Rig(ReadOnly):
     """A checked cable robot with m cables.
 
     Attributes:

@@ -36,7 +36,7 @@ from model.files.scene_file import (
     payloads,
 )
 from model.pages.page import html_table
-from model.pose import Array, Pose, RotationLimits, read_only
+from model.pose import Array, Pose, ReadOnly, RotationLimits, read_only
 from model.shapes import (
     Box,
     Capsule,
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Load:
+class Load(ReadOnly):
     """What the cables carry besides the platform's own weight.
 
     Attributes:
@@ -89,7 +89,7 @@ class Stop:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(ReadOnly):
     """A checked scene.
 
     Attributes:

@@ -6,7 +6,7 @@ import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import Any, NoReturn, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -395,3 +395,30 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
         if inner is not None:
             return inner
     return None
+
+
+# Lists of documents, which cannot be changed.
+
+
+class FixedList(list[Any]):
+    """A list of a document, which cannot be changed; ``list(it)`` copies it."""
+
+    def _refuse(self, *_given: object, **_named: object) -> NoReturn:
+        raise TypeError("this list belongs to a document, which cannot be changed; copy it")
+
+    def __reduce__(self) -> tuple[type[FixedList], tuple[list[Any]]]:
+        """Copies cannot be changed either."""
+        return type(self), (list(self),)
+
+
+for _name in ("append", "clear", "extend", "insert", "pop", "remove", "reverse", "sort"):
+    setattr(FixedList, _name, FixedList._refuse)
+for _name in ("setitem", "delitem", "iadd", "imul"):
+    setattr(FixedList, f"__{_name}__", FixedList._refuse)
+
+
+def fixed(value: Any) -> Any:
+    """A value whose lists, also within lists, are fixed."""
+    if type(value) is list:
+        return FixedList([fixed(entry) if type(entry) is list else entry for entry in value])
+    return value

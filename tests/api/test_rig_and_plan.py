@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import re
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,63 @@ def test_a_rig_at_a_pose_balances_its_weight(rig: cdpr.Rig) -> None:
     assert posed.is_wrench_feasible
     assert 0.0 < posed.dexterity < 1.0
     assert not posed.tensions.flags.writeable
+
+
+def arrays_in(thing: object, seen: set[int]) -> Iterator[np.ndarray]:
+    """Every array that an object holds, at any depth."""
+    if id(thing) in seen:
+        return
+    seen.add(id(thing))
+    if isinstance(thing, np.ndarray):
+        yield thing
+    parts = list(thing) if isinstance(thing, tuple | list) else []
+    if is_dataclass(thing):
+        parts = [getattr(thing, one.name) for one in fields(thing)]
+    for part in parts:
+        yield from arrays_in(part, seen)
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.copy, copy.deepcopy, lambda thing: pickle.loads(pickle.dumps(thing))],
+    ids=["copy", "deepcopy", "pickle"],
+)
+def test_no_array_of_a_copy_can_be_written_to(
+    plan: cdpr.Plan, copied: Callable[[Any], Any]
+) -> None:
+    hashes = plan.rig.plan_hash, plan.rig.hash, plan.scene.hash
+    hall = cdpr.load_scene(CONFIGS / "hall_pillar.yaml")
+    for thing in (plan, plan.rig, hall, plan.waypoints[0], plan.rig.at(plan.rig.home)):
+        arrays = list(arrays_in(copied(thing), set()))
+        assert len(arrays) >= 2
+        assert not any(array.flags.writeable for array in arrays)
+    again = copied(plan)
+    assert (again.rig.plan_hash, again.rig.hash, again.scene.hash) == hashes
+    assert again.waypoints == plan.waypoints
+    assert cdpr.check(again).passed
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda document: document.outlets_mm[0].__setitem__(0, 9999.0),
+        lambda document: document.outlets_mm.append([0.0, 0.0, 0.0]),
+        lambda document: document.winches.sort(),
+        lambda document: document.platform.size_mm.__imul__(2),
+        lambda document: copy.deepcopy(document).anchors_mm.pop(),
+        lambda document: pickle.loads(pickle.dumps(document)).anchors_mm.reverse(),
+        lambda document: document.model_copy(
+            update={"outlets_mm": [list(p) for p in document.outlets_mm]}
+        ).outlets_mm[0].clear(),
+    ],
+)  # fmt: skip
+def test_the_document_of_a_rig_cannot_be_changed_behind_its_hash(
+    rig: cdpr.Rig, change: Callable[[Any], object]
+) -> None:
+    fresh = rig.with_bus()
+    with pytest.raises(TypeError, match="cannot be changed"):
+        change(fresh.document)
+    assert fresh.plan_hash == rig.plan_hash
 
 
 def test_a_pose_that_cannot_be_held_says_so_and_has_no_tensions(rig: cdpr.Rig) -> None:
