@@ -15,7 +15,8 @@ from mcap.reader import make_reader
 
 import cdpr
 from cdpr.operation import set_speed
-from executor.recording.run_folder import RunFolder
+from executor.recording.run_folder import RunEvent, RunFolder
+from executor.remote.command_socket import find_runs
 from model.files.documents import PoseDocument
 from model.files.scene_file import StopDocument
 from model.pose import matrix_from_rotation_vector, quaternion_from_matrix
@@ -246,3 +247,31 @@ def test_a_figure_shows_error_tensions_and_clearance(run: cdpr.RunResult) -> Non
 def test_without_a_run_under_way_a_stop_reaches_nothing() -> None:
     with pytest.raises(cdpr.Fault):
         cdpr.stop()
+
+
+def test_runs_of_one_process_need_a_simulated_channel_each(tmp_path: Path) -> None:
+    """Both on one channel had been refused as disturbed by another program."""
+    rig, scene = ready()
+    plan = short_plan(rig, scene)
+    beside: list[str] = []
+
+    def run_beside(_event: RunEvent) -> None:
+        if beside:
+            return
+        with pytest.raises(
+            cdpr.Refused, match="in progress on this bus in this process"
+        ) as refused:
+            cdpr.run(plan, rig, folder=tmp_path / "same", cameras=[], realtime=False)
+        assert "rig.with_bus('virtual', name)" in refused.value.next_step
+        beside.append("refused")
+        other = rig.with_bus("virtual", "another")
+        run = cdpr.run(plan, other, folder=tmp_path / "beside", cameras=[], realtime=False)
+        beside.append(run.verdict)
+        with find_runs() as runs:
+            beside.append(str(len(runs)))
+
+    first = cdpr.run(
+        plan, rig, folder=tmp_path / "first", cameras=[], realtime=False, on_event=run_beside
+    )
+    assert (first.verdict, *beside) == ("PASSED", "refused", "PASSED", "1")
+    assert not (tmp_path / "same").exists()
