@@ -34,6 +34,7 @@ from model.files.validation import (
     key_path,
     model_in,
     parse_yaml,
+    plain_data,
     position_of,
     problems_of,
 )
@@ -248,6 +249,24 @@ def load_yaml(path: Path, model: type[Model]) -> Model:
         what = "the file is empty" if empty else "the file must hold keys and values"
         problems.append(Problem("", what, 1, 1))
     raise InvalidFile(str(path), sorted(problems, key=lambda p: (p.line, p.column)))
+
+
+def document_of(data: Mapping[str, Any], model: type[Model], where: str) -> Model:
+    """A document from a file's keys and values in Python, arrays included.
+
+    Raises:
+        InvalidFile: With every key that does not fit.
+    """
+    plain = plain_data(data)
+    if not isinstance(plain, dict):
+        what = f"expected keys and values in a dictionary, not {type(data).__name__}"
+        raise BadInput(what, where=where)
+    _require_kind(plain, model, Path(where))
+    check_version(plain, model, Path(where), {})
+    document, problems = _validated(plain, model, {})
+    if document is None:
+        raise InvalidFile(where, problems, "correct these keys; the pages on files describe them")
+    return document
 
 
 _MARKS = {

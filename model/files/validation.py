@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, get_args
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -397,7 +398,20 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
-# Lists of documents, which cannot be changed.
+# Data of a script as of a file, and lists of documents, which cannot be changed.
+
+
+def plain_data(value: Any) -> Any:
+    """A value with dictionaries and lists in place of mappings, tuples and arrays."""
+    match value:
+        case np.ndarray() | np.generic():
+            return value.tolist()
+        case Mapping():
+            return {str(key): plain_data(one) for key, one in value.items()}
+        case list() | tuple():
+            return [plain_data(one) for one in value]
+        case _:
+            return value
 
 
 class FixedList(list[Any]):

@@ -13,6 +13,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pytest
+import yaml
 
 import cdpr
 from executor.cameras.sources import choose_camera
@@ -105,6 +106,42 @@ def test_the_document_of_a_rig_cannot_be_changed_behind_its_hash(
     with pytest.raises(TypeError, match="cannot be changed"):
         change(fresh.document)
     assert fresh.plan_hash == rig.plan_hash
+
+
+@pytest.mark.parametrize("name", [path.name for path in CONFIGS.glob("*.yaml")])
+def test_a_rig_or_scene_is_made_again_from_its_own_keys(name: str) -> None:
+    kind, load = (cdpr.Rig, cdpr.load_rig) if "winches" in (CONFIGS / name).read_text() else (
+        cdpr.Scene, cdpr.load_scene
+    )  # fmt: skip
+    loaded: Any = load(CONFIGS / name)
+    assert kind.from_dict(loaded.as_dict()).hash == loaded.hash
+    in_file = yaml.safe_load((CONFIGS / name).read_text())
+    assert kind.from_dict(in_file).hash == loaded.hash
+
+
+def test_a_rig_is_varied_in_memory_and_checked_like_a_file(rig: cdpr.Rig) -> None:
+    data = rig.as_dict()
+    wider = np.array(data["outlets_mm"]) * [1.1, 1.1, 1.0]
+    varied = cdpr.Rig.from_dict(
+        {**data, "outlets_mm": wider, "anchors_mm": tuple(map(tuple, data["anchors_mm"]))}
+    )
+    np.testing.assert_allclose(varied.outlets, rig.outlets * [1.1, 1.1, 1.0])
+    assert varied.plan_hash != rig.plan_hash
+    data["outlets_mm"][0][0] = 1e4  # its own lists, which changes no rig
+    assert rig.as_dict()["outlets_mm"] != data["outlets_mm"]
+    data.update(platfrom={}, anchors_mm=data["anchors_mm"][:-1])
+    data["cables"]["min_tension_n"] = np.nan
+    with pytest.raises(cdpr.BadInput) as refused:
+        cdpr.Rig.from_dict(data)
+    for word in ("Rig.from_dict: platfrom:", "'platform'", "cables.min_tension_n", "finite"):
+        assert word in str(refused.value)
+    for wrong in (None, [1], "rig.yaml", {3: 4}, {}):
+        with pytest.raises(cdpr.BadInput):
+            cdpr.Rig.from_dict(wrong)  # type: ignore[arg-type]
+    with pytest.raises(cdpr.BadInput, match="this is a rig file, not a scene file"):
+        cdpr.Scene.from_dict(rig.as_dict())
+    with pytest.raises(cdpr.BadInput, match="schema version 2"):
+        cdpr.Rig.from_dict({**rig.as_dict(), "schema_version": 2})
 
 
 def test_a_pose_that_cannot_be_held_says_so_and_has_no_tensions(rig: cdpr.Rig) -> None:
@@ -293,7 +330,7 @@ def test_objects_show_themselves_briefly_and_in_a_notebook(
     for shown in (rig, scene, plan, cdpr.check(plan), rig.at(rig.home)):
         assert len(repr(shown)) < 300
         assert repr(shown).startswith("<")
-    for shown in (rig, scene, plan, cdpr.check(plan)):
+    for shown in (rig, scene, plan, cdpr.check(plan), rig.at(rig.home)):
         assert shown._repr_html_().count("<tr>") >= 3
 
 
