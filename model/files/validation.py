@@ -15,6 +15,7 @@ from pydantic.fields import FieldInfo
 from yaml.composer import Composer
 
 from model.errors import Problem
+from model.files.reading import SHORTEN
 
 # YAML text as plain data, with the line and column of every key.
 #
@@ -94,15 +95,19 @@ class _Loader(Composer, yaml.CSafeLoader):
         event: Any = self.peek_event()
         self._count, self._depth = self._count + 1, self._depth + 1
         if self._depth > DEPTH_LIMIT:
-            raise _too_much(f"nested too deeply, more than {DEPTH_LIMIT} levels", event.start_mark)
+            what, hint = f"nested too deeply, more than {DEPTH_LIMIT} levels", "write it flatter"
+            raise _too_much(what, event.start_mark, hint)
         node: yaml.Node | None = super().compose_node(parent, index)
         self._depth -= 1
         if not isinstance(event, yaml.AliasEvent):
             self._sizes[id(node)] = self._written_out(node)
         # A node within itself has no size yet; the model reports that it refers to itself.
-        if max(self._count, self._sizes.get(id(node), 0)) > NODE_LIMIT:
-            what = f"more than {NODE_LIMIT} keys and values, aliases counted"
-            raise _too_much(what, event.start_mark)
+        what = f"more than {NODE_LIMIT} keys and values"
+        if self._count > NODE_LIMIT:
+            raise _too_much(what, event.start_mark, SHORTEN)
+        if self._sizes.get(id(node), 0) > NODE_LIMIT:
+            hint = "write the file without such aliases"
+            raise _too_much(f"{what}, with aliases expanded", event.start_mark, hint)
         return node
 
     def _written_out(self, node: yaml.Node | None) -> int:
@@ -158,8 +163,7 @@ def parse_yaml(text: str) -> YamlTree:
         raise YamlSyntaxError("not valid here: nested too deeply", 1, 1) from None
 
 
-def _too_much(what: str, mark: yaml.Mark) -> YamlSyntaxError:
-    hint = "split the file, or write it without such aliases"
+def _too_much(what: str, mark: yaml.Mark, hint: str) -> YamlSyntaxError:
     return YamlSyntaxError(f"too much to read: {what}", mark.line + 1, mark.column + 1, hint)
 
 
