@@ -261,7 +261,7 @@ def report(folder: str | Path) -> Path:
     For a run that was killed, or whose disk was full, missing results are recovered too.
 
     Raises:
-        BadInput: There is no such folder, or a file of the run was changed.
+        BadInput: There is no such folder, or a file of the run differs from its checksum.
     """
     opened = RunFolder.open_cut_short(Path(folder))
     rewrite_report(opened)
