@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from executor.evaluation import rewrite_report
 from executor.recording.resume import passing, scene_after
@@ -144,7 +145,10 @@ def workspace_map(
     slices: Sequence[tuple[Literal["x", "y", "z"], float]] = (),
     volume: bool | None = None,
     step: float | None = None,
+    lower: ArrayLike | None = None,
+    upper: ArrayLike | None = None,
     rotation: Array | None = None,
+    characteristic_length: float | None = None,
     workers: int | None = None,
     listener: Listener = SILENT,
 ) -> list[Maps]:
@@ -156,7 +160,11 @@ def workspace_map(
         slices: Axis and position [m] of planes (default: the horizontal one through home).
         volume: Map the whole workspace too (default: only without slices).
         step: Grid spacing, [m] (default: a fiftieth of the longest side).
+        lower: Corner of the mapped region, shape (3,), [m] (default: that of the workspace).
+        upper: The opposite corner.
         rotation: Of the platform, shape (3, 3) (default: the scene's start, else home).
+        characteristic_length: Divides moments in the condition number, [m] (default: the anchors'
+            root mean square radius).
         workers: Number of processes (default: one per core).
         listener: Receives the progress.
 
@@ -164,13 +172,30 @@ def workspace_map(
         The grid of each plane or volume, with arrays of values by name.
 
     Raises:
-        BadInput: A plane is outside the workspace, or there are too many points.
+        BadInput: A plane is outside the region, a number cannot be used, or there are too many
+            points.
     """
     require_types((rig, Rig), *([] if scene is None else [(scene, Scene)]))
     planes = [("xyz".index(axis), position) for axis, position in slices]
-    grids = workspace_grids(rig, planes, volume=volume, step=step)
-    question = Question.about(rig, scene, rotation)
+    corners = {"lower": _corner("lower", lower), "upper": _corner("upper", upper)}
+    grids = workspace_grids(rig, planes, volume=volume, step=step, **corners)
+    question = Question.about(rig, scene, rotation, characteristic_length)
     return map_workspace(question, grids, workers=workers, listener=listener)
+
+
+def _corner(name: str, given: ArrayLike | None) -> Array | None:
+    if given is None:
+        return None
+    try:
+        corner = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        corner = np.empty(0)
+    if corner.shape != (3,) or not np.isfinite(corner).all():
+        raise BadInput(
+            f"{name} must be three finite numbers, x, y and z in metres; it is {given!r}",
+            where="workspace_map",
+        )
+    return corner
 
 
 def stop() -> list[int]:
@@ -236,7 +261,7 @@ def report(folder: str | Path) -> Path:
     For a run that was killed, or whose disk was full, missing results are recovered too.
 
     Raises:
-        BadInput: There is no such folder, or a file of the run was changed.
+        BadInput: There is no such folder, or a file of the run differs from its checksum.
     """
     opened = RunFolder.open_cut_short(Path(folder))
     rewrite_report(opened)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -32,6 +33,10 @@ from model.winches import WinchMap
 if TYPE_CHECKING:
     from simulation.ground_truth import PowerLoss
     from simulation.rig import SimulatedRig
+
+#: Buses whose drives are simulated in this process at the moment, of any thread.
+_simulated: set[str] = set()
+_simulating = threading.Lock()
 
 #: Time for drives that lost their master to notice and come to rest, [s].
 ALONE = 1.0
@@ -104,6 +109,29 @@ class _Drives:
 
 
 @contextmanager
+def _held_in_process(settings: BusSettings) -> Iterator[None]:
+    """Holds a bus of the interface ``virtual``, whose ends find each other by its name.
+
+    Raises:
+        Refused: Drives are simulated on it already.
+    """
+    with _simulating:
+        if settings.canonical in _simulated:
+            raise Refused(
+                "a motion is in progress on this bus in this process",
+                where=f"bus {settings}",
+                why="the simulated drives of both would answer on one channel",
+                next_step="wait until it ends, or simulate on a channel of its own:"
+                " rig.with_bus('virtual', name); nothing was moved",
+            )
+        _simulated.add(settings.canonical)
+    try:
+        yield
+    finally:
+        _simulated.discard(settings.canonical)
+
+
+@contextmanager
 def _locked_bus(
     rig: Rig,
     simulated_start: Pose,
@@ -115,6 +143,8 @@ def _locked_bus(
     settings = BusSettings.of(rig)
     with ExitStack() as stack:
         stack.enter_context(SetUpLock(settings).held())
+        if settings.interface == IN_PROCESS:
+            stack.enter_context(_held_in_process(settings))
         bus = open_bus(settings)
         stack.callback(bus.shutdown)
         if settings.interface != IN_PROCESS:

@@ -12,6 +12,7 @@ import numpy as np
 from executor.cameras.multi_camera import CameraRecords
 from executor.cameras.process import CameraSample
 from executor.control.path_runs import Outcome
+from executor.recording.checksums import CHECKSUMS, write_checksums
 from executor.recording.clearance import (
     ClearanceRow,
     ClearanceTable,
@@ -58,6 +59,8 @@ CLEARANCE_RATE = 10.0
 
 #: Files that `rewrite_report` makes from the others.
 _FROM_OTHERS = (FUSED, MCAP, REPORT)
+#: Files that it writes again where they exist.
+_RENEWED = (CHECKSUMS, REPORT)
 _File = tuple[str, Callable[[], object]]
 """A file's name, and the function that writes it."""
 
@@ -239,7 +242,7 @@ def write_results(folder: RunFolder, result: EvaluatedRun) -> None:
         Fault: A file could not be written.
     """
     files = _files(folder, result)
-    todo = [file for file in files if file[0] == REPORT or not folder.has(file[0])]
+    todo = [file for file in files if file[0] in _RENEWED or not folder.has(file[0])]
     missing = _written(todo, lambda: False)
     if missing:
         name, why = next(iter(missing.items()))
@@ -282,6 +285,7 @@ def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:
         (SUMMARY, partial(folder.write_summary, result.summary)),
         (FUSED, lambda: folder.write_fused(fused_table(cycles, poses))),
         (MCAP, write_channels),
+        (CHECKSUMS, partial(write_checksums, folder.path)),
         (REPORT, partial(build_report, folder)),
     ]
 
@@ -293,8 +297,8 @@ def _written(files: Sequence[_File], given_up: Callable[[], bool]) -> dict[str, 
         try:
             if name in _FROM_OTHERS and given_up():
                 missing[name] = "interrupted"
-            elif name == SUMMARY and missing:  # it marks a folder with all its tables
-                missing[name] = next(iter(missing.values()))
+            elif name in (SUMMARY, CHECKSUMS) and missing.keys() - {*_FROM_OTHERS}:
+                missing[name] = next(iter(missing.values()))  # they mark a folder with its tables
             else:
                 write()
         except CdprError as error:

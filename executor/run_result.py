@@ -160,7 +160,8 @@ def load_run(folder: str | Path) -> RunResult:
     """The result of a finished run, from its folder.
 
     Raises:
-        BadInput: There is no such folder, or a file of the run is missing or was changed.
+        BadInput: There is no such folder, or a file of the run is missing or differs from its
+            checksum (`executor.recording.checksums`).
     """
     opened = RunFolder.open(Path(folder))
     page = opened.report if opened.report.is_file() else None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.files.camera_file import CameraDocument, Gamma, TagDocument
-from model.pose import Array, Pose, read_only
+from model.pose import Array, Pose, ReadOnly, read_only
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,7 @@ Z_95 = 1.96
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Camera:
+class Camera(ReadOnly):
     """A calibrated camera.
 
     Attributes:

@@ -11,7 +11,8 @@ monotonic.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +27,29 @@ def read_only(values: ArrayLike) -> Array:
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
+
+
+class ReadOnly:
+    """Base of frozen dataclasses whose arrays are read-only: so are those of their copies.
+
+    NumPy makes the array of a pickled or deeply copied object writeable.
+    """
+
+    __slots__ = ()
+
+    def __reduce__(self) -> tuple[Callable[..., ReadOnly], tuple[object, ...]]:
+        """Copies and pickles the fields alone; what was computed from them is left out."""
+        names = [one.name for one in fields(self)]  # type: ignore[arg-type]
+        return _remade, (type(self), {name: getattr(self, name) for name in names})
+
+
+def _remade(kind: type[ReadOnly], values: dict[str, object]) -> ReadOnly:
+    made = kind.__new__(kind)
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+        object.__setattr__(made, name, value)
+    return made
 
 
 def skew(vector: ArrayLike) -> Array:
@@ -113,8 +137,10 @@ def _is_rotation(matrix: Array) -> bool:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pose:
+class Pose(ReadOnly):
     """Position and orientation of a frame in another, usually ``world_from_platform``.
+
+    Poses of the same numbers are equal; `distance_to` and `angle_to` compare within a tolerance.
 
     Attributes:
         position: Shape (3,), [m].
@@ -144,6 +170,18 @@ class Pose:
                 why="its rows are not of length 1, not at right angles, or mirrored",
                 next_step="compute it from a unit quaternion: Pose.from_quaternion(position, wxyz)",
             )
+
+    def __eq__(self, other: object) -> bool:
+        """Whether every number is the same."""
+        if not isinstance(other, Pose):
+            return NotImplemented
+        return np.array_equal(self.position, other.position) and np.array_equal(
+            self.rotation, other.rotation
+        )
+
+    def __hash__(self) -> int:
+        """Equal for equal poses."""
+        return hash((*self.position.tolist(), *self.rotation.ravel().tolist()))
 
     @classmethod
     def level(cls, position: ArrayLike) -> Pose:

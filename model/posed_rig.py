@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from model.kinematics import cables_at, structure_matrix_of
-from model.pose import Array, Pose, read_only
+from model.pages.page import html_table
+from model.pose import Array, Pose, ReadOnly, read_only
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PosedRig:
+class PosedRig(ReadOnly):
     """Kinematics and statics of a rig at one pose; the arrays are read-only.
 
     Attributes:
@@ -67,6 +68,19 @@ class PosedRig:
             f"<PosedRig {self.rig.name} at [{x:.1f}, {y:.1f}, {z:.1f}] mm: {held},"
             f" capacity margin {self.capacity_margin:.1f} N, dexterity {self.dexterity:.3f}>"
         )
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        x, y, z = self.pose.position * 1000.0
+        rows = [
+            ("position", f"{x:.1f}, {y:.1f}, {z:.1f} mm"),
+            ("lengths", f"{', '.join(f'{length * 1e3:.1f}' for length in self.lengths)} mm"),
+            ("tensions", f"{', '.join(f'{tension:.1f}' for tension in self.tensions)} N"),
+            ("wrench feasible", "yes" if self.is_wrench_feasible else "no"),
+            ("capacity margin", f"{self.capacity_margin:.1f} N"),
+            ("dexterity", f"{self.dexterity:.3f}"),
+        ]
+        return html_table(f"Rig {self.rig.name} at a pose", rows)
 
 
 def posed_rig(rig: Rig, pose: Pose, load: Load | None = None) -> PosedRig:

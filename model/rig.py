@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from model.cameras import Camera, Tag, camera_from, tag_from
 from model.errors import BadInput, require_types
-from model.files.documents import document_hash, key_path, load_yaml, millimetres
+from model.files.documents import document_hash, document_of, key_path, load_yaml, millimetres
 from model.files.rig_file import MotionDocument, RigDocument, WinchDocument
 from model.pages.page import html_table
-from model.pose import Array, Pose, read_only
+from model.pose import Array, Pose, ReadOnly, read_only
 from model.posed_rig import PosedRig, posed_rig
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class CalibrationResult(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Rig:
+class Rig(ReadOnly):
     """A checked cable robot with m cables.
 
     Attributes:
@@ -163,6 +163,19 @@ class Rig:
     tag_error: float | None = None
     outlet_error: float | None = None
     anchor_error: float | None = None
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Rig:
+        """The rig of a rig file's keys and values; arrays are taken for lists.
+
+        Raises:
+            InvalidFile: With every key that does not fit.
+        """
+        return rig_from_document(document_of(data, RigDocument, "Rig.from_dict"))
+
+    def as_dict(self) -> dict[str, Any]:
+        """The keys and values of its file, in new lists, as for `from_dict`."""
+        return self.document.model_dump(mode="json", exclude_none=True)
 
     @property
     def name(self) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from model.files.documents import (
     Document,
     PoseDocument,
     document_hash,
+    document_of,
     key_path,
     load_yaml,
     millimetres,
@@ -36,7 +37,7 @@ from model.files.scene_file import (
     payloads,
 )
 from model.pages.page import html_table
-from model.pose import Array, Pose, RotationLimits, read_only
+from model.pose import Array, Pose, ReadOnly, RotationLimits, read_only
 from model.shapes import (
     Box,
     Capsule,
@@ -55,7 +56,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Load:
+class Load(ReadOnly):
     """What the cables carry besides the platform's own weight.
 
     Attributes:
@@ -89,7 +90,7 @@ class Stop:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(ReadOnly):
     """A checked scene.
 
     Attributes:
@@ -114,6 +115,19 @@ class Scene:
     load: Load
     stops: tuple[Stop, ...]
     rotation_limits: RotationLimits | None
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Scene:
+        """The scene of a scene file's keys and values; arrays are taken for lists.
+
+        Raises:
+            InvalidFile: With every key that does not fit.
+        """
+        return scene_from_document(document_of(data, SceneDocument, "Scene.from_dict"))
+
+    def as_dict(self) -> dict[str, Any]:
+        """The keys and values of its file, in new lists, as for `from_dict`."""
+        return self.document.model_dump(mode="json", exclude_none=True)
 
     @property
     def name(self) -> str:

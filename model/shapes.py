@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.pose import Array, Pose, read_only
+from model.pose import Array, Pose, ReadOnly, read_only
 
 Indices = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
@@ -17,7 +17,7 @@ _FLAT = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Box:
+class Box(ReadOnly):
     """A box about its centre; ``half_size`` shape (3,), [m]."""
 
     half_size: Array
@@ -47,7 +47,7 @@ class Capsule:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ConvexHull:
+class ConvexHull(ReadOnly):
     """The convex hull of ``vertices``, shape (n, 3), [m]; ``triangles`` shape (t, 3)."""
 
     vertices: Array
@@ -55,7 +55,7 @@ class ConvexHull:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TriangleMesh:
+class TriangleMesh(ReadOnly):
     """A surface of triangles: ``vertices`` shape (n, 3), [m]; ``triangles`` shape (t, 3).
 
     The enclosed volume is free. A scene's mesh around a convex volume is read as a `ConvexHull`.

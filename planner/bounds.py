@@ -45,8 +45,12 @@ def smallest_along(
     slope: float,
     required: float,
     tolerance: float,
+    share: float = 0.0,
 ) -> Smallest:
     """Finds the smallest value to a tolerance, or finer where a limit is otherwise not proved.
+
+    Where a value stays the same along a path, every interval must be bisected until its slope is
+    within the tolerance: far above its limit a value is worth less effort.
 
     Args:
         positions: First samples along the path, increasing, with both ends, shape (k,).
@@ -54,6 +58,7 @@ def smallest_along(
         slope: Largest change of the value per unit of path.
         required: Limit of the value; if every sample keeps it, the proof must as well.
         tolerance: Largest ``value - proved``.
+        share: Part of ``value - required`` that the tolerance may be, where that is more.
 
     Raises:
         Fault: A value is NaN.
@@ -66,7 +71,7 @@ def smallest_along(
     proved = smallest
     while len(low):
         bounds = (low_values + high_values - slope * (high - low)) / 2.0
-        target = to_be_proved(smallest, required, tolerance)
+        target = to_be_proved(smallest, required, tolerance, share)
         final = (bounds >= target) | (high - low < SHORTEST)
         if samples > MOST_SAMPLES:
             final[:] = True
@@ -87,10 +92,13 @@ def smallest_along(
     return Smallest(smallest, at, min(proved, smallest), samples)
 
 
-def to_be_proved(smallest: float, required: float, tolerance: float) -> float:
+def to_be_proved(smallest: float, required: float, tolerance: float, share: float = 0.0) -> float:
     """The bound to prove for the rest of a path, given its smallest sample."""
-    target = smallest - tolerance
-    return max(target, required) if smallest >= required else target
+    if smallest < required:
+        return smallest - tolerance
+    if share > 0.0:
+        tolerance = max(tolerance, share * (smallest - required))
+    return max(smallest - tolerance, required)
 
 
 def _known(values: Array) -> Array:

@@ -49,6 +49,9 @@ AXIS_RADII = 4.0
 """Smallest distance of an anchor from its pulley's swivel axis, in pulley radii."""
 CLEARANCE_TOLERANCE = 0.1e-3
 """Tolerance of the smallest clearances, [m]."""
+SELF_CLEARANCE_SHARE = 0.01
+"""Tolerance of the self clearance, as part of what exceeds the required one, where that is more: on
+many robots it is the same along most of a path."""
 MARGIN_TOLERANCE = 0.02
 """Tolerance of the smallest capacity margin, as part of the largest tension."""
 END_TOLERANCE = 1e-6
@@ -255,7 +258,9 @@ class _Check:
             return self.model.self_clearances(positions, rotations)
 
         required, slope = self.scene.self_clearance, self._self_slope()
-        closest, proof = self._closest(self.model.self_clearance, distances, slope, required)
+        closest, proof = self._closest(
+            self.model.self_clearance, distances, slope, required, SELF_CLEARANCE_SHARE
+        )
         self._clearance_violation("self clearance", closest, proof, required)
         return closest, proof
 
@@ -279,13 +284,14 @@ class _Check:
         distances: Callable[[Sequence[Pose]], Array],
         slope: float,
         required: float,
+        share: float = 0.0,
     ) -> tuple[Closest, Smallest]:
         """The closest pose; ``distances`` is ``nearest`` for many poses at once."""
 
         def evaluate(positions: Array) -> Array:
             return distances([self._pose(p) for p in positions.tolist()])
 
-        proof = smallest_along(self.samples, evaluate, slope, required, CLEARANCE_TOLERANCE)
+        proof = smallest_along(self.samples, evaluate, slope, required, CLEARANCE_TOLERANCE, share)
         pose = self._pose(proof.at)
         return Closest(nearest(pose), pose, proof.at), proof
 

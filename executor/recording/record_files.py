@@ -191,6 +191,12 @@ class SummaryDocument(_Record):
     events: list[EventRecord]
     versions: dict[str, str]
 
+    @model_validator(mode="after")
+    def _verdict_fits(self) -> SummaryDocument:
+        if self.passed != (self.verdict == "PASSED"):
+            raise ValueError(f"the verdict is {self.verdict}, but passed is {self.passed}")
+        return self
+
 
 def _is_moment_somewhere(text: str) -> str:
     if datetime.fromisoformat(text).tzinfo is None:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from executor.recording.checksums import require_unchanged
 from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import (
     AGAIN,
@@ -34,10 +35,10 @@ from model.files.rig_file import RigDocument
 from model.plan import Plan, load_plan, save_plan
 from model.rig import Rig, rig_from_document
 
-PLAN, RIG, SUMMARY, EVENTS = "plan.json", "rig.json", "summary.json", "events.jsonl"
-COURSE = "run.json"
-CYCLES, POSES, CLEARANCE = "cycles.csv", "poses.csv", "clearance.csv"
-FUSED, POSES_OF = "fused.csv", "poses-{}.csv"
+PLAN, RIG, COURSE = "plan.json", "rig.json", "run.json"
+SUMMARY, EVENTS = "summary.json", "events.jsonl"
+CYCLES, CLEARANCE, FUSED = "cycles.csv", "clearance.csv", "fused.csv"
+POSES, POSES_OF = "poses.csv", "poses-{}.csv"
 MCAP, REPORT, PICTURES = "run.mcap", "report.html", "pictures"
 NEEDED = (PLAN, RIG, CYCLES, POSES, CLEARANCE, SUMMARY, EVENTS)
 #: Written before anything moves.
@@ -119,17 +120,15 @@ class RunFolder:
         """The folder of a run that ended.
 
         Raises:
-            BadInput: There is no such folder, or a file of the run is missing; all are named.
+            BadInput: There is no such folder, or files of the run are missing or were changed.
         """
         if not path.is_dir():
-            raise BadInput(
-                "no such run folder",
-                where=str(path),
-                next_step="give the folder that `cdpr run -o` created",
-            )
+            then = "give the folder that `cdpr run -o` created"
+            raise BadInput("no such run folder", where=str(path), next_step=then)
         missing = [name for name in NEEDED if not (path / name).is_file()]
         if missing:
             raise cls(path)._incomplete(missing)
+        require_unchanged(path)
         return cls(path)
 
     @classmethod
@@ -139,11 +138,11 @@ class RunFolder:
         Raises:
             BadInput: There is no such folder, it is not a run folder, or the run is still active.
         """
-        begun = all((path / name).is_file() for name in BEGUN)
-        if not begun or (path / SUMMARY).is_file():
+        if (path / SUMMARY).is_file() or not all((path / name).is_file() for name in BEGUN):
             return cls.open(path)  # ended, of an earlier version, or raises with what is missing
         if cls(path).is_active():
             raise cls(path)._incomplete([])
+        require_unchanged(path)
         return cls(path)
 
     def _incomplete(self, missing: Sequence[str]) -> BadInput:

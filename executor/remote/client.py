@@ -151,20 +151,29 @@ def select_run(runs: Sequence[RunConnection], process: int | None, verb: str) ->
 
     Raises:
         Fault: No run is active.
-        BadInput: Several runs and none selected, or the selected one is not among them.
+        BadInput: Several runs and none selected, the selected one is not among them, or its process
+            has several.
     """
-    numbers = ", ".join(str(run.process) for run in runs)
+    processes = list(dict.fromkeys(run.process for run in runs))
+    numbers = ", ".join(map(str, processes))
     if not runs:
         raise no_run(verb)
-    if process is None and len(runs) > 1:
+    found = [run for run in runs if process in (None, run.process)]
+    if len(found) == 1:
+        return found[0]
+    if process is None and len(processes) > 1:
         raise BadInput(
             f"{len(runs)} runs are in progress",
             where=f"cdpr {verb}",
             next_step=f"name one with --process: {numbers}",
         )
-    for run in runs:
-        if process is None or run.process == process:
-            return run
+    if found:
+        raise BadInput(
+            f"process {found[0].process} has {len(found)} runs in progress",
+            where=f"cdpr {verb}",
+            why="threads of one program share its number",
+            next_step="start each run in a process of its own; `cdpr stop` stops all of them",
+        )
     raise BadInput(
         f"process {process} is not a run of this user",
         where=f"cdpr {verb}",
@@ -249,7 +258,7 @@ def stop_runs() -> StopResult:
     with find_runs() as runs:
         answers = ask_all(runs, "stop")
     return StopResult(
-        tuple(answer.process for answer in answers if answer.status is not None),
+        tuple(dict.fromkeys(a.process for a in answers if a.status is not None)),
         tuple(answer for answer in answers if answer.status is None),
     )
 

@@ -1,7 +1,8 @@
 """The command socket of a run, for `cdpr stop` and similar verbs from any terminal.
 
-A run listens on a socket named after its process in the user's run-time folders; a socket without
-a listening process was left by one that ended. It is advertised in every folder that another
+A run listens on a socket named after its process in the user's run-time folders: ``123.sock``, and
+``123-2.sock`` for a second one of the same process. A socket without a listening process was left
+by one that ended. It is advertised in every folder that another
 terminal may search, and only in folders that no other user can write to: a folder in /tmp of
 another user could contain links to this user's files, or sockets of other users. Root reaches the
 runs of all users, each in a folder private to that user.
@@ -12,7 +13,9 @@ Requests are answered in a separate thread, in every phase of the run.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
+import re
 import selectors
 import socket
 import stat
@@ -29,6 +32,11 @@ from executor.supervision import RequestBoard
 from model.errors import Refused
 
 _ENDING = ".sock"
+_NAME = re.compile(r"([0-9]+)(-[0-9]+)?\.sock")
+
+#: Names of this process's sockets: several threads may each run a robot.
+_named: set[str] = set()
+_naming = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +111,26 @@ def advertised() -> Iterator[list[socket.socket]]:
                 why="no such folder belongs to this user alone; another user may have created it",
                 next_step="remove it or restrict it (chmod 700), or set XDG_RUNTIME_DIR",
             )
-        name = f"{os.getpid()}{_ENDING}"
+        name = stack.enter_context(_own_name())
         listeners = []
         for folder in folders:
             listeners.append(stack.enter_context(_listen_in(folder, name)))
             stack.callback(_try_remove, folder, name)
         yield listeners
+
+
+@contextlib.contextmanager
+def _own_name() -> Iterator[str]:
+    """A name that no other run of this process has while the block runs."""
+    numbers = ("" if k == 1 else f"-{k}" for k in itertools.count(1))
+    with _naming:
+        names = (f"{os.getpid()}{number}{_ENDING}" for number in numbers)
+        name = next(name for name in names if name not in _named)
+        _named.add(name)
+    try:
+        yield name
+    finally:
+        _named.discard(name)
 
 
 def _listen_in(folder: int, name: str) -> socket.socket:
@@ -159,26 +181,22 @@ class RunConnection:
 
 @contextlib.contextmanager
 def find_runs() -> Iterator[list[RunConnection]]:
-    """Connects to all active runs, in order of their process IDs.
+    """Connects to all active runs, in order of their process IDs; a process may have several.
 
     Runs of this user; for root of all users.
     """
-    runs: dict[int, RunConnection] = {}
+    runs: dict[tuple[int, str], RunConnection] = {}
     with contextlib.ExitStack() as links:
         with _open_folders(_reachable_folders()) as folders:
             for folder in folders:
                 names = os.listdir(folder.descriptor)
-                for name in sorted(n for n in names if _is_of_a_run(n)):
+                for name in sorted(n for n in names if _NAME.fullmatch(n)):
                     run = _connect(folder.descriptor, name, folder.owner)
                     if run is None:
                         continue
                     links.callback(run.link.close)
-                    runs.setdefault(run.process, run)
-        yield [runs[number] for number in sorted(runs)]
-
-
-def _is_of_a_run(name: str) -> bool:
-    return name.endswith(_ENDING) and name.removesuffix(_ENDING).isdecimal()
+                    runs.setdefault((run.process, name), run)
+        yield [runs[key] for key in sorted(runs)]
 
 
 def _connect(folder: int, name: str, owner: int) -> RunConnection | None:
@@ -195,7 +213,9 @@ def _connect(folder: int, name: str, owner: int) -> RunConnection | None:
         _remove(folder, name)
         return None
     except BlockingIOError:
-        return RunConnection(int(name.removesuffix(_ENDING)), link, is_connected=False)
+        return RunConnection(
+            int(name.removesuffix(_ENDING).partition("-")[0]), link, is_connected=False
+        )
     except OSError:  # gone
         link.close()
         return None

@@ -10,10 +10,18 @@ import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from model.errors import BadInput, InvalidFile, Problem
 from model.files.reading import YAML_LIMIT, read_text
@@ -22,9 +30,11 @@ from model.files.validation import (
     Positions,
     YamlSyntaxError,
     YamlTree,
+    fixed,
     key_path,
     model_in,
     parse_yaml,
+    plain_data,
     position_of,
     problems_of,
 )
@@ -123,9 +133,23 @@ Finding = tuple[tuple[str | int, ...], str]
 
 
 class Document(BaseModel):
-    """A strict part of a file: unknown keys, wrong types, NaN and infinity are refused."""
+    """A strict part of a file: unknown keys, wrong types, NaN and infinity are refused.
+
+    Neither its keys nor its lists can be changed: hashes and checked objects are made from it.
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _fix_lists(self) -> Self:
+        for key, value in self.__dict__.items():
+            self.__dict__[key] = fixed(value)
+        return self
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """A copy with other values for some keys, which are not checked."""
+        fixed_update = {key: fixed(value) for key, value in (update or {}).items()}
+        return super().model_copy(update=fixed_update, deep=deep)
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Checks across the document's parts; each reads as few of them as possible.
@@ -225,6 +249,24 @@ def load_yaml(path: Path, model: type[Model]) -> Model:
         what = "the file is empty" if empty else "the file must hold keys and values"
         problems.append(Problem("", what, 1, 1))
     raise InvalidFile(str(path), sorted(problems, key=lambda p: (p.line, p.column)))
+
+
+def document_of(data: Mapping[str, Any], model: type[Model], where: str) -> Model:
+    """A document from a file's keys and values in Python, arrays included.
+
+    Raises:
+        InvalidFile: With every key that does not fit.
+    """
+    plain = plain_data(data)
+    if not isinstance(plain, dict):
+        what = f"expected keys and values in a dictionary, not {type(data).__name__}"
+        raise BadInput(what, where=where)
+    _require_kind(plain, model, Path(where))
+    check_version(plain, model, Path(where), {})
+    document, problems = _validated(plain, model, {})
+    if document is None:
+        raise InvalidFile(where, problems, "correct these keys; the pages on files describe them")
+    return document
 
 
 _MARKS = {

@@ -46,6 +46,16 @@ TABLE_LIMIT = table_limit(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE
 """Largest table of a run that this computer reads, [bytes]."""
 
 
+SHORTEN = (
+    "shorten the file; in a scene, simplify meshes or replace them by convex hulls"
+    " (docs/scene-file.md)"
+)
+_SHORTENED = {
+    TABLE_LIMIT: "check the path; for a longer run, split its plan",
+    YAML_LIMIT: f"check the path, or {SHORTEN}",
+}
+
+
 def read_bytes(path: Path, limit: int = TEXT_LIMIT) -> bytes:
     """The content of a regular file.
 
@@ -88,8 +98,8 @@ def _require_regular(path: Path, found: os.stat_result, limit: int) -> None:
             f"the file has {found.st_size / MEGABYTE:.1f} MB; at most {limit / MEGABYTE:.0f} MB"
             " are read",
             where=str(path),
-            why="a larger file may not fit into memory",
-            next_step="check the path; for a longer run, split its plan",
+            why="a larger file takes too long to read, or too much memory",
+            next_step=_SHORTENED.get(limit, "check the path"),
         )
 
 

@@ -6,14 +6,16 @@ import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import Any, NoReturn, get_args
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from yaml.composer import Composer
 
 from model.errors import Problem
+from model.files.reading import SHORTEN
 
 # YAML text as plain data, with the line and column of every key.
 #
@@ -93,15 +95,19 @@ class _Loader(Composer, yaml.CSafeLoader):
         event: Any = self.peek_event()
         self._count, self._depth = self._count + 1, self._depth + 1
         if self._depth > DEPTH_LIMIT:
-            raise _too_much(f"nested too deeply, more than {DEPTH_LIMIT} levels", event.start_mark)
+            what, hint = f"nested too deeply, more than {DEPTH_LIMIT} levels", "write it flatter"
+            raise _too_much(what, event.start_mark, hint)
         node: yaml.Node | None = super().compose_node(parent, index)
         self._depth -= 1
         if not isinstance(event, yaml.AliasEvent):
             self._sizes[id(node)] = self._written_out(node)
         # A node within itself has no size yet; the model reports that it refers to itself.
-        if max(self._count, self._sizes.get(id(node), 0)) > NODE_LIMIT:
-            what = f"more than {NODE_LIMIT} keys and values, aliases counted"
-            raise _too_much(what, event.start_mark)
+        what = f"more than {NODE_LIMIT} keys and values"
+        if self._count > NODE_LIMIT:
+            raise _too_much(what, event.start_mark, SHORTEN)
+        if self._sizes.get(id(node), 0) > NODE_LIMIT:
+            hint = "write the file without such aliases"
+            raise _too_much(f"{what}, with aliases expanded", event.start_mark, hint)
         return node
 
     def _written_out(self, node: yaml.Node | None) -> int:
@@ -157,8 +163,7 @@ def parse_yaml(text: str) -> YamlTree:
         raise YamlSyntaxError("not valid here: nested too deeply", 1, 1) from None
 
 
-def _too_much(what: str, mark: yaml.Mark) -> YamlSyntaxError:
-    hint = "split the file, or write it without such aliases"
+def _too_much(what: str, mark: yaml.Mark, hint: str) -> YamlSyntaxError:
     return YamlSyntaxError(f"too much to read: {what}", mark.line + 1, mark.column + 1, hint)
 
 
@@ -395,3 +400,43 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
         if inner is not None:
             return inner
     return None
+
+
+# Data of a script as of a file, and lists of documents, which cannot be changed.
+
+
+def plain_data(value: Any) -> Any:
+    """A value with dictionaries and lists in place of mappings, tuples and arrays."""
+    match value:
+        case np.ndarray() | np.generic():
+            return value.tolist()
+        case Mapping():
+            return {str(key): plain_data(one) for key, one in value.items()}
+        case list() | tuple():
+            return [plain_data(one) for one in value]
+        case _:
+            return value
+
+
+class FixedList(list[Any]):
+    """A list of a document, which cannot be changed; ``list(it)`` copies it."""
+
+    def _refuse(self, *_given: object, **_named: object) -> NoReturn:
+        raise TypeError("this list belongs to a document, which cannot be changed; copy it")
+
+    def __reduce__(self) -> tuple[type[FixedList], tuple[list[Any]]]:
+        """Copies cannot be changed either."""
+        return type(self), (list(self),)
+
+
+for _name in ("append", "clear", "extend", "insert", "pop", "remove", "reverse", "sort"):
+    setattr(FixedList, _name, FixedList._refuse)
+for _name in ("setitem", "delitem", "iadd", "imul"):
+    setattr(FixedList, f"__{_name}__", FixedList._refuse)
+
+
+def fixed(value: Any) -> Any:
+    """A value whose lists, also within lists, are fixed."""
+    if type(value) is list:
+        return FixedList([fixed(entry) if type(entry) is list else entry for entry in value])
+    return value

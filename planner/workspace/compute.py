@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from model.errors import BadInput
+from model.pages.page import html_table
 from model.pose import Array
 from model.progress import SILENT, Listener
 from model.rig import Rig
@@ -47,6 +49,15 @@ class Maps:
     def __repr__(self) -> str:
         """Name of the grid, number of points, and names of the values."""
         return f"<Maps {self.grid.name}: {self.grid.count} points of {', '.join(self.values)}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the share of allowed points, and the finite range of each value."""
+        rows = [("points", f"{self.grid.count}, {np.mean(self.verdict == 0) * 100:.1f} % allowed")]
+        for name, values in self.values.items():
+            known = values[np.isfinite(values)]
+            ends = f"{known.min():.5g} to {known.max():.5g}" if known.size else "–"
+            rows.append((name.replace("_", " "), ends))
+        return html_table(f"Workspace of {self.question.rig.name}: {self.grid.name}", rows)
 
     @property
     def closed(self) -> NDArray[np.bool_]:
@@ -167,6 +178,11 @@ def workspace_grids(
     """
     lower = rig.workspace_lower if lower is None else lower
     upper = rig.workspace_upper if upper is None else upper
+    if not np.all(lower < upper):
+        low, high = (
+            f"({', '.join(f'{x * 1e3:g}' for x in corner)}) mm" for corner in (lower, upper)
+        )
+        raise BadInput(f"the region has no extent from {low} to {high}")
     step = float(np.max(upper - lower)) / CELLS_OF_A_SLICE if step is None else step
     wanted = list(slices)
     if not wanted:

@@ -47,6 +47,7 @@ def ran(name: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
         ("run_simulated.py", "PASSED - ", ["runs/*/report.html", "run.png"]),
         ("track_images.py", "place_06.jpg:", []),
         ("compare_objectives.py", "capacity ", []),
+        ("parameter_study.py", "110 %   2.0 kg", []),
         ("own_planner.py", "around passes: <Plan", ["own-plan.json"]),
         ("calibrate_camera.py", "next: take more images", []),
     ],

@@ -74,3 +74,22 @@ def test_a_slice_of_the_workspace_is_mapped(rig: cdpr.Rig) -> None:
     middle = tuple(n // 2 for n in maps.grid.shape)
     assert maps.feasible[middle]
     assert "capacity_margin" in repr(maps)
+    assert maps._repr_html_().count("<tr>") >= 5
+
+
+def test_a_region_and_a_characteristic_length_are_mapped_as_by_the_verb(rig: cdpr.Rig) -> None:
+    lower, upper = [-0.1, -0.1, 0.4], np.array([0.1, 0.0, 0.5])
+    (maps,) = cdpr.workspace_map(
+        rig, volume=False, step=0.05, lower=lower, upper=upper,
+        characteristic_length=0.2, workers=1,
+    )  # fmt: skip
+    x, y, z = maps.grid.axes
+    np.testing.assert_allclose([x[0], x[-1], y[0], y[-1], *z], [-0.1, 0.1, -0.1, 0.0, 0.445])
+    assert maps.question.length == 0.2
+    for corner in ([0.1, 0.1], [0.1, 0.1, np.nan], "abc", [[1, 2, 3]]):
+        with pytest.raises(cdpr.BadInput, match="upper must be three finite numbers"):
+            cdpr.workspace_map(rig, upper=corner, workers=1)
+    with pytest.raises(cdpr.BadInput, match="characteristic length"):
+        cdpr.workspace_map(rig, characteristic_length=0.0, workers=1)
+    with pytest.raises(cdpr.BadInput, match="no extent"):
+        cdpr.workspace_map(rig, lower=upper, upper=lower, workers=1)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import re
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+import yaml
 
 import cdpr
 from executor.cameras.sources import choose_camera
@@ -46,6 +49,99 @@ def test_a_rig_at_a_pose_balances_its_weight(rig: cdpr.Rig) -> None:
     assert posed.is_wrench_feasible
     assert 0.0 < posed.dexterity < 1.0
     assert not posed.tensions.flags.writeable
+
+
+def arrays_in(thing: object, seen: set[int]) -> Iterator[np.ndarray]:
+    """Every array that an object holds, at any depth."""
+    if id(thing) in seen:
+        return
+    seen.add(id(thing))
+    if isinstance(thing, np.ndarray):
+        yield thing
+    parts = list(thing) if isinstance(thing, tuple | list) else []
+    if is_dataclass(thing):
+        parts = [getattr(thing, one.name) for one in fields(thing)]
+    for part in parts:
+        yield from arrays_in(part, seen)
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.copy, copy.deepcopy, lambda thing: pickle.loads(pickle.dumps(thing))],
+    ids=["copy", "deepcopy", "pickle"],
+)
+def test_no_array_of_a_copy_can_be_written_to(
+    plan: cdpr.Plan, copied: Callable[[Any], Any]
+) -> None:
+    hashes = plan.rig.plan_hash, plan.rig.hash, plan.scene.hash
+    hall = cdpr.load_scene(CONFIGS / "hall_pillar.yaml")
+    for thing in (plan, plan.rig, hall, plan.waypoints[0], plan.rig.at(plan.rig.home)):
+        arrays = list(arrays_in(copied(thing), set()))
+        assert len(arrays) >= 2
+        assert not any(array.flags.writeable for array in arrays)
+    again = copied(plan)
+    assert (again.rig.plan_hash, again.rig.hash, again.scene.hash) == hashes
+    assert again.waypoints == plan.waypoints
+    assert cdpr.check(again).passed
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda document: document.outlets_mm[0].__setitem__(0, 9999.0),
+        lambda document: document.outlets_mm.append([0.0, 0.0, 0.0]),
+        lambda document: document.winches.sort(),
+        lambda document: document.platform.size_mm.__imul__(2),
+        lambda document: copy.deepcopy(document).anchors_mm.pop(),
+        lambda document: pickle.loads(pickle.dumps(document)).anchors_mm.reverse(),
+        lambda document: document.model_copy(
+            update={"outlets_mm": [list(p) for p in document.outlets_mm]}
+        ).outlets_mm[0].clear(),
+    ],
+)  # fmt: skip
+def test_the_document_of_a_rig_cannot_be_changed_behind_its_hash(
+    rig: cdpr.Rig, change: Callable[[Any], object]
+) -> None:
+    fresh = rig.with_bus()
+    with pytest.raises(TypeError, match="cannot be changed"):
+        change(fresh.document)
+    assert fresh.plan_hash == rig.plan_hash
+
+
+@pytest.mark.parametrize("name", [path.name for path in CONFIGS.glob("*.yaml")])
+def test_a_rig_or_scene_is_made_again_from_its_own_keys(name: str) -> None:
+    kind, load = (cdpr.Rig, cdpr.load_rig) if "winches" in (CONFIGS / name).read_text() else (
+        cdpr.Scene, cdpr.load_scene
+    )  # fmt: skip
+    loaded: Any = load(CONFIGS / name)
+    assert kind.from_dict(loaded.as_dict()).hash == loaded.hash
+    in_file = yaml.safe_load((CONFIGS / name).read_text())
+    assert kind.from_dict(in_file).hash == loaded.hash
+
+
+def test_a_rig_is_varied_in_memory_and_checked_like_a_file(rig: cdpr.Rig) -> None:
+    data = rig.as_dict()
+    wider = np.array(data["outlets_mm"]) * [1.1, 1.1, 1.0]
+    varied = cdpr.Rig.from_dict(
+        {**data, "outlets_mm": wider, "anchors_mm": tuple(map(tuple, data["anchors_mm"]))}
+    )
+    np.testing.assert_allclose(varied.outlets, rig.outlets * [1.1, 1.1, 1.0])
+    assert varied.plan_hash != rig.plan_hash
+    data["outlets_mm"][0][0] = 1e4  # its own lists, which changes no rig
+    assert rig.as_dict()["outlets_mm"] != data["outlets_mm"]
+    data.update(platfrom={}, anchors_mm=data["anchors_mm"][:-1])
+    data["cables"]["min_tension_n"] = np.nan
+    with pytest.raises(cdpr.BadInput) as refused:
+        cdpr.Rig.from_dict(data)
+    for word in ("Rig.from_dict: platfrom:", "'platform'", "cables.min_tension_n", "finite"):
+        assert word in str(refused.value)
+    for wrong in (None, [1], "rig.yaml", {3: 4}, {}):
+        with pytest.raises(cdpr.BadInput):
+            cdpr.Rig.from_dict(wrong)  # type: ignore[arg-type]
+    with pytest.raises(cdpr.BadInput, match="this is a rig file, not a scene file"):
+        cdpr.Scene.from_dict(rig.as_dict())
+    with pytest.raises(cdpr.BadInput, match="schema version 2"):
+        cdpr.Rig.from_dict({**rig.as_dict(), "schema_version": 2})
 
 
 def test_a_pose_that_cannot_be_held_says_so_and_has_no_tensions(rig: cdpr.Rig) -> None:
@@ -234,7 +330,7 @@ def test_objects_show_themselves_briefly_and_in_a_notebook(
     for shown in (rig, scene, plan, cdpr.check(plan), rig.at(rig.home)):
         assert len(repr(shown)) < 300
         assert repr(shown).startswith("<")
-    for shown in (rig, scene, plan, cdpr.check(plan)):
+    for shown in (rig, scene, plan, cdpr.check(plan), rig.at(rig.home)):
         assert shown._repr_html_().count("<tr>") >= 3
 
 

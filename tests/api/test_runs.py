@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +17,8 @@ from mcap.reader import make_reader
 
 import cdpr
 from cdpr.operation import set_speed
-from executor.recording.run_folder import RunFolder
+from executor.recording.run_folder import RunEvent, RunFolder
+from executor.remote.command_socket import find_runs
 from model.files.documents import PoseDocument
 from model.files.scene_file import StopDocument
 from model.pose import matrix_from_rotation_vector, quaternion_from_matrix
@@ -200,7 +203,8 @@ def test_a_camera_that_failed_fails_the_run_when_it_is_reported_again(tmp_path: 
     assert [camera.name for camera in course.cameras] == ["front"]
     failed = replace(course.cameras[0], failed="no answer since 0.30 s")
     RunFolder(run.folder).write_course(replace(course, cameras=(failed,)))
-    (run.folder / "summary.json").unlink()
+    for name in ("summary.json", "SHA256SUMS"):  # as if it had been so from the beginning
+        (run.folder / name).unlink()
     cdpr.report(run.folder)
     again = cdpr.load_run(run.folder)
     assert again.verdict == "FAILED"
@@ -246,3 +250,90 @@ def test_a_figure_shows_error_tensions_and_clearance(run: cdpr.RunResult) -> Non
 def test_without_a_run_under_way_a_stop_reaches_nothing() -> None:
     with pytest.raises(cdpr.Fault):
         cdpr.stop()
+
+
+#: Parts of files of a record that are replaced by others.
+CHANGES = (
+    ("cycles.csv", b"0.01", b"0.02"),
+    ("summary.json", b"PASSED", b"FAILED"),
+    ("summary.json", b'"lost_replies": 0', b'"lost_replies": 1'),
+    ("clearance.csv", b"1", b"2"),
+    ("events.jsonl", b"moving", b"MOVING"),
+    ("run.json", b"virtual", b"VIRTUAL"),
+    ("run.mcap", b"foxglove", b"foxgl0ve"),
+)
+
+
+@pytest.mark.parametrize(("name", "old", "new"), CHANGES)
+def test_a_record_that_was_changed_is_not_loaded_or_reported(
+    run: cdpr.RunResult, tmp_path: Path, name: str, old: bytes, new: bytes
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(run.folder, folder)
+    assert cdpr.load_run(folder).summary == run.summary
+    data = (folder / name).read_bytes()
+    assert old in data
+    (folder / name).write_bytes(data.replace(old, new, 1))
+    for use in (cdpr.load_run, cdpr.report):
+        with pytest.raises(cdpr.BadInput, match=f"changed after the run: {re.escape(name)}"):
+            use(folder)
+    (folder / name).write_bytes(data)
+    assert cdpr.load_run(folder).summary == run.summary
+
+
+def test_the_checksums_of_a_record_are_those_of_sha256sum(run: cdpr.RunResult) -> None:
+    lines = (run.folder / "SHA256SUMS").read_text().splitlines()
+    sums = dict(reversed(line.split("  ")) for line in lines)
+    assert {"plan.json", "rig.json", "cycles.csv", "summary.json", "run.mcap"} <= sums.keys()
+    for name, stated in sums.items():
+        assert hashlib.sha256((run.folder / name).read_bytes()).hexdigest() == stated
+
+
+@pytest.mark.parametrize("line", ["", "0" * 64, f"{'0' * 64}  ../rig.yaml", f"{'0' * 64}  notes"])
+def test_damaged_checksums_are_named(run: cdpr.RunResult, tmp_path: Path, line: str) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(run.folder, folder)
+    (folder / "SHA256SUMS").write_text(f"{line}\n")
+    with pytest.raises(cdpr.BadInput, match="SHA256SUMS:1: not a checksum"):
+        cdpr.load_run(folder)
+
+
+def test_a_record_of_an_earlier_version_must_agree_with_itself(
+    run: cdpr.RunResult, tmp_path: Path
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(run.folder, folder)
+    (folder / "SHA256SUMS").unlink()
+    assert cdpr.load_run(folder).passed
+    summary = folder / "summary.json"
+    summary.write_text(summary.read_text().replace("PASSED", "FAILED", 1))
+    with pytest.raises(cdpr.BadInput, match="the verdict is FAILED, but passed is True"):
+        cdpr.load_run(folder)
+
+
+def test_runs_of_one_process_need_a_simulated_channel_each(tmp_path: Path) -> None:
+    """Both on one channel had been refused as disturbed by another program."""
+    rig, scene = ready()
+    plan = short_plan(rig, scene)
+    beside: list[str] = []
+
+    def run_beside(_event: RunEvent) -> None:
+        if beside:
+            return
+        with pytest.raises(
+            cdpr.Refused, match="in progress on this bus in this process"
+        ) as refused:
+            cdpr.run(plan, rig, folder=tmp_path / "same", cameras=[], realtime=False)
+        assert "rig.with_bus('virtual', name)" in refused.value.next_step
+        beside.append("refused")
+        other = rig.with_bus("virtual", "another")
+        run = cdpr.run(plan, other, folder=tmp_path / "beside", cameras=[], realtime=False)
+        beside.append(run.verdict)
+        with find_runs() as runs:
+            beside.append(str(len(runs)))
+
+    first = cdpr.run(
+        plan, rig, folder=tmp_path / "first", cameras=[], realtime=False, on_event=run_beside
+    )
+    assert (first.verdict, *beside) == ("PASSED", "refused", "PASSED", "1")
+    assert not (tmp_path / "same").exists()

@@ -261,6 +261,10 @@ def test_which_run_is_meant_must_be_clear():
             select_run([one, other], 9, "hold")
         with pytest.raises(Fault, match="no active run"):
             select_run([], None, "hold")
+        for process in (None, 7):
+            with pytest.raises(BadInput, match="process 7 has 2 runs") as refused:
+                select_run([one, RunConnection(7, theirs)], process, "hold")
+            assert "a process of its own" in refused.value.next_step
 
 
 @pytest.mark.parametrize("asked", [0, 1])

@@ -10,7 +10,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -112,6 +112,24 @@ def test_a_run_that_ended_leaves_nothing(folders):
         assert _reached() == [os.getpid()]
     assert not any(list(folder.iterdir()) for folder in folders)
     assert _reached() == []
+
+
+def test_several_runs_of_one_process_are_reached_each_until_its_own_end(folders):
+    """Each in a thread of a script: a second one had taken the name of the first."""
+    pid = os.getpid()
+    with ExitStack() as second, ExitStack() as third:
+        with advertised():
+            second.enter_context(advertised())
+            third.enter_context(advertised())
+            assert _reached() == [pid] * 3
+            second.close()
+            assert _reached() == [pid] * 2
+            second.enter_context(advertised())
+            names = [path.name for path in folders[0].iterdir()]
+            assert sorted(names) == [f"{pid}-2.sock", f"{pid}-3.sock", f"{pid}.sock"]
+        assert _reached() == [pid] * 2
+    assert _reached() == []
+    assert not any(list(folder.iterdir()) for folder in folders)
 
 
 NOBODY = 65534

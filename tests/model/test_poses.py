@@ -169,3 +169,19 @@ def test_a_pose_in_a_file_is_the_same_to_a_nanometre(pose: Pose) -> None:
     assert again == document
     same(document.pose(), pose, atol=1e-9)
     assert "-0.0" not in [str(x) for x in document.position_mm]
+
+
+@given(poses, st.integers(0, 2))
+def test_poses_of_the_same_numbers_are_equal(pose: Pose, changed: int) -> None:
+    again = Pose(pose.position, pose.rotation)
+    assert again == pose
+    assert hash(again) == hash(pose)
+    assert pose != pose.matrix().tolist()
+    moved = Pose(np.nextafter(pose.position, np.eye(3)[changed] * 99.0), pose.rotation)
+    assert (moved == pose) == np.array_equal(moved.position, pose.position)
+
+
+def test_a_zero_of_either_sign_is_the_same_pose() -> None:
+    zero, negative = Pose.level([0.0, 0.0, 1.0]), Pose.level([-0.0, 0.0, 1.0])
+    assert zero == negative
+    assert len({zero, negative}) == 1

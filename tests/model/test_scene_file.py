@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -277,3 +279,37 @@ def test_a_scene_cannot_be_changed_into_an_invalid_one(change: dict[str, Any]) -
 def test_the_example_scenes_load_the_same_twice(name: str) -> None:
     path = CONFIGS / f"{name}.yaml"
     assert load_scene(path).hash == load_scene(path).hash
+
+
+def bowl(rings: int) -> dict[str, Any]:
+    """An open surface of revolution with 40 · (rings - 1) triangles."""
+    around = range(20)
+    points = [
+        [math.cos(k * math.pi / 10) * (10 + ring), math.sin(k * math.pi / 10) * (10 + ring), ring]
+        for ring in range(rings)
+        for k in around
+    ]
+    corners = [
+        (20 * ring + k, 20 * ring + (k + 1) % 20) for ring in range(rings - 1) for k in around
+    ]
+    triangles = [[[a, b, a + 20], [b, b + 20, a + 20]] for a, b in corners]
+    return {"points_mm": points, "triangles": [t for pair in triangles for t in pair]}
+
+
+@pytest.mark.parametrize(("rings", "refusal"), [(160, ""), (180, "40000 keys"), (900, "MB")])
+def test_a_mesh_that_is_too_large_is_refused_with_what_helps(
+    tmp_path: Path, rings: int, refusal: str
+) -> None:
+    obstacle = {"name": "bowl", "mesh": bowl(rings), "position_mm": [500, 0, 0]}
+    pose = {"position_mm": [0, 0, 0]}
+    content = {"schema_version": 1, "name": "s", "start": pose, "goal": pose}
+    path = tmp_path / "scene.yaml"
+    path.write_text(json.dumps({**content, "obstacles": [obstacle]}))
+    if not refusal:
+        (loaded,) = load_scene(path).obstacles
+        assert len(loaded.shape.triangles) == 40 * (rings - 1)
+        return
+    with pytest.raises(BadInput, match=refusal) as caught:
+        load_scene(path)
+    assert "simplify meshes or replace them by convex hulls" in caught.value.next_step
+    assert not any(word in str(caught.value) for word in ("alias", "split"))

@@ -128,6 +128,21 @@ def test_a_text_that_would_expand_too_far_is_refused_first(text: str) -> None:
         parse_yaml(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        (levels("[{}]"), "without such aliases"),
+        ("a: [" + "1, " * 50_000 + "]", "simplify meshes or replace them by convex hulls"),
+        ("[" * 100, "flatter"),
+    ],
+)
+def test_the_advice_about_a_long_text_is_the_one_that_helps(text: str, hint: str) -> None:
+    with pytest.raises(YamlSyntaxError) as refused:
+        parse_yaml(text)
+    assert hint in refused.value.next_step
+    assert ("aliases" in f"{refused.value.what} {refused.value.next_step}") == ("*a" in text)
+
+
 def test_a_text_that_contains_itself_is_read_in_finite_time() -> None:
     data = parse_yaml("a: &a [*a]").data
     assert data["a"][0] is data["a"]

@@ -221,16 +221,20 @@ def test_cables_too_near_each_other_get_no_advice_about_obstacles(gachon, scene_
         require_usable_ends(gachon, crossing)
     assert "share" not in refusal.value.why
     assert refusal.value.next_step.startswith("move the start, or reduce clearance.self_mm")
-    document = gachon.document.model_copy(deep=True)
-    document.outlets_mm[:2] = document.outlets_mm[1::-1]
+    outlets = gachon.document.outlets_mm
+    document = gachon.document.model_copy(update={"outlets_mm": [*outlets[1::-1], *outlets[2:]]})
     thick = replace(rig_from_document(document), cable_radius=0.003)
     with pytest.raises(BadInput, match=r"cable 1 touches cable 2") as refusal:
         require_usable_ends(thick, scene_with())
     assert "reduce" not in refusal.value.next_step
     assert refusal.value.next_step.endswith("are interchanged, correct the rig file")
-    document = gachon.document.model_copy(deep=True)
-    document.platform.size_mm[2] = 20.0
-    document.anchors_mm[1] = document.anchors_mm[0]
+    platform, anchors = gachon.document.platform, gachon.document.anchors_mm
+    document = gachon.document.model_copy(
+        update={
+            "platform": platform.model_copy(update={"size_mm": [*platform.size_mm[:2], 20.0]}),
+            "anchors_mm": [anchors[0], anchors[0], *anchors[2:]],
+        }
+    )
     shared = replace(scene_with(), self_clearance=0.012)
     with pytest.raises(BadInput, match=r"cable 1 is .* mm from cable 2") as refusal:
         require_usable_ends(rig_from_document(document), shared)
@@ -241,11 +245,19 @@ def test_cables_too_near_each_other_get_no_advice_about_obstacles(gachon, scene_
 
 
 def test_more_cables_than_can_be_planned_for_are_refused_at_once(gachon, scene_with) -> None:
-    document = gachon.document.model_copy(deep=True)
-    for i in range(17):
-        document.outlets_mm.append([value - 10.0 * i for value in document.outlets_mm[i % 8]])
-        document.anchors_mm.append(document.anchors_mm[i % 8])
-        document.winches.append(document.winches[0].model_copy(update={"node_id": 9 + i}))
+    document = gachon.document
+    outlets, anchors, winches = document.outlets_mm, document.anchors_mm, document.winches
+    further = range(17)
+    document = document.model_copy(
+        update={
+            "outlets_mm": [*outlets, *([x - 10.0 * i for x in outlets[i % 8]] for i in further)],
+            "anchors_mm": [*anchors, *(anchors[i % 8] for i in further)],
+            "winches": [
+                *winches,
+                *(winches[0].model_copy(update={"node_id": 9 + i}) for i in further),
+            ],
+        }
+    )
     with pytest.raises(BadInput, match="25 cables are too many") as refusal:
         require_usable_ends(rig_from_document(document), scene_with())
     assert "the largest number is 24" in refusal.value.what

@@ -63,6 +63,7 @@ def test_the_verdict_is_reported_with_the_path_of_the_report(
 
 def test_every_file_of_the_run_folder_is_there_and_no_other(folder: RunFolder) -> None:
     assert {path.name for path in folder.path.iterdir()} == {
+        "SHA256SUMS",
         "clearance.csv",
         "cycles.csv",
         "events.jsonl",

@@ -14,12 +14,15 @@ ROOT = Path(__file__).resolve().parents[2]
 def build(folder: Path) -> dict[str, list[Path]]:
     """Writes the valid files into a folder; returns their paths by kind."""
     from calibration.results import write_result
+    from executor.recording.checksums import write_checksums
     from tests.calibration.results import camera_result_of
     from tests.executor import fake_run
 
     folder.mkdir(parents=True)
     run = fake_run.write(fake_run.make(every=20), folder / "run").path
     _cut_short(run, folder / "cut")
+    shutil.copytree(folder / "cut", folder / "checksums")
+    write_checksums(folder / "checksums")
     _endpoints(folder / "flat_endpoints.json")
     (folder / "poses.csv").write_text(
         "picture,x_mm,y_mm,z_mm,qw,qx,qy,qz\na.png,1,2,300,1,0,0,0\nb.png,4,5,300,1,0,0,0\n"
@@ -42,6 +45,7 @@ def build(folder: Path) -> dict[str, list[Path]]:
             path for path in sorted(run.iterdir()) if path.suffix in (".json", ".jsonl", ".csv")
         ],
         "cut": [folder / "cut" / name for name in ("run.json", "cycles.csv", "events.jsonl")],
+        "checksums": [folder / "checksums" / "SHA256SUMS"],
         "result": [write_result(folder, camera_result_of())],
         "places": [ROOT / "examples/rig_session/places.csv"],
         "poses": [folder / "poses.csv"],

@@ -94,7 +94,17 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
         if seed.name in ("cycles.csv", "poses.csv", "summary.json", "plan.json", "rig.json")
     ]
     unfinished = [Reader(f"cut:{seed.name}", seed, _cut, cut / seed.name) for seed in corpus["cut"]]
-    return found + whole + again + unfinished
+    return found + whole + again + unfinished + _checksums(corpus["checksums"][0], scratch)
+
+
+def _checksums(seed: Path, scratch: Path) -> list[Reader]:
+    """Compares the files of a run with mutated checksums."""
+    from executor.recording.checksums import require_unchanged
+
+    folder = scratch / "checksums"
+    shutil.copytree(seed.parent, folder)
+    call = lambda path: require_unchanged(path.parent)  # noqa: E731
+    return [Reader("checksums", seed, call, folder / seed.name)]
 
 
 def _message(path: Path) -> None:

@@ -1,0 +1,69 @@
+"""``SHA256SUMS``: checksums of a run's files, as ``sha256sum -c SHA256SUMS`` reads them.
+
+Written when a run ends, and compared whenever its folder is opened: a file that was edited, damaged
+or mixed up with that of another run is named. It proves nothing against one who also rewrites the
+checksums. Images and the report are left out; runs of earlier versions have none.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+
+from executor.recording.record_files import AGAIN
+from model.errors import BadInput
+from model.files.documents import write_atomic
+from model.files.reading import MEGABYTE, read_text, unreadable
+
+CHECKSUMS = "SHA256SUMS"
+_LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
+#: Files that are compared; cameras have names of their own.
+_RECORD = re.compile(
+    r"(plan|rig|run|summary)\.json|events\.jsonl|run\.mcap"
+    r"|(cycles|clearance|fused|poses|poses-.+)\.csv"
+)
+
+
+def write_checksums(folder: Path) -> None:
+    """Writes the checksums of all files of a run that exist.
+
+    Raises:
+        BadInput: A file cannot be read, or the folder cannot be written to.
+    """
+    names = sorted(path.name for path in folder.iterdir() if _RECORD.fullmatch(path.name))
+    lines = [f"{_checksum(folder / name)}  {name}\n" for name in names]
+    write_atomic(folder / CHECKSUMS, "".join(lines))
+
+
+def require_unchanged(folder: Path) -> None:
+    """Requires the files of a run to be as they were written; missing ones are not considered.
+
+    Raises:
+        BadInput: One was changed, or the checksums cannot be read; all are named.
+    """
+    path = folder / CHECKSUMS
+    if not path.is_file():
+        return
+    changed = []
+    for number, line in enumerate(read_text(path, MEGABYTE).splitlines(), start=1):
+        found = _LINE.fullmatch(line)
+        if found is None or not _RECORD.fullmatch(found[2]):
+            raise BadInput("not a checksum", where=f"{path}:{number}", next_step=AGAIN)
+        if (folder / found[2]).is_file() and _checksum(folder / found[2]) != found[1]:
+            changed.append(found[2])
+    if changed:
+        raise BadInput(
+            f"changed after the run: {', '.join(changed)}",
+            where=str(folder),
+            why=f"edited, damaged, or of another run: its checksum in {CHECKSUMS} differs",
+            next_step=f"{AGAIN}; to use it as it is, remove {CHECKSUMS}",
+        )
+
+
+def _checksum(path: Path) -> str:
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise unreadable(path, error) from None
