@@ -103,6 +103,8 @@ def rotation_vector_from_matrix(matrix: ArrayLike) -> Array:
 
 _FOUR_DIGITS = 1e-3
 """Deviation of a quaternion's length, or of a matrix, that was written with four digits."""
+_FARTHEST = 1e9
+"""Sum of coordinates that a position stays below, [m]: files hold no larger numbers."""
 _ROUND_OFF = 1e-9
 """Deviation up to which a rotation is used as it is; beyond, the nearest exact one replaces it."""
 
@@ -153,11 +155,11 @@ class Pose:
                 where="Pose(position, rotation)",
                 next_step="pass a position of shape (3,) [m] and a rotation of shape (3, 3)",
             )
-        if not math.isfinite(sum(self.position.tolist())):
+        if not sum(map(abs, self.position.tolist())) < _FARTHEST:
             raise BadInput(
-                f"the position {self.position.tolist()} m of a pose is not finite",
+                f"the position {self.position.tolist()} m of a pose is not finite, or too far away",
                 where="Pose(position, rotation)",
-                next_step="pass three finite numbers, in metres",
+                next_step="pass three numbers, in metres",
             )
         off = _deviation(self.rotation)
         if not off < _FOUR_DIGITS:

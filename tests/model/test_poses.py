@@ -112,7 +112,7 @@ def test_a_pose_of_other_things_than_numbers_is_bad_input(values: Any) -> None:
             make()
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e9, -1e300])
 def test_a_position_that_is_not_finite_is_refused(value: float) -> None:
     for axis in range(3):
         position = np.zeros(3)
