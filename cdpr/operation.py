@@ -13,7 +13,14 @@ from executor.recording.resume import passing, scene_after
 from executor.recording.run_folder import RunFolder
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
 from executor.supervision import FASTEST, SLOWEST
-from model.errors import BadInput, require_types
+from model.errors import (
+    BadInput,
+    path_of,
+    real_number,
+    require_types,
+    sequence_of,
+    truth_value,
+)
 from model.files.scene_file import StopDocument
 from model.plan import Plan, plan_from_document, require_same_rig
 from model.pose import Array, Pose
@@ -88,21 +95,25 @@ def plan(
         Refused: The pose at the end of the run is unknown.
         NoSolution: There is no path, or the search ended at its limit.
     """
-    poses = [pose for pose in (start, goal, *via) if pose is not None]
-    require_types((rig, Rig), (scene, Scene), *((pose, Pose) for pose in poses))
+    via = sequence_of("via", via)
+    poses = [*via, *(pose for pose in (start, goal) if pose is not None)]
+    require_types((rig, Rig), (scene, Scene), (listener, Listener), *((p, Pose) for p in poses))
     if from_run is not None and start is not None:
         raise BadInput("from_run and start contradict each other", next_step="leave out one")
-    of_legs: list[int] = [] if rounds is None else np.atleast_1d(rounds).tolist()
+    of_legs: list[Any] = []
+    if rounds is not None:
+        several = np.iterable(rounds) and not isinstance(rounds, str)
+        of_legs = list(rounds) if several else [rounds]  # type: ignore[arg-type]
     settings = settings_from_options(
         PlanningOptions(
             planner=planner,
             seed=seed,
             cost=cost,
-            weight=weights or (),
-            budget_ms=None if budget is None else budget * 1000.0,
+            weight={} if weights is None else weights,
+            budget_ms=None if budget is None else 1e3 * real_number("budget", budget, "s"),
             rounds=of_legs,
-            longest_mm=None if longest is None else longest * 1000.0,
-            free_rotation=free_rotation,
+            longest_mm=None if longest is None else 1e3 * real_number("longest", longest, "m"),
+            free_rotation=truth_value("free_rotation", free_rotation),
             mode=mode,
             max_iterations=max_iterations,
         )
@@ -110,7 +121,7 @@ def plan(
     scene = scene.changed(start=start, goal=goal, clearance=clearance)
     done: Sequence[StopDocument] = ()
     if from_run is not None:
-        scene, done, _ = scene_after(scene, rig, Path(from_run))
+        scene, done, _ = scene_after(scene, rig, path_of(from_run))
     scene = passing(scene, via)
     each = of_legs if len(of_legs) > 1 else ()
     return plan_from_document(plan_path(rig, scene, settings, listener, rounds=each, done=done))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import ValidationError
 
-from model.errors import BadInput, InvalidFile
+from model.errors import BadInput, InvalidFile, path_of
 from model.files.documents import check_version, document_hash, problems_of, write_atomic
 from model.files.plan_file import (
     OptimalPlannerDocument,
@@ -71,8 +71,9 @@ class Plan:
         Raises:
             BadInput: The folder cannot be written to.
         """
-        save_plan(self.document, Path(path))
-        return Path(path)
+        path = path_of(path)
+        save_plan(self.document, path)
+        return path
 
     def plot(self) -> Figure:
         """A figure of the path among its obstacles, with the robot at the start."""
@@ -126,7 +127,7 @@ def load_plan(path: str | Path) -> Plan:
         BadInput: It cannot be read, is not JSON, holds NaN, or its hash does not match.
         InvalidFile: With every key that does not fit.
     """
-    path = Path(path)
+    path = path_of(path)
     data = _json_object(path)
     if data.get("kind") != "cdpr-plan":
         raise BadInput("this is not a plan file", where=str(path), next_step=PLAN_AGAIN)

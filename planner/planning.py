@@ -134,7 +134,7 @@ def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> S
         raise BadInput(
             "a scene with stops cannot have a limit on the path length",
             why="each leg is planned on its own, without knowing the others' lengths",
-            next_step="leave out --longest-mm, or plan from stop to stop",
+            next_step="leave out `longest=`, or plan from stop to stop",
         )
     if not rounds:
         return [settings] * count
