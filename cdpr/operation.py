@@ -36,9 +36,13 @@ from planner.settings import (
     PlannerName,
     PlanningOptions,
     settings_from_options,
+    whole_number,
 )
 from planner.workspace.compute import Maps, map_workspace, workspace_grids
 from planner.workspace.maps import Question
+
+#: Largest number of processes that share a map.
+MOST_WORKERS = 1024
 
 
 def plan(
@@ -96,8 +100,8 @@ def plan(
         NoSolution: There is no path, or the search ended at its limit.
     """
     via = sequence_of("via", via)
-    poses = [*via, *(pose for pose in (start, goal) if pose is not None)]
-    require_types((rig, Rig), (scene, Scene), (listener, Listener), *((p, Pose) for p in poses))
+    require_types((rig, Rig), (scene, Scene), (listener, Listener))
+    require_types(*((pose, Pose) for pose in via), optional=((start, Pose), (goal, Pose)))
     if from_run is not None and start is not None:
         raise BadInput("from_run and start contradict each other", next_step="leave out one")
     of_legs: list[Any] = []
@@ -168,20 +172,44 @@ def workspace_map(
         volume: Map the whole workspace too (default: only without slices).
         step: Grid spacing, [m] (default: a fiftieth of the longest side).
         rotation: Of the platform, shape (3, 3) (default: the scene's start, else home).
-        workers: Number of processes (default: one per core).
+        workers: Number of processes, at least 1 (default: one per core).
         listener: Receives the progress.
 
     Returns:
         The grid of each plane or volume, with arrays of values by name.
 
     Raises:
-        BadInput: A plane is outside the workspace, or there are too many points.
+        BadInput: An argument is of another type, a plane is outside the workspace, or there are too
+            many points.
     """
-    require_types((rig, Rig), *([] if scene is None else [(scene, Scene)]))
-    planes = [("xyz".index(axis), position) for axis, position in slices]
+    require_types((rig, Rig), (listener, Listener), optional=[(scene, Scene)])
+    planes = [_plane(one) for one in sequence_of("slices", slices)]
+    step = None if step is None else real_number("step", step, "m")
+    volume = None if volume is None else truth_value("volume", volume)
+    if workers is not None:
+        workers = whole_number("workers", workers, least=1, most=MOST_WORKERS)
     grids = workspace_grids(rig, planes, volume=volume, step=step)
     question = Question.about(rig, scene, rotation)
     return map_workspace(question, grids, workers=workers, listener=listener)
+
+
+def _plane(given: object) -> tuple[int, float]:
+    """Index of the axis and position [m] of a slice such as ``("z", 0.4)``.
+
+    Raises:
+        BadInput: It is something else.
+    """
+    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != 2:
+        axis = None
+    else:
+        axis, position = given
+    if not (isinstance(axis, str) and axis in ("x", "y", "z")):
+        raise BadInput(
+            f"{given!r} is not a slice",
+            where="workspace_map(slices=…)",
+            next_step="pass a list of axes and positions in metres, such as [('z', 0.4)]",
+        )
+    return "xyz".index(axis), real_number(f"the position of the slice {axis}", position, "m")
 
 
 def stop() -> list[int]:
@@ -249,6 +277,6 @@ def report(folder: str | Path) -> Path:
     Raises:
         BadInput: There is no such folder, or a file of the run was changed.
     """
-    opened = RunFolder.open_cut_short(Path(folder))
+    opened = RunFolder.open_cut_short(path_of(folder))
     rewrite_report(opened)
     return opened.report

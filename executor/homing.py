@@ -121,7 +121,7 @@ def home(
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     in_process = is_simulated(rig)
-    require_types((listener, Listener), *([] if pose is None else [(pose, Pose)]))
+    require_types((listener, Listener), optional=[(pose, Pose)])
     require_functions(confirm=confirm)
     require_own_time(rig, realtime)
     given = [camera] if isinstance(camera, str | int | np.integer) else camera or []

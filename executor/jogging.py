@@ -79,7 +79,7 @@ def jog(
     Raises:
         CdprError: As for `executor.runner.run`; or the straight path is too long or not free.
     """
-    require_types((rig, Rig), (listener, Listener), *([] if scene is None else [(scene, Scene)]))
+    require_types((rig, Rig), (listener, Listener), optional=[(scene, Scene)])
     require_functions(confirm=confirm, on_event=on_event)
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
@@ -191,9 +191,7 @@ def require_distance(by: Array | None, *, to_home: bool) -> None:
         return
     length_mm = math.hypot(*by) * 1000.0
     if not 0.0 < length_mm < math.inf:
-        raise BadInput(
-            "the jog distance is zero", where="`by=`", next_step="give X Y Z, not all 0"
-        )
+        raise BadInput("the jog distance is zero", where="`by=`", next_step="give X Y Z, not all 0")
     _require_jog(length_mm, 0.0)
 
 

@@ -131,7 +131,7 @@ def run(
         StoppedByOperator: Cancelled before anything moved.
         KeyboardInterrupt: Ctrl-C, after the drives stopped together and the record was written.
     """
-    require_types((plan, Plan), (rig, Rig), (listener, Listener))
+    require_types((plan, Plan), (rig, Rig), (listener, Listener), optional=[(start, Pose)])
     require_functions(confirm=confirm, on_event=on_event)
     require_same_rig(plan, rig, plan_file)
     chosen = resolve_cameras(rig, cameras, is_simulated(rig))

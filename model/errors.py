@@ -118,16 +118,24 @@ _OTHERS = {
     "Load": "scene.load, or leave it out",
     "Listener": "an object of a subclass of model.progress.Listener, or leave it out",
     "Board": "a cdpr.Chessboard, or another board of `calibration`",
+    "Camera": "rig.camera(), or rig.camera(name)",
+    "Survey": "a calibration.extrinsics.surveyed_tags.Survey, or leave it out",
 }
 
 
-def require_types(*given: tuple[object, type[Any]]) -> None:
+def require_types(
+    *given: tuple[object, type[Any]], optional: Iterable[tuple[object, type[Any]]] = ()
+) -> None:
     """Requires objects of these types of `cdpr`, where a script may pass a path or a list.
+
+    Args:
+        given: Values and their types.
+        optional: The same, where None is allowed.
 
     Raises:
         BadInput: One is of another type; with the function that makes it.
     """
-    for value, kind in given:
+    for value, kind in (*given, *(one for one in optional if one[0] is not None)):
         if not isinstance(value, kind):
             name, shown = kind.__name__, repr(value)
             if isinstance(value, PathLike):
@@ -138,6 +146,17 @@ def require_types(*given: tuple[object, type[Any]]) -> None:
                 f"{_MAKERS[name]}({shown if made_from and len(shown) < 80 else '...'})"
             )
             raise BadInput(f"expected a {name}, not {found}", next_step=f"pass {pass_it}")
+
+
+def require_text(**given: object) -> None:
+    """Requires texts, by the name of their argument.
+
+    Raises:
+        BadInput: One is something else.
+    """
+    for name, value in given.items():
+        if not isinstance(value, str):
+            raise _unusable(name, "text", value)
 
 
 def require_functions(**given: object) -> None:

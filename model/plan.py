@@ -106,8 +106,17 @@ def plan_from_document(document: PlanDocument) -> Plan:
 
 
 def sealed(fields: dict[str, Any]) -> PlanDocument:
-    """A plan document with its hash, from all of its other fields."""
-    unsealed = PlanDocument(**{"schema_version": 1, **fields, "hash": ""})
+    """A plan document with its hash, from all of its other fields.
+
+    Raises:
+        BadInput: A value is not one of a plan file.
+    """
+    try:
+        unsealed = PlanDocument(**{"schema_version": 1, **fields, "hash": ""})
+    except ValidationError as error:
+        problems = problems_of(error, PlanDocument, {})
+        what = "; ".join(f"{problem.key}: {problem.what}" for problem in problems)
+        raise BadInput(f"a plan file cannot hold this plan: {what}") from None
     return unsealed.model_copy(update={"hash": _digest(unsealed)})
 
 

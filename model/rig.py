@@ -227,7 +227,7 @@ class Rig:
         Raises:
             NoCable: A cable has no path at this pose.
         """
-        require_types((pose, Pose), *([] if load is None else [(load, Load)]))
+        require_types((pose, Pose), optional=[(load, Load)])
         return posed_rig(self, pose, load)
 
     def clipped(self, pose: Pose) -> Pose:
@@ -300,7 +300,7 @@ class Rig:
     def plot(self, pose: Pose | None = None, scene: Scene | None = None) -> Figure:
         """A figure of the rig at a pose (home when left out), among a scene's obstacles."""
         shown = self.home if pose is None else pose
-        require_types((shown, Pose), *([] if scene is None else [(scene, Scene)]))
+        require_types((shown, Pose), optional=[(scene, Scene)])
         from model.figures import rig_figure  # loads matplotlib
 
         return rig_figure(self, shown, scene)

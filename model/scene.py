@@ -151,7 +151,7 @@ class Scene:
                 stops do not fit the payload.
         """
         document = self.document
-        require_types(*((pose, Pose) for pose in (start, goal) if pose is not None))
+        require_types(optional=((start, Pose), (goal, Pose)))
         if clearance is not None:
             clearance = real_number("clearance", clearance, "m")
         if clearance is not None and not 0.0 <= clearance < np.inf:

@@ -369,7 +369,9 @@ def _refuse_unused(options: PlanningOptions) -> None:
 
 
 def _is_given(value: object) -> bool:
-    return value is not None and value is not False and value not in ((), [], {})
+    if isinstance(value, list | tuple | Mapping):
+        return bool(value)
+    return value is not None and value is not False
 
 
 def _optimal_settings(options: PlanningOptions) -> OptimalSettings | TurningSettings:

@@ -28,7 +28,7 @@ from executor.realtime.scheduling import interrupts_blocked, one_thread
 from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedRequests, unpack_event
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import record_failure
-from model.errors import CdprError, Fault, Refused, StoppedByOperator
+from model.errors import Fault, Refused, StoppedByOperator
 from model.progress import SILENT, Listener
 
 #: Interval of reading the rings and of the heartbeat, [s].

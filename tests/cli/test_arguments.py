@@ -128,7 +128,10 @@ def test_the_option_is_named_as_it_was_typed(
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
-        ("`budget=` and `rounds=` exclude each other", "--budget-ms and --rounds exclude each other"),
+        (
+            "`budget=` and `rounds=` exclude each other",
+            "--budget-ms and --rounds exclude each other",
+        ),
         ("leave out `weights=`", "leave out --weight"),
         ("pass `planner='optimal'`", "pass --planner optimal"),
         ("without `free_rotation=True`", "without --free-rotation"),

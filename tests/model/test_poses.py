@@ -96,7 +96,15 @@ def test_a_quaternion_or_matrix_of_another_length_is_refused(turn: Vector, more:
         Pose.from_quaternion(np.zeros(3), (1.0 + 2.0 * more) * quaternion_from_matrix(matrix))
 
 
-NOT_NUMBERS: list[Any] = ["abc", ["a", "b", "c"], [1.0, [2.0], 3.0], {"x": 1.0}, None, 3.0, iter(())]
+NOT_NUMBERS: list[Any] = [
+    "abc",
+    ["a", "b", "c"],
+    [1.0, [2.0], 3.0],
+    {"x": 1.0},
+    None,
+    3.0,
+    iter(()),
+]
 
 
 @pytest.mark.parametrize("values", NOT_NUMBERS)

@@ -131,7 +131,12 @@ def test_an_exception_of_a_callback_fails_the_run_and_is_named(
     ],
 )
 def test_leaving_the_program_in_a_callback_stops_the_run_and_keeps_its_record(
-    plan: Plan, slow_rig: Path, tmp_path: Path, error: type[BaseException], code: str, realtime: bool
+    plan: Plan,
+    slow_rig: Path,
+    tmp_path: Path,
+    error: type[BaseException],
+    code: str,
+    realtime: bool,
 ) -> None:
     def leave(event: RunEvent) -> None:
         if event.code == code:
