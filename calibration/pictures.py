@@ -19,7 +19,7 @@ from calibration.targets.boards import Board, DetectedBoard, generic_camera
 from drivers.cameras.files import ImageFolder, OneCamerasPictures
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from executor.cameras.sources import require_camera_source
-from model.errors import BadInput
+from model.errors import BadInput, path_of
 from model.files.documents import write_bytes_atomic
 from model.pose import Array
 from model.progress import SILENT, Listener
@@ -222,7 +222,7 @@ class ImageSet:
             advance(number)
 
 
-ImageSource = ImageSet | str | Path | Callable[[], ImageSet]
+ImageSource = ImageSet | str | int | Path | Callable[[], ImageSet]
 """Images, a function that opens them, or a folder, video, camera index or camera address."""
 DEFAULT_IMAGES, DEFAULT_TAG_IMAGES = 20, 40
 """Default number of images for camera extrinsics, and for the tag layout."""
@@ -242,7 +242,9 @@ def open_images(folder: Path) -> ImageSet:
     return ImageSet(images, len(images.names), images.unused)
 
 
-def open_source(source: str | Path, camera: Camera, wanted: int | None, usual: int) -> ImageSet:
+def open_source(
+    source: str | int | Path, camera: Camera, wanted: int | None, usual: int
+) -> ImageSet:
     """The images of a source.
 
     Args:
@@ -256,7 +258,8 @@ def open_source(source: str | Path, camera: Camera, wanted: int | None, usual: i
             a folder.
         HardwareMissing: The camera does not open.
     """
-    path, most = Path(source), wanted or usual
+    path = path_of(str(source) if isinstance(source, int) else source)
+    most = wanted or usual
     if path.is_dir():
         if wanted is not None:
             raise BadInput(

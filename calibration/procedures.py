@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import radians
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +64,7 @@ from calibration.tag_map.result import (
 )
 from calibration.targets.boards import Board, read_corners
 from executor.kernels import ready_to_measure
-from model.errors import BadInput, Fault, Refused
+from model.errors import BadInput, Fault, Refused, path_of, require_types, sequence_of
 from model.kinematics import NoCable
 from model.pose import Pose, read_only
 from model.progress import SILENT, Listener
@@ -103,8 +104,9 @@ def calibrate_camera(
     Raises:
         BadInput: Image sizes differ, or too few images show the board.
     """
-    require_file_name(name, "--name")
-    source = folder if isinstance(folder, ImageSet) else open_images(Path(folder))
+    require_types((board, Board), (listener, Listener))
+    require_file_name(name, "`name=`")
+    source = folder if isinstance(folder, ImageSet) else open_images(path_of(folder))
     to = Destination.of(output)
     to.require_free("camera", name)
     with source.reported("detecting the board", listener) as images:
@@ -136,7 +138,7 @@ def calibrate_camera_from_corners(
     Raises:
         BadInput: The file cannot be read, or as in `fit_corners`.
     """
-    require_file_name(name, "--name")
+    require_file_name(name, "`name=`")
     to = Destination.of(output)
     to.require_free("camera", name)
     found = fit_corners(read_corners(corners), size, lens, str(corners))
@@ -181,9 +183,13 @@ def locate_camera(
     Raises:
         BadInput: There are no tags, or too few images that show them.
     """
+    require_types((rig, Rig), (listener, Listener), optional=[(survey, Survey)])
     taken_by = rig.camera(camera)
     require_file_name(taken_by.name, "cameras")
-    known = poses_by_picture(Path(poses), taken_by.name) if isinstance(poses, str | Path) else poses
+    if poses is None or isinstance(poses, Mapping):
+        known = poses
+    else:
+        known = poses_by_picture(path_of(poses), taken_by.name)
     if known is None:
         require_frame_tags(rig)
     tags = rig.frame_tags if known is None else rig.platform_tags
@@ -230,6 +236,7 @@ def locate_tags(
     Raises:
         BadInput: There are no tags, or too few images that show them.
     """
+    require_types((rig, Rig), (listener, Listener))
     taken_by = rig.camera(camera)
     require_file_name(rig.name, "name")
     require_tags(rig, fixed_tag)
@@ -272,6 +279,7 @@ def measure_readout(
     Raises:
         BadInput: There are no tags, or the images do not determine the readout.
     """
+    require_types((rig, Rig), (camera, Camera), (listener, Listener))
     require_file_name(camera.name, "cameras")
     require_tags(rig, None)
     pictures, to = open_timed_images(source, camera, rate), Destination.of(output)
@@ -331,8 +339,10 @@ def calibrate_rig(
     Raises:
         BadInput: The data cannot be read, are too few, or do not fit the rig file.
     """
-    require_file_name(name, "--name")
-    paths = [Path(path) for path in ([data] if isinstance(data, (str, Path)) else data)]
+    require_types((rig, Rig), (listener, Listener))
+    require_file_name(name, "`name=`")
+    given = [data] if isinstance(data, str | PathLike) else sequence_of("data", data)
+    paths = [path_of(one) for one in given]
     counted, measured = rig_measurements(rig, paths)
     length, turn = pose_deviations
     measured = replace(

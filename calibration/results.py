@@ -18,7 +18,7 @@ import yaml
 from pydantic import AfterValidator, Field
 
 from calibration.statistics import Interval
-from model.errors import BadInput
+from model.errors import BadInput, path_of, require_text
 from model.files.documents import (
     AnyNonNegative,
     AnyNumber,
@@ -235,6 +235,7 @@ def require_file_name(name: str, where: str) -> None:
     Raises:
         BadInput: The name is empty, or has a slash or a null character.
     """
+    require_text(name=name)
     if not name or "/" in name or "\0" in name:
         raise BadInput(
             f"{name!r} cannot be part of a file name",
@@ -369,7 +370,7 @@ class Destination:
         """A destination; for a folder, one that does not replace files of the same day."""
         if isinstance(output, Destination):
             return output
-        return cls(None if output is None else Path(output))
+        return cls(None if output is None else path_of(output))
 
     def require_free(self, kind: str, name: str) -> None:
         """Creates the folder before the computation, so that no work is lost.

@@ -11,7 +11,7 @@ from drivers.cameras.files import ImageFolder
 from drivers.cameras.live import LiveCamera, VideoFile
 from executor.cameras.sources import parse_camera_sources, require_camera_source
 from executor.track import TrackResult, track_sources
-from model.errors import require_types
+from model.errors import path_of, require_functions, require_types
 from model.plan import Plan
 from model.progress import SILENT, Listener
 from model.rig import Rig
@@ -75,7 +75,8 @@ def track(
         NoPlatformSeen: No image gave a pose.
         BadInput: A source cannot be used, or an image has another size.
     """
-    require_types((rig, Rig))
+    require_types((rig, Rig), (listener, Listener), optional=((scene, Scene), (plan, Plan)))
+    require_functions(stopped=stopped, keep=keep)
     if isinstance(source, Mapping):
         sources = [f"{name}={one}" for name, one in source.items()]
     else:
@@ -86,7 +87,7 @@ def track(
         scene=scene,
         plan=plan,
         pictures=pictures,
-        overlay=None if overlay is None else Path(overlay),
+        overlay=None if overlay is None else path_of(overlay),
         stopped=stopped,
         keep=keep,
         listener=listener,
@@ -99,4 +100,4 @@ def load_calibration(path: str | Path) -> ResultDocument:
     Raises:
         BadInput: It cannot be read, is not a calibration result, or was edited.
     """
-    return load_result(Path(path))
+    return load_result(path_of(path))

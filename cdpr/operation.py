@@ -14,7 +14,14 @@ from executor.recording.resume import passing, scene_after
 from executor.recording.run_folder import RunFolder
 from executor.remote.client import no_answer, no_run, request_run, stop_runs
 from executor.supervision import FASTEST, SLOWEST
-from model.errors import BadInput, require_types
+from model.errors import (
+    BadInput,
+    path_of,
+    real_number,
+    require_types,
+    sequence_of,
+    truth_value,
+)
 from model.files.scene_file import StopDocument
 from model.plan import Plan, plan_from_document, require_same_rig
 from model.pose import Array, Pose
@@ -30,9 +37,13 @@ from planner.settings import (
     PlannerName,
     PlanningOptions,
     settings_from_options,
+    whole_number,
 )
 from planner.workspace.compute import Maps, map_workspace, workspace_grids
 from planner.workspace.maps import Question
+
+#: Largest number of processes that share a map.
+MOST_WORKERS = 1024
 
 
 def plan(
@@ -89,21 +100,25 @@ def plan(
         Refused: The pose at the end of the run is unknown.
         NoSolution: There is no path, or the search ended at its limit.
     """
-    poses = [pose for pose in (start, goal, *via) if pose is not None]
-    require_types((rig, Rig), (scene, Scene), *((pose, Pose) for pose in poses))
+    via = sequence_of("via", via)
+    require_types((rig, Rig), (scene, Scene), (listener, Listener))
+    require_types(*((pose, Pose) for pose in via), optional=((start, Pose), (goal, Pose)))
     if from_run is not None and start is not None:
         raise BadInput("from_run and start contradict each other", next_step="leave out one")
-    of_legs: list[int] = [] if rounds is None else np.atleast_1d(rounds).tolist()
+    of_legs: list[Any] = []
+    if rounds is not None:
+        several = np.iterable(rounds) and not isinstance(rounds, str)
+        of_legs = list(rounds) if several else [rounds]  # type: ignore[arg-type]
     settings = settings_from_options(
         PlanningOptions(
             planner=planner,
             seed=seed,
             cost=cost,
-            weight=weights or (),
-            budget_ms=None if budget is None else budget * 1000.0,
+            weight={} if weights is None else weights,
+            budget_ms=None if budget is None else 1e3 * real_number("budget", budget, "s"),
             rounds=of_legs,
-            longest_mm=None if longest is None else longest * 1000.0,
-            free_rotation=free_rotation,
+            longest_mm=None if longest is None else 1e3 * real_number("longest", longest, "m"),
+            free_rotation=truth_value("free_rotation", free_rotation),
             mode=mode,
             max_iterations=max_iterations,
         )
@@ -111,7 +126,7 @@ def plan(
     scene = scene.changed(start=start, goal=goal, clearance=clearance)
     done: Sequence[StopDocument] = ()
     if from_run is not None:
-        scene, done, _ = scene_after(scene, rig, Path(from_run))
+        scene, done, _ = scene_after(scene, rig, path_of(from_run))
     scene = passing(scene, via)
     each = of_legs if len(of_legs) > 1 else ()
     return plan_from_document(plan_path(rig, scene, settings, listener, rounds=each, done=done))
@@ -165,18 +180,22 @@ def workspace_map(
         rotation: Of the platform, shape (3, 3) (default: the scene's start, else home).
         characteristic_length: Divides moments in the condition number, [m] (default: the anchors'
             root mean square radius).
-        workers: Number of processes (default: one per core).
+        workers: Number of processes, at least 1 (default: one per core).
         listener: Receives the progress.
 
     Returns:
         The grid of each plane or volume, with arrays of values by name.
 
     Raises:
-        BadInput: A plane is outside the region, a number cannot be used, or there are too many
-            points.
+        BadInput: An argument is of another type, a plane is outside the region, or there are too
+            many points.
     """
-    require_types((rig, Rig), *([] if scene is None else [(scene, Scene)]))
-    planes = [("xyz".index(axis), position) for axis, position in slices]
+    require_types((rig, Rig), (listener, Listener), optional=[(scene, Scene)])
+    planes = [_plane(one) for one in sequence_of("slices", slices)]
+    step = None if step is None else real_number("step", step, "m")
+    volume = None if volume is None else truth_value("volume", volume)
+    if workers is not None:
+        workers = whole_number("workers", workers, least=1, most=MOST_WORKERS)
     corners = {"lower": _corner("lower", lower), "upper": _corner("upper", upper)}
     grids = workspace_grids(rig, planes, volume=volume, step=step, **corners)
     question = Question.about(rig, scene, rotation, characteristic_length)
@@ -196,6 +215,25 @@ def _corner(name: str, given: ArrayLike | None) -> Array | None:
             where="workspace_map",
         )
     return corner
+
+
+def _plane(given: object) -> tuple[int, float]:
+    """Index of the axis and position [m] of a slice such as ``("z", 0.4)``.
+
+    Raises:
+        BadInput: It is something else.
+    """
+    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != 2:
+        axis = None
+    else:
+        axis, position = given
+    if not (isinstance(axis, str) and axis in ("x", "y", "z")):
+        raise BadInput(
+            f"{given!r} is not a slice",
+            where="workspace_map(slices=…)",
+            next_step="pass a list of axes and positions in metres, such as [('z', 0.4)]",
+        )
+    return "xyz".index(axis), real_number(f"the position of the slice {axis}", position, "m")
 
 
 def stop() -> list[int]:
@@ -263,6 +301,6 @@ def report(folder: str | Path) -> Path:
     Raises:
         BadInput: There is no such folder, or a file of the run differs from its checksum.
     """
-    opened = RunFolder.open_cut_short(Path(folder))
+    opened = RunFolder.open_cut_short(path_of(folder))
     rewrite_report(opened)
     return opened.report

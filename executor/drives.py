@@ -75,10 +75,9 @@ def require_own_time(rig: Rig, realtime: bool) -> None:
     """
     if not (realtime or is_simulated(rig)):
         raise BadInput(
-            "--fast needs drives simulated in this process",
-            where="--fast",
+            "`realtime=False` needs drives simulated in this process",
             why="time on a real bus cannot run faster",
-            next_step="leave out --fast (in Python realtime=False), or use the interface 'virtual'",
+            next_step="leave out `realtime=False`, or use the interface 'virtual'",
         )
 
 
@@ -91,7 +90,7 @@ def require_simulated_start(rig: Rig, start: Pose | None) -> None:
     if start is not None and not is_simulated(rig):
         raise BadInput(
             "only a platform simulated in this process can be placed",
-            where="--simulated-start-mm",
+            where="`start=`",
             next_step="leave it out, or use the interface 'virtual'",
         )
 

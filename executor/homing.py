@@ -23,7 +23,13 @@ from executor.interlock.reference import HomingReference, reference_at
 from executor.proposals import Facts, ForgetProposal, HomingProposal, require_confirmed
 from executor.supervision import RequestBoard, Supervisor
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
-from model.errors import BadInput, Refused, StoppedByOperator
+from model.errors import (
+    BadInput,
+    Refused,
+    StoppedByOperator,
+    require_functions,
+    require_types,
+)
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
@@ -115,6 +121,8 @@ def home(
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     in_process = is_simulated(rig)
+    require_types((listener, Listener), optional=[(pose, Pose)])
+    require_functions(confirm=confirm)
     require_own_time(rig, realtime)
     given = [camera] if isinstance(camera, str | int | np.integer) else camera or []
     sources = [str(source) for source in given]
@@ -189,7 +197,7 @@ def require_one_pose(at_home: bool, pose: Pose | None, cameras: Sequence[str]) -
     """
     if (at_home, pose is not None, bool(cameras)).count(True) != 1:
         raise BadInput(
-            "state the platform pose by exactly one of --at-home, --pose-mm and --camera",
+            "state the platform pose by exactly one of `at_home=`, `pose=` and `camera=`",
             where="cdpr home",
             why="homing needs a known pose",
             next_step="put the platform on a jig and pass --at-home or --pose-mm X Y Z, or let it"
@@ -232,7 +240,7 @@ def _stated_pose(rig: Rig, pose: Pose | None) -> Pose:
     if not inside.all():
         raise BadInput(
             "the pose is outside the workspace",
-            where="--pose-mm",
+            where="`pose=`",
             next_step="give the position of the platform's origin in the world frame, in mm",
         )
     return pose
@@ -249,7 +257,7 @@ def _target(rig: Rig, tension: float | None, limit: float) -> float:
         raise Refused(
             f"a pretension of {target:g} N must be from {rig.min_tension:g} N to 80 % of the"
             f" limit of {limit:g} N",
-            where="--tension-n",
+            where="`tension=`",
             why="cables must be taut afterwards, with headroom below the limit while winding in",
             next_step="set another pretension or limit",
         )

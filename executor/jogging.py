@@ -21,7 +21,7 @@ from executor.recording.run_folder import RunEvent, RunFolder
 from executor.runner import RunOptions, RunResult, prepare_plan, run_prepared
 from executor.supervision import Supervisor
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
-from model.errors import BadInput, Refused, require_types
+from model.errors import BadInput, Refused, path_of, require_functions, require_types
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument
 from model.jit import KernelSet, compilation
@@ -79,12 +79,13 @@ def jog(
     Raises:
         CdprError: As for `executor.runner.run`; or the straight path is too long or not free.
     """
-    require_types((rig, Rig), *([] if scene is None else [(scene, Scene)]))
+    require_types((rig, Rig), (listener, Listener), optional=[(scene, Scene)])
+    require_functions(confirm=confirm, on_event=on_event)
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     require_distance(by, to_home=to_home)
     around = empty_scene(slow) if scene is None else scene.changed(stops=())
-    output = free_folder("jog") if folder is None else Path(folder)
+    output = free_folder("jog") if folder is None else path_of(folder)
     RunFolder.require_free(output)
     interlock = MotionInterlock(slow)
     interlock.require_free()
@@ -176,13 +177,13 @@ def require_distance(by: Array | None, *, to_home: bool) -> None:
     """
     if by is not None and to_home:
         raise BadInput(
-            "--by-mm and --to-home exclude each other",
+            "`by=` and `to_home=` exclude each other",
             where="cdpr jog",
             next_step="leave one of them out",
         )
     if by is None and not to_home:
         raise BadInput(
-            "no motion given: use --by-mm X Y Z, --to-home, or --cable N --mm X",
+            "no motion given: use `by=` or `to_home=`, or jog a single cable",
             where="cdpr jog",
             next_step="see `cdpr jog --help`",
         )
@@ -190,9 +191,7 @@ def require_distance(by: Array | None, *, to_home: bool) -> None:
         return
     length_mm = math.hypot(*by) * 1000.0
     if not 0.0 < length_mm < math.inf:
-        raise BadInput(
-            "the jog distance is zero", where="--by-mm", next_step="give X Y Z in mm, not all 0"
-        )
+        raise BadInput("the jog distance is zero", where="`by=`", next_step="give X Y Z, not all 0")
     _require_jog(length_mm, 0.0)
 
 
@@ -227,18 +226,18 @@ def _require_cable(rig: Rig, cable: int, length: float) -> None:
     if not 1 <= cable <= rig.cable_count:
         raise BadInput(
             f"there is no cable {cable}",
-            where="--cable",
+            where="`cable=`",
             next_step=f"name one from 1 to {rig.cable_count}, in the order of the rig file",
         )
     if length == 0.0 or not math.isfinite(length):
         raise BadInput(
-            "the jog distance is zero", where="--mm", next_step="give a length in mm other than 0"
+            "the jog distance is zero", where="`length=`", next_step="give a length other than 0"
         )
     length_mm = abs(length) * 1000.0
     if length_mm > LONGEST_MM * _ROUNDED:
         raise Refused(
             f"{length_mm:g} mm exceeds the limit of {LONGEST_MM:g} mm",
-            where="--mm",
+            where="`length=`",
             why="a single cable is moved in short steps, under observation",
             next_step="use several steps",
         )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 from drivers.can_bus import IN_PROCESS
 from executor.interlock.fault_latch import LatchedFault
 from executor.interlock.interlock import MotionInterlock, ReferenceStatus, reference_status
-from model.errors import StoppedByOperator
+from model.errors import BadInput, StoppedByOperator, is_truth_value, require_functions
 from model.pose import Pose
 from model.rig import Camera, Rig
 from model.scene import Scene
@@ -46,9 +46,21 @@ def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal)
     """Asks for confirmation; without a callback, the call itself confirms.
 
     Raises:
+        BadInput: It is not a function, or the answer is neither True nor False.
         StoppedByOperator: The answer was no.
     """
-    if confirm is not None and not confirm(proposal):
+    require_functions(confirm=confirm)
+    if confirm is None:
+        return
+    answer = confirm(proposal)
+    if not is_truth_value(answer):
+        raise BadInput(
+            f"confirm must return True or False, it returned {answer!r:.60}",
+            where=proposal.title,
+            why=f"any other answer may be a no; {proposal.otherwise}",
+            next_step="return True to go on, or False to cancel",
+        )
+    if not answer:
         raise StoppedByOperator(proposal.otherwise, next_step="run it again and confirm")
 
 

@@ -16,6 +16,7 @@ from drivers.can_bus import IN_PROCESS
 from executor.recording.csv_columns import TableFile
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
 from executor.recording.verdict import faults_among
+from model.errors import path_of
 from model.pages.page import html_table
 
 if TYPE_CHECKING:
@@ -163,6 +164,6 @@ def load_run(folder: str | Path) -> RunResult:
         BadInput: There is no such folder, or a file of the run is missing or differs from its
             checksum (`executor.recording.checksums`).
     """
-    opened = RunFolder.open(Path(folder))
+    opened = RunFolder.open(path_of(folder))
     page = opened.report if opened.report.is_file() else None
     return RunResult(opened.path, opened.summary(), report=page)

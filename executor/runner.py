@@ -39,9 +39,15 @@ from executor.remote.command_socket import advertised, serving
 from executor.remote.status import RunStatus
 from executor.run_result import RunResult
 from executor.state_machine import LoopEvent, State
-from executor.supervision import LocalRequests, Supervisor
+from executor.supervision import Callbacks, LocalRequests, Supervisor
 from executor.trajectory.setpoints import PreparedRun, prepare
-from model.errors import CdprError, require_types
+from model.errors import (
+    CdprError,
+    StoppedByOperator,
+    path_of,
+    require_functions,
+    require_types,
+)
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -109,7 +115,8 @@ def run(
         confirm: Called once, before any device is opened; False cancels it. Without it the call
             itself confirms the motion.
         on_event: Receives each event of the run. It is called by the thread that supervises the
-            motion and must return at once; an exception stops the run.
+            motion and must return at once. An exception stops and fails the run;
+            `KeyboardInterrupt` and `SystemExit` stop it as Ctrl-C does.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
         plan_file: Name of the plan in messages.
 
@@ -124,7 +131,8 @@ def run(
         StoppedByOperator: Cancelled before anything moved.
         KeyboardInterrupt: Ctrl-C, after the drives stopped together and the record was written.
     """
-    require_types((plan, Plan), (rig, Rig))
+    require_types((plan, Plan), (rig, Rig), (listener, Listener), optional=[(start, Pose)])
+    require_functions(confirm=confirm, on_event=on_event)
     require_same_rig(plan, rig, plan_file)
     chosen = resolve_cameras(rig, cameras, is_simulated(rig))
     require_synthetic_images(chosen.values(), not realtime)
@@ -132,7 +140,7 @@ def run(
     if plan.scene.obstacles:
         require_stated_errors(rig, list(chosen))
     require_simulated_start(rig, start)
-    output = dated_folder() if folder is None else Path(folder)
+    output = dated_folder() if folder is None else path_of(folder)
     RunFolder.require_free(output)
     interlock = MotionInterlock(rig)
     interlock.require_free()
@@ -192,11 +200,15 @@ def run_prepared(
         with folder.held():
             _move_and_measure(job, moved)
             result = options.supervisor.conclude(partial(_conclude, job, moved, course))
+    except StoppedByOperator:
+        moved.leave()
+        raise
     finally:
         moved.close()
         if not moved.begun:
             folder.discard()
     options.supervisor.finish()
+    moved.leave()
     return result
 
 
@@ -220,7 +232,8 @@ class _MotionData:
         recorder: Of cycles and events.
         outcome: Of the motion.
         seen: Camera records.
-        troubles: Missing data, a sentence each.
+        troubles: Missing data, and what a function of the caller raised late, a sentence each.
+        callbacks: Functions of the caller.
     """
 
     begun: bool = False
@@ -229,6 +242,12 @@ class _MotionData:
     outcome: Outcome | None = None
     seen: CameraRecords | None = None
     troubles: list[str] = field(default_factory=list)
+    callbacks: Callbacks | None = None
+
+    def leave(self) -> None:
+        """Raises what ended the program in a function of the caller."""
+        if self.callbacks is not None:
+            self.callbacks.leave()
 
     def take_event(self, code: str, text: str, at: float) -> None:
         """Records an event of another source than the loop.
@@ -291,6 +310,8 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
     opening = partial(
         open_cameras, prepared.rig, prepared.scene, job.cameras, job.folder.path, pictures, board
     )
+    guarded = (callbacks := Callbacks(board.ask_stop)).guarded
+    moved.callbacks = callbacks
     with ExitStack() as stack:
         listeners = stack.enter_context(advertised())
         stack.enter_context(serving(listeners, board, status))
@@ -304,17 +325,19 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
                 if cameras
                 else None
             )  # fmt: skip
+            show = guarded("listener.progress", advance)
+            on_event = options.on_event
             recorder = moved.recorder = Recorder(
                 prepared,
                 job.folder,
                 status,
                 trigger=watch.trigger if watch else None,
                 every=max(1, round(1.0 / (rate * cycle))),
-                progress=lambda row: advance(
+                progress=lambda row: show(
                     row, watch.rates if watch else "", f"{recorder.state.value}, row"
                 ),
-                announce=listener.note,
-                on_event=options.on_event,
+                announce=guarded("listener.note", listener.note),
+                on_event=None if on_event is None else guarded("on_event", on_event),
                 own_thread=options.realtime,
             )
             moved.outcome = _move(job, board, recorder, moved)
@@ -385,6 +408,9 @@ def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
     """Computes the verdict, reports it, then writes the result files."""
     outcome, supervisor = moved.outcome, job.options.supervisor
     assert outcome is not None
+    late = moved.callbacks.error if moved.callbacks is not None else ""
+    if late and late not in outcome.cause:
+        moved.troubles.append(late)
     course = replace(
         course,
         started=outcome.started,

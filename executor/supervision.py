@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from model.errors import StoppedByOperator
+from model.errors import CdprError, Fault, StoppedByOperator
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +95,64 @@ class LocalRequests:
     def read(self) -> OperatorRequests:
         """See `RequestBoard`."""
         return OperatorRequests(self._stop, self._hold, self._speed, for_what=self._for_what)
+
+
+# Functions of the calling program that the motion calls.
+
+
+class CallbackFailed(Fault):
+    """A function of the calling program raised an exception."""
+
+
+def record_failure(error: Exception) -> str:
+    """What failed while a cycle or an event was taken, in a clause without advice."""
+    if isinstance(error, CallbackFailed):
+        return error.what
+    return f"recording failed: {in_one_line(error)}"
+
+
+def in_one_line(error: Exception) -> str:
+    """Message of an error, without cause and advice."""
+    return error.what if isinstance(error, CdprError) else f"{type(error).__name__}: {error}"
+
+
+class Callbacks:
+    """Functions of the calling program: what they raise stops the motion and is reported.
+
+    They are called in the thread of the motion, which an exception would end without a stop.
+
+    Attributes:
+        error: The first exception, as a clause; empty for none.
+        leaving: `KeyboardInterrupt` or `SystemExit` of a function, to raise after the record.
+    """
+
+    def __init__(self, ask_stop: Callable[[], None]) -> None:
+        """``ask_stop`` requests the operator's stop."""
+        self.error = ""
+        self.leaving: BaseException | None = None
+        self._ask_stop = ask_stop
+
+    def guarded(self, name: str, function: Callable[..., object]) -> Callable[..., None]:
+        """The function, which then raises nothing but `CallbackFailed`."""
+
+        def call(*values: object) -> None:
+            try:
+                function(*values)
+            except Exception as error:
+                text = error.what if isinstance(error, CdprError) else str(error)
+                what = f"{name} raised {type(error).__name__}: {text}".rstrip(": ")
+                self.error = self.error or what
+                raise CallbackFailed(what) from error
+            except BaseException as error:
+                self.leaving = self.leaving or error
+                self._ask_stop()
+
+        return call
+
+    def leave(self) -> None:
+        """Raises what ended the program in a function."""
+        if self.leaving is not None:
+            raise self.leaving
 
 
 # Supervisor of a motion, for the calling program.

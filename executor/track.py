@@ -146,10 +146,10 @@ def require_plan_used(sources: Iterable[str], plan: object | None) -> None:
     named = list(sources)
     if plan is not None and SYNTHETIC not in named:
         raise BadInput(
-            "--plan is for the synthetic camera",
+            "`plan=` is for the synthetic camera",
             where="track",
             why=f"images come from {', '.join(named)}",
-            next_step="name the obstacles with --scene, or the source 'synthetic'",
+            next_step="name the obstacles with `scene=`, or the source 'synthetic'",
         )
 
 
@@ -299,7 +299,7 @@ def _opened(
             raise BadInput(
                 "the synthetic camera needs a path to render",
                 where=f"track, camera {camera.name!r}",
-                next_step="pass --plan plan.json",
+                next_step="pass `plan=`, the path of the platform",
             )
         timed_poses = _poses_in_time(rig, camera, plan)
         return _rendered(rig, scene, camera, timed_poses), len(timed_poses)

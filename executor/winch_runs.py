@@ -87,7 +87,7 @@ def limit_of(rig: Rig, limit: float | None) -> float:
         raise Refused(
             f"the tension limit of {limit:g} N is not above {rig.min_tension:g} N and at most"
             f" {rig.max_tension:g} N",
-            where="--limit-n",
+            where="`limit=`",
             why="that is the range of tensions in the rig file",
             next_step="choose a limit in this range",
         )

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from os import PathLike
-from typing import Any, ClassVar
+from numbers import Real
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+T = TypeVar("T")
 
 
 class CdprError(Exception):
@@ -101,6 +105,8 @@ class AlreadyExists(BadInput):
         super().__init__(what, where=where, why=why, next_step="choose another name")
 
 
+# Arguments of library functions, which a script may pass as anything.
+
 _MAKERS = {
     "Rig": "cdpr.load_rig",
     "Scene": "cdpr.load_scene",
@@ -108,25 +114,117 @@ _MAKERS = {
     "Pose": "cdpr.Pose.level",
     "CalibrationResult": "cdpr.load_calibration",
 }
+_OTHERS = {
+    "Load": "scene.load, or leave it out",
+    "Listener": "an object of a subclass of model.progress.Listener, or leave it out",
+    "Board": "a cdpr.Chessboard, or another board of `calibration`",
+    "Camera": "rig.camera(), or rig.camera(name)",
+    "Survey": "a calibration.extrinsics.surveyed_tags.Survey, or leave it out",
+}
 
 
-def require_types(*given: tuple[object, type[Any]]) -> None:
+def require_types(
+    *given: tuple[object, type[Any]], optional: Iterable[tuple[object, type[Any]]] = ()
+) -> None:
     """Requires objects of these types of `cdpr`, where a script may pass a path or a list.
+
+    Args:
+        given: Values and their types.
+        optional: The same, where None is allowed.
 
     Raises:
         BadInput: One is of another type; with the function that makes it.
     """
-    for value, kind in given:
+    for value, kind in (*given, *(one for one in optional if one[0] is not None)):
         if not isinstance(value, kind):
-            maker, shown = _MAKERS[kind.__name__], repr(value)
+            name, shown = kind.__name__, repr(value)
             if isinstance(value, PathLike):
                 shown = repr(str(value))
-            made_from = isinstance(value, str | PathLike) or kind.__name__ == "Pose"
+            made_from = isinstance(value, str | PathLike) or name == "Pose"
             found = "text" if isinstance(value, str) else type(value).__name__
-            raise BadInput(
-                f"expected a {kind.__name__}, not {found}",
-                next_step=f"pass {maker}({shown if made_from and len(shown) < 80 else '...'})",
+            pass_it = _OTHERS.get(name) or (
+                f"{_MAKERS[name]}({shown if made_from and len(shown) < 80 else '...'})"
             )
+            raise BadInput(f"expected a {name}, not {found}", next_step=f"pass {pass_it}")
+
+
+def require_text(**given: object) -> None:
+    """Requires texts, by the name of their argument.
+
+    Raises:
+        BadInput: One is something else.
+    """
+    for name, value in given.items():
+        if not isinstance(value, str):
+            raise _unusable(name, "text", value)
+
+
+def require_functions(**given: object) -> None:
+    """Requires functions, by the name of their argument; None for those left out.
+
+    Raises:
+        BadInput: One cannot be called.
+    """
+    for name, value in given.items():
+        if not (value is None or callable(value)):
+            raise _unusable(name, "a function", value)
+
+
+def sequence_of(name: str, values: Iterable[T]) -> tuple[T, ...]:
+    """The values of any iterable, once.
+
+    Raises:
+        BadInput: It is not iterable, or a text.
+    """
+    if isinstance(values, str | bytes) or not isinstance(values, Iterable):
+        raise _unusable(name, "a list", values)
+    return tuple(values)
+
+
+def is_truth_value(value: object) -> bool:
+    """Whether it is True or False, also NumPy's; ``"no"``, 0 and None are neither."""
+    of_numpy = getattr(value, "shape", None) == () and str(getattr(value, "dtype", "")) == "bool"
+    return isinstance(value, bool) or of_numpy
+
+
+def truth_value(name: str, value: object) -> bool:
+    """True or False, also NumPy's.
+
+    Raises:
+        BadInput: It is something else.
+    """
+    if not is_truth_value(value):
+        raise _unusable(name, "True or False", value)
+    return bool(value)
+
+
+def real_number(name: str, value: object, unit: str = "") -> float:
+    """A number of any type, such as NumPy's, as a float; the caller checks its range.
+
+    Raises:
+        BadInput: It is a text, a list or another object.
+    """
+    single = value.item() if getattr(value, "shape", None) == () else value  # type: ignore[attr-defined]
+    if isinstance(single, bool) or not isinstance(single, Real):
+        raise _unusable(name, f"a number [{unit}]" if unit else "a number", value)
+    return float(single)
+
+
+def path_of(value: object) -> Path:
+    """A path, from text or a path object.
+
+    Raises:
+        BadInput: It is something else, such as None, a number or bytes.
+    """
+    if not isinstance(value, str | PathLike) or not isinstance(fspath(value), str):
+        raise _unusable("the path", "a str or a pathlib.Path", value)
+    return Path(fspath(value))
+
+
+def _unusable(name: str, expected: str, value: object) -> BadInput:
+    shown = repr(value)
+    shown = f"{shown[:60]}…" if len(shown) > 60 else shown
+    return BadInput(f"{name} must be {expected}, it is {shown} ({type(value).__name__})")
 
 
 class Refused(CdprError):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import ValidationError
 
-from model.errors import BadInput, InvalidFile
+from model.errors import BadInput, InvalidFile, path_of
 from model.files.documents import check_version, document_hash, problems_of, write_atomic
 from model.files.plan_file import (
     OptimalPlannerDocument,
@@ -71,8 +71,9 @@ class Plan:
         Raises:
             BadInput: The folder cannot be written to.
         """
-        save_plan(self.document, Path(path))
-        return Path(path)
+        path = path_of(path)
+        save_plan(self.document, path)
+        return path
 
     def plot(self) -> Figure:
         """A figure of the path among its obstacles, with the robot at the start."""
@@ -105,8 +106,17 @@ def plan_from_document(document: PlanDocument) -> Plan:
 
 
 def sealed(fields: dict[str, Any]) -> PlanDocument:
-    """A plan document with its hash, from all of its other fields."""
-    unsealed = PlanDocument(**{"schema_version": 1, **fields, "hash": ""})
+    """A plan document with its hash, from all of its other fields.
+
+    Raises:
+        BadInput: A value is not one of a plan file.
+    """
+    try:
+        unsealed = PlanDocument(**{"schema_version": 1, **fields, "hash": ""})
+    except ValidationError as error:
+        problems = problems_of(error, PlanDocument, {})
+        what = "; ".join(f"{problem.key}: {problem.what}" for problem in problems)
+        raise BadInput(f"a plan file cannot hold this plan: {what}") from None
     return unsealed.model_copy(update={"hash": _digest(unsealed)})
 
 
@@ -126,7 +136,7 @@ def load_plan(path: str | Path) -> Plan:
         BadInput: It cannot be read, is not JSON, holds NaN, or its hash does not match.
         InvalidFile: With every key that does not fit.
     """
-    path = Path(path)
+    path = path_of(path)
     data = _json_object(path)
     if data.get("kind") != "cdpr-plan":
         raise BadInput("this is not a plan file", where=str(path), next_step=PLAN_AGAIN)

@@ -125,15 +125,31 @@ def rotation_vector_from_matrix(matrix: ArrayLike) -> Array:
     return np.array([factor * x, factor * y, factor * z])
 
 
-def _is_rotation(matrix: Array) -> bool:
-    """Right-handed and orthonormal to about 1e-3, as of a quaternion written with four digits."""
-    (a, b, c), (d, e, f), third = matrix.tolist()
-    cross = (b * f - c * e, c * d - a * f, a * e - b * d)
-    return (
-        abs(a * a + b * b + c * c - 1.0) < 2e-3
-        and abs(d * d + e * e + f * f - 1.0) < 2e-3
-        and all(abs(x - y) < 2e-3 for x, y in zip(cross, third, strict=True))
-    )
+_FOUR_DIGITS = 1e-3
+"""Deviation of a quaternion's length, or of a matrix, that was written with four digits."""
+_FARTHEST = 1e9
+"""Sum of coordinates that a position stays below, [m]: files hold no larger numbers."""
+_ROUND_OFF = 1e-9
+"""Deviation up to which a rotation is used as it is; beyond, the nearest exact one replaces it."""
+
+
+def _deviation(matrix: Array) -> float:
+    """How far a matrix is from a rotation: its rows' lengths, and the third from their product."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    lengths = abs(a * a + b * b + c * c - 1.0) + abs(d * d + e * e + f * f - 1.0)
+    third = abs(b * f - c * e - g) + abs(c * d - a * f - h) + abs(a * e - b * d - i)
+    return float(lengths + third)
+
+
+def _floats(values: ArrayLike, name: str) -> Array:
+    try:
+        return read_only(values)
+    except (TypeError, ValueError):
+        raise BadInput(
+            f"the {name} of a pose does not consist of numbers: {str(values)[:60]}",
+            where="Pose(position, rotation)",
+            next_step="pass a list or an array of numbers",
+        ) from None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,10 +160,12 @@ class Pose(ReadOnly):
 
     Attributes:
         position: Shape (3,), [m].
-        rotation: Rotation matrix, shape (3, 3).
+        rotation: Rotation matrix, shape (3, 3); orthonormal to round-off. One that was written with
+            few decimals is replaced by the nearest rotation.
 
     Raises:
-        BadInput: A wrong shape, or no rotation: a reflection, a scaled matrix, NaN.
+        BadInput: A wrong shape, a value that is not a finite number, or no rotation: a reflection,
+            a scaled matrix.
     """
 
     position: Array
@@ -155,21 +173,31 @@ class Pose(ReadOnly):
 
     def __post_init__(self) -> None:
         """Copies the arrays and makes them read-only."""
-        object.__setattr__(self, "position", read_only(self.position))
-        object.__setattr__(self, "rotation", read_only(self.rotation))
+        object.__setattr__(self, "position", _floats(self.position, "position"))
+        object.__setattr__(self, "rotation", _floats(self.rotation, "rotation"))
         if self.position.shape != (3,) or self.rotation.shape != (3, 3):
             raise BadInput(
                 f"a pose of shapes {self.position.shape} and {self.rotation.shape}",
                 where="Pose(position, rotation)",
                 next_step="pass a position of shape (3,) [m] and a rotation of shape (3, 3)",
             )
-        if not _is_rotation(self.rotation):
+        if not sum(map(abs, self.position.tolist())) < _FARTHEST:
+            raise BadInput(
+                f"the position {self.position.tolist()} m of a pose is not finite, or too far away",
+                where="Pose(position, rotation)",
+                next_step="pass three numbers, in metres",
+            )
+        off = _deviation(self.rotation)
+        if not off < _FOUR_DIGITS:
             raise BadInput(
                 "the matrix of a pose is no rotation",
                 where="Pose(position, rotation)",
                 why="its rows are not of length 1, not at right angles, or mirrored",
                 next_step="compute it from a unit quaternion: Pose.from_quaternion(position, wxyz)",
             )
+        if off > _ROUND_OFF:
+            left, _, right = np.linalg.svd(self.rotation)
+            object.__setattr__(self, "rotation", read_only(left @ right))
 
     def __eq__(self, other: object) -> bool:
         """Whether every number is the same."""
@@ -186,12 +214,27 @@ class Pose(ReadOnly):
     @classmethod
     def level(cls, position: ArrayLike) -> Pose:
         """A pose without rotation at ``position`` [m]."""
-        return cls(np.asarray(position, dtype=np.float64), np.eye(3))
+        return cls(_floats(position, "position"), np.eye(3))
 
     @classmethod
     def from_quaternion(cls, position: ArrayLike, quaternion: ArrayLike) -> Pose:
-        """A pose from ``position`` [m] and a unit quaternion (w, x, y, z)."""
-        return cls(np.asarray(position, dtype=np.float64), matrix_from_quaternion(quaternion))
+        """A pose from ``position`` [m] and a unit quaternion (w, x, y, z).
+
+        Raises:
+            BadInput: The length of the quaternion is not 1 to about 1e-3, or as for `Pose`.
+        """
+        wxyz = _floats(quaternion, "quaternion")
+        length = math.hypot(*wxyz.tolist()) if wxyz.shape == (4,) else math.nan
+        if not abs(length - 1.0) < _FOUR_DIGITS:
+            raise BadInput(
+                f"{wxyz.tolist()} is not a unit quaternion (w, x, y, z)",
+                where="Pose.from_quaternion(position, quaternion)",
+                why=f"its length is {length:.6g}" if wxyz.shape == (4,) else "it needs 4 numbers",
+                next_step="divide it by its length; [1, 0, 0, 0] is the level orientation",
+            )
+        if abs(length - 1.0) > _ROUND_OFF:
+            wxyz = read_only(wxyz / length)
+        return cls(_floats(position, "position"), matrix_from_quaternion(wxyz))
 
     @property
     def quaternion(self) -> Array:

@@ -12,17 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.cameras import Camera, Tag, camera_from, tag_from
-from model.errors import BadInput, require_types
+from model.errors import BadInput, path_of, require_types
 from model.files.documents import document_hash, document_of, key_path, load_yaml, millimetres
 from model.files.rig_file import MotionDocument, RigDocument, WinchDocument
 from model.pages.page import html_table
 from model.pose import Array, Pose, ReadOnly, read_only
 from model.posed_rig import PosedRig, posed_rig
+from model.scene import Load, Scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from model.scene import Load, Scene
 
 __all__ = [
     "NOT_IN_PLAN_HASH",
@@ -241,11 +240,12 @@ class Rig(ReadOnly):
         Raises:
             NoCable: A cable has no path at this pose.
         """
-        require_types((pose, Pose))
+        require_types((pose, Pose), optional=[(load, Load)])
         return posed_rig(self, pose, load)
 
     def clipped(self, pose: Pose) -> Pose:
         """The pose with its origin moved to the nearest point of the workspace box."""
+        require_types((pose, Pose))
         position = np.clip(pose.position, self.workspace_lower, self.workspace_upper)
         return Pose(position, pose.rotation)
 
@@ -312,9 +312,11 @@ class Rig(ReadOnly):
 
     def plot(self, pose: Pose | None = None, scene: Scene | None = None) -> Figure:
         """A figure of the rig at a pose (home when left out), among a scene's obstacles."""
+        shown = self.home if pose is None else pose
+        require_types((shown, Pose), optional=[(scene, Scene)])
         from model.figures import rig_figure  # loads matplotlib
 
-        return rig_figure(self, pose or self.home, scene)
+        return rig_figure(self, shown, scene)
 
     def __repr__(self) -> str:
         """Name, size and bus."""
@@ -356,7 +358,7 @@ def load_rig(path: str | Path) -> Rig:
         BadInput: The file cannot be read.
         InvalidFile: With every problem and its position.
     """
-    return rig_from_document(load_yaml(Path(path), RigDocument))
+    return rig_from_document(load_yaml(path_of(path), RigDocument))
 
 
 def rig_from_document(document: RigDocument) -> Rig:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from model.errors import BadInput
+from model.errors import BadInput, path_of, real_number, require_types
 from model.files.documents import (
     Document,
     PoseDocument,
@@ -161,13 +161,13 @@ class Scene(ReadOnly):
         """The same scene with another start, goal, obstacle clearance [m], stops or payload.
 
         Raises:
-            BadInput: A number is not finite, the clearance is negative, or stops do not fit the
-                payload.
+            BadInput: An argument is of another type, the clearance is negative or not finite, or
+                stops do not fit the payload.
         """
         document = self.document
-        for name, pose in (("start", start), ("goal", goal)):
-            if pose is not None and not np.all(np.isfinite(pose.matrix())):
-                raise BadInput(f"the {name} holds a value that is not a finite number")
+        require_types(optional=((start, Pose), (goal, Pose)))
+        if clearance is not None:
+            clearance = real_number("clearance", clearance, "m")
         if clearance is not None and not 0.0 <= clearance < np.inf:
             raise BadInput(f"the clearance must be 0 mm or more (it is {clearance * 1000.0:g} mm)")
         update: dict[str, object] = {}
@@ -212,7 +212,7 @@ def load_scene(path: str | Path) -> Scene:
         BadInput: The file cannot be read.
         InvalidFile: With every problem and its position.
     """
-    return scene_from_document(load_yaml(Path(path), SceneDocument))
+    return scene_from_document(load_yaml(path_of(path), SceneDocument))
 
 
 def scene_from_document(document: SceneDocument) -> Scene:

@@ -137,16 +137,18 @@ class _Check:
     def __init__(self, rig: Rig, scene: Scene, path: PosePath) -> None:
         self.rig, self.scene, self.path = rig, scene, path
         self.model = ClearanceModel(rig, scene)
-        self.samples = path.samples(SPACING)
         self.violations: list[Violation] = []
         self.length_unit = rms_anchor_radius(rig.anchors)
+        is_far = self._check_workspace()
+        self.samples = np.empty(0) if is_far else path.samples(SPACING)
         self._poses = {sample: path.pose(sample) for sample in self.samples.tolist()}
 
     def report(self, ends: tuple[str, str] | None) -> CheckReport:
         """Figures and violations; ``ends`` names the poses that it must begin and end at."""
-        self._check_workspace()
         if ends is not None:
             self._check_ends(ends)
+        if not self.samples.size:
+            return self._unchecked()
         self._check_rotations()
         self._check_pulleys()
         obstacle, obstacle_proof = self._obstacle_clearance()
@@ -170,18 +172,44 @@ class _Check:
             violations=tuple(self.violations),
         )
 
+    def _unchecked(self) -> CheckReport:
+        """The report of a path so far outside that sampling it would take hours or all memory."""
+        first = self.path.poses[0]
+        return CheckReport(
+            length=self.path.length,
+            samples=0,
+            obstacle_clearance=None,
+            proved_obstacle_clearance=-np.inf,
+            required_obstacle_clearance=self.scene.obstacle_clearance,
+            self_clearance=Closest(self.model.self_clearance(first), first, 0.0),
+            proved_self_clearance=-np.inf,
+            required_self_clearance=self.scene.self_clearance,
+            min_tension=np.nan,
+            max_tension=np.nan,
+            capacity_margin=-np.inf,
+            proved_capacity_margin=-np.inf,
+            max_cable_speed=np.inf,
+            violations=tuple(self.violations),
+        )
+
     def _pose(self, position: float) -> Pose:
         return self._poses.get(position) or self.path.pose(position)
 
-    def _check_workspace(self) -> None:
+    def _check_workspace(self) -> bool:
+        """Whether the path is farther outside the workspace box than the box is large."""
         positions = np.array([pose.position for pose in self.path.poses])
         outside = np.maximum(
             self.rig.workspace_lower - positions, positions - self.rig.workspace_upper
         ).max(axis=1)
         worst = int(np.argmax(outside))
+        size = float(np.linalg.norm(self.rig.workspace_upper - self.rig.workspace_lower))
+        is_far = not outside[worst] <= size
         if not outside[worst] <= END_TOLERANCE:
             what = "the path leaves the workspace box"
+            if is_far:
+                what += " so far that nothing else was checked (are all positions in metres?)"
             self._violation(what, float(outside[worst]), 0.0, "mm", positions[worst])
+        return is_far
 
     def _check_ends(self, ends: tuple[str, str]) -> None:
         scene, poses = self.scene, self.path.poses

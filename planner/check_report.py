@@ -91,7 +91,8 @@ class CheckReport:
 
     Attributes:
         length: Distance travelled by the platform's origin, [m].
-        samples: Poses at which distances were computed.
+        samples: Poses at which distances were computed; 0 for a path far outside the workspace box,
+            of which nothing else is known.
         obstacle_clearance: The smallest; None in a scene without obstacles.
         proved_obstacle_clearance: [m]; infinite without obstacles.
         required_obstacle_clearance: [m].
@@ -148,6 +149,8 @@ class CheckReport:
 
     def facts(self) -> list[tuple[str, str]]:
         """Human-readable figures of the check: name and value."""
+        if not self.samples:
+            return [("length", f"{self.length * 1000:.1f} mm, no pose checked")]
         own = self.self_clearance
         facts = [
             ("length", f"{self.length * 1000:.1f} mm, {self.samples} poses checked"),
@@ -185,14 +188,14 @@ class CheckReport:
             "proved_obstacle_clearance_mm": _finite(self.proved_obstacle_clearance * 1000.0),
             "required_obstacle_clearance_mm": self.required_obstacle_clearance * 1000.0,
             "self_clearance": self.self_clearance.as_dict(),
-            "proved_self_clearance_mm": self.proved_self_clearance * 1000.0,
+            "proved_self_clearance_mm": _finite(self.proved_self_clearance * 1000.0),
             "required_self_clearance_mm": self.required_self_clearance * 1000.0,
             "exactness_mm": self.exactness * 1000.0,
             "min_tension_n": _finite(self.min_tension),
             "max_tension_n": _finite(self.max_tension),
             "capacity_margin_n": _finite(self.capacity_margin),
             "proved_capacity_margin_n": _finite(self.proved_capacity_margin),
-            "max_cable_speed_mm_s": self.max_cable_speed * 1000.0,
+            "max_cable_speed_mm_s": _finite(self.max_cable_speed * 1000.0),
         }
 
 

@@ -62,7 +62,7 @@ def require_feasible_length(scene: Scene, longest: float) -> None:
         f"no path of at most {longest * 1e3:.1f} mm joins start and goal: the straight line is"
         f" {straight * 1e3:.1f} mm long",
         where=f"scene {scene.name}",
-        next_step="allow a longer path with --longest-mm, or leave it out",
+        next_step="allow a longer path with `longest=`, or leave it out",
         values={"longest_mm": longest * 1e3, "straight_mm": straight * 1e3},
     )
 
@@ -113,9 +113,9 @@ def _require_same_orientation(scene: Scene, leg: Leg) -> None:
         raise BadInput(
             f"start and {leg.end} differ in orientation by {np.degrees(angle):.3g} deg",
             where=f"scene {leg.scene.name}",
-            why="without --free-rotation the search keeps the platform's orientation",
-            next_step=f"plan with --free-rotation (the scene then needs rotation_limits), or give"
-            f" the {leg.end} the start's rotation_wxyz",
+            why="without `free_rotation=True` the search keeps the platform's orientation",
+            next_step="plan with `free_rotation=True` (the scene then needs rotation_limits), or"
+            f" give the {leg.end} the start's rotation_wxyz",
             values={"angle_deg": float(np.degrees(angle))},
         )
 

@@ -11,9 +11,8 @@ from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from model.errors import BadInput, Fault, NoSolution, require_types
+from model.errors import BadInput, Fault, NoSolution, require_text, require_types, sequence_of
 from model.files.documents import PoseDocument
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import StopDocument
@@ -134,7 +133,7 @@ def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> S
         raise BadInput(
             "a scene with stops cannot have a limit on the path length",
             why="each leg is planned on its own, without knowing the others' lengths",
-            next_step="leave out --longest-mm, or plan from stop to stop",
+            next_step="leave out `longest=`, or plan from stop to stop",
         )
     if not rounds:
         return [settings] * count
@@ -155,17 +154,15 @@ def _joined(routes: Sequence[Route]) -> tuple[Route, tuple[int, ...]]:
         raw=_end_to_end([route.raw for route in routes]),
         nodes=np.concatenate([route.nodes for route in routes]),
         parents=np.concatenate(
-            [_offset(route.parents, n) for route, n in zip(routes, before, strict=True)]
+            [
+                np.where(r.parents < 0, -1, r.parents + n)
+                for r, n in zip(routes, before, strict=True)
+            ]
         ),
         iterations=sum(route.iterations for route in routes),
         edge_checks=sum(route.edge_checks for route in routes),
     )
     return joined, tuple(accumulate(lengths[:-1]))
-
-
-def _offset(parents: NDArray[np.int64], before: int) -> NDArray[np.int64]:
-    """Parents after ``before`` other nodes; roots stay -1."""
-    return np.where(parents < 0, -1, parents + before)
 
 
 def _end_to_end(paths: Sequence[Array]) -> Array:
@@ -327,14 +324,16 @@ def plan_from_waypoints(
         BadInput: There are fewer than two waypoints, or ``stops`` does not match the scene's stops.
         PlanRejected: With every violation: what, by how much and where.
     """
+    waypoints = sequence_of("waypoints", waypoints)
     require_types((rig, Rig), (scene, Scene), *((pose, Pose) for pose in waypoints))
+    require_text(author=author)
     if len(waypoints) < 2:
         raise BadInput(
             f"a path needs two waypoints, not {len(waypoints)}",
             where=f"plan for {rig.name} in {scene.name}",
             next_step="start at scene.start and end at scene.goal",
         )
-    stops = [whole_number("the waypoint of a stop", index) for index in stops]
+    stops = [whole_number("the waypoint of a stop", k) for k in sequence_of("stops", stops)]
     report = check_path(rig, scene, waypoints, stops)
     if not report.passed:
         raise PlanRejected(

@@ -6,10 +6,10 @@ import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
-from model.errors import BadInput, NoSolution
-from model.files.documents import SEED_LARGEST, WHOLE_LARGEST
+from model.errors import BadInput, NoSolution, real_number
+from model.files.documents import LARGEST, SEED_LARGEST, WHOLE_LARGEST
 from planner.path import Progress
 from planner.rrt.variants import TEXT, AlgorithmVariant, ConeDraw, FailureRate, Focus, Steer
 
@@ -130,15 +130,15 @@ class Weights:
         """Refuses weights that leave nothing to minimise.
 
         Raises:
-            BadInput: A weight is negative or not finite, or neither the length nor the kinematic
-                cost has one.
+            BadInput: A weight is negative or larger than files hold, or neither the length nor
+                the kinematic cost has one.
         """
         for entry in fields(self):
             value = getattr(self, entry.name)
-            if not 0.0 <= value < math.inf:
+            if not 0.0 <= value <= LARGEST:
                 raise BadInput(
                     f"the weight of {entry.name} must be 0 or more, it is {value:g}",
-                    next_step="leave it out, or give it a finite number",
+                    next_step=f"leave it out, or give it a number of at most {LARGEST:g}",
                 )
         if self.length + self.kinematic == 0.0:
             raise BadInput(
@@ -193,11 +193,12 @@ class AnytimeSettings:
             BadInput: The seed or the rounds are out of range, or a limit is not positive.
         """
         object.__setattr__(self, "seed", whole_number("the seed", self.seed, most=SEED_LARGEST))
-        if not 0.0 < self.budget < math.inf:
-            raise BadInput(f"the budget must be above 0 ms, it is {self.budget * 1e3:g} ms")
+        if not 0.0 < self.budget * 1e3 <= LARGEST:
+            what = f"the budget must be above 0 ms and finite, it is {self.budget * 1e3:g} ms"
+            raise BadInput(what)
         if self.rounds is not None:
             object.__setattr__(self, "rounds", whole_number("rounds", self.rounds, least=1))
-        if not self.longest > 0.0:
+        if not (0.0 < self.longest * 1e3 <= LARGEST or self.longest == math.inf):
             raise BadInput(f"the longest path must be above 0 mm, not {self.longest * 1e3:g} mm")
 
     def is_over(self, rounds: int, spent: float, least: int = LEAST_ROUNDS) -> bool:
@@ -216,7 +217,7 @@ class AnytimeSettings:
     @property
     def longer(self) -> str:
         """How a user makes the search longer."""
-        return "raise --budget-ms" if self.rounds is None else "raise --rounds"
+        return "raise `budget=`" if self.rounds is None else "raise `rounds=`"
 
     def not_found(self, rounds: int, gap: float) -> str:
         """Message after rounds without a path; ``gap`` between the trees, [m]."""
@@ -236,7 +237,7 @@ class AnytimeSettings:
             where=where,
             why=f"the path found is {length:.1f} mm long, the straight line"
             f" {straight * 1e3:.1f} mm",
-            next_step=f"allow a longer path, or {self.longer}; `--cost length` without a limit"
+            next_step=f"allow a longer path, or {self.longer}; `cost='length'` without a limit"
             " shows how short paths can be",
             values={**values, "longest_mm": limit, "found_mm": length},
         )
@@ -279,6 +280,8 @@ _OPTIONS = {
     "adaptive": (*_PAPER, "failure_rate", "focus", "cone_draw"),
     "goal-bias": _PAPER,
 }
+_ARGUMENTS = {"weight": "weights", "budget_ms": "budget", "longest_mm": "longest"}
+"""Arguments of `cdpr.plan` with another name than the option."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -289,7 +292,7 @@ class PlanningOptions:
         planner: Which planner searches.
         seed: Of the random numbers.
         cost: Objective; when left out ``length``, or ``kinematic`` for the paper's planners.
-        weight: Weights of a sum of objectives, by name, or as texts ``NAME=NUMBER``.
+        weight: Weights of a sum of objectives, by name.
         budget_ms: Optimal: time to find and improve a path.
         rounds: Optimal: rounds instead of the budget, one number or one per leg; reproducible.
         longest_mm: Optimal: length limit of the path.
@@ -307,7 +310,7 @@ class PlanningOptions:
     planner: PlannerName = "optimal"
     seed: int = 0
     cost: Objective | None = None
-    weight: Mapping[str, float] | Sequence[str] = ()
+    weight: Mapping[str, float] = field(default_factory=dict)
     budget_ms: float | None = None
     rounds: Sequence[int] = ()
     longest_mm: float | None = None
@@ -325,10 +328,19 @@ class PlanningOptions:
 def settings_from_options(options: PlanningOptions) -> Settings:
     """The settings of the planner chosen.
 
+    Messages name the arguments of `cdpr.plan`; the command line names its options instead.
+
     Raises:
         BadInput: An option does not apply to the planner, options contradict each other, or a
             value cannot be used.
     """
+    for name in ("planner", "cost", "mode"):
+        value = getattr(options, name)
+        if not isinstance(value, str | None):
+            raise BadInput(f"the {name} must be text, it is {value!r}")
+    if not isinstance(options.weight, Mapping):
+        what = f"the weights must be a mapping such as {{'length': 1.0}}, not {options.weight!r}"
+        raise BadInput(what)
     if options.planner not in _OPTIONS:
         raise BadInput(
             f"unknown planner {options.planner!r}", next_step=f"use one of: {', '.join(_OPTIONS)}"
@@ -344,34 +356,36 @@ def _refuse_unused(options: PlanningOptions) -> None:
     known = {name for names in _OPTIONS.values() for name in names}
     unused = [name for name in sorted(known - set(own)) if _is_given(getattr(options, name))]
     if unused:
-        named = ", ".join("--" + name.replace("_", "-") for name in unused)
+        named = ", ".join(f"`{_ARGUMENTS.get(name, name)}=`" for name in unused)
         raise BadInput(
-            f"--planner {options.planner} does not take {named}",
-            next_step="leave it out, or choose another planner; see `cdpr plan --help`",
+            f"`planner={options.planner!r}` does not take {named}",
+            next_step="leave it out, or choose another planner",
         )
     if options.steer is not None and options.mode != "paper":
         raise BadInput(
-            "--steer applies only to --mode paper; RRT* steps never pass the sample",
-            next_step="pass --mode paper as well, or leave out --steer",
+            "`steer=` applies only to `mode='paper'`; RRT* steps never pass the sample",
+            next_step="pass `mode='paper'` as well, or leave out `steer=`",
         )
 
 
 def _is_given(value: object) -> bool:
-    return value is not None and value is not False and value not in ((), [], {})
+    if isinstance(value, list | tuple | Mapping):
+        return bool(value)
+    return value is not None and value is not False
 
 
 def _optimal_settings(options: PlanningOptions) -> OptimalSettings | TurningSettings:
     if options.weight and options.cost is not None:
         raise BadInput(
-            "--cost and --weight contradict each other", next_step="leave out one of them"
+            "`cost=` and `weights=` contradict each other", next_step="leave out one of them"
         )
     if options.budget_ms is not None and options.rounds:
         raise BadInput(
-            "--budget-ms and --rounds contradict each other", next_step="leave out one of them"
+            "`budget=` and `rounds=` contradict each other", next_step="leave out one of them"
         )
     budget = options.budget_ms
     given: dict[str, Any] = {} if budget is None else {"budget": budget / 1000.0}
-    cost = options.cost or "length"
+    cost = "length" if options.cost is None else options.cost
     _require_objective(cost)
     return (TurningSettings if options.free_rotation else OptimalSettings)(
         weights=_weights(options.weight) if options.weight else OBJECTIVES[cost],
@@ -389,44 +403,28 @@ def _require_objective(name: str) -> None:
         )
 
 
-def _weights(given: Mapping[str, float] | Sequence[str]) -> Weights:
-    if isinstance(given, Mapping):
-        for name in given:
-            _require_objective(name)
-        return Weights(**given)
-    names = get_args(Objective)
-    read: dict[str, float] = {}
-    for text in given:
-        name, _, number = text.partition("=")
-        if name in read:
-            raise BadInput(f"--weight {text}: {name!r} appears twice", next_step="give it once")
-        if name not in names:
-            raise BadInput(
-                f"--weight {text}: {name!r} is not an objective",
-                next_step=f"use {', '.join(names)}",
-            )
-        try:
-            read[name] = float(number)
-        except ValueError:
-            raise BadInput(
-                f"--weight {text}: {number!r} is not a number", next_step="write --weight length=1"
-            ) from None
-    return Weights(**read)
+def _weights(given: Mapping[str, float]) -> Weights:
+    for name in given:
+        _require_objective(name)
+    numbers = {name: real_number(f"the weight of {name}", x) for name, x in given.items()}
+    return Weights(**numbers)
 
 
 def _paper_settings(options: PlanningOptions) -> PlannerSettings:
     cost = options.cost
+    if cost is not None:
+        _require_objective(cost)
     if cost in ("clearance", "capacity"):
         raise BadInput(
-            f"--planner {options.planner} has no cost {cost!r}",
-            next_step="use --planner optimal, or --cost kinematic or length",
+            f"`planner={options.planner!r}` has no cost {cost!r}",
+            next_step="use `planner='optimal'`, or the cost 'kinematic' or 'length'",
         )
     most = options.max_iterations
     given: dict[str, Any] = {} if most is None else {"max_iterations": most}
     return PlannerSettings(
         sampler="adaptive" if options.planner == "adaptive" else "goal-bias",
         cost="length" if cost == "length" else "kinematic",
-        mode=options.mode or "rewire",
+        mode="rewire" if options.mode is None else options.mode,
         seed=options.seed,
         readings=_readings(options),
         **given,

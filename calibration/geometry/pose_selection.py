@@ -12,7 +12,7 @@ from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.model import RigModel
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from model.clearance import ClearanceModel
-from model.errors import NoSolution
+from model.errors import NoSolution, require_types
 from model.files.documents import PoseDocument
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument, StopDocument
@@ -27,7 +27,7 @@ from model.statics.tension_distribution import TensionInfeasible
 from model.statics.wrench_sets import rms_anchor_radius
 from model.winches import WinchMap
 from planner.planning import plan_path
-from planner.settings import OBJECTIVES, TurningSettings
+from planner.settings import OBJECTIVES, TurningSettings, whole_number
 
 STEP_OF_TURN = float(np.radians(1.0))
 """Step in which rotations from the home orientation are checked for collisions, [rad]."""
@@ -263,9 +263,12 @@ def measurement_poses(
         listener: Receives the progress.
 
     Raises:
-        BadInput: The seed is out of range.
+        BadInput: An argument is of another type, or the seed is out of range.
         NoSolution: Too few poses are feasible and free, or there is no path between two.
     """
+    require_types((rig, Rig), (scene, Scene), (listener, Listener))
+    count = whole_number("count", count, least=1)
+    candidates = whole_number("candidates", candidates, least=1)
     settings = TurningSettings(weights=OBJECTIVES["length"], seed=seed, rounds=ROUNDS)
     room = RESERVE_SHARE * (rig.max_tension - rig.min_tension) if reserve is None else reserve
     of_poses = (0.3e-3,) * 3 + (radians(0.05),) * 3

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -41,6 +41,7 @@ class DetectedBoard:
     twice: tuple[int, ...] = ()
 
 
+@runtime_checkable
 class Board(Protocol):
     """Interface of a board for `calibration.intrinsics.calibrate`."""
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import inspect
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import wraps
@@ -19,7 +20,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints, overload
 
 import typer
 
-from model.errors import BadInput, StoppedByOperator
+from model.errors import BadInput, CdprError, StoppedByOperator
 from model.files.output import file_identity, refuse_overwriting
 from model.files.reading import shown
 
@@ -71,7 +72,8 @@ def _declaration(
 def as_command(verb: Callable[..., None]) -> Callable[..., None]:
     """The verb with one parameter per option, annotated as Typer reads it.
 
-    It checks the values first. Ctrl-C outside a run counts as the operator's stop.
+    It checks the values first. Errors name its options where the library names its arguments.
+    Ctrl-C outside a run counts as the operator's stop.
     """
     expanded: dict[str, list[inspect.Parameter]] = {}
     groups: dict[str, Any] = {}
@@ -91,6 +93,9 @@ def as_command(verb: Callable[..., None]) -> Callable[..., None]:
             for name, group in groups.items():
                 values[name] = group(**{p.name: values.pop(p.name) for p in expanded[name]})
             verb(**values)
+        except CdprError as error:
+            name_options(error, typed)
+            raise
         except KeyboardInterrupt:
             raise StoppedByOperator("interrupted") from None
 
@@ -119,6 +124,33 @@ def _typed(name: str, declared: Field[Any]) -> str:
     if declared.metadata["kind"] is typer.Argument:
         return name
     return max(declared.metadata["names"], key=len, default=f"--{name.replace('_', '-')}")
+
+
+_ARGUMENT = re.compile(r"`([a-z_]+)=([^`]*)`")
+_UNIT = re.compile(r"_(mm|ms|n|mm_s)$")
+_OTHER_NAMES = {"realtime": "fast", "start": "simulated_start", "length": "mm"}
+"""Arguments of library functions, and the options named otherwise."""
+
+
+def name_options(error: CdprError, options: Mapping[str, str]) -> None:
+    """Replaces arguments of library functions in a message, such as ```budget=```, by options.
+
+    Args:
+        error: Changed in place.
+        options: How the user types them, such as ``--budget-ms``, by parameter name.
+    """
+    by_name = {_UNIT.sub("", name): typed for name, typed in options.items()}
+
+    def as_typed(found: re.Match[str]) -> str:
+        name, value = _UNIT.sub("", found.group(1)), found.group(2).strip("'")
+        for known in (name, name.removesuffix("s"), _OTHER_NAMES.get(name)):
+            if known in by_name:
+                shown = "" if value in ("True", "False") else value
+                return f"{by_name[known]} {shown}".rstrip()
+        return found.group()
+
+    for part in ("what", "where", "why", "next_step"):
+        setattr(error, part, _ARGUMENT.sub(as_typed, getattr(error, part)))
 
 
 def given_options(group: Any) -> dict[str, object]:

@@ -33,7 +33,14 @@ from model.rig import load_rig
 from model.scene import load_scene
 from planner.planning import plan_path
 from planner.rrt.variants import ConeDraw, FailureRate, Focus, Steer
-from planner.settings import Mode, Objective, PlannerName, PlanningOptions, settings_from_options
+from planner.settings import (
+    OBJECTIVES,
+    Mode,
+    Objective,
+    PlannerName,
+    PlanningOptions,
+    settings_from_options,
+)
 
 _PANEL = "Open readings of the paper's text (docs/paper.md)"
 
@@ -79,6 +86,7 @@ class SearchOptions:
     def with_seed(self, seed: int) -> PlanningOptions:
         """As options of the planner's library."""
         given: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
+        given["weight"] = _weights(self.weight or [])
         return PlanningOptions(seed=seed, **{k: v for k, v in given.items() if v is not None})
 
 
@@ -142,6 +150,30 @@ def plan(
     next_step = f"cdpr check {file}, then {run_it}"
     facts = [*begun, *plan_facts(document), ("next", next_step)]
     present(as_json, {"plan": str(output), **plan_as_dict(document)}, f"plan {output}", facts)
+
+
+def _weights(texts: Sequence[str]) -> dict[str, float]:
+    """Weights of a sum of objectives, by name, from texts ``NAME=NUMBER``.
+
+    Raises:
+        BadInput: One cannot be read, or appears twice.
+    """
+    read: dict[str, float] = {}
+    for text in texts:
+        name, _, number = text.partition("=")
+        if name in read:
+            raise BadInput(f"--weight {text}: {name!r} appears twice", next_step="give it once")
+        if name not in OBJECTIVES:
+            raise BadInput(
+                f"--weight {text}: {name!r} is not an objective",
+                next_step=f"use {', '.join(OBJECTIVES)}",
+            )
+        try:
+            read[name] = float(number)
+        except ValueError:
+            what = f"--weight {text}: {number!r} is not a number"
+            raise BadInput(what, next_step="write --weight length=1") from None
+    return read
 
 
 def _via_point(text: str) -> Pose:

@@ -41,7 +41,7 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
         if not in_process:
             raise BadInput(
                 "no camera was named",
-                where="--camera",
+                where="`cameras=`",
                 why="the drives are not simulated in this process, so no image can be rendered",
                 next_step="name a real camera: --camera INDEX, in Python cameras=INDEX; or run"
                 " without one: --no-camera, cameras=[]",
@@ -50,7 +50,7 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
     if wanted == SYNTHETIC and not in_process:
         raise BadInput(
             "the synthetic camera needs drives simulated in this process",
-            where="--camera",
+            where="`cameras=`",
             next_step="use the interface 'virtual', a real camera, or none: --no-camera, in Python"
             " cameras=[]",
         )
@@ -64,7 +64,7 @@ def _require_live(source: str) -> None:
     if not is_camera(source):
         raise BadInput(
             f"{source!r} is not a live camera source",
-            where="--camera",
+            where="`cameras=`",
             why="images must be taken during the motion, not read from a file or folder",
             next_step="name an index such as 0, a device such as /dev/video0, or an address",
         )
@@ -92,7 +92,7 @@ def choose_cameras(
         choose_camera(rig, SYNTHETIC, without, in_process)
         return dict.fromkeys(rig.cameras, SYNTHETIC)
     if rig.cameras:
-        chosen = parse_camera_sources(rig, wanted, None, "--camera")
+        chosen = parse_camera_sources(rig, wanted, None, "`cameras=`")
         for source in chosen.values():
             choose_camera(rig, source, without, in_process)
         return chosen
@@ -134,10 +134,10 @@ def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Ca
     if len(wanted) != 1:
         raise BadInput(
             f"{len(wanted)} cameras are given; only one can be used",
-            where="--camera",
+            where="`camera=`",
             next_step="name the one that sees the most tags from the shortest distance",
         )
-    ((camera, source),) = parse_camera_sources(rig, wanted, None, "--camera").items()
+    ((camera, source),) = parse_camera_sources(rig, wanted, None, "`camera=`").items()
     choose_camera(rig, source, False, in_process)
     return camera, source
 
@@ -161,7 +161,7 @@ def parse_camera_sources(
         return {rig.camera(wanted): sources[0]}
     if wanted is not None:
         raise BadInput(
-            "--camera is for a single source without a name",
+            "`camera=` is for a single source without a name",
             where=where,
             next_step="leave it out, or name the camera in the source: NAME=SOURCE",
         )
@@ -239,14 +239,13 @@ def require_synthetic_images(sources: Iterable[str], fast: bool) -> None:
     """Requires synthetic cameras in simulated time, where real image times are meaningless.
 
     Raises:
-        BadInput: ``--fast`` is given, and a source is a real camera.
+        BadInput: A run is fast, and a source is a real camera.
     """
     real = [source for source in sources if source != SYNTHETIC]
     if fast and real:
         raise BadInput(
-            "--fast needs synthetic cameras",
-            where=f"--camera {real[0]}",
+            "`realtime=False` needs synthetic cameras",
+            where=f"`cameras={real[0]}`",
             why="a real camera takes images in real time; a fast run would end before",
-            next_step="leave out --fast (in Python realtime=False), or pass --camera synthetic"
-            " (cameras='synthetic')",
+            next_step="leave out `realtime=False`, or pass `cameras='synthetic'`",
         )

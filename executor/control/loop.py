@@ -21,7 +21,7 @@ from executor.control.sync_master import SyncMaster, changed_states
 from executor.safety.fault_messages import Alarm, StopReaction, shared_causes
 from executor.safety.gate import Purpose
 from executor.state_machine import ON_PATH, CycleRecord, Event, LoopEvent, Machine, State
-from executor.supervision import OperatorRequests
+from executor.supervision import OperatorRequests, in_one_line, record_failure
 from executor.trajectory.setpoints import CheckedSetpoints
 from executor.trajectory.time_scaling import smooth_step
 from model.errors import CdprError, Refused
@@ -278,9 +278,7 @@ class Loop:
         try:
             call()
         except Exception as error:
-            self._listener_error = (
-                self._listener_error or f"recording failed: {_in_one_line(error)}"
-            )
+            self._listener_error = self._listener_error or record_failure(error)
 
     def _handle_alarms(self, alarms: tuple[Alarm, ...]) -> None:
         """Reacts to alarms, and to a record that cannot be kept."""
@@ -359,7 +357,7 @@ class Loop:
         try:
             self._master.stop_now()
         except Exception as error:
-            text = f"{_in_one_line(error)}; the drives stop on loss of the master"
+            text = f"{in_one_line(error)}; the drives stop on loss of the master"
             self._report("stop_not_sent", text)
 
     def _drain(self) -> None:
@@ -373,7 +371,7 @@ class Loop:
             before = self._master.status
             left = self._master.leave(self._one_more_latched)
         except Exception as error:  # the drives have been commanded to stop; nothing more is needed
-            text = f"{_in_one_line(error)}; the drives stop on loss of the master"
+            text = f"{in_one_line(error)}; the drives stop on loss of the master"
             self._report("bus_lost", text)
             return
         if before is None or left.holding:
@@ -423,11 +421,6 @@ class Loop:
     def _report(self, code: str, text: str) -> None:
         event = LoopEvent(self._cycle, self._clock.time, code, text)
         self._call_listener(lambda: self._on_event(event))
-
-
-def _in_one_line(error: Exception) -> str:
-    """Message of an error, without cause and advice."""
-    return error.what if isinstance(error, CdprError) else f"{type(error).__name__}: {error}"
 
 
 _ACTIVE = ON_PATH | {State.ENABLING, State.APPROACHING, State.SECURING}

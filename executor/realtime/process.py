@@ -27,7 +27,8 @@ from executor.realtime.child import (
 from executor.realtime.scheduling import interrupts_blocked, one_thread
 from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedRequests, unpack_event
 from executor.state_machine import CycleRecord, LoopEvent, State
-from model.errors import CdprError, Fault, Refused, StoppedByOperator
+from executor.supervision import record_failure
+from model.errors import Fault, Refused, StoppedByOperator
 from model.progress import SILENT, Listener
 
 #: Interval of reading the rings and of the heartbeat, [s].
@@ -228,7 +229,5 @@ class RealTimeProcess:
         """A record that cannot be kept causes a path stop; supervision continues."""
         try:
             take()
-        except CdprError as error:
-            self._board.complain(f"recording failed: {error.what}")
         except Exception as error:
-            self._board.complain(f"recording failed: {type(error).__name__}: {error}")
+            self._board.complain(record_failure(error))

@@ -78,7 +78,7 @@ def run_end(folder: RunFolder) -> RunEnd:
     if final_state == NOT_ENDED:
         raise _unknown("the run did not finish, so its last cycles are not on record", where)
     if not len(cycles):
-        raise BadInput("the run has no cycle", where=where, next_step="plan with --start-mm")
+        raise BadInput("the run has no cycle", where=where, next_step="plan with `start=`")
     stops, leg = plan.scene.document.stops, int(cycles.leg[-1])
     if not 1 <= leg <= len(stops) + 1:
         what = f"the run ended on leg {leg}, its plan has {len(stops) + 1}"
@@ -184,7 +184,7 @@ def scene_after(
         raise BadInput(
             "the run ended at the scene's goal: nothing remains to be done",
             where=str(folder),
-            next_step="give another scene, or another goal with --goal-mm",
+            next_step="give another scene, or another goal with `goal=`",
         )
     _require_room(after, rig)
     return after, done, end
@@ -205,12 +205,12 @@ def _require_room(scene: Scene, rig: Rig) -> None:
     near, own = model.smallest(scene.start), model.self_clearance(scene.start)
     pairs = [(own, scene.self_clearance, "set clearance.self_mm in the scene to")]
     if near is not None:
-        pairs.insert(0, (near, scene.obstacle_clearance, "pass --clearance-mm"))
+        pairs.insert(0, (near, scene.obstacle_clearance, "pass `clearance=`"))
     for nearest, asked, ask in pairs:
         if nearest.distance >= asked + CLEARANCE_RESERVE:
             continue
         possible = math.floor((nearest.distance - CLEARANCE_RESERVE) * 1e5) / 100.0
-        step = "move the platform away by hand and plan from its new pose with --start-mm"
+        step = "move the platform away by hand and plan from its new pose with `start=`"
         if possible > 0.0:
             step = f"{ask} {possible:g}, which then holds for the whole new plan; or {step}"
         raise BadInput(

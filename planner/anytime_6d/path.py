@@ -214,7 +214,7 @@ def turning_problem(
         raise BadInput(
             "the scene has no limits for rotation",
             where=f"scene {scene.name}",
-            why="--free-rotation searches orientations within the scene's rotation_limits",
+            why="`free_rotation=True` searches orientations within the scene's rotation_limits",
             next_step="add a line such as `rotation_limits: {tilt_deg: 10, turn_deg: 30}`",
         )
     rotation = np.array(scene.start.rotation)

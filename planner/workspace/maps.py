@@ -68,10 +68,11 @@ class Question:
             length: [m]; the root mean square radius of the anchors when left out.
 
         Raises:
-            BadInput: The length is not positive.
+            BadInput: The matrix is not a rotation, or the length is not positive.
         """
         if rotation is None:
             rotation = (scene.start if scene else rig.home).rotation
+        rotation = Pose(np.zeros(3), rotation).rotation
         names = list(OF_THE_ROBOT)
         if scene is not None and scene.obstacles:
             names.append(OBSTACLE_CLEARANCE)

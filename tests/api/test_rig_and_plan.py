@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -265,6 +267,18 @@ def test_arguments_that_contradict_each_other_are_refused(rig: cdpr.Rig, scene: 
         (lambda *_: cdpr.open_camera("r.yaml", 0), "a Rig", "cdpr.load_rig('r.yaml')"),
         (lambda *_: cdpr.track("r.yaml", 0), "a Rig, not text", "cdpr.load_rig('r.yaml')"),
         (lambda *_: cdpr.workspace_map("r.yaml"), "a Rig", "cdpr.load_rig('r.yaml')"),
+        (lambda rig, scene: rig.at(rig.home, scene), "a Load, not Scene", "scene.load"),
+        (lambda rig, _: rig.plot([0, 0, 1]), "a Pose, not list", "cdpr.Pose.level([0, 0, 1])"),
+        (lambda rig, scene: rig.plot(scene), "a Pose, not Scene", "cdpr.Pose.level"),
+        (lambda rig, _: rig.clipped([0, 0, 1]), "a Pose, not list", "Pose.level([0, 0, 1])"),
+        (lambda _, scene: scene.changed(start=[0, 0, 1]), "a Pose, not list", "Pose.level("),
+        (lambda rig, scene: cdpr.plan(rig, scene, listener=print), "a Listener", "subclass"),
+        (lambda rig, _: cdpr.run(rig, rig), "a Plan, not Rig", "cdpr.load_plan(...)"),
+        (lambda *_: cdpr.calibrate_camera("images", "board"), "a Board, not text", "Chessboard"),
+        (lambda *_: cdpr.calibrate_rig("r.yaml", []), "a Rig", "cdpr.load_rig('r.yaml')"),
+        (lambda *_: cdpr.locate_camera("r.yaml", 0), "a Rig", "cdpr.load_rig('r.yaml')"),
+        (lambda *_: cdpr.locate_tags("r.yaml", 0), "a Rig", "cdpr.load_rig('r.yaml')"),
+        (lambda rig, _: cdpr.measurement_poses(rig, "s.yaml"), "a Scene", "load_scene('s.yaml')"),
     ],
 )
 def test_a_path_in_place_of_an_object_is_refused_with_what_loads_it(
@@ -273,6 +287,92 @@ def test_a_path_in_place_of_an_object_is_refused_with_what_loads_it(
     with pytest.raises(cdpr.BadInput, match=f"expected {what}") as caught:
         call(rig, scene)
     assert step in caught.value.next_step
+
+
+WRONG: list[Any] = [
+    *(None, True, 3, -1, 1.5, math.nan, math.inf, 10**30, "x", "", b"x", object(), print),
+    *([], [None], ["x"], [[1], [2, 3]], {}, {"x": 1}, {"length": "1"}, {"z": 0.4}, ("z", 0.4)),
+    *([("q", 0.4)], [("Z", 0.4)], [("xy", 0.1)], [("", 0.4)], [(2, 0.4)], [("z", "0.4")]),
+    *(np.zeros(3), np.zeros((3, 3)), np.ones((3, 3)), np.array([0.01]), np.array(["x"])),
+]
+
+
+def calls_with_a_wrong_argument(name: str) -> Callable[[cdpr.Rig, cdpr.Scene, Any], object]:
+    """A quick call of the library with one argument replaced."""
+    verb, _, argument = name.partition(" ")
+    match verb:
+        case "plan":
+            return lambda rig, scene, x: cdpr.plan(rig, scene, **{"rounds": 1, argument: x})
+        case "waypoints":
+            return lambda rig, scene, x: cdpr.plan_from_waypoints(
+                rig, scene, **{"waypoints": [scene.start, scene.start], argument: x}
+            )
+        case "workspace_map":
+            quick = {"slices": [("z", 0.4)], "volume": False, "step": 0.2, "workers": 1}
+            return lambda rig, scene, x: cdpr.workspace_map(rig, scene, **{**quick, argument: x})
+        case "changed":
+            return lambda _, scene, x: scene.changed(**{argument: x})
+        case "rig":
+            return lambda rig, _, x: getattr(rig, argument)(x)
+        case _:
+            return lambda *given: getattr(cdpr, verb)(given[-1])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("plan " + name for name in ("planner", "cost", "weights", "budget", "rounds", "seed")),
+        *("plan " + name for name in ("longest", "free_rotation", "start", "goal", "via")),
+        *("plan " + name for name in ("from_run", "clearance", "mode", "max_iterations")),
+        *("waypoints waypoints", "waypoints stops", "waypoints author"),
+        *("workspace_map " + name for name in ("slices", "step", "rotation", "workers")),
+        *("changed start", "changed goal", "changed clearance"),
+        *("rig at", "rig clipped"),
+        *("load_rig", "load_scene", "load_plan", "load_run", "load_calibration", "report"),
+    ],
+)
+def test_only_errors_of_cdpr_come_from_wrong_arguments(
+    rig: cdpr.Rig, scene: cdpr.Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    call = calls_with_a_wrong_argument(name)
+    for value in WRONG:
+        with suppress(cdpr.CdprError):
+            call(rig, scene, value)
+
+
+def test_a_wrong_argument_is_named_with_its_value(
+    rig: cdpr.Rig, scene: cdpr.Scene, plan: cdpr.Plan
+) -> None:
+    for call, text in (
+        (lambda: cdpr.plan(rig, scene, budget="1"), "budget must be a number [s], it is '1' (str)"),
+        (lambda: cdpr.plan(rig, scene, longest=[1.0]), "longest must be a number [m]"),
+        (lambda: cdpr.plan(rig, scene, free_rotation="no"), "free_rotation must be True or False"),
+        (lambda: cdpr.plan(rig, scene, via=None), "via must be a list, it is None"),
+        (lambda: cdpr.plan(rig, scene, via=rig.home), "via must be a list, it is Pose("),
+        (lambda: cdpr.plan(rig, scene, weights="length=1"), "the weights must be a mapping"),
+        (lambda: cdpr.workspace_map(rig, volume="no"), "volume must be True or False"),
+        (lambda: cdpr.workspace_map(rig, workers=0), "workers must be a whole number from 1"),
+        (lambda: cdpr.workspace_map(rig, slices=("z", 0.4)), "'z' is not a slice"),
+        (lambda: cdpr.workspace_map(rig, slices=[("xy", 0.1)]), "('xy', 0.1) is not a slice"),
+        (lambda: cdpr.workspace_map(rig, rotation=np.ones((3, 3))), "no rotation"),
+        (lambda: cdpr.load_rig(None), "the path must be a str or a pathlib.Path, it is None"),
+        (lambda: plan.save(3), "the path must be a str or a pathlib.Path, it is 3 (int)"),
+    ):
+        with pytest.raises(cdpr.BadInput, match=re.escape(text)):
+            call()  # type: ignore[no-untyped-call]
+
+
+def test_poses_to_pass_come_from_any_iterable(rig: cdpr.Rig, scene: cdpr.Scene) -> None:
+    """The poses of an iterator had been left out without a word."""
+    between = np.add(scene.start.position, [(0.0, 0.0, 0.01), (0.01, 0.0, 0.02)])
+    listed = [cdpr.Pose.level(position) for position in between]
+    wanted = cdpr.plan(rig, scene, via=listed, rounds=1)
+    assert len(wanted.stops) == 2
+    for via in (iter(listed), map(cdpr.Pose.level, between), np.array(listed, dtype=object)):
+        found = cdpr.plan(rig, scene, via=via, rounds=1)  # type: ignore[arg-type]
+        assert found.document.waypoints == wanted.document.waypoints
+        assert found.stops == wanted.stops
 
 
 def test_messages_of_the_library_name_what_a_script_passes(rig: cdpr.Rig) -> None:

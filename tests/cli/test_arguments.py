@@ -125,6 +125,30 @@ def test_the_option_is_named_as_it_was_typed(
     one_message(call(verb, *words), 2, option)
 
 
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        (
+            "`budget=` and `rounds=` exclude each other",
+            "--budget-ms and --rounds exclude each other",
+        ),
+        ("leave out `weights=`", "leave out --weight"),
+        ("pass `planner='optimal'`", "pass --planner optimal"),
+        ("without `free_rotation=True`", "without --free-rotation"),
+        ("leave out `realtime=False`", "leave out --fast"),
+        ("`start=`: add `tags`", "--start-mm: add `tags`"),
+        ("`tension=` is unknown to this verb", "`tension=` is unknown to this verb"),
+        ("write front=0", "write front=0"),
+    ],
+)
+def test_arguments_of_the_library_are_shown_as_options(text: str, shown: str) -> None:
+    names = ("budget_ms", "rounds", "weight", "planner", "free_rotation", "fast", "start_mm")
+    error = BadInput(text, where=text, why=text, next_step=text)
+    options = {name: f"--{name.replace('_', '-')}" for name in names}
+    arguments.name_options(error, options)
+    assert {error.what, error.where, error.why, error.next_step} == {shown}
+
+
 def test_track_never_draws_into_its_source_pictures(tmp_path: Path) -> None:
     source = tmp_path / "src"
     shutil.copytree(CONFIGS.parent / "examples/rig_session/pictures", source)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
 from executor.proposals import ForgetProposal
 from executor.state_machine import State
-from model.errors import Refused
+from model.errors import BadInput, Refused, StoppedByOperator
 from model.rig import Rig, load_rig, rig_from_document
 from tests.cli.plans import RIG
 
@@ -89,6 +90,27 @@ def test_a_reference_is_not_announced_as_discarded_where_none_will_be() -> None:
     none, one = asked
     assert none == "homing reference: none: absolute encoders match the rig file"
     assert one.startswith("the present homing reference, which would be discarded: valid, made")
+    assert MotionInterlock(rig).kept_reference() is None
+
+
+@pytest.mark.parametrize("answer", ["no", "yes", 1, 0, None, [], np.array([True])])
+def test_an_answer_that_is_neither_true_nor_false_confirms_nothing(answer: Any) -> None:
+    rig = rig_with("absolute")
+    MotionInterlock(rig).file.write(reference_of(rig))
+    with pytest.raises(BadInput, match="confirm must return True or False, it returned"):
+        use_rig_file_counts(rig, confirm=lambda _: answer)
+    assert MotionInterlock(rig).kept_reference() is not None
+
+
+def test_a_confirmation_may_be_of_numpy_and_must_be_a_function() -> None:
+    rig = rig_with("absolute")
+    MotionInterlock(rig).file.write(reference_of(rig))
+    with pytest.raises(StoppedByOperator):
+        use_rig_file_counts(rig, confirm=lambda _: np.bool_(False))  # type: ignore[arg-type,return-value]
+    with pytest.raises(BadInput, match="confirm must be a function"):
+        use_rig_file_counts(rig, confirm=True)  # type: ignore[arg-type]
+    assert MotionInterlock(rig).kept_reference() is not None
+    use_rig_file_counts(rig, confirm=lambda _: np.bool_(True))  # type: ignore[arg-type,return-value]
     assert MotionInterlock(rig).kept_reference() is None
 
 

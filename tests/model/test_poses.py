@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -65,9 +67,66 @@ def test_no_pose_has_a_matrix_that_is_no_rotation(turn: Vector, factor: float, r
 
 
 @given(turns)
-def test_a_quaternion_written_with_four_digits_is_a_rotation(turn: Vector) -> None:
-    written = np.round(quaternion_from_matrix(matrix_from_rotation_vector(turn)), 4)
-    assert Pose.from_quaternion([0.0, 0.0, 0.0], written).position.shape == (3,)
+def test_a_rotation_written_with_four_digits_is_made_exact(turn: Vector) -> None:
+    """So that what is checked is what a file keeps, which normalises quaternions."""
+    matrix = matrix_from_rotation_vector(turn)
+    written = np.round(quaternion_from_matrix(matrix), 4)
+    for pose in (
+        Pose.from_quaternion([0.0, 0.0, 0.0], written),
+        Pose(np.zeros(3), np.round(matrix, 4)),
+    ):
+        np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-14)
+        np.testing.assert_allclose(pose.rotation, matrix, atol=3e-4)
+        same(PoseDocument.of(pose).pose(), pose)
+        assert not pose.rotation.flags.writeable
+
+
+@given(turns, st.floats(-1e-10, 1e-10))
+def test_a_rotation_with_round_off_is_kept_as_it_is(turn: Vector, off: float) -> None:
+    matrix = matrix_from_rotation_vector(turn) * (1.0 + off)
+    np.testing.assert_array_equal(Pose(np.zeros(3), matrix).rotation, matrix)
+
+
+@given(turns, st.floats(0.0006, 3.0) | st.floats(-0.4, -0.0006))
+def test_a_quaternion_or_matrix_of_another_length_is_refused(turn: Vector, more: float) -> None:
+    matrix = matrix_from_rotation_vector(turn)
+    with pytest.raises(BadInput, match="no rotation"):
+        Pose(np.zeros(3), (1.0 + more) * matrix)
+    with pytest.raises(BadInput, match="not a unit quaternion"):
+        Pose.from_quaternion(np.zeros(3), (1.0 + 2.0 * more) * quaternion_from_matrix(matrix))
+
+
+NOT_NUMBERS: list[Any] = [
+    "abc",
+    ["a", "b", "c"],
+    [1.0, [2.0], 3.0],
+    {"x": 1.0},
+    None,
+    3.0,
+    iter(()),
+]
+
+
+@pytest.mark.parametrize("values", NOT_NUMBERS)
+def test_a_pose_of_other_things_than_numbers_is_bad_input(values: Any) -> None:
+    for make in (
+        lambda: Pose.level(values),
+        lambda: Pose(values, np.eye(3)),
+        lambda: Pose(np.zeros(3), values),
+        lambda: Pose.from_quaternion(np.zeros(3), values),
+        lambda: Pose.from_quaternion(values, [1.0, 0.0, 0.0, 0.0]),
+    ):
+        with pytest.raises(BadInput):
+            make()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e9, -1e300])
+def test_a_position_that_is_not_finite_is_refused(value: float) -> None:
+    for axis in range(3):
+        position = np.zeros(3)
+        position[axis] = value
+        with pytest.raises(BadInput, match="not finite"):
+            Pose.level(position)
 
 
 @pytest.mark.parametrize(("position", "rotation"), [([0.0] * 2, np.eye(3)), ([0.0] * 3, np.eye(4))])

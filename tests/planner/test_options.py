@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
+import numpy as np
 import pytest
 
 from model.errors import BadInput
@@ -13,6 +15,7 @@ from planner.settings import (
     PlannerSettings,
     PlanningOptions,
     TurningSettings,
+    Weights,
     settings_from_options,
 )
 
@@ -28,10 +31,11 @@ def test_units_of_options_become_si() -> None:
     assert (settings.budget, settings.longest, settings.seed) == (0.02, 0.8, 3)
 
 
-def test_weights_are_a_mapping_or_texts() -> None:
-    by_name = settings_from_options(PlanningOptions(weight={"length": 1.0, "clearance": 2.0}))
-    by_text = settings_from_options(PlanningOptions(weight=["length=1", "clearance=2"]))
-    assert by_name == by_text
+def test_weights_are_numbers_of_any_type_by_name() -> None:
+    settings = settings_from_options(
+        PlanningOptions(weight={"length": np.float32(1.0), "clearance": Fraction(2)})  # type: ignore[dict-item]
+    )
+    assert settings == OptimalSettings(weights=Weights(length=1.0, clearance=2.0))
 
 
 def test_the_papers_planners_have_their_own_cost_and_variant() -> None:
@@ -46,13 +50,25 @@ def test_the_papers_planners_have_their_own_cost_and_variant() -> None:
         ({"planner": "best"}, "unknown planner 'best'"),
         ({"cost": "time"}, "'time' is not an objective"),
         ({"weight": {"time": 1.0}}, "'time' is not an objective"),
-        ({"weight": ["length=1", "length=2"]}, "twice"),
-        ({"weight": ["length=1"], "cost": "length"}, "contradict each other"),
-        ({"budget_ms": 1.0, "rounds": (1,)}, "contradict each other"),
-        ({"mode": "paper"}, "does not take --mode"),
-        ({"planner": "adaptive", "rounds": (3,)}, "does not take --rounds"),
+        ({"weight": ["length=1"]}, "a mapping"),
+        ({"weight": "length=1"}, "a mapping"),
+        ({"weight": {"length": "1"}}, "the weight of length must be a number"),
+        ({"weight": {"length": None}}, "the weight of length must be a number"),
+        ({"weight": {"length": 1e300}}, "the weight of length"),
+        ({"weight": {"length": 1.0}, "cost": "length"}, "`cost=` and `weights=` contradict"),
+        ({"budget_ms": 1.0, "rounds": (1,)}, "`budget=` and `rounds=` contradict each other"),
+        ({"mode": "paper"}, "does not take `mode=`"),
+        ({"planner": "adaptive", "rounds": (3,)}, "does not take `rounds=`"),
+        ({"planner": "adaptive", "longest_mm": 9.0, "weight": {"length": 1.0}}, "`longest=`, `wei"),
         ({"planner": "adaptive", "cost": "clearance"}, "has no cost 'clearance'"),
+        ({"planner": "adaptive", "cost": "beauty"}, "'beauty' is not an objective"),
+        ({"planner": ["optimal"]}, "the planner must be text"),
+        ({"cost": ["length"]}, "the cost must be text"),
+        ({"cost": ""}, "'' is not an objective"),
+        ({"planner": "adaptive", "mode": ""}, "unknown mode ''"),
         ({"budget_ms": math.nan}, "budget"),
+        ({"budget_ms": 1e300}, "budget"),
+        ({"longest_mm": 1e300}, "longest path"),
     ],
 )
 def test_contradictions_are_refused(options: dict[str, object], named: str) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import pickle
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,6 +49,55 @@ def test_a_path_through_an_obstacle_is_rejected_with_every_violation() -> None:
 def test_a_path_that_misses_the_goal_is_rejected() -> None:
     with pytest.raises(PlanRejected, match="does not meet the scene's goal"):
         plan_from_waypoints(RIG, BLOCKED, [BLOCKED.start, BLOCKED.start])
+
+
+@pytest.mark.parametrize("scale", [10.0, 1000.0, 1e8])
+def test_a_path_far_outside_is_rejected_for_that_alone(scale: float) -> None:
+    """As of a waypoint in mm: sampling every 5 mm took hours and all memory."""
+    far = Pose.level(scale * np.array([-0.115, -0.185, 0.5]))
+    with pytest.raises(PlanRejected, match="so far that nothing else was checked") as rejected:
+        plan_from_waypoints(RIG, BLOCKED, [BLOCKED.start, far, BLOCKED.goal])
+    (violation,) = rejected.value.violations
+    assert violation.measured > 0.5
+    report = rejected.value.report
+    assert report.samples == 0
+    assert report.facts()
+    assert report._repr_html_()
+    json.dumps(report.as_dict(), allow_nan=False)
+
+
+def test_a_path_a_bit_outside_gets_the_whole_report() -> None:
+    above = Pose.level([*BLOCKED.start.position[:2], RIG.workspace_upper[2] + 0.05])
+    with pytest.raises(PlanRejected, match="leaves the workspace box") as rejected:
+        plan_from_waypoints(RIG, BLOCKED, [BLOCKED.start, above, BLOCKED.start])
+    report = rejected.value.report
+    assert report.samples > 10
+    assert len(report.facts()) > 4
+    assert len(rejected.value.violations) > 1
+
+
+@pytest.mark.parametrize("make", [iter, list, lambda poses: np.array(poses, dtype=object)])
+def test_waypoints_come_from_any_iterable(make: Callable[[list[Pose]], Any]) -> None:
+    plan = plan_from_waypoints(RIG, FREE, make([FREE.start, FREE.goal]))
+    assert len(plan.waypoints) == 2
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"author": 3},
+        {"author": None},
+        {"stops": 1},
+        {"stops": None},
+        {"waypoints": None},
+        {"waypoints": "path"},
+        {"waypoints": 3},
+        {"waypoints": np.zeros((3, 3))},
+    ],
+)
+def test_other_things_than_poses_stops_and_text_are_refused(arguments: dict[str, Any]) -> None:
+    with pytest.raises(BadInput):
+        plan_from_waypoints(RIG, FREE, **{"waypoints": [FREE.start, FREE.goal], **arguments})
 
 
 def test_one_waypoint_is_refused() -> None:

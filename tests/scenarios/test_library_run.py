@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from executor.recording import recorder
 from executor.recording.run_folder import RunEvent, RunFolder
 from model.errors import BadInput, StoppedByOperator
 from model.plan import Plan, load_plan
+from model.progress import Advance, Listener
 from model.rig import Rig, load_rig
 from tests.cli.plans import RIG
 
@@ -97,6 +100,107 @@ def test_ctrl_c_in_a_script_ends_in_a_coordinated_stop_that_is_on_record(
     assert folder.summary()["verdict"] == "STOPPED"
     assert folder.report.is_file()
     MotionInterlock(rig).require_free()
+
+
+@pytest.mark.parametrize("code", ["enabled", "moving", "held"])
+def test_an_exception_of_a_callback_fails_the_run_and_is_named(
+    plan: Plan, rig: Rig, tmp_path: Path, code: str
+) -> None:
+    """At any event, the last one included, after which nothing is left to stop."""
+
+    def fail(event: RunEvent) -> None:
+        if event.code == code:
+            raise ValueError("boom")
+
+    result = runner.run(
+        plan, rig, folder=tmp_path / "run", cameras=(), realtime=False, on_event=fail
+    )
+    assert any("on_event raised ValueError: boom" in line for line in result.details())
+    assert "recording failed" not in " ".join(result.details())
+    assert result.verdict == "FAILED"
+    assert result.report.is_file()
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "realtime"),
+    [
+        (KeyboardInterrupt, "enabled", False),
+        (KeyboardInterrupt, "moving", False),
+        (SystemExit, "enabled", False),
+        (SystemExit, "moving", True),
+    ],
+)
+def test_leaving_the_program_in_a_callback_stops_the_run_and_keeps_its_record(
+    plan: Plan,
+    slow_rig: Path,
+    tmp_path: Path,
+    error: type[BaseException],
+    code: str,
+    realtime: bool,
+) -> None:
+    def leave(event: RunEvent) -> None:
+        if event.code == code:
+            raise error(7)
+
+    rig = load_rig(slow_rig)
+    with pytest.raises(error, match="7"):
+        runner.run(
+            plan, rig, folder=tmp_path / "run", cameras=(), realtime=realtime, on_event=leave
+        )
+    folder = RunFolder.open(tmp_path / "run")
+    assert folder.summary()["verdict"] == "STOPPED"
+    assert folder.report.is_file()
+    MotionInterlock(rig).require_free()
+
+
+class FailingListener(Listener):
+    def note(self, text: str) -> None:
+        raise RuntimeError(text)
+
+    def progress(self, text: str, total: float | None) -> AbstractContextManager[Advance]:
+        def fail(value: float, note: str = "", text: str = "") -> None:
+            raise RuntimeError("no terminal")
+
+        return nullcontext(fail)
+
+
+def test_a_failing_listener_is_named_too(plan: Plan, rig: Rig, tmp_path: Path) -> None:
+    result = runner.run(
+        *(plan, rig),
+        folder=tmp_path / "run",
+        cameras=(),
+        realtime=False,
+        listener=FailingListener(),
+    )
+    assert result.verdict == "FAILED"
+    text = " ".join(result.details())
+    assert "listener.progress raised RuntimeError: no terminal" in text
+    assert "recording failed" not in text
+
+
+@pytest.mark.parametrize("name", ["confirm", "on_event"])
+def test_a_callback_that_cannot_be_called_is_refused_before_anything_else(
+    plan: Plan, rig: Rig, tmp_path: Path, name: str
+) -> None:
+    arguments: dict[str, Any] = {name: 3}
+    with pytest.raises(BadInput, match=f"{name} must be a function"):
+        runner.run(plan, rig, folder=tmp_path / "run", realtime=False, **arguments)
+    with pytest.raises(BadInput, match=f"{name} must be a function"):
+        jogging.jog(rig, None, to_home=True, folder=tmp_path / "run", realtime=False, **arguments)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("answer", ["no", "yes", 1, None, np.array([True])])
+def test_only_true_moves(plan: Plan, rig: Rig, tmp_path: Path, answer: Any) -> None:
+    with pytest.raises(BadInput, match="confirm must return True or False"):
+        runner.run(
+            *(plan, rig),
+            folder=tmp_path / "run",
+            cameras=(),
+            realtime=False,
+            confirm=lambda _: answer,
+        )
+    assert not (tmp_path / "run").exists()
 
 
 def test_limits_of_the_verbs_are_those_of_the_library(rig: Rig) -> None:

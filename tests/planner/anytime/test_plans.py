@@ -164,7 +164,7 @@ def test_a_longest_path_below_the_straight_distance_is_refused_before_the_search
     settings = OptimalSettings(longest=0.5, budget=3600.0)
     with pytest.raises(BadInput, match=r"500\.0 mm .* straight line is 518\.8 mm") as refusal:
         make_plan(gachon, ready_scene("environment_1"), settings)
-    assert "--longest-mm" in str(refusal.value)
+    assert "`longest=`" in str(refusal.value)
 
 
 @pytest.mark.parametrize("seed", range(4))

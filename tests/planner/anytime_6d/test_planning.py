@@ -143,7 +143,7 @@ def test_without_limits_in_the_scene_the_next_step_is_stated() -> None:
 def test_ends_of_different_orientation_need_the_option() -> None:
     with pytest.raises(BadInput, match="differ in orientation by 6 deg") as caught:
         make_plan(GACHON, RAMP)
-    assert "--free-rotation" in str(caught.value)
+    assert "`free_rotation=True`" in str(caught.value)
 
 
 def test_a_search_that_finds_nothing_states_what_blocked_it() -> None:
