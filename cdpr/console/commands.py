@@ -52,6 +52,7 @@ class PlainCommand(_Command):
         "home",
         "reset",
         "release",
+        "read_drives",
         "run",
         "jog_begin",
         "cable_begin",

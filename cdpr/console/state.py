@@ -30,6 +30,8 @@ from model.rig import Rig
 SHOWN = 4000
 #: Exit code of a verb that the operator stopped.
 STOPPED = 130
+#: Time for which the page shows that a press did not begin, [s].
+NOT_BEGUN_SHOWN = 5.0
 BEFORE_MOTION = "Stopped during the preparation: nothing was moved."
 #: Folder of the plans and scenes that the console writes.
 MADE = Path("console")
@@ -266,11 +268,24 @@ def jog_state(status: dict[str, Any] | None) -> dict[str, Any]:
     if status is not None and "cable_jog" in status:
         why_not = "single cables are being jogged: end that first"
     jog = None if status is None else status.get("jog")
-    ahead = {"limit": None, "room_mm": None}
+    ahead = {
+        "limit": None,
+        "room_mm": None,
+        "not_begun": None if jog is None else _not_begun(status),
+    }
     if jog and jog["limit"]:
         short = jog["limit"].partition(" with the platform at ")[0]
-        ahead = {"limit": short, "room_mm": jog["room_mm"]}
+        ahead |= {"limit": short, "room_mm": jog["room_mm"]}
     return {**_session_state(status, jog, why_not), **ahead}
+
+
+def _not_begun(status: dict[str, Any] | None) -> str | None:
+    """Why the newest press did not begin, for a few seconds after it; None if it did."""
+    if status is None or not status["events"]:
+        return None
+    event = status["events"][-1]
+    is_recent = status["elapsed_s"] - event["time_s"] <= NOT_BEGUN_SHOWN
+    return event["text"] if event["code"] == "jog_not_begun" and is_recent else None
 
 
 def cable_state(status: dict[str, Any] | None) -> dict[str, Any]:

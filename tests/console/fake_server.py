@@ -239,6 +239,7 @@ class Fake:
             "moving": self.jog_ready and self.held is not None,
             "limit": None,
             "room_mm": None,
+            "not_begun": None,
         }
         if self.held and near < 60.0:
             jog.update(limit="clearance to obstacle_1", room_mm=near - 10.0)
@@ -293,6 +294,7 @@ class Fake:
                 ],
             },
             "measured": self._measured(near),
+            "drives_read": None,
             "next_stop": self._next_stop(),
             "preview": self.plan,
             "plan_start_off_mm": None if self.plan is None else 0.0,
@@ -449,6 +451,8 @@ class Fake:
             self.jog_ready, self.cable_ready = command == "jog_begin", False
         elif command == "reset":
             self.latched = None
+        elif command == "read_drives":
+            self.over["drives_read"] = {"at": "19:12:05", "why_not": None}
         elif command in ("home", "release"):
             self.homed = command == "home"
         elif command == "load_plan":

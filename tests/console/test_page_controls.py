@@ -43,7 +43,7 @@ def moving(state: str, **wished: Any) -> dict[str, Any]:
 RUN = {"verb": "run", "text": ""}
 PLANS = {"load_plan", "compare", "compare_end", "plan", "plan_poses", "go_to"}
 PLANS |= {"plan_files", "scene_files"}
-REST = {"home", "release", "run", "jog_begin", "service_begin"} | PLANS
+REST = {"home", "release", "read_drives", "run", "jog_begin", "service_begin"} | PLANS
 ALWAYS = {"stop", "jog_setting", "cable_setting", "plan_setting"}
 SERVICE = {"yours": True, "held_by": "A", "mode": "service"}
 TAUGHT = {"teach", "teach_at", "edit_pose", "give_control"}
@@ -326,7 +326,8 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     for name in ("home", "release"):
         page.locator(f"#{name}").click()
         page.locator(".confirm").click()
-    desk.fake.ask(set={"latched": "slack", "homed": True})
+    desk.fake.ask(set={"latched": "slack", "homed": True}, state={"simulated": False})
+    page.locator("#read-drives").click()
     page.locator("#reset").click()
     page.locator(".confirm").click()
     page.locator("summary", has_text="Make a plan").click()
@@ -373,6 +374,7 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
             "stop",
             "home",
             "release",
+            "read_drives",
             "reset",
             "teach",
             "teach_at",

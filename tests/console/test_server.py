@@ -36,6 +36,8 @@ from cdpr.console.state import StoredState, VerbOutcome, _without_commands
 from cdpr.console.watch import RunWatch
 from executor.remote.command_socket import advertised
 from executor.remote.command_socket import serving as commands
+from executor.remote.status import bus_name
+from executor.state_machine import State
 from executor.supervision import LocalRequests
 from model.plan import load_plan, save_plan
 from model.pose import Pose
@@ -118,14 +120,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class MovesOn:
-    """A minimal `RunStatus` with only the bus of a run, and its rig."""
+#: States in which no path is left to be held or resumed.
+OVER = {State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED, State.LATCHED}
 
-    def __init__(self, bus: str, rig: str) -> None:
-        self._bus, self._rig = bus, rig
+
+class MovesOn:
+    """A minimal `RunStatus` with only the bus of a run, its rig and its state."""
+
+    def __init__(self, bus: str, rig: str, state: str = "moving") -> None:
+        self._status = {"bus": bus, "rig": rig, "state": state}
 
     def as_dict(self) -> dict[str, Any]:
-        return {"bus": self._bus, "rig": self._rig}
+        return self._status
 
 
 @pytest.fixture(autouse=True)
@@ -204,6 +210,23 @@ def test_a_latch_is_shown_together_with_the_end_of_the_verb_that_left_it(
     monkeypatch.setattr("cdpr.console.session.read_stored", lambda *_, **__: latched)
     state = console.update()
     assert (state["busy"], state["latched"]) == (None, "cable 4 is slack")
+    console.close()
+
+
+@pytest.mark.parametrize("state", State)
+def test_hold_and_resume_are_refused_by_a_run_that_is_over(state: State) -> None:
+    """Its process may still write the report, and would answer that the request was taken."""
+    rig = load_rig(RIG)
+    console = Console(ConsoleFiles(RIG, rig, (), (), (), None, True, False))
+    run: Any = MovesOn(bus_name(rig), rig.name, state.value)
+    with advertised() as listeners, commands(listeners, LocalRequests(), run):
+        assert console.watch.update().status is not None
+        for request, values in (("hold", {}), ("speed", {"percent": 50}), ("resume", {})):
+            why_not = console.watch.send(request, **values)
+            if state in OVER:
+                assert f"`{request}` has no effect" in why_not
+            else:
+                assert why_not == ""
     console.close()
 
 
