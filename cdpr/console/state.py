@@ -34,7 +34,7 @@ from model.rig import Rig
 SHOWN = 4000
 #: Exit code of a verb that the operator stopped.
 STOPPED = 130
-#: States on the way to a page at a time: more would queue in a slow connection, each older.
+#: States in transit to a page at a time: more would queue in a slow connection, each older.
 MOST_IN_TRANSIT = 2
 #: Time for which the page shows that a press did not begin, [s].
 NOT_BEGUN_SHOWN = 5.0
@@ -337,7 +337,7 @@ def measured_state(status: dict[str, Any] | None, age: float) -> dict[str, Any] 
     return measured_data(measured, max(0.0, status["elapsed_s"] - measured["time_s"]) + age)
 
 
-# States on the way to the pages.
+# States in transit to the pages.
 
 
 class StateTimes:
@@ -371,7 +371,7 @@ class StateTimes:
 
 
 class StateFlow:
-    """States on the way to a page, and what the page needs to know how old they are.
+    """States in transit to a page, and what the page needs to know how old they are.
 
     A state has the time when it was made, and names the newest acknowledgement before it: when the
     page sent it, by the page's clock, and when it arrived here. As it was sent before it arrived,
@@ -379,7 +379,7 @@ class StateFlow:
     """
 
     def __init__(self) -> None:
-        """Starts with nothing on the way."""
+        """Starts with nothing in transit."""
         self._sent: list[int] = []
         self._has_room = asyncio.Event()
         self._has_room.set()
