@@ -277,6 +277,21 @@ def test_nothing_is_cut_off_and_touch_targets_are_large(
             assert found.audit("cut") == [], view
 
 
+def test_many_cables_and_a_long_name_cover_nothing(desk: Visit) -> None:
+    """At every width; that drives are simulated is always shown."""
+    name = "large_hall_of_the_institute_with_a_name_of_some_length_and_number_0815"
+    read = {"at": "19:12:05", "why_not": None}
+    for cables in (8, 10, 24):
+        tensions = [8.0 + 3.5 * k for k in range(cables)]
+        desk.fake.ask(state={"rig": name, "tensions_n": tensions, "drives_read": read})
+        expect(desk.page.locator("#tensions li")).to_have_count(cables)
+        for width, height in ((320, 640), (390, 844), (768, 1024), (1024, 768), (1400, 780)):
+            desk.page.set_viewport_size({"width": width, "height": height})
+            desk.view("live")
+            assert desk.audit("overlapping") == [], (cables, width)
+            assert desk.audit("cut") == [], (cables, width)
+
+
 def test_everything_has_a_name_and_is_reached_by_keyboard(desk: Visit) -> None:
     """Every control that is shown, in every view, by Tab or, for tabs and radios, by an arrow."""
     fill_everything(desk)

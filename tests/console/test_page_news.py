@@ -217,13 +217,13 @@ def test_values_read_at_rest_are_not_shown_as_live(desk: Visit) -> None:
     assert not value.evaluate(quiet)
     read = {"at": "19:12:05", "why_not": None}
     desk.fake.ask(state={"drives_read": read})
-    expect(said).to_have_text("Read at 19:12:05; not watched at rest.")
-    expect(lamp).to_have_text("Read at 19:12:05")
+    expect(said).to_have_text("Read at 19:12:05, not watched.")
+    expect(lamp).to_have_text("Read 19:12:05")
     for figure in (value, desk.page.locator("#tile-clearance dd")):
         assert figure.evaluate(quiet)
     released = {"platform": None, "clearance_mm": None, "tensions_n": [0.0] * 8}
     desk.fake.ask(state={**released, "drives_read": {**read, "why_not": "the torque was removed"}})
-    expect(said).to_contain_text("not watched at rest. The torque was removed.")
+    expect(said).to_contain_text("not watched. The torque was removed.")
     expect(desk.page.locator("#value-x")).to_have_text("–")
     expect(desk.page.locator("#tension-trouble")).to_have_text("8 cables are slack: at least 5 N")
     unread = {"drives_read": {**read, "why_not": "drive 3 does not answer"}, "tensions_n": None}

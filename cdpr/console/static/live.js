@@ -10,7 +10,7 @@ const LAMPS = {
   drives: ({ motion, jog, cable, drives_read: read, tensions_n: tensions }) => {
     const drives = motion?.drives ?? [], on = drives.filter((d) => d.state === "operation enabled").length;
     const ready = jog.ready || cable.ready, holding = drives.filter((d) => d.state === "quick stop active").length;
-    if (!drives.length && read?.at) return tensions ? [`Read at ${read.at}`, "quiet"] : ["Drives not read", "stop"];
+    if (!drives.length && read?.at) return tensions ? [`Read ${read.at}`, "quiet"] : ["Drives not read", "stop"];
     if (!drives.length) return [ready ? "Drives on" : "No drive data", ready ? "pass" : "quiet"];
     // After a quick stop drives hold by themselves, with torque.
     const text = !on && holding ? `${holding} of ${drives.length} drives hold` : `${on} of ${drives.length} drives on`;
@@ -31,7 +31,7 @@ const BEFORE = { run: "Preparing the run", home: "Preparing to home", plan: "Pla
 function readText({ drives_read: read, tensions_n: tensions }) {
   if (!read) return "";
   const why = read.why_not ? ` ${read.why_not[0].toUpperCase()}${read.why_not.slice(1)}.` : "";
-  return `${read.at && tensions ? `Read at ${read.at}; not watched at rest.` : ""}${why}`.trim();
+  return `${read.at && tensions ? `Read at ${read.at}, not watched.` : ""}${why}`.trim();
 }
 
 /** More than two cables in the same trouble are counted: a list would be longer than its space. */
@@ -76,7 +76,9 @@ export class Live {
 
   show(state) {
     write(at("rig"), state.rig);
-    write(at("bus"), `${state.bus}${state.simulated ? " · simulated drives" : ""}`);
+    mark(at("rig"), "title", state.rig);
+    write(at("bus"), state.bus);
+    write(at("simulated"), state.simulated ? "simulated drives" : "");
     document.title = `${motionText(state)} – ${state.rig}`;
     for (const [name, read] of Object.entries(LAMPS)) {
       const [text, kind] = read(state), lamp = at(`lamp-${name}`);
@@ -143,6 +145,8 @@ export class Live {
       const bar = make("span", { class: "bar" }), value = make("span", { class: "value figure" });
       return { bar, value, row: make("li", {}, make("span", { class: "cable" }, make("span", { class: "unseen" }, "Cable "), String(k + 1)), make("span", { class: "track", "aria-hidden": "true" }, bar), value) };
     });
+    list.classList.toggle("dense", count > 8);
+    list.classList.toggle("many", count > 12);
     list.replaceChildren(...this.#bars.map(({ row }) => row));
   }
 }
