@@ -33,6 +33,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tests.cli.plans import RIG  # noqa: E402
+from tests.console.cut import acknowledgement  # noqa: E402
 from tests.scenarios.test_console import Busy, Operator, console, drives, operator  # noqa: E402
 
 #: Messages that are sent before their answers are read; sockets and connections at a time.
@@ -129,6 +130,7 @@ class Attack:
             while time.monotonic() < again:
                 said = json.loads(await page.recv())
                 if said["kind"] != "answer":
+                    await page.send(acknowledgement(said))
                     continue
                 self.answers["done" if said["ok"] else "refused"] += 1
                 if said["to"] == mark["id"]:
@@ -229,6 +231,7 @@ class Holder:
             while True:
                 said = json.loads(await page.recv())
                 if said["kind"] == "state":
+                    await page.send(acknowledgement(said))
                     await self._check(page, said)
 
     async def _check(self, page: ClientConnection, state: dict[str, Any]) -> None:

@@ -33,6 +33,7 @@ from executor.remote.client import request_run  # noqa: E402
 from model.errors import Fault  # noqa: E402
 from tests.cli.plans import RIG, write_short_plan  # noqa: E402
 from tests.console.browsing import browser_at, chromium  # noqa: E402
+from tests.console.cut import receive  # noqa: E402
 from tests.scenarios.test_console import console, drives, page_at  # noqa: E402
 from tests.scenarios.test_processes import program  # noqa: E402
 
@@ -54,7 +55,7 @@ def viewers(address: str, count: int) -> Iterator[list[int]]:
     def view(number: int) -> None:
         with page_at(address) as page:
             while not over.is_set():
-                page.recv(timeout=10)
+                receive(page, timeout=10)
                 taken[number] += 1
 
     threads = [threading.Thread(target=view, args=(number,)) for number in range(count)]

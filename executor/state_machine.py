@@ -141,6 +141,7 @@ class CycleRecord:
         error_frames: Error frames of the bus since then.
         following_error: Largest of the cables, [m]; NaN while the drives do not follow.
         lateness: In cycles.
+        press: Of a jog, whose line ``index`` belongs to; 0 before the first, and in other motions.
     """
 
     cycle: int
@@ -157,6 +158,7 @@ class CycleRecord:
     error_frames: int
     following_error: float
     lateness: float
+    press: int = 0
 
 
 @dataclass(frozen=True, slots=True)

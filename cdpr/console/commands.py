@@ -52,6 +52,7 @@ class PlainCommand(_Command):
         "home",
         "reset",
         "release",
+        "read_drives",
         "run",
         "jog_begin",
         "cable_begin",
@@ -175,6 +176,14 @@ class LetGo(_Incoming):
     hold: Number
 
 
+class Seen(_Incoming):
+    """A state has reached the page, with the time of receipt on the page's clock."""
+
+    kind: Literal["seen"]
+    seq: Number
+    at_ms: Annotated[float, Field(ge=0.0, le=1e15, allow_inf_nan=False)]
+
+
 Message = (
     PlainCommand
     | TakeCommand
@@ -189,8 +198,8 @@ Message = (
     | ForgetCommand
 )
 _Commands = Annotated[Message, Field(discriminator="command")]
-_ANY: TypeAdapter[Message | Held | LetGo] = TypeAdapter(
-    Annotated[_Commands | Held | LetGo, Field(discriminator="kind")]
+_ANY: TypeAdapter[Message | Held | LetGo | Seen] = TypeAdapter(
+    Annotated[_Commands | Held | LetGo | Seen, Field(discriminator="kind")]
 )
 
 
@@ -198,7 +207,7 @@ class NotAMessage(ValueError):
     """The received text is not a valid message; the error's text says why."""
 
 
-def parse_message(text: str) -> Message | Held | LetGo:
+def parse_message(text: str) -> Message | Held | LetGo | Seen:
     """The message in a text.
 
     Raises:
@@ -364,6 +373,11 @@ class PageControl:
     def holder_name(self) -> str | None:
         """Name of the page that has control."""
         return None if self.holder is None else self._pages[self.holder].name
+
+    def as_dict(self, page: int) -> dict[str, object]:
+        """Data for a page."""
+        yours, held_by = self.holder == page, self.holder_name()
+        return {"yours": yours, "held_by": held_by, "mode": self.mode(page)}
 
     def hold(self, page: int, hold: int, seq: int, motion: int) -> int | None:
         """The press number for a held control of a page; None if refused or over.

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 import secrets
 import signal
 import socket
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
@@ -23,9 +21,17 @@ from fastapi import FastAPI, HTTPException, Request, Response, WebSocket, WebSoc
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 
-from cdpr.console.commands import Held, Inbox, LetGo, Message, NotAMessage, parse_message
+from cdpr.console.commands import (
+    Held,
+    Inbox,
+    LetGo,
+    Message,
+    NotAMessage,
+    Seen,
+    parse_message,
+)
 from cdpr.console.session import Console
-from cdpr.console.state import plans_and_scenes
+from cdpr.console.state import StateFlow, StateTimes, plans_and_scenes
 from cdpr.console.view import scene_of
 from executor.realtime.scheduling import prompt_threads, take_short_turns
 from executor.recording.record_files import RUNS
@@ -34,8 +40,10 @@ from model.errors import BadInput
 
 #: States per second.
 RATE = 20.0
-#: A page that does not receive a state within this time is disconnected, [s].
+#: A page to which a state cannot be sent within this time is disconnected, [s].
 PATIENCE = 2.0
+#: So is one that acknowledges none within this time, [s].
+UNSEEN = 10.0
 #: Largest number of open pages; STOP by `POST /stop` works without one.
 MOST_PAGES = 64
 #: A page whose newest state was followed by another this long ago cannot jog, [s].
@@ -79,8 +87,7 @@ class ConsoleServer:
         self._console = console
         self._state: dict[str, Any] = {}
         self._news = asyncio.Condition()
-        self._seq = 0
-        self._made_at: deque[float] = deque(maxlen=round(2.0 * RATE))  # times of the newest states
+        self._times = StateTimes(round(2.0 * RATE))
         self._stops = ThreadPoolExecutor(STOPS_AT_ONCE, "cdpr-stop")
         self._presses = ThreadPoolExecutor(PRESSES_AT_ONCE, "cdpr-press")
         self._stopping: set[asyncio.Task[None]] = set()
@@ -126,8 +133,7 @@ class ConsoleServer:
             with suppress(Exception):  # such as a removed file; it is tried again
                 self._state = await run_in_threadpool(self._console.update)
                 async with self._news:
-                    self._seq += 1
-                    self._made_at.append(loop.time())
+                    self._times.add(loop.time())
                     self._news.notify_all()
             await asyncio.sleep(max(0.005, began + 1.0 / RATE - loop.time()))
 
@@ -228,11 +234,11 @@ class ConsoleServer:
         """
         await page.accept()
         number = self._console.control.join("?" if page.client is None else page.client.host)
-        inbox = Inbox()
+        inbox, flow = Inbox(), StateFlow()
         tasks = [
             asyncio.create_task(work)
             for work in (
-                self._send_states(page, number),
+                self._send_states(page, number, flow),
                 self._execute_commands(page, number, inbox),
                 self._forward_held(inbox),
                 self._forward_releases(inbox),
@@ -241,7 +247,7 @@ class ConsoleServer:
         ]
         try:
             while True:
-                self._take(page, number, await page.receive_text(), inbox)
+                self._take(page, number, await page.receive_text(), inbox, flow)
         except (WebSocketDisconnect, RuntimeError, KeyError):  # KeyError: binary
             pass
         finally:
@@ -249,36 +255,38 @@ class ConsoleServer:
                 task.cancel()
             await run_in_threadpool(self._console.leave, number)
 
-    async def _send_states(self, page: WebSocket, number: int) -> None:
+    async def _send_states(self, page: WebSocket, number: int, flow: StateFlow) -> None:
+        """Sends the newest state, whenever the page has acknowledged enough of those before."""
         seen = 0  # no state before the first update
         while True:
+            try:
+                await asyncio.wait_for(flow.room(), UNSEEN)
+            except TimeoutError:
+                return await _disconnect(page)
             async with self._news:
-                while self._seq == seen:
+                while self._times.seq == seen:
                     await self._news.wait()
-                seen = self._seq
-            control = self._console.control
-            own = {
-                "yours": control.holder == number,
-                "held_by": control.holder_name(),
-                "mode": control.mode(number),
-            }
-            state = {**self._state, "seq": seen, "control": own}
+                seen = self._times.seq
+            flow.send(seen)
+            own = {"control": self._console.control.as_dict(number), "echo": flow.echo}
+            state = {**self._state, "seq": seen, "made_ms": 1e3 * self._times.newest, **own}
             try:
                 await asyncio.wait_for(page.send_json(state), PATIENCE)
             except (TimeoutError, RuntimeError, WebSocketDisconnect):
-                with suppress(RuntimeError):
-                    await page.close(1013)
-                return
+                return await _disconnect(page)
 
-    def _take(self, page: WebSocket, number: int, text: str, inbox: Inbox) -> None:
+    def _take(self, page: WebSocket, number: int, text: str, inbox: Inbox, flow: StateFlow) -> None:
         """Begins STOP at once; passes everything else to the page's tasks."""
         try:
             message = parse_message(text)
         except NotAMessage as error:
             inbox.refuse(0, str(error))
             return
-        if isinstance(message, Held):
-            if (behind := self._behind(message.state)) <= BEHIND:
+        now = asyncio.get_running_loop().time()
+        if isinstance(message, Seen):
+            flow.take(message, now)
+        elif isinstance(message, Held):
+            if (behind := self._times.behind(message.state, now)) <= BEHIND:
                 inbox.hold(self._console.held(number, message), message)
                 return
             released = LetGo(kind="let_go", hold=message.hold)
@@ -294,17 +302,6 @@ class ConsoleServer:
             inbox.refuse(message.id, "earlier commands of this page are not finished yet")
         else:
             inbox.commands.put_nowait(message)
-
-    def _behind(self, newest: int) -> float:
-        """How long ago the state was made that follows the newest one of a page, [s]; 0 if none.
-
-        By this computer's clock alone: it bounds the delay of the connection, there and back.
-        """
-        missed = self._seq - newest
-        if missed <= 0:  # or a state of another server
-            return 0.0 if missed == 0 else math.inf
-        oldest = max(-missed, -len(self._made_at))
-        return asyncio.get_running_loop().time() - self._made_at[oldest]
 
     async def _stop_and_answer(self, page: WebSocket, number: int, message: Message) -> None:
         why_not = await _run_in(self._stops, self._console.command, number, message)
@@ -331,6 +328,11 @@ class ConsoleServer:
 async def _run_in(pool: ThreadPoolExecutor, work: Callable[..., T], *arguments: Any) -> T:
     """Works in threads of its own, so that it waits for no other request."""
     return await asyncio.get_running_loop().run_in_executor(pool, work, *arguments)
+
+
+async def _disconnect(page: WebSocket) -> None:
+    with suppress(RuntimeError):  # it is gone already
+        await page.close(1013)
 
 
 async def _send_refusals(page: WebSocket, inbox: Inbox) -> None:

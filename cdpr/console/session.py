@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,13 +45,11 @@ from cdpr.console.state import (
 from cdpr.console.teach import TaughtPoses, scene_text
 from cdpr.console.view import (
     LoadedPlan,
-    RobotNow,
     RobotView,
     nearest_data,
     pose_data,
-    shown_tensions,
 )
-from cdpr.console.watch import CameraPictures, RunWatch
+from cdpr.console.watch import CameraPictures, RobotWatch, RunWatch
 from executor.drives import is_simulated
 from executor.jogging import FASTEST
 from executor.remote.client import stop_runs
@@ -113,15 +111,14 @@ class Console:
         self.pictures = CameraPictures()
         self.poses = TaughtPoses(MADE / "poses.json")
         self.plan = LoadedPlan(self.rig)
-        self._control_lock, self._one_at_a_time = threading.Lock(), threading.Lock()
+        self._control_lock, self._one_at_a_time = threading.Lock(), threading.RLock()
         self._line = ""
-        self._robot: RobotNow | None = None
-        if is_simulated(self.rig):
-            self._robot = self.view.simulated_at(self.rig.home)
         self._planned: Path | None = None
-        self._at_rest: Future[StatusResult] | None = None
         self._asks = ThreadPoolExecutor(1, "cdpr-drives")
-        self._was_busy = True  # so that the drives are read at the start
+        read = None if is_simulated(self.rig) else self._read_drives
+        self.robot = RobotWatch(self.view, read, self._asks)
+        if is_simulated(self.rig):
+            self.robot.simulate_at(self.rig.home)
         self._stored = StoredState(None, False, None)
         self._stored_for: tuple[float, str | None] = (float("-inf"), None)
 
@@ -133,10 +130,9 @@ class Console:
         self._load_planned()
         if report.status is not None:
             self.verbs.is_under_way = True
-            seen = self.view.take(report.status)
-            self._robot = seen or self._robot
+        is_busy = report.status is not None or self.verbs.verb is not None
+        self.robot.update(report.status, is_busy=is_busy)
         self.pictures.watch(report.status, self.view.rig)
-        self._ask_at_rest(report.status is not None or self.verbs.verb is not None)
         self._read_stored()
         return self._state(report.status, time.monotonic() - report.at)
 
@@ -163,25 +159,14 @@ class Console:
         except CdprError as error:  # replaced or removed meanwhile
             self.verbs.fail(error)
 
-    def _ask_at_rest(self, busy: bool) -> None:
-        """Reads the drives once after each motion; they may be silent or absent.
-
-        No verb is started meanwhile, as it would find the drives in use.
-        """
-        if self._at_rest is not None and self._at_rest.done():
-            answer, self._at_rest = self._at_rest, None
-            if answer.exception() is None and not busy:
-                self._robot = self.view.at_rest(answer.result()) or self._robot
-        ended, self._was_busy = self._was_busy and not busy, busy
-        if ended and self._at_rest is None and not is_simulated(self.rig):
-            self._at_rest = self._asks.submit(self._read_drives)
-
     def _read_drives(self) -> StatusResult:
+        """Reads the drives; no verb is started meanwhile, as it would find them in use."""
         with self._one_at_a_time:
             return read_status(self.rig)
 
     def _state(self, status: dict[str, Any] | None, age: float) -> dict[str, Any]:
-        robot, rig, verb = self._robot, self.view.rig, self.verbs.verb
+        seen, rig, verb = self.robot.now, self.view.rig, self.verbs.verb
+        robot = seen.robot
         loaded, compared = self.plan.preview, self.plan.compared
         near = None if robot is None else robot.nearest
         return {
@@ -197,7 +182,8 @@ class Console:
             "outcome": outcome_state(self.verbs.outcome),
             "motion": None if status is None else {**status, "age_s": round(age, 3)},
             "platform": None if robot is None else pose_data(rig, robot.pose, "drives"),
-            "tensions_n": shown_tensions(status, robot),
+            "tensions_n": seen.tensions,
+            "drives_read": seen.as_dict(),
             "tension_limits_n": [rig.min_tension, rig.max_tension],
             "clearance_mm": near and nearest_data(near, self.view.required_clearance),
             "measured": measured_state(status, age),
@@ -216,7 +202,10 @@ class Console:
         if verb == self._stored_for[1] and now - self._stored_for[0] < STORED_EVERY:
             return
         self._stored_for = now, verb
-        self._stored = read_stored(self.rig, is_moving=self.watch.last.status is not None)
+        stored = read_stored(self.rig, is_moving=self.watch.last.status is not None)
+        if stored != self._stored:  # changed by another program, such as `cdpr reset`
+            self.robot.ask()
+        self._stored = stored
 
     # Commands.
 
@@ -248,13 +237,16 @@ class Console:
         """
         self.plan.load(path)
         if is_simulated(self.rig) and self.plan.start is not None:
-            self._robot = self.view.simulated_at(self.plan.start)
+            self.robot.simulate_at(self.plan.start)
 
     def _command(self, page: int, message: Message) -> str:
         if isinstance(message, TakeCommand):
             moving = self.watch.last.status is not None
             with self._control_lock:
-                return self.control.take(page, moving=moving, force=message.force)
+                why_not = self.control.take(page, moving=moving, force=message.force)
+            if not why_not:
+                self.robot.ask()  # who operates sees the present drives
+            return why_not
         if message.command == "give_control":
             with self._control_lock:
                 press = self.control.give(page)
@@ -290,6 +282,9 @@ class Console:
         return ""
 
     def _plain(self, command: str) -> str:
+        if command == "read_drives":
+            self.robot.ask()
+            return ""
         if command in ("service_begin", "service_end"):
             return self._service(on=command == "service_begin")
         requests = {"hold": "hold", "resume": "resume", "jog_end": "end"}
@@ -318,8 +313,7 @@ class Console:
     def _run(self) -> str:
         if self.plan.preview is None or not self.plan.preview["passed"]:
             return "load a plan that passes its check first"
-        here = None if self._robot is None or is_simulated(self.rig) else self._robot.pose
-        if here is not None and self.plan.begins_elsewhere(here):
+        if (here := self.robot.pose_at_rest()) is not None and self.plan.begins_elsewhere(here):
             off = self.plan.off_mm(here)
             return f"the platform is {off} mm from the plan's start: plan from its current pose"
         cameras = [text for source in self.files.cameras for text in ("--camera", source)]
@@ -332,7 +326,8 @@ class Console:
         scene = self.files.scene_file
         around = ["--no-scene"] if scene is None else ["--scene", str(scene)]
         speed = ["--speed-mm-s", f"{1e3 * FASTEST:g}"]
-        at = start_options(self.rig, None if self._robot is None else self._robot.pose)
+        robot = self.robot.now.robot
+        at = start_options(self.rig, None if robot is None else robot.pose)
         rig = str(self.files.rig_file)
         return self._start_verb("jog", [rig, "--hold-to-run", *speed, *around, *at])
 
@@ -397,17 +392,7 @@ class Console:
         return Pose(position, self._pose_now().rotation)
 
     def _pose_now(self) -> Pose:
-        jog = (self.watch.last.status or {}).get("jog")
-        if jog is not None:  # the commanded pose, exactly: jogs do not rotate the platform
-            position, rotation = millimetres(jog["position_mm"]), np.array(jog["quaternion"])
-            return Pose.from_quaternion(position, rotation / np.linalg.norm(rotation))
-        if self._robot is None:
-            raise Refused(
-                "the platform's pose is not known yet",
-                where="console",
-                next_step="enable the drives for jogging, or run a plan",
-            )
-        return self._robot.pose
+        return self.robot.pose(self.watch.last.status)
 
     # Jogging.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import math
 import os
 import re
 import signal
@@ -9,12 +11,14 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from cdpr.console.commands import Seen
 from cdpr.console.view import measured_data
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
@@ -30,6 +34,10 @@ from model.rig import Rig
 SHOWN = 4000
 #: Exit code of a verb that the operator stopped.
 STOPPED = 130
+#: States in transit to a page at a time: more would queue in a slow connection, each older.
+MOST_IN_TRANSIT = 2
+#: Time for which the page shows that a press did not begin, [s].
+NOT_BEGUN_SHOWN = 5.0
 BEFORE_MOTION = "Stopped during the preparation: nothing was moved."
 #: Folder of the plans and scenes that the console writes.
 MADE = Path("console")
@@ -266,11 +274,24 @@ def jog_state(status: dict[str, Any] | None) -> dict[str, Any]:
     if status is not None and "cable_jog" in status:
         why_not = "single cables are being jogged: end that first"
     jog = None if status is None else status.get("jog")
-    ahead = {"limit": None, "room_mm": None}
+    ahead = {
+        "limit": None,
+        "room_mm": None,
+        "not_begun": None if jog is None else _not_begun(status),
+    }
     if jog and jog["limit"]:
         short = jog["limit"].partition(" with the platform at ")[0]
-        ahead = {"limit": short, "room_mm": jog["room_mm"]}
+        ahead |= {"limit": short, "room_mm": jog["room_mm"]}
     return {**_session_state(status, jog, why_not), **ahead}
+
+
+def _not_begun(status: dict[str, Any] | None) -> str | None:
+    """Why the newest press did not begin, for a few seconds after it; None if it did."""
+    if status is None or not status["events"]:
+        return None
+    event = status["events"][-1]
+    is_recent = status["elapsed_s"] - event["time_s"] <= NOT_BEGUN_SHOWN
+    return event["text"] if event["code"] == "jog_not_begun" and is_recent else None
 
 
 def cable_state(status: dict[str, Any] | None) -> dict[str, Any]:
@@ -314,3 +335,71 @@ def measured_state(status: dict[str, Any] | None, age: float) -> dict[str, Any] 
     if status is None or measured is None or status["elapsed_s"] is None:
         return None
     return measured_data(measured, max(0.0, status["elapsed_s"] - measured["time_s"]) + age)
+
+
+# States in transit to the pages.
+
+
+class StateTimes:
+    """Numbers of the states, and when the newest were made."""
+
+    def __init__(self, kept: int) -> None:
+        """Before any state; keeps the times of that many."""
+        self.seq = 0
+        """Number of the newest; 0 before any."""
+        self._made: deque[float] = deque(maxlen=kept)
+
+    @property
+    def newest(self) -> float:
+        """When the newest one was made, [s]."""
+        return self._made[-1]
+
+    def add(self, now: float) -> None:
+        """Counts a state made now, [s]."""
+        self.seq += 1
+        self._made.append(now)
+
+    def behind(self, seq: int, now: float) -> float:
+        """How long ago the state was made that follows a page's newest one, [s]; 0 if none.
+
+        By this computer's clock alone: it bounds the delay of the connection, there and back.
+        """
+        missed = self.seq - seq
+        if missed <= 0:  # or a state of another server
+            return 0.0 if missed == 0 else math.inf
+        return now - self._made[max(-missed, -len(self._made))]
+
+
+class StateFlow:
+    """States in transit to a page, and what the page needs to know how old they are.
+
+    A state has the time when it was made, and names the newest acknowledgement before it: when the
+    page sent it, by the page's clock, and when it arrived here. As it was sent before it arrived,
+    the difference of the clocks, and with it the age of a state, is known on one side.
+    """
+
+    def __init__(self) -> None:
+        """Starts with nothing in transit."""
+        self._sent: list[int] = []
+        self._has_room = asyncio.Event()
+        self._has_room.set()
+        self.echo: dict[str, float] | None = None
+        """The newest acknowledgement: ``at_ms`` of the page, and when it was ``received_ms``."""
+
+    async def room(self) -> None:
+        """Waits until another state may be sent."""
+        await self._has_room.wait()
+
+    def send(self, seq: int) -> None:
+        """Notes a state as sent."""
+        self._sent.append(seq)
+        if len(self._sent) >= MOST_IN_TRANSIT:
+            self._has_room.clear()
+
+    def take(self, message: Seen, now: float) -> None:
+        """Takes an acknowledgement, of this state and those before it, received now [s]."""
+        left = [seq for seq in self._sent if seq > message.seq]
+        if len(left) < len(self._sent):  # one that was sent and not acknowledged before
+            self._sent = left
+            self.echo = {"at_ms": message.at_ms, "received_ms": 1e3 * now}
+            self._has_room.set()

@@ -17,7 +17,7 @@ from executor.runner import prepare_plan
 from executor.service import StatusResult
 from executor.trajectory.setpoints import PreparedRun
 from model.clearance import ClearanceModel, Nearest
-from model.errors import CdprError
+from model.errors import CdprError, Refused
 from model.kinematics import cable_lengths, cables_at, forward_kinematics
 from model.pages.scene import (
     Moment,
@@ -163,9 +163,15 @@ class RobotView:
             self._winches.unstrained_from_counts(counts), np.maximum(tensions, 0.0)
         )
         try:
-            self._pose = forward_kinematics(self.rig, lengths, self._pose, tolerance=1e-6).pose
-        except CdprError:  # with slack cables no pose fits
+            found = forward_kinematics(self.rig, lengths, self._pose, tolerance=1e-6)
+        except CdprError:
             return None
+        motion = self.rig.motion
+        if not found.worst <= motion.start_tolerance + motion.following_error:
+            return (
+                None  # a cable is slack, slipped or was wound in alone; the nearest pose is wrong
+            )
+        self._pose = found.pose
         return RobotNow(self._pose, tensions.tolist(), self._near(self._pose))
 
     def at_rest(self, status: StatusResult) -> RobotNow | None:
@@ -218,12 +224,32 @@ class RobotView:
         self._pose = rig.home
 
 
-def shown_tensions(status: dict[str, Any] | None, robot: RobotNow | None) -> list[float] | None:
-    """Tensions [N] of the run, even where no pose fits; else those last seen."""
-    drives = [] if status is None else status["drives"]
-    if drives:
-        return [drive["tension_n"] for drive in drives]
-    return None if robot is None else [round(t, 2) for t in robot.tensions]
+def commanded_pose(rig: Rig, jog: dict[str, Any], robot: RobotNow) -> Pose:
+    """The commanded pose of a jog session, exactly: jogs do not rotate the platform.
+
+    Args:
+        rig: The robot.
+        jog: See `executor.remote.status`.
+        robot: By its drives.
+
+    Raises:
+        Refused: A cable has another length by the drives than commanded, beyond the tolerance at
+            the start of a run.
+    """
+    rotation = np.array(jog["quaternion"])
+    pose = Pose.from_quaternion(
+        np.array(jog["position_mm"]) / 1000.0, rotation / np.linalg.norm(rotation)
+    )
+    off = float(np.max(np.abs(cable_lengths(rig, pose) - cable_lengths(rig, robot.pose))))
+    if off <= rig.motion.start_tolerance:
+        return pose
+    raise Refused(
+        f"the drives are not where the jog commanded them: a cable is {1e3 * off:.1f} mm off,"
+        f" at most {1e3 * rig.motion.start_tolerance:g} mm are allowed",
+        where="console",
+        why="the platform still moves, or a drive does not follow",
+        next_step="release the control and try again; if that fails, end jogging",
+    )
 
 
 # Preview of a plan: path, checks, clearance and tensions along it.

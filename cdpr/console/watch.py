@@ -1,6 +1,6 @@
-"""Follows the run on the rig's bus over its command socket, and its cameras' images.
+"""Follows the run on the rig's bus over its command socket, its robot, and its cameras' images.
 
-It reconnects to the next run. Detections are outlined in the images.
+It reconnects to the next run. At rest the drives are read. Detections are outlined in the images.
 """
 
 from __future__ import annotations
@@ -8,14 +8,20 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+from cdpr.console.view import RobotNow, RobotView, commanded_pose
 from executor.cameras.live_image import ImageReader, LiveImage
 from executor.remote.client import Answer, RunLink
 from executor.remote.command_socket import find_runs
 from executor.remote.protocol import make_line
+from executor.service import StatusResult
+from model.errors import CdprError, Refused
+from model.pose import Pose
 from model.rig import Rig
 
 #: Period of the search for a run at rest, [s].
@@ -28,6 +34,15 @@ ANSWERED_WITHIN = 0.5
 FRESH = 0.1
 #: Commands sent to a silent run too: executed late, they move nothing.
 _ALWAYS = frozenset({"let_go", "hold", "end"})
+#: Commands for the rest of a path, and states after it.
+_ON_PATH = frozenset({"hold", "resume", "speed"})
+_OVER = {
+    "stopping": "is stopping",
+    "securing": "is over",
+    "finished": "is over",
+    "stopped": "is over: it was stopped",
+    "latched": "is over: a fault stopped it",
+}
 _SILENT = "the run does not answer"
 _MOVES = "the robot moves; wait, or stop it"
 
@@ -125,7 +140,10 @@ class RunWatch:
             if answer.what:
                 return answer.what
             self._take(answer)
-            return "" if answer.status is not None else _SILENT
+            if answer.status is None:
+                return _SILENT
+            over = _OVER.get(answer.status["state"]) if command in _ON_PATH else None
+            return f"the run {over}; `{command}` has no effect" if over else ""
 
     def close(self) -> None:
         """Closes the connection."""
@@ -161,6 +179,158 @@ class RunWatch:
     def _disconnect(self) -> None:
         self._run = None
         self._links.close()
+
+
+# Pose and tensions of the robot.
+#: Drives that another program used are read again after this time, [s].
+USED_FOR = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotSeen:
+    """What is known of the robot; tensions may be known without a pose.
+
+    Attributes:
+        robot: None if no pose is known, or none fits the cables.
+        tensions: [N]; None if unknown.
+        at: Local time of these values if nothing watches the drives; None while a run reports.
+        why_not: Why some of it is unknown, or older than the last attempt to read it.
+    """
+
+    robot: RobotNow | None
+    tensions: list[float] | None
+    at: str | None = None
+    why_not: str | None = None
+
+    def as_dict(self) -> dict[str, Any] | None:
+        """Data for the page on values that are not live or incomplete; None if live."""
+        if self.at is None and self.why_not is None:
+            return None
+        return {"at": self.at, "why_not": self.why_not}
+
+
+class RobotWatch:
+    """The robot of the run that reports; at rest, by its drives when they were read last.
+
+    At rest the drives are read after each motion and when `ask` is called, not repeatedly: a drive
+    answers one reader at a time, which may be a program of another computer, and a serial adapter
+    has one user.
+    """
+
+    def __init__(
+        self, view: RobotView, read: Callable[[], StatusResult] | None, pool: ThreadPoolExecutor
+    ) -> None:
+        """Before any status.
+
+        Args:
+            view: Computes the pose.
+            read: Reads the drives; None if each run simulates its own.
+            pool: Reads them without blocking.
+        """
+        self._view, self._read, self._pool = view, read, pool
+        self._lock = threading.Lock()
+        self._answer: Future[StatusResult] | None = None
+        self._due = 0.0  # when to read the drives, on the monotonic clock; at the start
+        self.now = RobotSeen(None, None, why_not="the drives have not been read yet")
+
+    def simulate_at(self, pose: Pose) -> None:
+        """Places the robot where simulated drives start."""
+        robot = self._view.simulated_at(pose)
+        self.now = RobotSeen(robot, [round(tension, 2) for tension in robot.tensions])
+
+    def ask(self) -> None:
+        """Requests a reading of the drives, at rest."""
+        self._due = 0.0
+
+    def pose(self, status: dict[str, Any] | None) -> Pose:
+        """The pose commanded by a jog, or by the drives, which are read at rest.
+
+        Args:
+            status: See `executor.remote.status`; None at rest.
+
+        Raises:
+            Refused: It is unknown, or the drives are elsewhere than commanded.
+        """
+        if status is None:
+            self._read_now()
+        seen = self.now
+        if seen.robot is None or (status is None and seen.why_not):
+            raise Refused(
+                "the platform's pose is not known",
+                where="console",
+                why=seen.why_not or "no run has reported it",
+                next_step="read the drives; home those that lost their reference",
+            )
+        jog = (status or {}).get("jog")
+        return seen.robot.pose if jog is None else commanded_pose(self._view.rig, jog, seen.robot)
+
+    def pose_at_rest(self) -> Pose | None:
+        """The pose by the drives, which are read; None if unknown, or if a run simulates them.
+
+        An old reading must not refuse a run: the platform may have been moved since.
+        """
+        if self._read is None:
+            return None
+        self._read_now()
+        seen = self.now
+        return None if seen.robot is None or seen.why_not else seen.robot.pose
+
+    def _read_now(self) -> None:
+        """Reads the drives at rest in this thread."""
+        if self._read is not None:
+            self._take_reading(self._read)
+
+    def update(self, status: dict[str, Any] | None, *, is_busy: bool) -> None:
+        """Takes a run's status, or what was read at rest.
+
+        Args:
+            status: See `executor.remote.status`; None at rest.
+            is_busy: A motion is in progress or being prepared.
+        """
+        if status is not None and status["drives"]:
+            robot = self._view.take(status)
+            why_not = None if robot else "the cables fit no pose; some may be slack"
+            tensions = [drive["tension_n"] for drive in status["drives"]]
+            self.now = RobotSeen(robot, tensions, why_not=why_not)
+        elif self._read is not None:
+            with self._lock:
+                if self.now.at is None and self.now.tensions is not None:
+                    self.now = replace(self.now, at=_local_time())  # the run reports no more
+        if self._answer is not None and self._answer.done():
+            answer, self._answer = self._answer, None
+            if not is_busy:
+                self._take_reading(answer.result)
+        if is_busy:
+            self._due = 0.0
+        elif self._read is not None and self._answer is None and time.monotonic() >= self._due:
+            self._due = math.inf
+            self._answer = self._pool.submit(self._read)
+
+    def _take_reading(self, read: Callable[[], StatusResult]) -> None:
+        """Takes a reading; silent drives leave nothing known, whatever was known before."""
+        try:
+            result = read()
+            if result.missing is not None:
+                raise result.missing
+        except CdprError as error:
+            seen = RobotSeen(None, None, _local_time(), error.what)
+        except Exception as error:  # such as an adapter that was unplugged
+            seen = RobotSeen(None, None, _local_time(), f"{type(error).__name__}: {error}")
+        else:
+            if result.drives is None:
+                self._due = time.monotonic() + USED_FOR
+                seen = replace(self.now, why_not="another program uses the drives")
+            else:
+                why_not = result.why_no_pose or result.reference.why_not
+                tensions = [round(drive.tension, 2) for drive in result.drives]
+                robot = self._view.at_rest(result)
+                seen = RobotSeen(robot, tensions, _local_time(), why_not)
+        with self._lock:
+            self.now = seen
+
+
+def _local_time() -> str:
+    return time.strftime("%H:%M:%S")
 
 
 # Images of the cameras that measure a run, with outlines of the detections.

@@ -50,7 +50,9 @@ class Feed:
 
     @property
     def rate(self) -> float:
-        """Current rate, rows per cycle; from 0 to 1."""
+        """Current rate, rows per cycle; from 0 to 1, and 0 at the end."""
+        if self.at_end:
+            return 0.0
         return min(max(self._change.at(self._passed)[1], 0.0), 1.0)
 
     @property

@@ -68,6 +68,7 @@ class Loop:
         self._feed = Feed(len(checked), checked.cycle, checked.rig.motion)
         self._cycle = self._bus_faults = 0
         self._taken_over = self._held_before = False
+        self._press = 0  # of jogs: the one whose line is followed
         self._reported: set[tuple[str, str]] = set()
         self._listener_error = ""
         self._held = _HELD if self._group.capabilities.holds_on_quick_stop else _BRAKED
@@ -260,6 +261,7 @@ class Loop:
             error_frames=done.status.error_frames,
             following_error=done.following_error,
             lateness=done.lateness,
+            press=self._press,
         )
         self._cycle += 1
         self._call_listener(lambda: self._on_cycle(record))

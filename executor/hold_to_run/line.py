@@ -11,7 +11,7 @@ import numpy as np
 from drivers.stopping_distance import require_stopping_room
 from executor.hold_to_run.presses import PlatformPress, PressBoard
 from executor.realtime.shared_memory import Ring, SharedMemory
-from executor.state_machine import CycleRecord, State
+from executor.state_machine import ON_PATH, CycleRecord, State
 from executor.trajectory.path import Path, line
 from executor.trajectory.setpoints import (
     CheckedTrajectory,
@@ -200,7 +200,7 @@ class JogProver:
         motion = rig.motion
         to_rest = motion.speed / motion.acceleration + motion.acceleration / motion.jerk
         self._wanted_rows = (AHEAD + to_rest) / self._cycle
-        self._line = JogLine(rig, scene, start, np.zeros(3))
+        self._line = self._followed = JogLine(rig, scene, start, np.zeros(3))
         self._press, self._size, self._narrows, self._is_whole = 0, FIRST_ROWS, False, True
         self._row = 0.0
         self.limit = ""
@@ -209,38 +209,43 @@ class JogProver:
     @property
     def pose(self) -> Pose:
         """Last commanded pose, ``world_from_platform``."""
-        return self._line.pose(self._row)
+        return self._followed.pose(self._row)
 
     @property
     def room(self) -> float:
         """Checked length ahead of the platform, [m]."""
-        return self._line.travelled(self._line.rows - 1) - self._line.travelled(self._row)
+        return self._line.travelled(self._line.rows - 1) - self._line.travelled(self._row_on_line)
+
+    @property
+    def _row_on_line(self) -> float:
+        """Row on the line that is checked: its first until the loop follows it."""
+        return self._row if self._followed is self._line else 0.0
 
     def take_cycle(self, record: CycleRecord) -> None:
-        """Takes a cycle; checks at most one piece."""
-        if record.state is not State.MOVING:
+        """Takes a cycle; checks at most one piece.
+
+        The loop follows the line of a press only if its first piece arrives before its end.
+        """
+        if record.state not in ON_PATH:
             return
+        if record.press == self._press:
+            self._followed = self._line
+        self._row = record.index  # on the line that the loop follows
         press = self._board.held()
-        if not isinstance(press, PlatformPress):
-            press = None
-        if press is None or press.number == self._press:
-            self._row = record.index
-        if press is None:
+        if record.state is not State.MOVING or not isinstance(press, PlatformPress):
             return
         if press.number != self._press:
-            rests = record.rate == 0.0 or record.index >= self._line.rows - 1
             # The motion of this cycle was decided up to one cycle before it began.
-            if rests and record.at - press.free_since > CERTAIN * self._cycle:
-                self._row = record.index
+            if record.rate == 0.0 and record.at - press.free_since > CERTAIN * self._cycle:
                 self._begin(press)
-        elif not self._is_whole and self._line.rows - 1 - record.index < self._wanted_rows:
+        elif not self._is_whole and self._line.rows - 1 - self._row_on_line < self._wanted_rows:
             self._check(press)
 
     def _begin(self, press: PlatformPress) -> None:
         start = self.pose
         rotation = start.rotation if press.in_platform else np.eye(3)
         self._line = JogLine(self._rig, self._scene, start, rotation @ press.direction)
-        self._press, self._row, self.limit = press.number, 0.0, ""
+        self._press, self.limit = press.number, ""
         self._size, self._narrows, self._is_whole = FIRST_ROWS, False, False
         self._check(press)
 

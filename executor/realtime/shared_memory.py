@@ -165,7 +165,7 @@ class CycleRecordCodec:
     def __init__(self, cables: int) -> None:
         """A codec for this number of cables."""
         self._cables = cables
-        self._layout = struct.Struct(f"<Qd B dd HQQ dd {4 * cables}i 7d")
+        self._layout = struct.Struct(f"<Qd B dd HQQ ddQ {4 * cables}i 7d")
         self.size = self._layout.size
 
     def pack(self, record: CycleRecord, pose: Pose | None) -> bytes:
@@ -182,6 +182,7 @@ class CycleRecordCodec:
             record.error_frames,
             record.following_error,
             record.lateness,
+            record.press,
             *record.targets,
             *record.actual,
             *record.torques,
@@ -193,10 +194,10 @@ class CycleRecordCodec:
         """The inverse of `pack`."""
         values = self._layout.unpack(content)
         cycle, at, state, index, rate, missing, rejected, error_frames = values[:8]
-        error, lateness = values[8:10]
+        error, lateness, press = values[8:11]
         m = self._cables
-        targets, actual, torques, words = (values[10 + k * m : 10 + (k + 1) * m] for k in range(4))
-        pose_values = values[10 + 4 * m :]
+        targets, actual, torques, words = (values[11 + k * m : 11 + (k + 1) * m] for k in range(4))
+        pose_values = values[11 + 4 * m :]
         record = CycleRecord(
             cycle=cycle,
             at=at,
@@ -212,6 +213,7 @@ class CycleRecordCodec:
             error_frames=error_frames,
             following_error=error,
             lateness=lateness,
+            press=press,
         )
         if math.isnan(pose_values[0]):
             return record, None

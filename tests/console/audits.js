@@ -36,6 +36,26 @@
       .map(this.nameOf);
   },
 
+  /** Parts of the live view that reach into each other or beyond their own edge, and what the head hides. */
+  overlapping() {
+    const box = (e) => e.getBoundingClientRect();
+    const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1;
+    const found = [], parts = this.shown("#scene, #tension, #curves, #news, #simulated, .lamps, #rig");
+    for (const [k, one] of parts.entries()) {
+      for (const other of parts.slice(k + 1)) {
+        const isLive = [one, other].every((e) => e.closest("#live")) || [one, other].every((e) => e.closest("#top"));
+        if (isLive && meet(box(one), box(other))) found.push(`${this.nameOf(one)} and ${this.nameOf(other)}`);
+      }
+    }
+    for (const row of this.shown("#tensions li")) {
+      const [inner, outer] = [box(row), box(document.getElementById("tension"))];
+      if (inner.right > outer.right || inner.bottom > outer.bottom) found.push(`row ${row.textContent}`);
+    }
+    const simulated = document.getElementById("simulated");
+    if (simulated.scrollWidth > simulated.clientWidth + 1 || box(simulated).right > innerWidth || box(simulated).width < 50) found.push("simulated drives");
+    return [...found, ...(document.documentElement.scrollWidth > innerWidth ? ["scrolls sideways"] : [])];
+  },
+
   /** Texts that do not fit in their element. */
   cut() {
     return this.shown("button, .tiles dt, .tiles dd, .lamps span, #stop-words, #tensions .value")

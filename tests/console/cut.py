@@ -1,15 +1,33 @@
-"""A TCP proxy that can go silent or cut the connection, like a network."""
+"""Connections: a page's, without a browser, and a TCP proxy that can go silent or cut it."""
 
 from __future__ import annotations
 
+import json
 import selectors
 import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import TracebackType
+from typing import Any
+
+from websockets.sync.client import ClientConnection
 
 _CHUNK = 65536
+
+
+def acknowledgement(state: dict[str, Any], at_ms: float = 0.0) -> str:
+    """What a page sends when a state has reached it: else the server sends no further one."""
+    return json.dumps({"kind": "seen", "seq": state["seq"], "at_ms": at_ms})
+
+
+def receive(page: ClientConnection, timeout: float = 60.0) -> dict[str, Any]:
+    """The next message; a state is acknowledged."""
+    message = json.loads(page.recv(timeout=timeout))
+    assert isinstance(message, dict)
+    if message["kind"] == "state":
+        page.send(acknowledgement(message))
+    return message
 
 
 class CutConnection:

@@ -153,6 +153,8 @@ class Fake:
         self.events: list[dict[str, Any]] = []
         self.pictures: list[float] = []
         self.slow_ms = 0
+        self.seen: dict[WebSocket, dict[str, float]] = {}
+        self.behind_ms = 0.0  # how much longer states take to the page
         self.planning: str | None = None  # the plan being made
         self.planning_ticks = 0  # until it is made
         self.files = {
@@ -239,6 +241,7 @@ class Fake:
             "moving": self.jog_ready and self.held is not None,
             "limit": None,
             "room_mm": None,
+            "not_begun": None,
         }
         if self.held and near < 60.0:
             jog.update(limit="clearance to obstacle_1", room_mm=near - 10.0)
@@ -293,6 +296,9 @@ class Fake:
                 ],
             },
             "measured": self._measured(near),
+            "drives_read": None,
+            "made_ms": 1e3 * time.monotonic() - self.behind_ms,
+            "echo": self.seen.get(reader),
             "next_stop": self._next_stop(),
             "preview": self.plan,
             "plan_start_off_mm": None if self.plan is None else 0.0,
@@ -398,8 +404,11 @@ class Fake:
 
     def take(self, page: WebSocket, message: dict[str, Any]) -> tuple[bool, str]:
         """Executes a page's command; returns whether it was done, and the answer."""
-        self.received.append(message)
         kind = message["kind"]
+        if kind == "seen":
+            self.seen[page] = {"at_ms": message["at_ms"], "received_ms": 1e3 * time.monotonic()}
+            return True, ""
+        self.received.append(message)
         ready = self.cable_ready if "cable" in message else self.jog_ready
         if kind == "held" and ready and message["hold"] > self.spent:
             if self.held is None:
@@ -449,6 +458,8 @@ class Fake:
             self.jog_ready, self.cable_ready = command == "jog_begin", False
         elif command == "reset":
             self.latched = None
+        elif command == "read_drives":
+            self.over["drives_read"] = {"at": "19:12:05", "why_not": None}
         elif command in ("home", "release"):
             self.homed = command == "home"
         elif command == "load_plan":
@@ -580,6 +591,7 @@ async def speak(fake: Fake, page: WebSocket) -> None:
         pass
     finally:
         fake.sockets.pop(page, None)
+        fake.seen.pop(page, None)
         if fake.in_control is page:
             fake.in_control = None
 

@@ -170,6 +170,19 @@ def test_the_age_grows_by_the_page_s_own_clock(desk: Visit) -> None:
     expect(desk.page.locator("#stale-text")).to_have_text(re.compile(r"for 1\.[0-9] s"))
 
 
+def test_data_of_a_slow_connection_are_as_old_as_they_are(desk: Visit) -> None:
+    """They arrive 20 times a second: their receipt says nothing about their age."""
+    expect(desk.page.locator("#lamp-data")).to_have_text(re.compile("Data 0\\.[0-2]"))
+    desk.fake.ask(set={"behind_ms": 300.0})
+    expect(desk.page.locator("#lamp-data")).to_have_text(re.compile("Data 0\\.[34]"))
+    desk.fake.ask(set={"behind_ms": 8000.0})
+    slow = re.compile(r"The connection is slow: data are 8\.[0-9] s old")
+    expect(desk.page.locator("#stale-text")).to_have_text(slow)
+    assert desk.audit("usable") == ["stop"]
+    desk.fake.ask(set={"behind_ms": 0.0})
+    expect(desk.page.locator("#stale")).to_be_hidden()
+
+
 def test_a_run_that_does_not_report_is_stale_though_the_server_speaks(desk: Visit) -> None:
     desk.take_control()
     desk.load()

@@ -43,7 +43,7 @@ def moving(state: str, **wished: Any) -> dict[str, Any]:
 RUN = {"verb": "run", "text": ""}
 PLANS = {"load_plan", "compare", "compare_end", "plan", "plan_poses", "go_to"}
 PLANS |= {"plan_files", "scene_files"}
-REST = {"home", "release", "run", "jog_begin", "service_begin"} | PLANS
+REST = {"home", "release", "read_drives", "run", "jog_begin", "service_begin"} | PLANS
 ALWAYS = {"stop", "jog_setting", "cable_setting", "plan_setting"}
 SERVICE = {"yours": True, "held_by": "A", "mode": "service"}
 TAUGHT = {"teach", "teach_at", "edit_pose", "give_control"}
@@ -277,6 +277,21 @@ def test_nothing_is_cut_off_and_touch_targets_are_large(
             assert found.audit("cut") == [], view
 
 
+def test_many_cables_and_a_long_name_cover_nothing(desk: Visit) -> None:
+    """At every width; that drives are simulated is always shown."""
+    name = "large_hall_of_the_institute_with_a_name_of_some_length_and_number_0815"
+    read = {"at": "19:12:05", "why_not": None}
+    for cables in (8, 10, 24):
+        tensions = [8.0 + 3.5 * k for k in range(cables)]
+        desk.fake.ask(state={"rig": name, "tensions_n": tensions, "drives_read": read})
+        expect(desk.page.locator("#tensions li")).to_have_count(cables)
+        for width, height in ((320, 640), (390, 844), (768, 1024), (1024, 768), (1400, 780)):
+            desk.page.set_viewport_size({"width": width, "height": height})
+            desk.view("live")
+            assert desk.audit("overlapping") == [], (cables, width)
+            assert desk.audit("cut") == [], (cables, width)
+
+
 def test_everything_has_a_name_and_is_reached_by_keyboard(desk: Visit) -> None:
     """Every control that is shown, in every view, by Tab or, for tabs and radios, by an arrow."""
     fill_everything(desk)
@@ -326,7 +341,8 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     for name in ("home", "release"):
         page.locator(f"#{name}").click()
         page.locator(".confirm").click()
-    desk.fake.ask(set={"latched": "slack", "homed": True})
+    desk.fake.ask(set={"latched": "slack", "homed": True}, state={"simulated": False})
+    page.locator("#read-drives").click()
     page.locator("#reset").click()
     page.locator(".confirm").click()
     page.locator("summary", has_text="Make a plan").click()
@@ -373,6 +389,7 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
             "stop",
             "home",
             "release",
+            "read_drives",
             "reset",
             "teach",
             "teach_at",

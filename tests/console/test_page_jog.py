@@ -226,6 +226,9 @@ def test_what_rests_is_not_said_to_move(desk: Visit) -> None:
     desk.fake.ask(state={"jog": {**jog, "moving": True}})
     expect(desk.page.locator("#jog-state")).to_have_text("Moving")
     expect(desk.page.locator("#motion-text")).to_have_text("Jogging")
+    why = "press 7: its line does not begin where the platform rests"
+    desk.fake.ask(state={"jog": {**jog, "moving": False, "not_begun": why}})
+    expect(desk.page.locator("#jog-limit")).to_contain_text(f"Not begun: {why}")
     desk.page.mouse.up()
 
 

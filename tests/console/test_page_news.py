@@ -207,6 +207,32 @@ def test_drives_that_are_on_are_the_normal_state_and_drives_that_hold_are_not_of
     expect(lamp).to_have_text("8 of 8 drives hold")
 
 
+def test_values_read_at_rest_are_not_shown_as_live(desk: Visit) -> None:
+    """Nothing watches the drives then: they may lose power, or be moved by another program."""
+    lamp, said = desk.page.locator("#lamp-drives"), desk.page.locator("#drives-read")
+    value = desk.page.locator("#tensions .value").first
+    quiet = """e => getComputedStyle(e).color
+      === getComputedStyle(document.querySelector('.quiet')).color"""
+    expect(said).to_be_hidden()
+    assert not value.evaluate(quiet)
+    read = {"at": "19:12:05", "why_not": None}
+    desk.fake.ask(state={"drives_read": read})
+    expect(said).to_have_text("Read at 19:12:05, not watched.")
+    expect(lamp).to_have_text("Read 19:12:05")
+    for figure in (value, desk.page.locator("#tile-clearance dd")):
+        assert figure.evaluate(quiet)
+    released = {"platform": None, "clearance_mm": None, "tensions_n": [0.0] * 8}
+    desk.fake.ask(state={**released, "drives_read": {**read, "why_not": "the torque was removed"}})
+    expect(said).to_contain_text("not watched. The torque was removed.")
+    expect(desk.page.locator("#value-x")).to_have_text("–")
+    expect(desk.page.locator("#tension-trouble")).to_have_text("8 cables are slack: at least 5 N")
+    unread = {"drives_read": {**read, "why_not": "drive 3 does not answer"}, "tensions_n": None}
+    desk.fake.ask(state=unread)
+    expect(lamp).to_have_text("Drives not read")
+    expect(said).to_have_text("Drive 3 does not answer.")
+    expect(desk.page.locator("#tension-trouble")).to_have_text("Unknown.")
+
+
 def test_no_number_is_a_negative_zero(desk: Visit) -> None:
     pose = {"name": "one", "position_mm": [-0.04, -0.0, 445.0], "quaternion": [1, 0, 0, 0]}
     platform = {"position_mm": [-0.04, -0.0, 445.0], "tilt_deg": -0.0, "turn_deg": -0.001}

@@ -23,19 +23,27 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from cdpr.console import server
-from cdpr.console.commands import MOST_WAITING, Held, LetGo, parse_message
+from cdpr.console.commands import MOST_WAITING, Held, LetGo, Seen, parse_message
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
 from cdpr.console.session import Console, ConsoleFiles
-from cdpr.console.state import StoredState, VerbOutcome, _without_commands
+from cdpr.console.state import (
+    MOST_IN_TRANSIT,
+    StateFlow,
+    StoredState,
+    VerbOutcome,
+    _without_commands,
+)
 from cdpr.console.watch import RunWatch
 from executor.remote.command_socket import advertised
 from executor.remote.command_socket import serving as commands
+from executor.remote.status import bus_name
+from executor.state_machine import State
 from executor.supervision import LocalRequests
 from model.plan import load_plan, save_plan
 from model.pose import Pose
@@ -44,6 +52,7 @@ from model.scene import load_scene
 from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan, write_short_plan
 from tests.cli.program import call
 from tests.console import fake_server
+from tests.console.cut import acknowledgement, receive
 
 
 class Served:
@@ -118,14 +127,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class MovesOn:
-    """A minimal `RunStatus` with only the bus of a run, and its rig."""
+#: States in which no path is left to be held or resumed.
+OVER = {State.STOPPING, State.SECURING, State.FINISHED, State.STOPPED, State.LATCHED}
 
-    def __init__(self, bus: str, rig: str) -> None:
-        self._bus, self._rig = bus, rig
+
+class MovesOn:
+    """A minimal `RunStatus` with only the bus of a run, its rig and its state."""
+
+    def __init__(self, bus: str, rig: str, state: str = "moving") -> None:
+        self._status = {"bus": bus, "rig": rig, "state": state}
 
     def as_dict(self) -> dict[str, Any]:
-        return {"bus": self._bus, "rig": self._rig}
+        return self._status
 
 
 @pytest.fixture(autouse=True)
@@ -141,6 +154,7 @@ def slow_connections_count(request: pytest.FixtureRequest, monkeypatch: pytest.M
     """Only where a test is about them: the others' reports name any state."""
     if "slow" not in request.node.name:
         monkeypatch.setattr(server, "BEHIND", math.inf)
+        monkeypatch.setattr(server, "UNSEEN", math.inf)
 
 
 @pytest.fixture
@@ -153,9 +167,8 @@ def served(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
 def state(page: ClientConnection) -> dict[str, Any]:
     """The next state; skips answers."""
     while True:
-        message = json.loads(page.recv(timeout=10))
+        message = receive(page)
         if message["kind"] == "state":
-            assert isinstance(message, dict)
             return message
 
 
@@ -163,9 +176,8 @@ def answer_to(page: ClientConnection, text: str) -> dict[str, Any]:
     """Sends a message and returns its answer."""
     page.send(text)
     while True:
-        message = json.loads(page.recv(timeout=30))
+        message = receive(page)
         if message["kind"] == "answer":
-            assert isinstance(message, dict)
             return message
 
 
@@ -204,6 +216,23 @@ def test_a_latch_is_shown_together_with_the_end_of_the_verb_that_left_it(
     monkeypatch.setattr("cdpr.console.session.read_stored", lambda *_, **__: latched)
     state = console.update()
     assert (state["busy"], state["latched"]) == (None, "cable 4 is slack")
+    console.close()
+
+
+@pytest.mark.parametrize("state", State)
+def test_hold_and_resume_are_refused_by_a_run_that_is_over(state: State) -> None:
+    """Its process may still write the report, and would answer that the request was taken."""
+    rig = load_rig(RIG)
+    console = Console(ConsoleFiles(RIG, rig, (), (), (), None, True, False))
+    run: Any = MovesOn(bus_name(rig), rig.name, state.value)
+    with advertised() as listeners, commands(listeners, LocalRequests(), run):
+        assert console.watch.update().status is not None
+        for request, values in (("hold", {}), ("speed", {"percent": 50}), ("resume", {})):
+            why_not = console.watch.send(request, **values)
+            if state in OVER:
+                assert f"`{request}` has no effect" in why_not
+            else:
+                assert why_not == ""
     console.close()
 
 
@@ -573,11 +602,12 @@ def test_a_press_over_a_slow_connection_is_ended_and_the_page_is_told(served: Se
         while state(other)["seq"] < old + 10:  # half a second
             pass
         page.send(held(1, newest=old))
-        while (answer := json.loads(page.recv(timeout=10)))["kind"] != "answer":
+        while (answer := receive(page))["kind"] != "answer":
             newest = answer["seq"]
         assert "too slow to jog" in answer["what"]
         assert served.said == []
-        while (newest := state(page)["seq"]) < state(other)["seq"]:
+        reached = state(other)["seq"]
+        while (newest := state(page)["seq"]) < reached:
             pass
         page.send(held(2, newest=newest))
         assert said(served, page, ["held"])
@@ -585,6 +615,67 @@ def test_a_press_over_a_slow_connection_is_ended_and_the_page_is_told(served: Se
         assert said(served, page, ["held", "let_go"])
         page.send(held(3, newest=newest + 10**6))
         assert said(served, page, ["held", "let_go", "let_go"]), "no state of this server"
+
+
+@given(
+    made=st.lists(st.floats(0.0, 0.3), min_size=3, max_size=40),
+    there=st.lists(st.floats(0.0, 2.0), min_size=40, max_size=40),
+    back=st.lists(st.floats(0.0, 2.0), min_size=40, max_size=40),
+    ahead=st.floats(0.0, 1e6),
+)
+@example([0.05] * 40, [0.001] * 40, [0.001] * 40, 0.0)
+@example([0.05] * 40, [1.0] * 40, [1.0] * 40, 5.0)
+def test_a_page_is_never_shown_a_state_as_younger_than_it_is(
+    made: list[float], there: list[float], back: list[float], ahead: float
+) -> None:
+    """However slow the connection is in either direction, and whatever the page's clock shows."""
+    flow, now, ahead_ms = StateFlow(), 0.0, -math.inf
+    on_the_way: list[tuple[float, int, float, Any]] = []  # arrival, number, when made, its echo
+    acknowledged: list[tuple[float, Seen]] = []
+    for seq, period in enumerate(made, start=1):
+        now += period
+        for at, message in sorted(acknowledged, key=lambda one: one[0]):
+            if at <= now:
+                flow.take(message, at)
+        acknowledged = [one for one in acknowledged if one[0] > now]
+        if flow._has_room.is_set():
+            flow.send(seq)
+            on_the_way.append((now + there[seq - 1], seq, now, flow.echo))
+        assert len(flow._sent) <= MOST_IN_TRANSIT
+        for arrival, number, begin, echo in [one for one in on_the_way if one[0] <= now]:
+            if echo is not None:
+                ahead_ms = max(ahead_ms, echo["at_ms"] - echo["received_ms"])
+                shown = arrival + ahead - begin - ahead_ms / 1e3
+                assert shown >= arrival - begin - 1e-3
+                assert shown <= max(there) + max(back) + 1e-3, "the way there and back, at most"
+            at_ms = 1e3 * (arrival + ahead)
+            acknowledged.append(
+                (arrival + back[number - 1], Seen(kind="seen", seq=number, at_ms=at_ms))
+            )
+        on_the_way = [one for one in on_the_way if one[0] > now]
+
+
+def test_over_a_slow_connection_the_newest_state_is_sent_and_no_queue_builds_up(
+    served: Served,
+) -> None:
+    with served.page() as page, served.page() as other:
+        first = [json.loads(page.recv(timeout=30)) for _ in range(MOST_IN_TRANSIT)]
+        assert [one["echo"] for one in first] == [None] * MOST_IN_TRANSIT
+        while state(other)["seq"] < first[-1]["seq"] + 5:
+            pass
+        page.send(acknowledgement(first[-1], at_ms=7.0))
+        newest = json.loads(page.recv(timeout=30))
+        assert newest["seq"] >= first[-1]["seq"] + 5, "those in between were left out"
+        assert newest["echo"]["at_ms"] == 7.0
+
+
+def test_a_page_that_acknowledges_nothing_loses_its_connection(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as one that a frozen browser holds open; its control is free then."""
+    monkeypatch.setattr(server, "UNSEEN", 0.01)
+    with served.page() as page, pytest.raises(ConnectionClosed):
+        list(page)
 
 
 def test_a_cable_is_moved_by_a_page_in_service_mode_only(served: Served) -> None:

@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import chdtr
 
-from cdpr.console.view import ELLIPSOID_SCALE, RobotView, measured_data, nearest_data
+from cdpr.console.view import (
+    ELLIPSOID_SCALE,
+    RobotView,
+    commanded_pose,
+    measured_data,
+    nearest_data,
+)
+from cdpr.console.watch import USED_FOR, RobotWatch
+from executor.interlock.interlock import ReferenceStatus
 from executor.recording.run_folder import RunFolder
 from executor.remote import status
+from executor.service import DriveStatus, StatusResult
 from model.clearance import ClearanceModel
+from model.errors import HardwareMissing, Refused
 from model.kinematics import cable_lengths
 from model.plan import load_plan
 from model.pose import Array, Pose
@@ -73,6 +86,174 @@ def test_a_run_that_is_under_way_is_seen_in_its_own_scene(tmp_path: Path) -> Non
         view.take({**status_at(THE_RIG.home), "folder": str(folder.path)})
     assert [one.name for one in view.scene.obstacles] == [o.name for o in plan.scene.obstacles]
     assert view.scene.obstacles != SCENE.obstacles
+
+
+class AtOnce(ThreadPoolExecutor):
+    """Works in the thread that asks."""
+
+    def submit(self, work: Any, /, *arguments: Any) -> Any:  # type: ignore[override]
+        answer: Future[Any] = Future()
+        try:
+            answer.set_result(work(*arguments))
+        except Exception as error:
+            answer.set_exception(error)
+        return answer
+
+
+class Drives:
+    """A robot whose drives are read, by a pose; or its reading."""
+
+    def __init__(self) -> None:
+        self.reading: StatusResult | Exception = self.held_at(THE_RIG.home)
+        self.readings = 0
+        self.watch = RobotWatch(RobotView(THE_RIG, SCENE), self.read, AtOnce(1))
+
+    @staticmethod
+    def held_at(pose: Pose, tension: float = 20.0) -> StatusResult:
+        drives = tuple(DriveStatus(k, "operation enabled", 0, tension, True) for k in range(1, 9))
+        counts = ReferenceStatus(counts=True, why_not=None, made="", how="jig", file="")
+        return StatusResult("rig", "bus", None, None, False, counts, drives, pose)
+
+    def read(self) -> StatusResult:
+        self.readings += 1
+        if isinstance(self.reading, Exception):
+            raise self.reading
+        return self.reading
+
+    def rest(self) -> None:
+        for _ in range(3):
+            self.watch.update(None, is_busy=False)
+
+    def move(self, pose: Pose) -> None:
+        self.watch.update(status_at(pose), is_busy=True)
+
+
+def wound_in_at(pose: Pose) -> dict[str, Any]:
+    status = status_at(pose)
+    status["drives"][2]["position_counts"] -= 9000  # wound in by 14 mm
+    return status
+
+
+RELEASED = replace(
+    Drives.held_at(THE_RIG.home, 0.0),
+    pose=None,
+    reference=ReferenceStatus(counts=False, why_not="released", made=None, how=None, file=None),
+)
+SILENT = HardwareMissing("drive 3 does not answer", where="bus")
+
+
+@pytest.mark.parametrize(
+    ("reading", "tensions", "why_not"),
+    [
+        (RELEASED, [0.0] * 8, "released"),
+        (replace(RELEASED, why_no_pose="no pose fits"), [0.0] * 8, "no pose fits"),
+        (replace(RELEASED, drives=None, missing=SILENT), None, "drive 3 does not answer"),
+        (OSError("unplugged"), None, "OSError: unplugged"),
+        (SILENT, None, "drive 3 does not answer"),
+    ],
+)
+def test_what_is_not_read_at_rest_is_not_shown_as_known(
+    reading: StatusResult | Exception, tensions: list[float] | None, why_not: str
+) -> None:
+    """After a release, a loss of power or of the reference: neither pose nor old tensions."""
+    drives = Drives()
+    drives.rest()
+    seen = drives.watch.now
+    assert seen.robot is not None
+    assert (seen.tensions, seen.why_not) == ([20.0] * 8, None)
+    assert seen.at is not None, "nothing watches the drives at rest"
+    drives.move(THE_RIG.home)
+    assert drives.watch.now.as_dict() is None, "live"
+    drives.reading = reading
+    drives.rest()
+    seen = drives.watch.now
+    assert (seen.robot, seen.tensions, seen.why_not) == (None, tensions, why_not)
+    assert seen.at is not None
+    with pytest.raises(Refused, match="pose is not known"):
+        drives.watch.pose(None)
+    assert drives.watch.pose_at_rest() is None
+
+
+def test_a_run_whose_cables_fit_no_pose_keeps_no_old_one() -> None:
+    drives = Drives()
+    drives.move(THE_RIG.home)
+    assert drives.watch.now.robot is not None
+    drives.watch.update(wound_in_at(THE_RIG.home), is_busy=True)
+    seen = drives.watch.now
+    assert seen.robot is None
+    assert len(seen.tensions or []) == 8
+    assert "fit no pose" in (seen.why_not or "")
+    drives.watch.update({"folder": "", "drives": []}, is_busy=True)
+    assert drives.watch.now.tensions == seen.tensions, "before its first cycle nothing is known"
+
+
+def test_the_drives_are_read_after_a_motion_and_when_asked_and_not_otherwise() -> None:
+    drives = Drives()
+    drives.rest()
+    drives.rest()
+    assert drives.readings == 1, "at the start"
+    drives.watch.ask()
+    drives.rest()
+    assert drives.readings == 2
+    drives.move(THE_RIG.home)
+    drives.watch.ask()
+    drives.watch.update(None, is_busy=True)  # its report is being written
+    assert drives.readings == 2
+    assert drives.watch.now.at is not None, "nothing reports any more"
+    drives.rest()
+    assert drives.readings == 3
+
+
+def test_drives_that_another_program_uses_keep_their_values_and_are_read_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [1000.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    drives = Drives()
+    drives.rest()
+    known = drives.watch.now
+    drives.reading = replace(RELEASED, drives=None, being_set_up=True)
+    drives.watch.ask()
+    drives.rest()
+    seen = drives.watch.now
+    assert (seen.robot, seen.at) == (known.robot, known.at)
+    assert "another program" in (seen.why_not or "")
+    with pytest.raises(Refused):
+        drives.watch.pose(None)
+    drives.reading, before = RELEASED, drives.readings
+    drives.rest()
+    assert drives.readings == before
+    now[0] += USED_FOR
+    drives.rest()
+    assert drives.watch.now.why_not == "released"
+
+
+def test_a_pose_at_rest_is_that_of_the_drives_now() -> None:
+    """The platform may have been moved since the drives were read."""
+    drives = Drives()
+    drives.rest()
+    moved = Pose(THE_RIG.home.position + np.array([0.0, 0.0, 0.0254]), THE_RIG.home.rotation)
+    drives.reading = Drives.held_at(moved)
+    for pose in (drives.watch.pose_at_rest(), drives.watch.pose(None)):
+        assert pose is not None
+        assert pose.distance_to(moved) == 0.0
+
+
+@settings(deadline=None)
+@given(st.tuples(*[st.floats(-5e-3, 5e-3)] * 3))
+@example((0.0, 0.0, 0.0))
+@example((0.0, 0.0, 2.0e-3))
+def test_a_commanded_pose_is_taught_only_where_the_drives_are(off: tuple[float, ...]) -> None:
+    home = THE_RIG.home
+    jog = {"position_mm": (1e3 * home.position).tolist(), "quaternion": [*home.quaternion]}
+    there = Pose(home.position + np.array(off), home.rotation)
+    robot = RobotView(THE_RIG, None).simulated_at(there)
+    lengths = cable_lengths(THE_RIG, there) - cable_lengths(THE_RIG, home)
+    if np.abs(lengths).max() <= THE_RIG.motion.start_tolerance:
+        assert commanded_pose(THE_RIG, jog, robot).distance_to(home) < 1e-9
+        return
+    with pytest.raises(Refused, match="not where the jog commanded"):
+        commanded_pose(THE_RIG, jog, robot)
 
 
 def measurement_with(covariance: Array) -> dict[str, Any]:

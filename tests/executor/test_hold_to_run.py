@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from executor.hold_to_run import session as sessions
@@ -22,10 +22,12 @@ from executor.remote.protocol import STEPS_MM
 from executor.state_machine import CycleRecord, State
 from model.clearance import ClearanceModel
 from model.errors import CdprError, Fault, StoppedByOperator
-from model.kinematics import forward_kinematics
+from model.kinematics import cable_lengths, forward_kinematics
 from model.pose import Array, Pose
+from model.progress import Listener
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene
+from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 from tests.cli.plans import RIG
 from tests.effort import cases
@@ -126,6 +128,8 @@ def test_a_step_ends_where_it_should(length: float) -> None:
     path = positions(records)[-1] - positions(records[:5])[-1]
     assert path[2] == pytest.approx(length, abs=3e-5)
     assert np.abs(path[:2]).max() < 5e-5
+    last = [record for record in records if record.state is State.MOVING][-1]
+    assert last.rate == 0.0, "at rest, not at the speed of its last row"
 
 
 @pytest.mark.parametrize("percent", [5, 25])
@@ -204,6 +208,74 @@ def test_nothing_moves_unless_it_is_held(presses: list[tuple[int, int, int, bool
         if moves and record.state is State.MOVING:
             assert any(a <= record.at <= b + TIMEOUT + ramp for a, b in spans)
     assert not any(moved(records)[-20:])
+
+
+class Notes(Listener):
+    """Keeps the events that are reported to a user."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.texts.append(text)
+
+    warning = remark = note
+
+
+#: A press: its axis, its step, how long it is held and how long the page pauses then, both in
+#: cycles of 10 ms, and how it ends: let go, silent, or replaced by the next one.
+PRESSES = st.tuples(
+    st.integers(0, 5),
+    st.sampled_from([None, None, None, 0.0001, 0.001]),
+    st.sampled_from([1, 1, 2, 3, 4, 6, 25, 80]),
+    st.sampled_from([1, 2, 3, 5, 15, 40, 60]),
+    st.sampled_from(["let_go", "silent", "replaced"]),
+)
+
+
+@settings(max_examples=cases(25), deadline=None)
+@given(st.lists(PRESSES, min_size=1, max_size=7))
+@example([(4, None, 80, 60, "let_go"), (4, None, 1, 60, "let_go"), (1, None, 80, 60, "let_go")])
+@example([(4, None, 80, 2, "silent"), (5, None, 2, 60, "silent"), (4, None, 80, 60, "silent")])
+@example([(4, 0.001, 80, 60, "replaced"), (0, None, 1, 1, "replaced"), (4, None, 2, 1, "let_go")])
+def test_the_commanded_pose_is_the_drives_whatever_was_pressed(
+    presses: list[tuple[int, float | None, int, int, str]],
+) -> None:
+    """Clicks shorter than the first check, frozen pages, presses replaced; each line begins there.
+
+    A press that is over before its first piece arrives must not move the pose that the next line
+    begins at: it would be refused, and all after it.
+    """
+    cycle = rig().cycle
+    holds, begin = [], 0.5
+    for number, (axis, step, held, pause, end) in enumerate(presses, start=1):
+        until = begin + cycle * held
+        holds.append((begin, until, hold(number, AXES[axis], step=step)))
+        if end == "let_go":
+            holds.append((until, until + cycle, lambda board, n=number: board.let_go(n)))
+        begin = until + (0.0 if end == "replaced" else cycle * pause)
+    last = begin + 1.0  # at rest
+    z = np.array([0.0, 0.0, 1.0])
+    holds.append((last, last + 0.5, hold(len(presses) + 1, z)))
+    script, poses, notes = Script(holds, last + 1.5), [], Notes()
+
+    def on_cycle(record: CycleRecord, board: PressBoard, prover: JogProver) -> None:
+        poses.append(prover.pose)
+        script(record, board, prover)
+
+    jog_session(rig(), scene(), realtime=False, on_cycle=on_cycle, listener=notes)
+    assert not [text for text in notes.texts if "does not begin" in text]
+    winches = WinchMap(rig())
+    for record, pose in zip(script.records, poses, strict=True):
+        if record.state is State.MOVING:
+            commanded = winches.counts(
+                winches.unstrained(
+                    cable_lengths(rig(), pose), working_tensions(rig(), pose, scene().load).tensions
+                )
+            )
+            assert np.abs(commanded - record.targets).max() <= 3, "rounded, between two rows"
+    at = np.array([record.at for record in script.records])
+    assert np.array(moved(script.records))[at > last].any(), "the next press begins"
 
 
 def test_a_stop_ends_the_session_along_the_line() -> None:

@@ -127,6 +127,7 @@ def test_a_record_comes_back_as_it_was(state, counts, numbers, error, rotated):
         error_frames=7,
         following_error=error,
         lateness=numbers[3],
+        press=2**50,
     )
     wire = CycleRecordCodec(2)
     pose = Pose(np.array([0.1, -0.2, 0.3]), np.diag([1.0, -1.0, -1.0])) if rotated else None

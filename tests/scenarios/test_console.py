@@ -22,6 +22,7 @@ from websockets.sync.client import ClientConnection, connect
 from executor.remote.client import stop_runs
 from executor.remote.command_socket import find_runs
 from tests.cli.plans import CONFIGS
+from tests.console.cut import receive
 from tests.scenarios.test_processes import program
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
@@ -47,7 +48,7 @@ class Operator:
     def until(self, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
         """The first state that meets a condition."""
         for _ in range(PATIENCE):
-            message = json.loads(self._page.recv(timeout=60))
+            message = receive(self._page)
             if message["kind"] == "state":
                 self.state = message
                 late = "cycles late" in (message["latched"] or "")
@@ -61,9 +62,8 @@ class Operator:
         """The console's answer."""
         self._page.send(json.dumps({"kind": "command", "id": 1, "command": command, **values}))
         while True:
-            message = json.loads(self._page.recv(timeout=60))
+            message = receive(self._page)
             if message["kind"] == "answer":
-                assert isinstance(message, dict)
                 return message
 
     def does(self, command: str, **values: Any) -> dict[str, Any]:

@@ -63,6 +63,7 @@ export const BUTTONS = {
   home: [...OPERATOR, "idle", "unlatched"],
   reset: [...OPERATOR, "idle", "latched"],
   release: [...OPERATOR, "idle"],
+  read_drives: [...OPERATOR, "idle"],
   plan_files: [...OPERATOR, "idle"],
   load_plan: [...OPERATOR, "idle", "plan_file"],
   compare: [...OPERATOR, "idle", "planned", "plan_file"],

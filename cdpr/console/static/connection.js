@@ -1,6 +1,7 @@
 /* The connection to the server and the age of its data, on the page's monotonic clock.
 
-No message waits here: one that cannot be sent now is never sent, and no motion continues after a reconnection. The
+Each state is acknowledged with the time on this clock, and names when it was made and when the newest acknowledgement
+arrived, on the server's. That was after it was sent: so a state's age on arrival is known, at most. No message waits here: one that cannot be sent now is never sent, and no motion continues after a reconnection. The
 server ends the press of a page whose connection is slow, by the newest state that its reports name.
 Events: "state" (a new one), "age" (every 50 ms), "stale" (data became too old), "closed", "refused" (a message that
 the server rejected; `detail` gives the reason). */
@@ -8,6 +9,8 @@ the server rejected; `detail` gives the reason). */
 /** The page must report stale data within 0.5 s: less one frame and one state. */
 export const STALE_S = 0.45;
 const TICK_MS = 50, ANSWER_MS = 5000, RECONNECT_MS = [250, 500, 1000, 2000];
+/** Largest difference in rate of two computers' clocks. */
+const DRIFT = 2e-4;
 /** States of a run whose own status must be fresh; in all others nothing moves. */
 const REPORTING = ["enabling", "approaching", "moving", "holding", "stopping", "securing"];
 
@@ -25,6 +28,9 @@ export class Connection extends EventTarget {
   state = null;
   #socket = null;
   #received = null; // performance.now() of the last state
+  #opened = 0; // performance.now() when the connection was begun
+  #ahead = -Infinity; // of this clock before the server's, at least, [ms]
+  #delay = 0; // largest possible age of the last state when it was received, [s]
   #answers = new Map(); // id → callback
   #id = 0;
   #tries = 0;
@@ -43,12 +49,13 @@ export class Connection extends EventTarget {
   /** Why the data are stale, or null; the age of the data, [s]. */
   freshness() {
     if (this.#received === null) return { why: this.open ? "Waiting for data" : "Not connected to the console’s server", age: null };
-    const here = (performance.now() - this.#received) / 1000;
+    const here = (performance.now() - this.#received) / 1000 + this.#delay;
     const { motion } = this.state;
     const there = motion && REPORTING.includes(motion.state) && motion.age_s !== null ? motion.age_s + here : 0;
     const age = Math.max(here, there);
     if (!this.open) return { why: `Connection lost: data are ${age.toFixed(1)} s old`, age };
     if (age <= STALE_S) return { why: null, age };
+    if (this.#delay > STALE_S) return { why: `The connection is slow: data are ${age.toFixed(1)} s old`, age };
     const who = here > STALE_S ? "the console’s server" : "the run";
     return { why: `No data from ${who} for ${age.toFixed(1)} s`, age };
   }
@@ -88,6 +95,8 @@ export class Connection extends EventTarget {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     const socket = new WebSocket(`${scheme}://${location.host}${address("/ws")}`);
     this.#socket = socket;
+    this.#opened = performance.now();
+    this.#ahead = -Infinity; // the server may be another one
     socket.addEventListener("open", () => (this.#tries = 0));
     socket.addEventListener("message", (event) => this.#take(JSON.parse(event.data)));
     socket.addEventListener("close", () => this.#closed());
@@ -108,8 +117,12 @@ export class Connection extends EventTarget {
       return;
     }
     if (message.kind !== "state") return;
+    const now = performance.now(), { seq, made_ms: made, echo } = message;
+    this.send({ kind: "seen", seq, at_ms: now });
     this.state = message;
-    this.#received = performance.now();
+    if (echo) this.#ahead = Math.max(this.#ahead - DRIFT * (now - this.#received), echo.at_ms - echo.received_ms);
+    this.#received = now;
+    this.#delay = Math.max(0, echo ? now - made - this.#ahead : now - this.#opened) / 1000;
     clearTimeout(this.#due);
     this.#due = setTimeout(() => this.#tick(), 1 + 1000 * Math.max(0, STALE_S - this.freshness().age));
     this.dispatchEvent(new Event("state"));

@@ -105,7 +105,7 @@ function showPad(panel, jog, text, isHeld) {
   write(at(`${panel}-state`), text);
   if (jog.speed_mm_s) mark(at(`${panel}-speed`), "max", String(jog.speed_mm_s)); // the limit of the session
   showSpeed(panel);
-  const limit = jog.moving || isHeld ? ahead(jog) : "";
+  const limit = jog.not_begun ? `Not begun: ${jog.not_begun}. End jogging, then enable it again.` : jog.moving || isHeld ? ahead(jog) : "";
   write(at(`${panel}-limit`), limit);
   at(`${panel}-limit`).hidden = !limit;
 }

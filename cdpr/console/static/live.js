@@ -7,9 +7,10 @@ import { at, duration, known, make, mark, write } from "./elements.js";
 const LAMPS = {
   control: ({ control, read_only: readOnly }) =>
     readOnly ? ["Read-only", "quiet"] : control.mode === "service" ? ["Service mode", "stop"] : control.yours ? ["You have control", "pass"] : [control.held_by ? `Control: ${control.held_by}` : "Control is free", "quiet"],
-  drives: ({ motion, jog, cable }) => {
+  drives: ({ motion, jog, cable, drives_read: read, tensions_n: tensions }) => {
     const drives = motion?.drives ?? [], on = drives.filter((d) => d.state === "operation enabled").length;
     const ready = jog.ready || cable.ready, holding = drives.filter((d) => d.state === "quick stop active").length;
+    if (!drives.length && read?.at) return tensions ? [`Read ${read.at}`, "quiet"] : ["Drives not read", "stop"];
     if (!drives.length) return [ready ? "Drives on" : "No drive data", ready ? "pass" : "quiet"];
     // After a quick stop drives hold by themselves, with torque.
     const text = !on && holding ? `${holding} of ${drives.length} drives hold` : `${on} of ${drives.length} drives on`;
@@ -25,6 +26,26 @@ export const STATES = {
 };
 
 const BEFORE = { run: "Preparing the run", home: "Preparing to home", plan: "Planning", jog: "Preparing to jog", reset: "Resetting", release: "Releasing" };
+
+/** Where values at rest come from: no run reports the drives, and they may be moved or lose power unnoticed. */
+function readText({ drives_read: read, tensions_n: tensions }) {
+  if (!read) return "";
+  const why = read.why_not ? ` ${read.why_not[0].toUpperCase()}${read.why_not.slice(1)}.` : "";
+  return `${read.at && tensions ? `Read at ${read.at}, not watched.` : ""}${why}`.trim();
+}
+
+/** More than two cables in the same trouble are counted: a list would be longer than its space. */
+function troubleText(tensions, [low, high]) {
+  const words = (name, limit, values) => {
+    const found = tensions.flatMap((t, k) => (values(t) ? [k] : []));
+    if (found.length > 2) return [`${found.length} cables are ${name}: ${limit}`];
+    return found.map((k) => `Cable ${k + 1} is ${name}: ${known(tensions[k], 1, "N")}, ${limit}`);
+  };
+  return [
+    ...words("slack", `at least ${known(low, 0, "N")}`, (t) => t < low),
+    ...words("too tight", `at most ${known(high, 0, "N")}`, (t) => t > high),
+  ].join(". ");
+}
 
 /** The present motion, in a few words. */
 export function motionText({ motion, busy, jog, cable, latched }) {
@@ -55,7 +76,9 @@ export class Live {
 
   show(state) {
     write(at("rig"), state.rig);
-    write(at("bus"), `${state.bus}${state.simulated ? " · simulated drives" : ""}`);
+    mark(at("rig"), "title", state.rig);
+    write(at("bus"), state.bus);
+    write(at("simulated"), state.simulated ? "simulated drives" : "");
     document.title = `${motionText(state)} – ${state.rig}`;
     for (const [name, read] of Object.entries(LAMPS)) {
       const [text, kind] = read(state), lamp = at(`lamp-${name}`);
@@ -63,6 +86,9 @@ export class Live {
       lamp.className = kind;
     }
     write(at("motion-text"), motionText(state));
+    write(at("drives-read"), readText(state));
+    document.body.classList.toggle("resting", Boolean(state.drives_read?.at));
+    at("read-drives").hidden = state.simulated;
     this.#pose(state);
     this.#motion(state);
     this.#tensions(state);
@@ -94,7 +120,8 @@ export class Live {
   }
 
   /** Bars range from zero to 110 % of the upper limit, with the limits marked. */
-  #tensions({ tensions_n: tensions, tension_limits_n: [low, high] }) {
+  #tensions({ tensions_n: tensions, tension_limits_n: limits, drives_read: read }) {
+    const [low, high] = limits;
     const list = at("tensions"), full = 1.1 * high;
     if (tensions && this.#bars.length !== tensions.length) this.#make(tensions.length, list);
     list.style.setProperty("--low", `${(100 * low) / full}%`);
@@ -107,12 +134,10 @@ export class Live {
       write(value, known(tension, 1, "N"));
       row.classList.toggle("bad", trouble !== null);
     });
-    const words = (tensions ?? []).flatMap((t, k) =>
-      t < low ? `Cable ${k + 1} is slack: ${known(t, 1, "N")}, at least ${known(low, 0, "N")}`
-        : t > high ? `Cable ${k + 1} is too tight: ${known(t, 1, "N")}, at most ${known(high, 0, "N")}` : []);
-    write(at("tension-trouble"), tensions ? words.join(". ") : "Unknown: tensions are measured while the drives are enabled.");
-    mark(at("tension-trouble"), "class", words.length ? "trouble" : "quiet");
-    at("tension-trouble").hidden = Boolean(tensions) && !words.length;
+    const words = tensions ? troubleText(tensions, limits) : read?.at ? "Unknown." : "Unknown: tensions are measured while the drives are enabled.";
+    write(at("tension-trouble"), words);
+    mark(at("tension-trouble"), "class", tensions && words ? "trouble" : "quiet");
+    at("tension-trouble").hidden = !words;
   }
 
   #make(count, list) {
@@ -120,6 +145,8 @@ export class Live {
       const bar = make("span", { class: "bar" }), value = make("span", { class: "value figure" });
       return { bar, value, row: make("li", {}, make("span", { class: "cable" }, make("span", { class: "unseen" }, "Cable "), String(k + 1)), make("span", { class: "track", "aria-hidden": "true" }, bar), value) };
     });
+    list.classList.toggle("dense", count > 8);
+    list.classList.toggle("many", count > 12);
     list.replaceChildren(...this.#bars.map(({ row }) => row));
   }
 }

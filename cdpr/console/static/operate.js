@@ -38,6 +38,7 @@ export class Operate {
     at("home").addEventListener("click", () => this.#home());
     at("reset").addEventListener("click", () => this.#reset());
     at("release").addEventListener("click", () => this.#release());
+    at("read-drives").addEventListener("click", () => page.command("read_drives"));
     at("run").addEventListener("click", () => this.#run());
     at("load-plan").addEventListener("click", () => page.command("load_plan", { file: chosen("plan-file") }));
     at("compare-plan").addEventListener("click", () => page.command("compare", { file: chosen("plan-file") }));
