@@ -406,7 +406,7 @@ def model_in(annotation: Any) -> type[BaseModel] | None:
 
 
 def plain_data(value: Any) -> Any:
-    """A value with dictionaries and lists in place of mappings, tuples and arrays."""
+    """A value with dictionaries and lists instead of mappings, tuples and arrays."""
     match value:
         case np.ndarray() | np.generic():
             return value.tolist()
