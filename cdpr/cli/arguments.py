@@ -136,7 +136,7 @@ def name_options(error: CdprError, options: Mapping[str, str]) -> None:
     """Replaces arguments of library functions in a message, such as ```budget=```, by options.
 
     Args:
-        error: Changed in place.
+        error: Modified.
         options: How the user types them, such as ``--budget-ms``, by parameter name.
     """
     by_name = {_UNIT.sub("", name): typed for name, typed in options.items()}
