@@ -42,7 +42,7 @@ from cdpr.console.state import (
     start_options,
     stored_state,
 )
-from cdpr.console.teach import TaughtPoses, scene_text
+from cdpr.console.teach import TaughtPoses, picked_pose, scene_text
 from cdpr.console.view import (
     LoadedPlan,
     RobotNow,
@@ -132,7 +132,7 @@ class Console:
         self._line = self.verbs.update()
         self._load_planned()
         if report.status is not None:
-            self.verbs.is_under_way = True
+            self.verbs.follow(report.status)
             seen = self.view.take(report.status)
             self._robot = seen or self._robot
         self.pictures.watch(report.status, self.view.rig)
@@ -141,9 +141,13 @@ class Console:
         return self._state(report.status, time.monotonic() - report.at)
 
     def close(self) -> None:
-        """Ends a session of jogs begun here, and closes all connections; a run continues."""
-        if self.verbs.verb == "jog" and self.watch.send("end"):
-            self.verbs.stop_before_motion()
+        """Ends jogs begun here and a verb in preparation, and closes all connections.
+
+        A run that moves continues.
+        """
+        if self.verbs.verb == "jog":
+            self.watch.send("end")
+        self.verbs.stop_before_motion()
         self._asks.shutdown()
         self.pictures.close()
         self.watch.close()
@@ -278,7 +282,8 @@ class Console:
             case NameCommand():
                 self.poses.teach(message.name, self._pose_now())
             case PickCommand():
-                self.poses.teach(message.name, self._picked(message))
+                picked = picked_pose(self.view.rig, message.position_mm, self._pose_now())
+                self.poses.teach(message.name, picked)
             case RenameCommand():
                 self.poses.rename(message.pose, message.name)
             case MoveCommand():
@@ -382,19 +387,6 @@ class Console:
         MADE.mkdir(exist_ok=True)
         write_atomic(path, scene_text(document))
         return path
-
-    def _picked(self, message: PickCommand) -> Pose:
-        """The picked position, with the platform's present orientation."""
-        position = millimetres(message.position_mm)
-        rig = self.view.rig
-        if np.any(position < rig.workspace_lower) or np.any(position > rig.workspace_upper):
-            raise Refused(
-                "this position is outside the workspace",
-                where="console",
-                why="the rig file limits x, y and z of the platform",
-                next_step="pick another position or height",
-            )
-        return Pose(position, self._pose_now().rotation)
 
     def _pose_now(self) -> Pose:
         jog = (self.watch.last.status or {}).get("jog")

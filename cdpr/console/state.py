@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
@@ -59,19 +58,22 @@ class VerbOutcome:
 
 
 class StartedVerb:
-    """Runs one verb at a time, with output to a file: a pipe would break with the console."""
+    """Runs one verb at a time, with output to memory: a pipe would break with the console.
+
+    A file could not be written on a full disk, nor be removed after the end of the console.
+    """
 
     def __init__(self) -> None:
         """Before any verb."""
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
-        self._output = Path()
+        self._output = -1
         self.verb: str | None = None
         """Name of the running verb."""
         self.outcome: VerbOutcome | None = None
         """Result of the last verb."""
         self.is_under_way = False
-        """Whether the running verb has answered as a run, and takes its requests."""
+        """Whether the running verb's drives may move."""
 
     def start(self, verb: str, arguments: Sequence[str]) -> None:
         """Starts a verb without a terminal.
@@ -95,6 +97,13 @@ class StartedVerb:
             if self.outcome is not None:
                 self.outcome = replace(self.outcome, exit_code=error.exit_code, text=str(error))
 
+    def follow(self, status: dict[str, Any]) -> None:
+        """Notes from a run's status whether the running verb's drives may move."""
+        with self._lock:
+            is_own = self._process is not None and self._process.pid == status["process"]
+            if is_own and status["state"] != "preparing":
+                self.is_under_way = True
+
     def stop_before_motion(self) -> bool:
         """Ends a verb that would move drives but is still being prepared; returns whether it did.
 
@@ -112,30 +121,32 @@ class StartedVerb:
             return self._update()
 
     def _start(self, verb: str, arguments: Sequence[str]) -> None:
-        descriptor, name = tempfile.mkstemp(prefix=f"cdpr-{verb}-", suffix=".log")
+        output = os.memfd_create(f"cdpr-{verb}")
         command = [sys.executable, "-c", "from cdpr.cli import main; main()", verb, *arguments]
         try:
             self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
-                stdout=descriptor,
+                stdout=output,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "NO_COLOR": "1", "COLUMNS": "100"},
                 start_new_session=True,
             )
-        finally:
-            os.close(descriptor)
-        self._output, self.verb, self.outcome = Path(name), verb, None
+        except BaseException:
+            os.close(output)
+            raise
+        self._output, self.verb, self.outcome = output, verb, None
         self.is_under_way = False
 
     def _update(self) -> str:
         if self._process is None or self.verb is None:
             return ""
-        text = self._output.read_text(encoding="utf-8", errors="replace")
         code = self._process.poll()
+        written = os.pread(self._output, os.fstat(self._output).st_size, 0)
+        text = written.decode(encoding="utf-8", errors="replace")
         if code is not None:
             self.outcome = _outcome(self.verb, code, text)
-            self._output.unlink(missing_ok=True)
+            os.close(self._output)
             self._process = self.verb = None
         lines = text.strip().splitlines()
         return lines[-1].strip() if lines else ""
@@ -144,6 +155,8 @@ class StartedVerb:
 def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
     if code == -signal.SIGTERM:
         code, text = STOPPED, f"{text}\n{BEFORE_MOTION}"
+    if code and not text.strip():
+        text = f"`cdpr {verb}` ended with exit code {code} and no message."
     report, fault = _REPORT.findall(text), _HELP.findall(text)
     return VerbOutcome(
         verb=verb,

@@ -32,11 +32,12 @@ from cdpr.console import server
 from cdpr.console.commands import MOST_WAITING, Held, LetGo, parse_message
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
 from cdpr.console.session import Console, ConsoleFiles
-from cdpr.console.state import StoredState, VerbOutcome, _without_commands
+from cdpr.console.state import StoredState, VerbOutcome, _outcome, _without_commands
 from cdpr.console.watch import RunWatch
+from executor.remote.command_server import commands_from_start
+from executor.remote.command_server import serving as commands
 from executor.remote.command_socket import advertised
-from executor.remote.command_socket import serving as commands
-from executor.supervision import LocalRequests
+from executor.supervision import LocalRequests, Supervisor
 from model.plan import load_plan, save_plan
 from model.pose import Pose
 from model.rig import load_rig
@@ -195,9 +196,9 @@ def test_a_latch_is_shown_together_with_the_end_of_the_verb_that_left_it(
     console, latched = Served().console, StoredState("cable 4 is slack", False, None)
     monkeypatch.setattr(time, "monotonic", lambda: 1000.0)
     assert console.update()["latched"] is None
-    verbs, output = console.verbs, tmp_path / "output"
-    output.touch()
-    verbs.verb, verbs._output, verbs._process = "jog", output, subprocess.Popen(["sleep", "60"])
+    verbs = console.verbs
+    verbs.verb, verbs._process = "jog", subprocess.Popen(["sleep", "60"])
+    verbs._output = os.memfd_create("output")
     with verbs._process as process:
         assert console.update()["busy"]["verb"] == "jog"
         process.kill()
@@ -205,6 +206,33 @@ def test_a_latch_is_shown_together_with_the_end_of_the_verb_that_left_it(
     state = console.update()
     assert (state["busy"], state["latched"]) == (None, "cable 4 is slack")
     console.close()
+
+
+def test_the_output_of_a_verb_needs_no_disk_and_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk is the cause of many failures: the page must show it."""
+    console = Served().console
+    del console.verbs.start
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr("tempfile.mkstemp", lambda **_: pytest.fail("a file is written"))
+    console.verbs.start("run", ["no-such-plan.json"])
+    process = console.verbs._process
+    assert process is not None
+    assert process.wait() == 2
+    outcome = console.update()["outcome"]
+    assert "no-such-plan.json" in outcome["text"]
+    assert sorted(tmp_path.iterdir()) == before
+    console.close()
+
+
+@pytest.mark.parametrize(("code", "text"), [(1, ""), (4, " \n"), (-9, "")])
+def test_a_verb_that_fails_without_a_message_states_its_exit_code(code: int, text: str) -> None:
+    assert _outcome("home", code, text).text == (
+        f"`cdpr home` ended with exit code {code} and no message."
+    )
+    assert _outcome("home", 0, "").text == ""
+    assert _outcome("home", 1, "why").text == "why"
 
 
 @pytest.mark.parametrize("verb", ["home", "release", "run", "jog"])
@@ -226,14 +254,21 @@ def test_stop_ends_a_verb_that_is_still_being_prepared(verb: str) -> None:
     console.close()
 
 
-def test_a_session_of_jogs_that_is_still_being_prepared_ends_with_the_console() -> None:
+@pytest.mark.parametrize("verb", ["home", "release", "run", "jog"])
+@pytest.mark.parametrize("state", [None, "preparing"])
+def test_a_verb_that_is_still_being_prepared_ends_with_the_console(
+    verb: str, state: str | None
+) -> None:
     console = Served().console
     del console.verbs.start
     console.watch.send = lambda *_, **__: "nothing moves"  # type: ignore[method-assign]
-    console.verbs.start("jog", ["--help"])
+    console.verbs.start(verb, ["--help"])
     process = console.verbs._process
     assert process is not None
     os.kill(process.pid, signal.SIGSTOP)
+    console.verbs.follow({"process": process.pid + 1, "state": "moving"})  # another's run
+    if state is not None:
+        console.verbs.follow({"process": process.pid, "state": state})
     console.close()
     os.kill(process.pid, signal.SIGCONT)
     assert process.wait() == -signal.SIGTERM
@@ -244,10 +279,11 @@ def test_stop_leaves_what_moves_nothing_and_what_writes_its_report_alone() -> No
     del console.verbs.start
     for verb, is_under_way in (("plan", False), ("reset", False), ("run", True)):
         console.verbs.start(verb, ["--help"])
-        console.verbs.is_under_way = is_under_way
-        assert console.stop() == "nothing moves"
         process = console.verbs._process
         assert process is not None
+        if is_under_way:
+            console.verbs.follow({"process": process.pid, "state": "moving"})
+        assert console.stop() == "nothing moves"
         assert process.wait() == 0
         console.verbs.update()
     console.close()
@@ -395,6 +431,62 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
             assert [asked("service_begin"), asked("service_end"), asked("reset")] == [""] * 3
     assert [verb for verb, _ in served.started] == ["reset"] * 2
     console.close()
+
+
+def test_a_motion_prepared_elsewhere_is_shown_and_gives_way_to_a_run() -> None:
+    console = Served().console
+    watch, rig = console.watch, console.rig
+    prepared = "a motion is being prepared; wait, or stop it"
+    with commands_from_start("run", rig, Supervisor(), realtime=False) as ahead:
+        motion = console.update()["motion"]
+        assert (motion["state"], motion["verb"], motion["process"]) == (
+            "preparing",
+            "run",
+            os.getpid(),
+        )
+        assert (watch.number, watch.why_busy()) == (0, prepared), "no press begins"
+        assert "takes only a stop" in RunWatch.send(watch, "hold")
+        moving: Any = MovesOn(motion["bus"], motion["rig"])
+        with ahead.during_motion(moving):
+            console.watch.update()
+            assert watch.number > 0
+            assert watch.why_busy() == "the robot moves; wait, or stop it"
+        watch.update()
+        assert (watch.number, watch.last.status) == (0, None)
+    console.close()
+
+
+def test_a_run_is_followed_rather_than_a_motion_in_preparation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Such as one that waits at its question while another terminal moves the robot."""
+    monkeypatch.setattr("cdpr.console.watch.SEARCH_PERIOD", 0.0)
+    console = Served().console
+    with commands_from_start("run", console.rig, Supervisor(), realtime=False):
+        motion = console.update()["motion"]
+        code = RUN_ELSEWHERE.format(bus=motion["bus"], rig=motion["rig"])
+        command, pipe = [sys.executable, "-c", code], subprocess.PIPE
+        with subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, cwd=Path(__file__).parents[2]
+        ) as run:
+            assert run.stdout is not None
+            run.stdout.readline()
+            console.watch.update()
+            assert console.watch.last.status == {"bus": motion["bus"], "rig": motion["rig"]}
+            run.communicate()
+    console.close()
+
+
+RUN_ELSEWHERE = """
+from types import SimpleNamespace
+from executor.remote.command_server import serving
+from executor.remote.command_socket import advertised
+from executor.supervision import LocalRequests, Supervisor
+status = SimpleNamespace(as_dict=lambda: {{"bus": {bus!r}, "rig": {rig!r}}})
+with advertised() as listeners, serving(listeners, LocalRequests(), status):
+    print("advertised", flush=True)
+    input()
+"""
 
 
 @pytest.mark.parametrize("path", ["/", "/scene", "/api/files", "/runs/one/report.html"])
