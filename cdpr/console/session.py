@@ -31,6 +31,7 @@ from cdpr.console.commands import (
 )
 from cdpr.console.state import (
     MADE,
+    BusControl,
     StartedVerb,
     StoredState,
     cable_state,
@@ -114,6 +115,7 @@ class Console:
         self.poses = TaughtPoses(MADE / "poses.json")
         self.plan = LoadedPlan(self.rig)
         self._control_lock, self._one_at_a_time = threading.Lock(), threading.Lock()
+        self._bus_control = BusControl(self.rig, self.control, self._control_lock)
         self._line = ""
         self._robot: RobotNow | None = None
         if is_simulated(self.rig):
@@ -129,6 +131,7 @@ class Console:
     def update(self) -> dict[str, Any]:
         """The state that all pages show; to be called about 20 times a second."""
         report = self.watch.update()
+        self.end_press(self._bus_control.update(moving=report.status is not None))
         self._line = self.verbs.update()
         self._load_planned()
         if report.status is not None:
@@ -151,6 +154,7 @@ class Console:
         self._asks.shutdown()
         self.pictures.close()
         self.watch.close()
+        self._bus_control.close()
 
     def _load_planned(self) -> None:
         """Loads the plan that was made here, once it is there; its check takes a moment."""
@@ -257,8 +261,7 @@ class Console:
     def _command(self, page: int, message: Message) -> str:
         if isinstance(message, TakeCommand):
             moving = self.watch.last.status is not None
-            with self._control_lock:
-                return self.control.take(page, moving=moving, force=message.force)
+            return self._bus_control.take(page, moving=moving, force=message.force)
         if message.command == "give_control":
             with self._control_lock:
                 press = self.control.give(page)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pwd
 import re
 import signal
 import subprocess
@@ -14,11 +15,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from cdpr.console.commands import PageControl
 from cdpr.console.view import measured_data
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock, reference_status
+from executor.interlock.locks import ControlLock
 from executor.jogging import FASTEST
 from executor.recording.record_files import RUNS
 from model.errors import BadInput, CdprError, Refused
@@ -150,6 +153,54 @@ class StartedVerb:
             self._process = self.verb = None
         lines = text.strip().splitlines()
         return lines[-1].strip() if lines else ""
+
+
+class BusControl:
+    """Gives a page control only while no other console of this robot has a page with control."""
+
+    def __init__(self, rig: Rig, pages: PageControl, guard: threading.Lock) -> None:
+        """No page has control.
+
+        Args:
+            rig: The robot and its bus.
+            pages: Of this console.
+            guard: Held while they change.
+        """
+        self._pages, self._guard = pages, guard
+        self._lock = ControlLock(BusSettings.of(rig))
+        self.close = self._lock.release
+
+    def take(self, page: int, *, moving: bool, force: bool) -> str:
+        """See `PageControl.take`; another console is asked for control first."""
+        name = f"{self._pages.name(page)} (console {os.getpid()} of {_user()})"
+        if why_not := self._lock.take(name, force=force and not moving):
+            return why_not
+        with self._guard:
+            if not self._lock.is_held:  # released since, as no page had control
+                return "control was released meanwhile: take it again"
+            return self._pages.take(page, moving=moving, force=force)
+
+    def update(self, *, moving: bool) -> int | None:
+        """Gives control up if no page has it, or at rest if another console asks for it.
+
+        Returns:
+            The press that a page held, if any.
+        """
+        press = None
+        with self._guard:
+            holder = self._pages.holder
+            if holder is not None and not moving and self._lock.is_wanted():
+                press, holder = self._pages.give(holder), None
+            if holder is None:
+                self._lock.release()
+                self._pages.elsewhere = self._lock.holder()
+        return press
+
+
+def _user() -> str:
+    with suppress(KeyError):
+        return pwd.getpwuid(os.getuid()).pw_name
+    return f"user {os.getuid()}"
 
 
 def _outcome(verb: str, code: int, text: str) -> VerbOutcome:

@@ -489,6 +489,31 @@ with advertised() as listeners, serving(listeners, LocalRequests(), status):
 """
 
 
+def test_one_page_of_all_consoles_of_a_robot_has_control(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cdpr.console.session.read_status", lambda _: pytest.fail("read"))
+    rig = load_rig(RIG).with_bus("udp_multicast", "239.74.9.13")
+    first, second = Served().console.files, Served().console.files
+    one, other = Console(replace(first, rig=rig)), Console(replace(second, rig=rig))
+    mine, theirs = one.control.join("here"), other.control.join("there")
+
+    def asked(console: Console, page: int, name: str) -> str:
+        message = parse_message(json.dumps({"kind": "command", "command": name}))
+        assert not isinstance(message, Held | LetGo)
+        return console.command(page, message)
+
+    assert asked(one, mine, "take_control") == ""
+    name = f"page {mine} on here (console {os.getpid()} of "
+    assert asked(other, theirs, "take_control").startswith(name)
+    assert asked(other, theirs, "reset") == "take control first"
+    other.update()
+    assert (other.control.holder_name() or "").startswith(name)
+    one.leave(mine)
+    one.update()
+    assert asked(other, theirs, "take_control") == ""
+    for console in (one, other):
+        console.close()
+
+
 @pytest.mark.parametrize("path", ["/", "/scene", "/api/files", "/runs/one/report.html"])
 def test_nothing_is_sent_without_the_token(served: Served, path: str) -> None:
     assert served.get(path, token=False)[0] == 403
