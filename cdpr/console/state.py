@@ -125,6 +125,8 @@ class StartedVerb:
 
     def _start(self, verb: str, arguments: Sequence[str]) -> None:
         output = os.memfd_create(f"cdpr-{verb}")
+        if verb == "jog":  # ends with the console, also if that is killed
+            arguments = [*arguments, "--end-with", str(os.getpid())]
         command = [sys.executable, "-c", "from cdpr.cli import main; main()", verb, *arguments]
         try:
             self._process = subprocess.Popen(
@@ -240,15 +242,23 @@ def local_file(name: str) -> Path:
 
 
 def plans_and_scenes() -> dict[str, list[str]]:
-    """Files to choose from, in the console's working folder."""
+    """Files to choose from, in the console's working folder, and those that cannot be named."""
     here = Path()
     plans = sorted({*here.glob("*.json"), *here.glob("plans/*.json"), *MADE.glob("*.plan.json")})
     folders = (here, here / "scenes", here / "configs")
     scenes = sorted({path for folder in folders for path in folder.glob("*.yaml")})
-    return {
+    found = {
         "plans": [str(path) for path in plans if _contains(path, '"kind": "cdpr-plan"')],
         "scenes": [str(path) for path in scenes if _contains(path, "\ngoal:")],
     }
+    named = {kind: [name for name in names if _is_text(name)] for kind, names in found.items()}
+    others = [name for names in found.values() for name in names if not _is_text(name)]
+    return {**named, "left_out": [os.fsencode(name).decode("utf-8", "replace") for name in others]}
+
+
+def _is_text(name: str) -> bool:
+    """Whether a file name is UTF-8, as all names in messages and plans are."""
+    return not any("\ud800" <= character <= "\udfff" for character in name)
 
 
 def _contains(path: Path, text: str) -> bool:

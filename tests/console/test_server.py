@@ -20,7 +20,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -38,6 +40,7 @@ from executor.remote.command_server import commands_from_start
 from executor.remote.command_server import serving as commands
 from executor.remote.command_socket import advertised
 from executor.supervision import LocalRequests, Supervisor
+from model.errors import BadInput
 from model.plan import load_plan, save_plan
 from model.pose import Pose
 from model.rig import load_rig
@@ -206,6 +209,60 @@ def test_a_latch_is_shown_together_with_the_end_of_the_verb_that_left_it(
     state = console.update()
     assert (state["busy"], state["latched"]) == (None, "cable 4 is slack")
     console.close()
+
+
+def test_a_file_whose_name_is_no_text_is_left_out_of_the_lists_and_named(
+    served: Served, folder: Path
+) -> None:
+    bad = Path(os.fsdecode(os.fsencode(folder) + b"/bad\xff.json"))
+    bad.write_text('{"kind": "cdpr-plan"')
+    try:
+        code, body, _ = served.get("/api/files")
+    finally:
+        bad.unlink()
+    assert code == 200
+    listed = json.loads(body)
+    assert (listed["plans"], listed["left_out"]) == (["short.json"], ["bad\ufffd.json"])
+    assert json.loads(served.get("/api/files")[1])["left_out"] == []
+
+
+@pytest.mark.parametrize("name", ["%00", "one/%00", "x" * 5000, "one", "../secret.txt", "%ff"])
+def test_a_file_of_a_run_that_cannot_be_is_not_found(served: Served, name: str) -> None:
+    assert served.get(f"/runs/{name}")[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("host", "shown"),
+    [
+        ("127.0.0.1", "127.0.0.1"),
+        ("::1", "[::1]"),
+        ("0.0.0.0", socket.gethostname()),
+        ("::", socket.gethostname()),
+        ("localhost", "localhost"),
+    ],
+)
+def test_the_printed_address_can_be_opened(
+    host: str, shown: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    printed: list[str] = []
+    monkeypatch.setattr(server, "web_server", lambda _: SimpleNamespace(run=lambda **_: None))
+    server.run_server(Served().console, host, 0, printed.append)
+    (address,) = printed
+    parts = urlsplit(address)
+    assert address.startswith(f"http://{shown}:{parts.port}/?token=")
+    assert parts.hostname == shown.strip("[]").lower()
+
+
+@pytest.mark.parametrize(
+    ("host", "where"),
+    [("no-such-host.invalid", "--host"), ("192.0.2.1", "--host"), ("x" * 70, "--host"),
+     ("2001:db8::1", "--host"), ("127.0.0.1", "--port")],
+)  # fmt: skip
+def test_an_address_that_cannot_be_used_names_the_option(host: str, where: str) -> None:
+    with listening("127.0.0.1", 0) as taken:
+        with pytest.raises(BadInput) as caught, listening(host, taken.getsockname()[1]):
+            pass
+        assert caught.value.where == where
 
 
 def test_the_output_of_a_verb_needs_no_disk_and_leaves_no_file(
