@@ -28,6 +28,8 @@ from model.errors import Refused
 _ENDING = ".sock"
 #: Of a motion that is still being prepared.
 _ENDING_AHEAD = ".preparing.sock"
+#: Temporary folder that does not depend on a terminal's ``TMPDIR``.
+FIXED = Path("/tmp")
 #: Name of the record of the last stop.
 _STOPPED = "stopped"
 
@@ -41,10 +43,26 @@ class _Folder:
 
 
 def _own_folders() -> list[Path]:
-    """The user's run-time folder, if the system has one, and one in the temporary folder."""
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    folders = [Path(base) / "cdpr"] if base else []
-    return [*folders, Path(tempfile.gettempdir()) / f"cdpr-{os.getuid()}"]
+    """The user's run-time folder, if the system has one, and those in temporary folders.
+
+    A terminal with another ``TMPDIR``, or without ``XDG_RUNTIME_DIR``, searches some of them, too;
+    only a run-time folder of another name keeps runs apart, such as those of tests.
+    """
+    return [_run_time_folder() / "cdpr", *(f / f"cdpr-{os.getuid()}" for f in _temporary_folders())]
+
+
+def _default_run_time_folder() -> Path:
+    return Path(f"/run/user/{os.getuid()}")
+
+
+def _run_time_folder() -> Path:
+    return Path(os.environ.get("XDG_RUNTIME_DIR") or _default_run_time_folder())
+
+
+def _temporary_folders() -> list[Path]:
+    own = Path(tempfile.gettempdir())
+    is_apart = own == FIXED or _run_time_folder() != _default_run_time_folder()
+    return [own] if is_apart else [own, FIXED]
 
 
 def _reachable_folders() -> list[Path]:
@@ -52,7 +70,8 @@ def _reachable_folders() -> list[Path]:
     own = _own_folders()
     if os.getuid() != 0:
         return own
-    others = [*Path("/run/user").glob("*/cdpr"), *Path(tempfile.gettempdir()).glob("cdpr-*")]
+    temporary = [path for folder in _temporary_folders() for path in folder.glob("cdpr-*")]
+    others = [*Path("/run/user").glob("*/cdpr"), *temporary]
     return [*own, *sorted(path for path in others if path not in own)]
 
 
@@ -187,7 +206,7 @@ def _try_remove(folder: int, name: str) -> None:
 def record_stop() -> None:
     """Records that a stop was requested now, in every folder; to be called before `find_runs`."""
     _made_folders()
-    line = f"{_boot()} {time.clock_gettime(time.CLOCK_BOOTTIME):.3f}\n".encode()
+    line = f"{_boot()} {time.clock_gettime(time.CLOCK_BOOTTIME)!r}\n".encode()
     name = f"{_STOPPED}-{os.getpid()}-{threading.get_ident()}.new"
     with _open_folders(_reachable_folders()) as folders:
         for folder in (one.descriptor for one in folders):

@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 from cdpr.cli.operate.supervision import STOP_SIGNALS, stop_requests
 from executor import homing, jogging, runner, service
 from executor.hold_to_run import session
+from executor.remote import command_socket
 from executor.remote.client import StopResult, ask_all, stop_runs
 from executor.remote.command_server import commands_from_start
 from executor.remote.command_socket import advertised, find_runs, is_stopped_since, record_stop
@@ -57,6 +58,7 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "runtime"))
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(command_socket, "FIXED", tmp_path / "temporary")
     return tmp_path / "runtime" / "cdpr", tmp_path / "temporary" / f"cdpr-{os.getuid()}"
 
 
@@ -95,6 +97,34 @@ def test_a_run_is_reached_also_from_a_terminal_without_a_run_time_folder(
         process.terminate()
         process.wait()
         assert _reached() == []
+
+
+@pytest.mark.parametrize("base", ["", "default", "apart"])
+def test_a_run_is_reached_from_a_terminal_with_another_temporary_folder(
+    tmp_path, monkeypatch, base
+):
+    """Only a run-time folder of another name keeps runs apart."""
+    monkeypatch.setattr(command_socket, "FIXED", tmp_path / "fixed")
+    default = tmp_path / "default"
+    monkeypatch.setattr(command_socket, "_default_run_time_folder", lambda: default)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / base) if base else "")
+    for name in ("fixed", "here", "there", *([base] if base else [])):
+        (tmp_path / name).mkdir()
+
+    def in_terminal(name: str) -> None:
+        monkeypatch.setenv("TMPDIR", str(tmp_path / name))
+        monkeypatch.setattr(tempfile, "tempdir", None)
+
+    in_terminal("here")
+    with advertised():
+        in_terminal("there")
+        assert _reached() == [os.getpid()]
+        monkeypatch.delenv("XDG_RUNTIME_DIR")
+        assert _reached() == ([] if base == "apart" else [os.getpid()])
+        assert is_stopped_since(0.0) is False
+        record_stop()
+        in_terminal("here")
+        assert is_stopped_since(0.0) is True
 
 
 def test_every_run_is_reached(folders):
@@ -139,6 +169,7 @@ def test_root_reaches_the_runs_of_other_users(monkeypatch):
         Path(folder).chmod(0o777)
         monkeypatch.setenv("TMPDIR", folder)
         monkeypatch.setattr(tempfile, "tempdir", None)
+        monkeypatch.setattr(command_socket, "FIXED", Path(folder))
         with _run() as process:
             assert _reached() == [process.pid]
 
