@@ -21,6 +21,7 @@ from executor.drives import is_simulated, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
 from executor.proposals import Facts, ForgetProposal, HomingProposal, require_confirmed
+from executor.remote.command_server import commands_from_start
 from executor.supervision import RequestBoard, Supervisor
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
 from model.errors import (
@@ -136,12 +137,7 @@ def home(
     limit = limit_of(rig, limit)
     target = _target(rig, tension, limit)
     speed = min(speed, rig.motion.speed)
-    interlock = MotionInterlock(rig)
-    interlock.require_free()
-    if source is not None:  # check that it delivers images before anything moves
-        measure_at_rest(rig, source, 1, rig.home, lambda: None, listener)
-    fastest = float(wind_in_speed(rig, target, limit, speed).max())
-    require_confirmed(confirm, HomingProposal(rig, target, limit, reach, speed, fastest, source))
+    interlock, operator = MotionInterlock(rig), supervisor or Supervisor()
     made: list[HomingReference] = []
 
     def at_rest(
@@ -155,21 +151,29 @@ def home(
         from simulation.ground_truth import PowerLoss  # a real bus loads no simulator
 
         lost_power = PowerLoss.drawn(rig, 0, simulated_slack, on_a_stand=source is None)
-    motion = WinchMotion(
-        rig=rig,
-        pose=known or rig.home,
-        limit=limit,
-        speed=speed,
-        make_law=partial(PretensionLaw, target=target, limit=limit, reach=reach, speed=speed),
-        lost_power=lost_power,
-        realtime=realtime,
-        need_real_time_rights=need_real_time_rights,
-        rehome=True,
-        name="home",
-        listener=listener,
-        supervisor=supervisor or Supervisor(),
-    )
-    move_by_law(motion, at_rest)
+    with commands_from_start("home", rig, operator, realtime=realtime) as commands:
+        interlock.require_free()
+        if source is not None:  # check that it delivers images before anything moves
+            measure_at_rest(rig, source, 1, rig.home, commands.require_no_stop, listener)
+        fastest = float(wind_in_speed(rig, target, limit, speed).max())
+        proposal = HomingProposal(rig, target, limit, reach, speed, fastest, source)
+        require_confirmed(confirm, proposal)
+        motion = WinchMotion(
+            rig=rig,
+            pose=known or rig.home,
+            limit=limit,
+            speed=speed,
+            make_law=partial(PretensionLaw, target=target, limit=limit, reach=reach, speed=speed),
+            lost_power=lost_power,
+            realtime=realtime,
+            need_real_time_rights=need_real_time_rights,
+            rehome=True,
+            name="home",
+            listener=listener,
+            supervisor=operator,
+            commands=commands,
+        )
+        move_by_law(motion, at_rest)
     (reference,) = made
     return HomeResult(reference, None if in_process else interlock.file.path)
 

@@ -18,8 +18,10 @@ from executor.interlock.interlock import MotionInterlock
 from executor.proposals import CableProposal, MotionProposal, require_confirmed
 from executor.recording.record_files import free_folder
 from executor.recording.run_folder import RunEvent, RunFolder
-from executor.runner import RunOptions, RunResult, prepare_plan, run_prepared
+from executor.remote.command_server import commands_from_start
+from executor.runner import RunOptions, RunResult, run_prepared
 from executor.supervision import Supervisor
+from executor.trajectory.setpoints import prepare_plan
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
 from model.errors import BadInput, Refused, path_of, require_functions, require_types
 from model.files.plan_file import PlanDocument
@@ -81,28 +83,31 @@ def jog(
     """
     require_types((rig, Rig), (listener, Listener), optional=[(scene, Scene)])
     require_functions(confirm=confirm, on_event=on_event)
-    slow = with_speed(rig, speed)
-    require_own_time(slow, realtime)
-    require_distance(by, to_home=to_home)
-    around = empty_scene(slow) if scene is None else scene.changed(stops=())
-    output = free_folder("jog") if folder is None else path_of(folder)
-    RunFolder.require_free(output)
-    interlock = MotionInterlock(slow)
-    interlock.require_free()
-    ready = interlock.referenced_rig()
-    start = ready.home if is_simulated(ready) else measured_pose(ready, around)
-    goal = ready.home if by is None else Pose(start.position + by, start.rotation)
-    plan = plan_from_document(plan_straight_move(ready, around, start, goal, listener))
-    options = RunOptions(
-        realtime=realtime,
-        start=start,
-        need_real_time_rights=need_real_time_rights,
-        listener=listener,
-        confirm=confirm,
-        on_event=on_event,
-        supervisor=supervisor or Supervisor(),
-    )
-    return run_prepared(prepare_plan(plan, ready, listener), output, {}, options)
+    operator = supervisor or Supervisor()
+    with commands_from_start("jog", rig, operator, realtime=realtime) as commands:
+        slow = with_speed(rig, speed)
+        require_own_time(slow, realtime)
+        require_distance(by, to_home=to_home)
+        around = empty_scene(slow) if scene is None else scene.changed(stops=())
+        output = free_folder("jog") if folder is None else path_of(folder)
+        RunFolder.require_free(output)
+        interlock = MotionInterlock(slow)
+        interlock.require_free()
+        ready = interlock.referenced_rig()
+        start = ready.home if is_simulated(ready) else measured_pose(ready, around)
+        goal = ready.home if by is None else Pose(start.position + by, start.rotation)
+        plan = plan_from_document(plan_straight_move(ready, around, start, goal, listener))
+        commands.require_no_stop()
+        options = RunOptions(
+            realtime=realtime,
+            start=start,
+            need_real_time_rights=need_real_time_rights,
+            listener=listener,
+            confirm=confirm,
+            on_event=on_event,
+            supervisor=operator,
+        )
+        return run_prepared(prepare_plan(plan, ready, listener), output, {}, options, commands)
 
 
 def with_speed(rig: Rig, speed: float) -> Rig:
@@ -299,23 +304,25 @@ def jog_cable(
     _require_cable(slow, cable, length)
     winch = slow.winches[cable - 1]
     limit = limit_of(slow, limit)
-    fastest = slow.motion.speed
-    MotionInterlock(slow).require_free()
-    require_confirmed(confirm, CableProposal(slow, cable, length, limit, fastest))
-    motion = WinchMotion(
-        rig=slow,
-        pose=slow.home,
-        limit=limit,
-        speed=fastest,
-        make_law=partial(CableStep, cable=cable - 1, length=length, limit=limit, speed=fastest),
-        lost_power=None,
-        realtime=realtime,
-        need_real_time_rights=need_real_time_rights,
-        rehome=False,
-        name="jog-cable",
-        listener=listener,
-        supervisor=supervisor or Supervisor(),
-    )
-    result = move_by_law(motion, lambda _result, _true_pose, _board: None)
+    fastest, operator = slow.motion.speed, supervisor or Supervisor()
+    with commands_from_start("jog", slow, operator, realtime=realtime) as commands:
+        MotionInterlock(slow).require_free()
+        require_confirmed(confirm, CableProposal(slow, cable, length, limit, fastest))
+        motion = WinchMotion(
+            rig=slow,
+            pose=slow.home,
+            limit=limit,
+            speed=fastest,
+            make_law=partial(CableStep, cable=cable - 1, length=length, limit=limit, speed=fastest),
+            lost_power=None,
+            realtime=realtime,
+            need_real_time_rights=need_real_time_rights,
+            rehome=False,
+            name="jog-cable",
+            listener=listener,
+            supervisor=operator,
+            commands=commands,
+        )
+        result = move_by_law(motion, lambda _result, _true_pose, _board: None)
     moved = (result.counts - result.began)[cable - 1] / winch.counts_per_metre
     return CableJog(cable, float(moved), result.tensions)

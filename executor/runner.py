@@ -35,12 +35,12 @@ from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import RunCourse, dated_folder
 from executor.recording.recorder import Recorder, require_readable_record
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
-from executor.remote.command_socket import advertised, serving
+from executor.remote.command_server import Commands, commands_from_start, joined
 from executor.remote.status import RunStatus
 from executor.run_result import RunResult
 from executor.state_machine import LoopEvent, State
 from executor.supervision import Callbacks, LocalRequests, Supervisor
-from executor.trajectory.setpoints import PreparedRun, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare_plan
 from model.errors import (
     CdprError,
     StoppedByOperator,
@@ -52,16 +52,9 @@ from model.plan import Plan, require_same_rig
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
-from planner.check import verify
 from tracking.shared_errors import require_stated_errors
 
-__all__ = [
-    "RunOptions",
-    "RunResult",
-    "prepare_plan",
-    "run",
-    "run_prepared",
-]
+__all__ = ["RunOptions", "RunResult", "run", "run_prepared"]
 
 #: Rate of progress reports without a camera, [Hz].
 PROGRESS_RATE = 10.0
@@ -133,18 +126,6 @@ def run(
     """
     require_types((plan, Plan), (rig, Rig), (listener, Listener), optional=[(start, Pose)])
     require_functions(confirm=confirm, on_event=on_event)
-    require_same_rig(plan, rig, plan_file)
-    chosen = resolve_cameras(rig, cameras, is_simulated(rig))
-    require_synthetic_images(chosen.values(), not realtime)
-    require_own_time(rig, realtime)
-    if plan.scene.obstacles:
-        require_stated_errors(rig, list(chosen))
-    require_simulated_start(rig, start)
-    output = dated_folder() if folder is None else path_of(folder)
-    RunFolder.require_free(output)
-    interlock = MotionInterlock(rig)
-    interlock.require_free()
-    referenced = interlock.referenced_rig()
     options = RunOptions(
         realtime=realtime,
         start=start,
@@ -155,21 +136,28 @@ def run(
         on_event=on_event,
         supervisor=supervisor or Supervisor(),
     )
-    return run_prepared(prepare_plan(plan, referenced, listener), output, chosen, options)
-
-
-def prepare_plan(plan: Plan, rig: Rig, listener: Listener = SILENT) -> PreparedRun:
-    """The checked set-points of a plan, for a rig.
-
-    Raises:
-        Refused: The plan, or its executed curve, does not pass the checks.
-    """
-    with listener.waiting("checking the plan and its set-points"):
-        return prepare(verify(plan, rig), rig)
+    with commands_from_start("run", rig, options.supervisor, realtime=realtime) as commands:
+        require_same_rig(plan, rig, plan_file)
+        chosen = resolve_cameras(rig, cameras, is_simulated(rig))
+        require_synthetic_images(chosen.values(), not realtime)
+        require_own_time(rig, realtime)
+        if plan.scene.obstacles:
+            require_stated_errors(rig, list(chosen))
+        require_simulated_start(rig, start)
+        output = dated_folder() if folder is None else path_of(folder)
+        RunFolder.require_free(output)
+        interlock = MotionInterlock(rig)
+        interlock.require_free()
+        prepared = prepare_plan(plan, interlock.referenced_rig(), listener)
+        return run_prepared(prepared, output, chosen, options, commands)
 
 
 def run_prepared(
-    prepared: PreparedRun, output: Path, cameras: Mapping[Camera, str], options: RunOptions
+    prepared: PreparedRun,
+    output: Path,
+    cameras: Mapping[Camera, str],
+    options: RunOptions,
+    commands: Commands | None = None,
 ) -> RunResult:
     """Confirms, arms, moves, measures, computes the verdict, then writes the result files.
 
@@ -180,19 +168,38 @@ def run_prepared(
         output: Run folder to create.
         cameras: From `resolve_cameras`; empty for none.
         options: Of the run.
+        commands: Those taken since the start of the verb; None to take them from now on.
 
     Raises:
         CdprError: As for `run`.
     """
-    require_readable_record(prepared)
-    proposal = MotionProposal(prepared, cameras, options.clearance_stop)
-    require_confirmed(options.confirm, proposal)
-    with options.listener.waiting("loading the report generator"):
-        _preload_results()
+    supervisor, realtime = options.supervisor, options.realtime
+    with joined(commands, "run", prepared.rig, supervisor, realtime=realtime) as taken:
+        taken.require_no_stop()
+        require_readable_record(prepared)
+        proposal = MotionProposal(prepared, cameras, options.clearance_stop)
+        require_confirmed(options.confirm, proposal)
+        taken.require_no_stop()
+        with options.listener.waiting("loading the report generator"):
+            _preload_results()
+        taken.require_no_stop()
+        result = _recorded(prepared, output, cameras, options, taken)
+    supervisor.finish()
+    return result
+
+
+def _recorded(
+    prepared: PreparedRun,
+    output: Path,
+    cameras: Mapping[Camera, str],
+    options: RunOptions,
+    commands: Commands,
+) -> RunResult:
+    """Moves and measures, with a run folder."""
     interface, simulated = prepared.rig.document.bus.interface, is_simulated(prepared.rig)
     course = RunCourse(datetime.now(UTC), interface, simulated, not options.realtime)
     folder = RunFolder.create(output)
-    job, moved = _Job(prepared, folder, cameras, options), _MotionData()
+    job, moved = _Job(prepared, folder, cameras, options, commands), _MotionData()
     try:
         folder.write_plan(prepared.plan.plan.document)
         folder.write_rig(prepared.rig.document)
@@ -207,7 +214,6 @@ def run_prepared(
         moved.close()
         if not moved.begun:
             folder.discard()
-    options.supervisor.finish()
     moved.leave()
     return result
 
@@ -220,6 +226,7 @@ class _Job:
     folder: RunFolder
     cameras: Mapping[Camera, str]
     options: RunOptions
+    commands: Commands
 
 
 @dataclass(slots=True, eq=False)
@@ -279,13 +286,9 @@ def _preload_results() -> None:
 
 def _move_and_measure(job: _Job, moved: _MotionData) -> None:
     """Moves and takes images; a failure after the start of motion becomes part of the outcome."""
-    board = SharedRequests() if job.options.realtime else LocalRequests()
+    board = job.commands.board
     try:
-        try:
-            job.options.supervisor.during(board, partial(_with_listeners, job, board, moved))
-        finally:
-            if isinstance(board, SharedRequests):
-                board.close()
+        job.options.supervisor.during(board, partial(_with_listeners, job, board, moved))
     except Exception as error:
         if not moved.begun or moved.recorder is None:
             raise
@@ -313,8 +316,7 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
     guarded = (callbacks := Callbacks(board.ask_stop)).guarded
     moved.callbacks = callbacks
     with ExitStack() as stack:
-        listeners = stack.enter_context(advertised())
-        stack.enter_context(serving(listeners, board, status))
+        stack.enter_context(job.commands.during_motion(status))
         cameras = stack.enter_context(opening(simulated_time=fast, listener=listener))
         with listener.progress("preparing, row", rows) as advance:
             watch = (

@@ -37,8 +37,9 @@ from executor.interlock.reference import RESTARTED
 from executor.proposals import Facts, ReleaseProposal, ResetProposal, require_confirmed
 from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedRequests
-from executor.remote.command_socket import advertised, serving
-from executor.remote.status import WinchStatus
+from executor.remote.client import preparations
+from executor.remote.command_server import Commands, commands_from_start
+from executor.remote.status import WinchStatus, bus_name
 from executor.state_machine import State
 from executor.supervision import Supervisor
 from model.errors import CdprError
@@ -78,6 +79,7 @@ class StatusResult:
         rig: Its name.
         bus: Interface and channel.
         run: ID of the process that moves or resets it.
+        preparing: IDs of processes that prepare a motion.
         latched: Cause of a latched fault.
         being_set_up: Another program configures or reads the drives.
         reference: Homing reference of the drives.
@@ -90,6 +92,7 @@ class StatusResult:
     rig: str
     bus: str
     run: int | None
+    preparing: tuple[int, ...]
     latched: str | None
     being_set_up: bool
     reference: ReferenceStatus
@@ -113,6 +116,9 @@ class StatusResult:
             ("latched fault", latched),
             ("reference", str(self.reference)),
         ]
+        if self.preparing:
+            who = ", ".join(map(str, self.preparing))
+            facts.append(("motion", f"process {who} is preparing one; `cdpr stop` cancels it"))
         if self.being_set_up:
             unread = "not read: another program is preparing a motion or reading them"
             facts.append(("drives", unread))
@@ -172,6 +178,7 @@ class StatusResult:
             "rig": self.rig,
             "bus": self.bus,
             "run": self.run,
+            "preparing": list(self.preparing),
             "latched": self.latched,
             "being_set_up": self.being_set_up,
             "reference": asdict(self.reference),
@@ -199,6 +206,7 @@ def status(rig: Rig) -> StatusResult:
         rig=rig.name,
         bus=str(settings),
         run=latched.process if latched and in_motion else None,
+        preparing=tuple(one["process"] for one in preparations(bus_name(rig))),
         latched=latched.cause if latched and not in_motion else None,
         being_set_up=False,
         reference=reference_status(interlock),
@@ -374,15 +382,16 @@ def release(
             released, and a fault is latched.
     """
     require_other_process(rig)
-    interlock = MotionInterlock(rig)
-    interlock.require_free()
-    bus, braked = str(BusSettings.of(rig)), is_braked(rig)
-    proposal = ReleaseProposal(rig, bus, braked, reference_status(interlock))
-    require_confirmed(confirm, proposal)
-    operator = supervisor or Supervisor()
-    with closing(SharedRequests()) as board:
+    interlock, operator = MotionInterlock(rig), supervisor or Supervisor()
+    with commands_from_start("release", rig, operator, realtime=True) as commands:
+        interlock.require_free()
+        bus, braked = str(BusSettings.of(rig)), is_braked(rig)
+        proposal = ReleaseProposal(rig, bus, braked, reference_status(interlock))
+        require_confirmed(confirm, proposal)
+        commands.require_no_stop()
         left = operator.during(
-            board, lambda: _released(rig, interlock, board, need_real_time_rights, listener)
+            commands.board,
+            lambda: _released(rig, interlock, commands, need_real_time_rights, listener),
         )
     operator.finish()
     return ReleaseResult(
@@ -394,11 +403,13 @@ def release(
 def _released(
     rig: Rig,
     interlock: MotionInterlock,
-    board: SharedRequests,
+    commands: Commands,
     need_real_time_rights: bool,
     listener: Listener,
 ) -> CycleStatus:
     """Releases the drives; returns their last status. Errors as `release_drives`."""
+    board = commands.board
+    assert isinstance(board, SharedRequests)
     status = WinchStatus(rig, board, simulated_time=False)
 
     def on_armed(denied: str) -> None:
@@ -407,7 +418,7 @@ def _released(
         status.take_release()
 
     with ExitStack() as stack:
-        stack.enter_context(serving(stack.enter_context(advertised()), board, status))
+        stack.enter_context(commands.during_motion(status))
         process = stack.enter_context(
             real_time_process(
                 StandstillMotion.of(Release, rig),

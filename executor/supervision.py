@@ -173,6 +173,15 @@ class Supervisor:
     def __init__(self) -> None:
         """Not interrupted."""
         self.interrupted = False
+        self.began: float | None = None
+        """Start of the program whose only task is the motion, [s] of `CLOCK_BOOTTIME`, if it is
+        one: a stop requested since then applies."""
+
+    def on_early_stop(self) -> None:
+        """Called by another thread when a stop is requested while the motion is prepared.
+
+        Without an interruption the preparation ends at its next step.
+        """
 
     def during(self, board: RequestBoard, motion: Callable[[], _T]) -> _T:
         """Runs a motion, from the opening of its devices to the last image.

@@ -19,7 +19,7 @@ from executor.realtime.process import real_time_process
 from executor.realtime.scheduling import Clock, SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import free_folder
-from executor.remote.command_socket import advertised, serving
+from executor.remote.command_server import Commands
 from executor.remote.protocol import Presses
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
@@ -59,6 +59,7 @@ class WinchMotion:
         name: Of the record folder in ``runs`` of a motion on a bus.
         listener: Receives progress.
         supervisor: Turns interrupts into stops.
+        commands: Those taken since the start of the verb.
     """
 
     rig: Rig
@@ -73,6 +74,7 @@ class WinchMotion:
     name: str
     listener: Listener
     supervisor: Supervisor
+    commands: Commands
 
 
 def limit_of(rig: Rig, limit: float | None) -> float:
@@ -107,40 +109,32 @@ def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchResult:
         KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
         CdprError: Nothing was enabled.
     """
-    return with_board(
+    return supervised(
         motion.rig,
         motion.supervisor,
-        lambda board: _supervised(motion, board, at_rest),
-        realtime=motion.realtime,
+        motion.commands,
+        lambda: _move(motion, at_rest),
     )
 
 
-def with_board(
-    rig: Rig,
-    supervisor: Supervisor,
-    move: Callable[[LocalRequests | SharedRequests], WinchResult],
-    *,
-    realtime: bool,
+def supervised(
+    rig: Rig, supervisor: Supervisor, commands: Commands, move: Callable[[], WinchResult]
 ) -> WinchResult:
-    """Moves with a board of requests that the supervisor can write to.
+    """Moves while the supervisor can request a stop.
 
     Args:
         rig: The robot.
         supervisor: Turns interrupts into stops.
+        commands: Those taken since the start of the verb.
         move: Moves until the drives hold on their own.
-        realtime: Whether the board is shared with another process.
 
     Raises:
         Fault: It ended with a fault, which is latched; with its cause.
         StoppedByOperator: The operator stopped it.
         KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
     """
-    board = SharedRequests() if realtime else LocalRequests()
-    try:
-        result = supervisor.during(board, lambda: move(board))
-    finally:
-        if isinstance(board, SharedRequests):
-            board.close()
+    commands.require_no_stop()
+    result = supervisor.during(commands.board, move)
     if result.state in (State.STOPPED, State.FINISHED):
         supervisor.finish()
     if result.state is State.STOPPED:
@@ -155,12 +149,11 @@ def with_board(
     return result
 
 
-def _supervised(
-    motion: WinchMotion, board: LocalRequests | SharedRequests, at_rest: AtRest
-) -> WinchResult:
+def _move(motion: WinchMotion, at_rest: AtRest) -> WinchResult:
+    board = motion.commands.board
     return move_supervised(
         motion.rig,
-        board,
+        motion.commands,
         _mover(motion, board),
         WinchStatus(motion.rig, board, simulated_time=not motion.realtime),
         motion.name,
@@ -185,7 +178,7 @@ def _progress(listener: Listener) -> Iterator[Callable[[CycleRecord], None]]:
 
 def move_supervised(
     rig: Rig,
-    board: LocalRequests | SharedRequests,
+    commands: Commands,
     mover: AbstractContextManager[WinchMover],
     status: WinchStatus,
     name: str,
@@ -201,7 +194,7 @@ def move_supervised(
 
     Args:
         rig: The robot.
-        board: Of operator requests.
+        commands: Those taken since the start of the verb.
         mover: See `winch_mover`.
         status: Answers on the command socket.
         name: Of the record folder in ``runs``; simulated drives leave none.
@@ -214,8 +207,7 @@ def move_supervised(
     """
     interlock = MotionInterlock(rig)
     with ExitStack() as stack:
-        listeners = stack.enter_context(advertised())
-        stack.enter_context(serving(listeners, board, status, presses))
+        stack.enter_context(commands.during_motion(status, presses))
         moving = stack.enter_context(mover)
         log = stack.enter_context(
             nullcontext() if is_simulated(rig) else recording(free_folder(name))

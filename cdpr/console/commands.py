@@ -313,6 +313,8 @@ class PageControl:
         """The page that has control."""
         self.is_service = False
         """Whether that page is in service mode."""
+        self.elsewhere: str | None = None
+        """Holder of control at another console of this robot."""
 
     def join(self, host: str) -> int:
         """Registers a page opened on a host; returns its number."""
@@ -371,8 +373,12 @@ class PageControl:
         return "service" if self.is_service else "operate"
 
     def holder_name(self) -> str | None:
-        """Name of the page that has control."""
-        return None if self.holder is None else self._pages[self.holder].name
+        """Name of the page that has control, here or at another console."""
+        return self.elsewhere if self.holder is None else self.name(self.holder)
+
+    def name(self, page: int) -> str:
+        """Name of a page."""
+        return self._pages[page].name
 
     def as_dict(self, page: int) -> dict[str, object]:
         """Data for a page."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import os
+import errno
 import secrets
-import signal
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -365,10 +364,11 @@ async def _static(name: str) -> Response:
 
 async def _run_file(name: str) -> Response:
     """A file below the folder of runs."""
-    path, root = (RUNS / name).resolve(), RUNS.resolve()
-    if not (path.is_relative_to(root) and path.is_file()):
-        raise HTTPException(404)
-    return FileResponse(path)
+    with suppress(OSError, ValueError):  # too long, or with a zero byte
+        path, root = (RUNS / name).resolve(), RUNS.resolve()
+        if path.is_relative_to(root) and path.is_file():
+            return FileResponse(path)
+    raise HTTPException(404)
 
 
 async def _help(code: str) -> Response:
@@ -392,24 +392,18 @@ def run_server(console: Console, host: str, port: int, on_ready: Callable[[str],
     """
     with listening(host, port) as listener:
         server = ConsoleServer(console, host=host)
-        on_ready(f"http://{host}:{listener.getsockname()[1]}/?token={server.token}")
+        on_ready(f"http://{_in_address(host)}:{listener.getsockname()[1]}/?token={server.token}")
         take_short_turns()
-        with prompt_threads(), _closed_terminal_ends():
+        with prompt_threads():
             web_server(server.app()).run(sockets=[listener])
 
 
-@contextmanager
-def _closed_terminal_ends() -> Iterator[None]:
-    """A closed terminal ends the server as SIGTERM does, and with it a session of jogs."""
-    before = signal.getsignal(signal.SIGHUP)
-    if before is signal.SIG_IGN:  # started with nohup: outlives its terminal
-        yield
-        return
-    signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGHUP, before)
+def _in_address(host: str) -> str:
+    """A host for a browser's address; this machine's name, if the server listens everywhere."""
+    with suppress(ValueError):
+        if ip_address(host).is_unspecified:
+            return socket.gethostname()
+    return f"[{host}]" if ":" in host else host
 
 
 def web_server(app: FastAPI) -> uvicorn.Server:
@@ -434,11 +428,16 @@ def listening(host: str, port: int) -> Iterator[socket.socket]:
         try:
             listener.bind((host, port))
             listener.listen(64)  # before the address is printed
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
+            is_port = getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES)
             raise BadInput(
-                f"cannot listen on {host}:{port}: {error.strerror or error}",
-                where="--port",
-                why="another program uses the port, or the address is not this machine's",
-                next_step="pass another --port, or 0 for a free one",
+                f"cannot listen on {host}:{port}: {getattr(error, 'strerror', None) or error}",
+                where="--port" if is_port else "--host",
+                why="another program uses the port, or it is reserved for root"
+                if is_port
+                else "this is not an address of this machine",
+                next_step="pass another --port, or 0 for a free one"
+                if is_port
+                else "pass an address of this machine, such as 127.0.0.1",
             ) from None
         yield listener

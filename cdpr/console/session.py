@@ -31,18 +31,17 @@ from cdpr.console.commands import (
 )
 from cdpr.console.state import (
     MADE,
-    StartedVerb,
+    BusControl,
     StoredState,
     cable_state,
     jog_state,
     local_file,
     measured_state,
-    outcome_state,
     read_stored,
-    start_options,
     stored_state,
 )
-from cdpr.console.teach import TaughtPoses, scene_text
+from cdpr.console.teach import TaughtPoses, picked_pose, scene_text
+from cdpr.console.verbs import StartedVerb, outcome_state, start_options
 from cdpr.console.view import (
     LoadedPlan,
     RobotView,
@@ -56,8 +55,8 @@ from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
 from executor.service import StatusResult
 from executor.service import status as read_status
-from model.errors import CdprError, Refused
-from model.files.documents import millimetres, write_atomic
+from model.errors import CdprError
+from model.files.documents import write_atomic
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import empty_scene, load_scene
@@ -112,6 +111,7 @@ class Console:
         self.poses = TaughtPoses(MADE / "poses.json")
         self.plan = LoadedPlan(self.rig)
         self._control_lock, self._one_at_a_time = threading.Lock(), threading.RLock()
+        self._bus_control = BusControl(self.rig, self.control, self._control_lock)
         self._line = ""
         self._planned: Path | None = None
         self._asks = ThreadPoolExecutor(1, "cdpr-drives")
@@ -126,10 +126,11 @@ class Console:
     def update(self) -> dict[str, Any]:
         """The state that all pages show; to be called about 20 times a second."""
         report = self.watch.update()
+        self.end_press(self._bus_control.update(moving=report.status is not None))
         self._line = self.verbs.update()
         self._load_planned()
         if report.status is not None:
-            self.verbs.is_under_way = True
+            self.verbs.follow(report.status)
         is_busy = report.status is not None or self.verbs.verb is not None
         self.robot.update(report.status, is_busy=is_busy)
         self.pictures.watch(report.status, self.view.rig)
@@ -137,12 +138,17 @@ class Console:
         return self._state(report.status, time.monotonic() - report.at)
 
     def close(self) -> None:
-        """Ends a session of jogs begun here, and closes all connections; a run continues."""
-        if self.verbs.verb == "jog" and self.watch.send("end"):
-            self.verbs.stop_before_motion()
+        """Ends jogs begun here and a verb in preparation, and closes all connections.
+
+        A run that moves continues.
+        """
+        if self.verbs.verb == "jog":
+            self.watch.send("end")
+        self.verbs.stop_before_motion()
         self._asks.shutdown()
         self.pictures.close()
         self.watch.close()
+        self._bus_control.close()
 
     def _load_planned(self) -> None:
         """Loads the plan that was made here, once it is there; its check takes a moment."""
@@ -242,8 +248,7 @@ class Console:
     def _command(self, page: int, message: Message) -> str:
         if isinstance(message, TakeCommand):
             moving = self.watch.last.status is not None
-            with self._control_lock:
-                why_not = self.control.take(page, moving=moving, force=message.force)
+            why_not = self._bus_control.take(page, moving=moving, force=message.force)
             if not why_not:
                 self.robot.ask()  # who operates sees the present drives
             return why_not
@@ -270,7 +275,8 @@ class Console:
             case NameCommand():
                 self.poses.teach(message.name, self._pose_now())
             case PickCommand():
-                self.poses.teach(message.name, self._picked(message))
+                picked = picked_pose(self.view.rig, message.position_mm, self._pose_now())
+                self.poses.teach(message.name, picked)
             case RenameCommand():
                 self.poses.rename(message.pose, message.name)
             case MoveCommand():
@@ -377,19 +383,6 @@ class Console:
         MADE.mkdir(exist_ok=True)
         write_atomic(path, scene_text(document))
         return path
-
-    def _picked(self, message: PickCommand) -> Pose:
-        """The picked position, with the platform's present orientation."""
-        position = millimetres(message.position_mm)
-        rig = self.view.rig
-        if np.any(position < rig.workspace_lower) or np.any(position > rig.workspace_upper):
-            raise Refused(
-                "this position is outside the workspace",
-                where="console",
-                why="the rig file limits x, y and z of the platform",
-                next_step="pick another position or height",
-            )
-        return Pose(position, self._pose_now().rotation)
 
     def _pose_now(self) -> Pose:
         return self.robot.pose(self.watch.last.status)

@@ -1,170 +1,83 @@
-"""Data sent to every page: started verbs, stored state, jog session, files to choose from."""
+"""Data sent to every page: stored state, control, jog session, files to choose from."""
 
 from __future__ import annotations
 
 import asyncio
 import math
 import os
-import re
-import signal
-import subprocess
-import sys
-import tempfile
+import pwd
 import threading
 from collections import deque
-from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cdpr.console.commands import Seen
+from cdpr.console.commands import PageControl, Seen
 from cdpr.console.view import measured_data
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock, reference_status
+from executor.interlock.locks import ControlLock
 from executor.jogging import FASTEST
-from executor.recording.record_files import RUNS
-from model.errors import BadInput, CdprError, Refused
-from model.pose import Pose
+from model.errors import BadInput, CdprError
 from model.rig import Rig
 
-#: Length of a verb's output that is shown, [characters].
-SHOWN = 4000
-#: Exit code of a verb that the operator stopped.
-STOPPED = 130
 #: States in transit to a page at a time: more would queue in a slow connection, each older.
 MOST_IN_TRANSIT = 2
 #: Time for which the page shows that a press did not begin, [s].
 NOT_BEGUN_SHOWN = 5.0
-BEFORE_MOTION = "Stopped during the preparation: nothing was moved."
 #: Folder of the plans and scenes that the console writes.
 MADE = Path("console")
-#: Verbs after which drives move, or let go.
-MOVING = frozenset({"home", "jog", "release", "run"})
-_REPORT = re.compile(r"(\S+/report\.html)")
-_HELP = re.compile(r"docs/faults/(\w+)\.md")
 
 
-@dataclass(frozen=True, slots=True)
-class VerbOutcome:
-    """The result of a verb.
+class BusControl:
+    """Gives a page control only while no other console of this robot has a page with control."""
 
-    Attributes:
-        verb: Name.
-        exit_code: Of the process.
-        text: The end of its output.
-        report: Path of the run's report, if one was written.
-        fault: Code of the fault whose help page the output names.
-    """
+    def __init__(self, rig: Rig, pages: PageControl, guard: threading.Lock) -> None:
+        """No page has control.
 
-    verb: str
-    exit_code: int
-    text: str
-    report: Path | None
-    fault: str | None
-
-
-class StartedVerb:
-    """Runs one verb at a time, with output to a file: a pipe would break with the console."""
-
-    def __init__(self) -> None:
-        """Before any verb."""
-        self._lock = threading.Lock()
-        self._process: subprocess.Popen[bytes] | None = None
-        self._output = Path()
-        self.verb: str | None = None
-        """Name of the running verb."""
-        self.outcome: VerbOutcome | None = None
-        """Result of the last verb."""
-        self.is_under_way = False
-        """Whether the running verb has answered as a run, and takes its requests."""
-
-    def start(self, verb: str, arguments: Sequence[str]) -> None:
-        """Starts a verb without a terminal.
-
-        Raises:
-            Refused: Another verb is running.
+        Args:
+            rig: The robot and its bus.
+            pages: Of this console.
+            guard: Held while they change.
         """
-        with self._lock:
-            self._update()
-            if self.verb is not None:
-                raise Refused(
-                    f"`cdpr {self.verb}` is still running",
-                    where="console",
-                    next_step="wait until it ends, or stop it",
-                )
-            self._start(verb, arguments)
+        self._pages, self._guard = pages, guard
+        self._lock = ControlLock(BusSettings.of(rig))
+        self.close = self._lock.release
 
-    def fail(self, error: CdprError) -> None:
-        """Notes that the last verb's result cannot be used, unless another one was started."""
-        with self._lock:
-            if self.outcome is not None:
-                self.outcome = replace(self.outcome, exit_code=error.exit_code, text=str(error))
+    def take(self, page: int, *, moving: bool, force: bool) -> str:
+        """See `PageControl.take`; another console is asked for control first."""
+        name = f"{self._pages.name(page)} (console {os.getpid()} of {_user()})"
+        if why_not := self._lock.take(name, force=force and not moving):
+            return why_not
+        with self._guard:
+            if not self._lock.is_held:  # released since, as no page had control
+                return "control was released meanwhile: take it again"
+            return self._pages.take(page, moving=moving, force=force)
 
-    def stop_before_motion(self) -> bool:
-        """Ends a verb that would move drives but is still being prepared; returns whether it did.
+    def update(self, *, moving: bool) -> int | None:
+        """Gives control up if no page has it, or at rest if another console asks for it.
 
-        One that has just begun to move takes the signal as a request to stop.
+        Returns:
+            The press that a page held, if any.
         """
-        with self._lock:
-            if self._process is None or self.verb not in MOVING or self.is_under_way:
-                return False
-            self._process.terminate()
-            return True
-
-    def update(self) -> str:
-        """The last line of the verb's output; records its end."""
-        with self._lock:
-            return self._update()
-
-    def _start(self, verb: str, arguments: Sequence[str]) -> None:
-        descriptor, name = tempfile.mkstemp(prefix=f"cdpr-{verb}-", suffix=".log")
-        command = [sys.executable, "-c", "from cdpr.cli import main; main()", verb, *arguments]
-        try:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=descriptor,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, "NO_COLOR": "1", "COLUMNS": "100"},
-                start_new_session=True,
-            )
-        finally:
-            os.close(descriptor)
-        self._output, self.verb, self.outcome = Path(name), verb, None
-        self.is_under_way = False
-
-    def _update(self) -> str:
-        if self._process is None or self.verb is None:
-            return ""
-        text = self._output.read_text(encoding="utf-8", errors="replace")
-        code = self._process.poll()
-        if code is not None:
-            self.outcome = _outcome(self.verb, code, text)
-            self._output.unlink(missing_ok=True)
-            self._process = self.verb = None
-        lines = text.strip().splitlines()
-        return lines[-1].strip() if lines else ""
+        press = None
+        with self._guard:
+            holder = self._pages.holder
+            if holder is not None and not moving and self._lock.is_wanted():
+                press, holder = self._pages.give(holder), None
+            if holder is None:
+                self._lock.release()
+                self._pages.elsewhere = self._lock.holder()
+        return press
 
 
-def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
-    if code == -signal.SIGTERM:
-        code, text = STOPPED, f"{text}\n{BEFORE_MOTION}"
-    report, fault = _REPORT.findall(text), _HELP.findall(text)
-    return VerbOutcome(
-        verb=verb,
-        exit_code=code,
-        text=_without_commands(text).strip()[-SHOWN:],
-        report=Path(report[-1]) if report else None,
-        fault=fault[-1] if fault else None,
-    )
-
-
-def _without_commands(text: str) -> str:
-    """Output without the commands that a terminal would need next: the page has buttons."""
-    return re.sub(r"(?m)^\s*next:?\s+cdpr .*\n?", "", text)
+def _user() -> str:
+    with suppress(KeyError):
+        return pwd.getpwuid(os.getuid()).pw_name
+    return f"user {os.getuid()}"
 
 
 def local_file(name: str) -> Path:
@@ -184,15 +97,23 @@ def local_file(name: str) -> Path:
 
 
 def plans_and_scenes() -> dict[str, list[str]]:
-    """Files to choose from, in the console's working folder."""
+    """Files to choose from, in the console's working folder, and those that cannot be named."""
     here = Path()
     plans = sorted({*here.glob("*.json"), *here.glob("plans/*.json"), *MADE.glob("*.plan.json")})
     folders = (here, here / "scenes", here / "configs")
     scenes = sorted({path for folder in folders for path in folder.glob("*.yaml")})
-    return {
+    found = {
         "plans": [str(path) for path in plans if _contains(path, '"kind": "cdpr-plan"')],
         "scenes": [str(path) for path in scenes if _contains(path, "\ngoal:")],
     }
+    named = {kind: [name for name in names if _is_text(name)] for kind, names in found.items()}
+    others = [name for names in found.values() for name in names if not _is_text(name)]
+    return {**named, "left_out": [os.fsencode(name).decode("utf-8", "replace") for name in others]}
+
+
+def _is_text(name: str) -> bool:
+    """Whether a file name is UTF-8, as all names in messages and plans are."""
+    return not any("\ud800" <= character <= "\udfff" for character in name)
 
 
 def _contains(path: Path, text: str) -> bool:
@@ -233,35 +154,6 @@ def read_stored(rig: Rig, *, is_moving: bool) -> StoredState:
     except CdprError as error:
         why = error.what
     return StoredState(None if fault is None or is_moving else fault.cause, not why, why)
-
-
-def start_options(rig: Rig, pose: Pose | None) -> list[str]:
-    """Options of `cdpr jog` that begin at a pose, where it simulates the drives itself."""
-    if pose is None or not is_simulated(rig):
-        return []
-    position = [f"{v:.4f}" for v in 1e3 * pose.position]
-    rotation = [f"{v:.9f}" for v in pose.quaternion]
-    return ["--simulated-start-mm", *position, "--simulated-start-wxyz", *rotation]
-
-
-def outcome_state(ended: VerbOutcome | None) -> dict[str, Any] | None:
-    """The last verb's result, with addresses of its report and help page."""
-    if ended is None:
-        return None
-    return {
-        "verb": ended.verb,
-        "ok": ended.exit_code == 0,
-        "stopped": ended.exit_code == STOPPED,
-        "text": ended.text,
-        "report": None if ended.report is None else _address_of(ended.report),
-        "fault_page": None if ended.fault is None else f"/help/{ended.fault}",
-    }
-
-
-def _address_of(report: Path) -> str | None:
-    """Address of a report on this server; None outside the folder of runs."""
-    path, root = report.resolve(), RUNS.resolve()
-    return f"/runs/{path.relative_to(root)}" if path.is_relative_to(root) else None
 
 
 def jog_state(status: dict[str, Any] | None) -> dict[str, Any]:

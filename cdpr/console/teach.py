@@ -11,12 +11,13 @@ import numpy as np
 import yaml
 from pydantic import Field, TypeAdapter, ValidationError
 
-from model.errors import BadInput, InvalidFile
-from model.files.documents import Document, Name, PoseDocument, write_atomic
+from model.errors import BadInput, InvalidFile, Refused
+from model.files.documents import Document, Name, PoseDocument, millimetres, write_atomic
 from model.files.reading import parse_json, read_text
 from model.files.scene_file import RotationLimitsDocument, SceneDocument, StopDocument
 from model.files.validation import problems_of
 from model.pose import Pose, largest_rotations
+from model.rig import Rig
 from model.scene import Scene
 
 #: Largest number of poses.
@@ -192,6 +193,28 @@ def _rotation_limits(poses: Sequence[TaughtPose]) -> RotationLimitsDocument:
 
 def _is_at(pose: Pose, other: Pose) -> bool:
     return pose.distance_to(other) <= NEAR and np.degrees(pose.angle_to(other)) <= ALIKE_DEG
+
+
+def picked_pose(rig: Rig, position_mm: list[float], now: Pose) -> Pose:
+    """The pose at a picked position, with the platform's present orientation.
+
+    Args:
+        rig: The robot.
+        position_mm: x, y, z in the world frame.
+        now: The present pose, ``world_from_platform``.
+
+    Raises:
+        Refused: It is outside the workspace.
+    """
+    position = millimetres(position_mm)
+    if np.any(position < rig.workspace_lower) or np.any(position > rig.workspace_upper):
+        raise Refused(
+            "this position is outside the workspace",
+            where="console",
+            why="the rig file limits x, y and z of the platform",
+            next_step="pick another position or height",
+        )
+    return Pose(position, now.rotation)
 
 
 def scene_text(document: SceneDocument) -> str:

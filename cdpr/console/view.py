@@ -13,9 +13,8 @@ import numpy as np
 from executor.interlock.interlock import MotionInterlock
 from executor.recording.run_folder import RunFolder
 from executor.report.page import plan_labels
-from executor.runner import prepare_plan
 from executor.service import StatusResult
-from executor.trajectory.setpoints import PreparedRun
+from executor.trajectory.setpoints import PreparedRun, prepare_plan
 from model.clearance import ClearanceModel, Nearest
 from model.errors import CdprError, Refused
 from model.kinematics import cable_lengths, cables_at, forward_kinematics

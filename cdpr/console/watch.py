@@ -1,6 +1,7 @@
 """Follows the run on the rig's bus over its command socket, its robot, and its cameras' images.
 
-It reconnects to the next run. At rest the drives are read. Detections are outlined in the images.
+It reconnects to the next run, and follows a motion in preparation while there is no run. At rest
+the drives are read. Detections are outlined in the images.
 """
 
 from __future__ import annotations
@@ -45,6 +46,12 @@ _OVER = {
 }
 _SILENT = "the run does not answer"
 _MOVES = "the robot moves; wait, or stop it"
+_PREPARED = "a motion is being prepared; wait, or stop it"
+
+
+def is_ahead(status: dict[str, Any]) -> bool:
+    """Whether a motion has not begun to open its devices, and takes only a stop."""
+    return "verb" in status
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +78,13 @@ class RunWatch:
         self._run: RunLink | None = None
         self._looked = float("-inf")
         self._count = 0
+        self._is_ahead = False
         self.last = RunReport(None, time.monotonic())
 
     @property
     def number(self) -> int:
-        """Number of the run that is followed, rising with each; 0 at rest."""
-        return 0 if self._run is None else self._count
+        """Number of the run that is followed, rising with each; 0 at rest and before the motion."""
+        return 0 if self._run is None or self._is_ahead else self._count
 
     def update(self) -> RunReport:
         """Asks the run for its status, or searches for a run."""
@@ -84,7 +92,8 @@ class RunWatch:
             return self.last  # another thread waits for an answer
         try:
             now = time.monotonic()
-            if self._run is None and now - self._looked >= SEARCH_PERIOD:
+            is_waiting = self._run is None or self._is_ahead
+            if is_waiting and now - self._looked >= SEARCH_PERIOD:
                 self._looked = now
                 self._connect()
             if self._run is None:
@@ -103,9 +112,9 @@ class RunWatch:
         A silent run may be one on this bus.
         """
         with self._lock:
-            silent = self._connect() if self._run is None else []
+            silent = self._connect() if self._run is None or self._is_ahead else []
             if self._run is not None:
-                return _MOVES
+                return _PREPARED if self._is_ahead else _MOVES
             if silent:
                 numbers = ", ".join(map(str, silent))
                 return f"process {numbers} moves a robot and does not answer; wait, or stop it"
@@ -154,24 +163,38 @@ class RunWatch:
         """Takes a status from an answer; without an answer the last one becomes stale."""
         if answer.status is not None:
             self.last = RunReport(answer.status, time.monotonic())
+            self._is_ahead = is_ahead(answer.status)
         elif answer.ended:
             self._disconnect()
             self.last = RunReport(None, time.monotonic())
 
     def _connect(self) -> list[int]:
-        """Connects to the run on this bus; if there is none, returns the silent processes."""
+        """Connects to the run on this bus, else to a motion in preparation.
+
+        If there is neither, returns the processes of silent runs.
+        """
+        self._disconnect()
         links, silent = self._links.enter_context(ExitStack()), []
-        for run in links.enter_context(find_runs()):
+        ahead: RunLink | None = None
+        for run in links.enter_context(find_runs(ahead=True)):
             link = RunLink(run)
             answer = link.ask(make_line("status"), PATIENCE)
             if answer.status is not None and self._is_here(answer.status):
-                self._run = link
-                self._count += 1
-                return []
-            if answer.status is None and not answer.ended:
+                if not is_ahead(answer.status):
+                    self._follow(link, is_ahead=False)
+                    return []
+                ahead = ahead or link
+            elif answer.status is None and not (answer.ended or run.is_ahead):
                 silent.append(run.process)
-        self._disconnect()
-        return silent
+        if ahead is None:
+            self._disconnect()
+            return silent
+        self._follow(ahead, is_ahead=True)
+        return []
+
+    def _follow(self, link: RunLink, *, is_ahead: bool) -> None:
+        self._run, self._is_ahead = link, is_ahead
+        self._count += 1
 
     def _is_here(self, status: dict[str, Any]) -> bool:
         return status["bus"] == self._bus and self._rig in (None, status["rig"])

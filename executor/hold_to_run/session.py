@@ -32,11 +32,12 @@ from executor.jogging import FASTEST, LONGEST_MM, measured_pose, with_speed
 from executor.proposals import CablesProposal, JogProposal, require_confirmed
 from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.scheduling import SimulatedClock
-from executor.realtime.shared_memory import SharedMemory, SharedRequests
+from executor.realtime.shared_memory import SharedMemory
+from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import CableStatus, JogStatus, SessionStatus
 from executor.state_machine import CycleRecord
-from executor.supervision import LocalRequests, RequestBoard, Supervisor
-from executor.winch_runs import limit_of, move_supervised, winch_mover, with_board
+from executor.supervision import RequestBoard, Supervisor
+from executor.winch_runs import limit_of, move_supervised, supervised, winch_mover
 from model.kinematics import cable_lengths
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -90,21 +91,23 @@ def jog_session(
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     require_simulated_start(slow, start)
-    interlock = MotionInterlock(slow)
-    interlock.require_free()
-    ready = interlock.referenced_rig()
-    around = (empty_scene(slow) if scene is None else scene).changed(stops=())
-    known = (start or ready.home) if is_simulated(ready) else None
-    start = known or measured_pose(ready, around)
-    require_confirmed(confirm, JogProposal(ready, around, start))
-    session = _Session(
-        ready,
-        _PlatformJogs(ready, around, start, on_cycle),
-        realtime,
-        need_real_time_rights,
-        listener,
-    )
-    with_board(ready, supervisor or Supervisor(), session.run, realtime=realtime)
+    operator = supervisor or Supervisor()
+    with commands_from_start("jog", slow, operator, realtime=realtime) as commands:
+        interlock = MotionInterlock(slow)
+        interlock.require_free()
+        ready = interlock.referenced_rig()
+        around = (empty_scene(slow) if scene is None else scene).changed(stops=())
+        known = (start or ready.home) if is_simulated(ready) else None
+        start = known or measured_pose(ready, around)
+        require_confirmed(confirm, JogProposal(ready, around, start))
+        session = _Session(
+            ready,
+            _PlatformJogs(ready, around, start, on_cycle),
+            realtime,
+            need_real_time_rights,
+            listener,
+        )
+        supervised(ready, operator, commands, partial(session.run, commands))
 
 
 def cable_session(
@@ -145,16 +148,18 @@ def cable_session(
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     limit = limit_of(slow, limit)
-    MotionInterlock(slow).require_free()
-    require_confirmed(confirm, CablesProposal(slow, limit))
-    session = _Session(
-        slow,
-        _CableJogs(slow, limit, on_cycle),
-        realtime,
-        need_real_time_rights,
-        listener,
-    )
-    with_board(slow, supervisor or Supervisor(), session.run, realtime=realtime)
+    operator = supervisor or Supervisor()
+    with commands_from_start("jog", slow, operator, realtime=realtime) as commands:
+        MotionInterlock(slow).require_free()
+        require_confirmed(confirm, CablesProposal(slow, limit))
+        session = _Session(
+            slow,
+            _CableJogs(slow, limit, on_cycle),
+            realtime,
+            need_real_time_rights,
+            listener,
+        )
+        supervised(slow, operator, commands, partial(session.run, commands))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -283,9 +288,9 @@ class _Session:
     need_real_time_rights: bool
     listener: Listener
 
-    def run(self, board: LocalRequests | SharedRequests) -> WinchResult:
+    def run(self, commands: Commands) -> WinchResult:
         """Runs the session; the command socket takes the presses."""
-        rig, clock = self.rig, SimulatedClock(self.rig.cycle)
+        rig, clock, board = self.rig, SimulatedClock(self.rig.cycle), commands.board
         now = time.monotonic if self.realtime else lambda: clock.now
         with ExitStack() as stack:
             presses = PressBoard(now, self.kind.cables)
@@ -309,7 +314,7 @@ class _Session:
             )
             return move_supervised(
                 rig,
-                board,
+                commands,
                 mover,
                 parts.status,
                 self.kind.folder,

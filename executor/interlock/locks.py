@@ -10,9 +10,10 @@ import fcntl
 import os
 import re
 import stat
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from drivers.can_bus import IN_PROCESS, BusSettings
@@ -233,3 +234,103 @@ class SetUpLock:
             yield locked_within(lock, 0.0)
         finally:
             os.close(lock)
+
+
+# Only one console at a time has a page that commands the robot on a bus. The interface ``virtual``
+# has no other user.
+
+
+#: The holder looks this often whether another console asks for control, [s].
+LOOKS_WITHIN = 1.0
+#: Readers release the lock within this time, [s].
+_READ_WITHIN = 0.2
+_LONGEST_NAME = 400
+
+
+class ControlLock:
+    """Lock of the console that has control of one bus.
+
+    Another console asks for it by holding a second lock.
+    """
+
+    def __init__(self, settings: BusSettings) -> None:
+        """Opens nothing yet."""
+        self._is_shared = settings.interface != IN_PROCESS
+        self._path = state_file("control", settings).with_suffix(".lock")
+        self._wish = state_file("control-wanted", settings).with_suffix(".lock")
+        self._held: int | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def is_held(self) -> bool:
+        """Whether this console has it."""
+        return self._held is not None or not self._is_shared
+
+    def take(self, name: str, *, force: bool) -> str:
+        """Takes it; returns why not, or an empty text.
+
+        Args:
+            name: Of the holder, for other consoles.
+            force: Ask the holder to give it up, and wait for that.
+
+        Raises:
+            Refused: The lock is not a regular file, or the file system has no locks.
+        """
+        with self._lock, ExitStack() as stack:
+            if self.is_held:
+                return ""
+            try:
+                self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                handle = open_lock(self._path, create=True)
+                stack.callback(os.close, handle)
+                wish = open_lock(self._wish, create=True)
+                stack.callback(os.close, wish)
+                if not locked_within(handle, _READ_WITHIN):
+                    holder = f"{_text_of(handle)} has control, and keeps it"
+                    if not force:
+                        return holder
+                    if not locked_within(wish, _READ_WITHIN):
+                        return "another console asks for control, too: try again"
+                    if not locked_within(handle, LOOKS_WITHIN):
+                        return f"{holder}: the robot moves, or that console does not answer"
+                os.truncate(handle, 0)
+                os.pwrite(handle, name.encode()[:_LONGEST_NAME], 0)
+            except OSError as error:
+                why = error.strerror or str(error)
+                return f"exclusive control cannot be ensured: {self._path}: {why}"
+            os.close(wish)
+            stack.pop_all()
+            self._held = handle
+            return ""
+
+    def release(self) -> None:
+        """Releases it, if this console has it; does not wait for `take`."""
+        if self._held is None:
+            return
+        with self._lock:
+            if self._held is not None:
+                os.close(self._held)
+                self._held = None
+
+    def is_wanted(self) -> bool:
+        """Whether another console asks for it."""
+        return self._is_shared and self._text_if_locked(self._wish) is not None
+
+    def holder(self) -> str | None:
+        """Name of the holder; None without one."""
+        return self._text_if_locked(self._path) if self._is_shared else None
+
+    def _text_if_locked(self, path: Path) -> str | None:
+        try:
+            handle = open_lock(path)
+        except OSError:  # no console of this computer has had control
+            return None
+        try:
+            return None if locked_within(handle, 0.0, fcntl.LOCK_SH) else _text_of(handle)
+        finally:
+            os.close(handle)
+
+
+def _text_of(handle: int) -> str:
+    text = os.pread(handle, _LONGEST_NAME, 0).decode(errors="replace")
+    return text if text.isprintable() and text else "another console"

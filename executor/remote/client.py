@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from executor.remote.command_socket import RunConnection, find_runs
+from executor.remote.command_socket import RunConnection, find_runs, record_stop
 from executor.remote.protocol import make_line
 from model.errors import BadInput, Fault
 from tracking.measurement import rates
@@ -186,8 +186,8 @@ def no_run(verb: str) -> Fault:
     return Fault(
         "no active run found for this user",
         where=f"cdpr {verb}",
-        why="it has ended, is still being prepared (Ctrl-C there ends it), has another TMPDIR, or"
-        " another user started it",
+        why="it has ended, is still being prepared (`cdpr stop` cancels it, also one that was just"
+        " started), or another user started it",
         next_step="press the emergency stop if the robot moves; a run of another user is"
         f" stopped by that user, or with `sudo cdpr {verb}`",
     )
@@ -253,9 +253,21 @@ class StopResult:
     silent: tuple[Answer, ...]
 
 
+def preparations(bus: str) -> list[dict[str, Any]]:
+    """Status of each motion on a bus that is still being prepared, and answers."""
+    with find_runs(ahead=True) as runs:
+        answers = ask_all([run for run in runs if run.is_ahead], "status")
+    return [answer.status for answer in answers if answer.status and answer.status["bus"] == bus]
+
+
 def stop_runs() -> StopResult:
-    """Stops every run of this user: all drives slow down together along the path, then hold."""
-    with find_runs() as runs:
+    """Stops every run of this user: all drives slow down together along the path, then hold.
+
+    A motion that is still being prepared ends before anything moves; so does one whose program was
+    just started, and answers nothing yet.
+    """
+    record_stop()
+    with find_runs(ahead=True) as runs:
         answers = ask_all(runs, "stop")
     return StopResult(
         tuple(dict.fromkeys(a.process for a in answers if a.status is not None)),

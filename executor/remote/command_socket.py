@@ -5,36 +5,39 @@ A run listens on a socket named after its process in the user's run-time folders
 by one that ended. It is advertised in every folder that another
 terminal may search, and only in folders that no other user can write to: a folder in /tmp of
 another user could contain links to this user's files, or sockets of other users. Root reaches the
-runs of all users, each in a folder private to that user.
-
-Requests are answered in a separate thread, in every phase of the run.
+runs of all users, each in a folder private to that user. A motion in preparation has a name of its
+own: it can be stopped, and takes no other command.
 """
 
 from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import os
 import re
-import selectors
 import socket
 import stat
 import struct
 import tempfile
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from executor.realtime.scheduling import prompt_threads, take_short_turns
-from executor.remote.protocol import Presses, StatusSource, answer_to, status_answer
-from executor.supervision import RequestBoard
 from model.errors import Refused
 
 _ENDING = ".sock"
-_NAME = re.compile(r"([0-9]+)(-[0-9]+)?\.sock")
+#: Of a motion that is still being prepared.
+_ENDING_AHEAD = ".preparing.sock"
+_STEM = re.compile(r"([0-9]+)(-[0-9]+)?")
+#: Temporary folder that does not depend on a terminal's ``TMPDIR``.
+FIXED = Path("/tmp")
+#: Name of the record of the last stop.
+_STOPPED = "stopped"
 
-#: Names of this process's sockets: several threads may each run a robot.
+#: Names of this process's sockets, without endings: several threads may each run a robot.
 _named: set[str] = set()
 _naming = threading.Lock()
 
@@ -48,10 +51,26 @@ class _Folder:
 
 
 def _own_folders() -> list[Path]:
-    """The user's run-time folder, if the system has one, and one in the temporary folder."""
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    folders = [Path(base) / "cdpr"] if base else []
-    return [*folders, Path(tempfile.gettempdir()) / f"cdpr-{os.getuid()}"]
+    """The user's run-time folder, if the system has one, and those in temporary folders.
+
+    A terminal with another ``TMPDIR``, or without ``XDG_RUNTIME_DIR``, searches some of them, too;
+    only a run-time folder of another name keeps runs apart, such as those of tests.
+    """
+    return [_run_time_folder() / "cdpr", *(f / f"cdpr-{os.getuid()}" for f in _temporary_folders())]
+
+
+def _default_run_time_folder() -> Path:
+    return Path(f"/run/user/{os.getuid()}")
+
+
+def _run_time_folder() -> Path:
+    return Path(os.environ.get("XDG_RUNTIME_DIR") or _default_run_time_folder())
+
+
+def _temporary_folders() -> list[Path]:
+    own = Path(tempfile.gettempdir())
+    is_apart = own == FIXED or _run_time_folder() != _default_run_time_folder()
+    return [own] if is_apart else [own, FIXED]
 
 
 def _reachable_folders() -> list[Path]:
@@ -59,7 +78,8 @@ def _reachable_folders() -> list[Path]:
     own = _own_folders()
     if os.getuid() != 0:
         return own
-    others = [*Path("/run/user").glob("*/cdpr"), *Path(tempfile.gettempdir()).glob("cdpr-*")]
+    temporary = [path for folder in _temporary_folders() for path in folder.glob("cdpr-*")]
+    others = [*Path("/run/user").glob("*/cdpr"), *temporary]
     return [*own, *sorted(path for path in others if path not in own)]
 
 
@@ -88,6 +108,29 @@ def _open_folders(paths: Sequence[Path]) -> Iterator[list[_Folder]]:
             os.close(folder.descriptor)
 
 
+@dataclass(frozen=True, slots=True)
+class AdvertisedSockets:
+    """Listening sockets of this process.
+
+    Attributes:
+        listeners: The sockets, one per folder.
+        folders: Descriptors of the folders.
+        stem: Name of the sockets, without ending.
+    """
+
+    listeners: list[socket.socket]
+    folders: list[int]
+    stem: str
+
+    def advertise(self) -> None:
+        """Gives the sockets of a motion in preparation the names of a run, too."""
+        ahead, name = (f"{self.stem}{ending}" for ending in (_ENDING_AHEAD, _ENDING))
+        for folder in self.folders:
+            with contextlib.suppress(OSError):  # the folder was removed
+                _remove(folder, name)
+                os.link(ahead, name, src_dir_fd=folder, dst_dir_fd=folder)
+
+
 @contextlib.contextmanager
 def advertised() -> Iterator[list[socket.socket]]:
     """Listens in every usable folder while the block runs.
@@ -98,10 +141,18 @@ def advertised() -> Iterator[list[socket.socket]]:
     Raises:
         Refused: No folder is writable only by this user.
     """
-    paths = _own_folders()
-    for path in paths:
-        with contextlib.suppress(OSError):  # exists, or its parent is read-only
-            path.mkdir(mode=0o700)
+    with _advertised(_ENDING) as sockets:
+        yield sockets.listeners
+
+
+def advertised_ahead() -> contextlib.AbstractContextManager[AdvertisedSockets]:
+    """As `advertised`, for a motion that is still being prepared."""
+    return _advertised(_ENDING_AHEAD)
+
+
+@contextlib.contextmanager
+def _advertised(ending: str) -> Iterator[AdvertisedSockets]:
+    paths = _made_folders()
     with _open_folders(paths) as opened, contextlib.ExitStack() as stack:
         folders = [folder.descriptor for folder in opened if folder.owner == os.getuid()]
         if not folders:
@@ -111,26 +162,36 @@ def advertised() -> Iterator[list[socket.socket]]:
                 why="no such folder belongs to this user alone; another user may have created it",
                 next_step="remove it or restrict it (chmod 700), or set XDG_RUNTIME_DIR",
             )
-        name = stack.enter_context(_own_name())
+        stem = stack.enter_context(_own_stem())
         listeners = []
         for folder in folders:
-            listeners.append(stack.enter_context(_listen_in(folder, name)))
-            stack.callback(_try_remove, folder, name)
-        yield listeners
+            listeners.append(stack.enter_context(_listen_in(folder, f"{stem}{ending}")))
+            for each in {ending, _ENDING}:
+                stack.callback(_try_remove, folder, f"{stem}{each}")
+        yield AdvertisedSockets(listeners, folders, stem)
+
+
+def _made_folders() -> list[Path]:
+    """This user's folders, after creating them where possible."""
+    paths = _own_folders()
+    for path in paths:
+        with contextlib.suppress(OSError):  # exists, or its parent is read-only
+            path.mkdir(mode=0o700)
+    return paths
 
 
 @contextlib.contextmanager
-def _own_name() -> Iterator[str]:
+def _own_stem() -> Iterator[str]:
     """A name that no other run of this process has while the block runs."""
     numbers = ("" if k == 1 else f"-{k}" for k in itertools.count(1))
     with _naming:
-        names = (f"{os.getpid()}{number}{_ENDING}" for number in numbers)
-        name = next(name for name in names if name not in _named)
-        _named.add(name)
+        stems = (f"{os.getpid()}{number}" for number in numbers)
+        stem = next(stem for stem in stems if stem not in _named)
+        _named.add(stem)
     try:
-        yield name
+        yield stem
     finally:
-        _named.discard(name)
+        _named.discard(stem)
 
 
 def _listen_in(folder: int, name: str) -> socket.socket:
@@ -164,6 +225,46 @@ def _try_remove(folder: int, name: str) -> None:
         os.unlink(name, dir_fd=folder)
 
 
+# A record of the last stop: it also reaches a program that is just being started.
+
+
+def record_stop() -> None:
+    """Records that a stop was requested now, in every folder; to be called before `find_runs`."""
+    _made_folders()
+    line = f"{_boot()} {time.clock_gettime(time.CLOCK_BOOTTIME)!r}\n".encode()
+    name = f"{_STOPPED}-{os.getpid()}-{threading.get_ident()}.new"
+    with _open_folders(_reachable_folders()) as folders:
+        for folder in (one.descriptor for one in folders):
+            with contextlib.suppress(OSError):  # such as a full disk: runs are stopped all the same
+                _remove(folder, name)
+                flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+                with os.fdopen(os.open(name, flags, 0o644, dir_fd=folder), "wb") as stream:
+                    stream.write(line)
+                os.rename(name, _STOPPED, src_dir_fd=folder, dst_dir_fd=folder)
+
+
+def is_stopped_since(began: float) -> bool:
+    """Whether a stop of this user's runs was requested since then, [s] of `CLOCK_BOOTTIME`."""
+    with _open_folders(_own_folders()) as folders:
+        return any(_last_stop(folder.descriptor) >= began for folder in folders)
+
+
+def _last_stop(folder: int) -> float:
+    """Time of the last recorded stop, [s]; minus infinity without one since this computer began."""
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        with os.fdopen(os.open(_STOPPED, flags, dir_fd=folder), "rb") as stream:
+            boot, at = stream.read(100).split()
+        return float(at) if boot.decode() == _boot() else -math.inf
+    except (OSError, ValueError):
+        return -math.inf
+
+
+def _boot() -> str:
+    """Identifies the time since this computer was started."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+
+
 @dataclass(frozen=True, slots=True)
 class RunConnection:
     """A connection to a run.
@@ -172,191 +273,75 @@ class RunConnection:
         process: Its process ID.
         link: The socket; the owner closes it.
         is_connected: False for a run that accepts no connections, as it is suspended or hangs.
+        is_ahead: Its motion was still being prepared when it was found.
     """
 
     process: int
     link: socket.socket
     is_connected: bool = True
+    is_ahead: bool = False
 
 
 @contextlib.contextmanager
-def find_runs() -> Iterator[list[RunConnection]]:
+def find_runs(*, ahead: bool = False) -> Iterator[list[RunConnection]]:
     """Connects to all active runs, in order of their process IDs; a process may have several.
 
     Runs of this user; for root of all users.
+
+    Args:
+        ahead: Also to motions that are still being prepared.
     """
+    endings = (_ENDING, _ENDING_AHEAD) if ahead else (_ENDING,)
     runs: dict[tuple[int, str], RunConnection] = {}
+    seen: set[tuple[str, int]] = set()
     with contextlib.ExitStack() as links:
         with _open_folders(_reachable_folders()) as folders:
             for folder in folders:
                 names = os.listdir(folder.descriptor)
-                for name in sorted(n for n in names if _NAME.fullmatch(n)):
-                    run = _connect(folder.descriptor, name, folder.owner)
+                for name, stem in _sockets(names, endings):
+                    if (stem, folder.owner) in seen:
+                        continue
+                    run = _connect(folder, name, int(stem.partition("-")[0]))
                     if run is None:
                         continue
+                    seen.add((stem, folder.owner))
                     links.callback(run.link.close)
-                    runs.setdefault((run.process, name), run)
+                    runs.setdefault((run.process, stem), run)
         yield [runs[key] for key in sorted(runs)]
 
 
-def _connect(folder: int, name: str, owner: int) -> RunConnection | None:
+def _sockets(names: Sequence[str], endings: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Names of sockets, whole and without ending; those of one run in the order of the endings."""
+    for ending in endings:
+        for name in sorted(names):
+            stem = name.removesuffix(ending)
+            if stem != name and _STEM.fullmatch(stem):
+                yield name, stem
+
+
+def _connect(folder: _Folder, name: str, process: int) -> RunConnection | None:
     """Connects to the folder owner's run at a socket; removes a socket without a listener."""
+    is_ahead = name.endswith(_ENDING_AHEAD)
     with contextlib.suppress(FileNotFoundError):
-        if not stat.S_ISSOCK(os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode):
+        found = os.stat(name, dir_fd=folder.descriptor, follow_symlinks=False)
+        if not stat.S_ISSOCK(found.st_mode):
             return None
     link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     link.setblocking(False)  # else it waits for a suspended run with many waiting clients
     try:
-        link.connect(_path_in(folder, name))
+        link.connect(_path_in(folder.descriptor, name))
     except ConnectionRefusedError:
         link.close()
-        _remove(folder, name)
+        _remove(folder.descriptor, name)
         return None
     except BlockingIOError:
-        return RunConnection(
-            int(name.removesuffix(_ENDING).partition("-")[0]), link, is_connected=False
-        )
+        return RunConnection(process, link, is_connected=False, is_ahead=is_ahead)
     except OSError:  # gone
         link.close()
         return None
     credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     process, user, _ = struct.unpack("3i", credentials)
-    if user != owner:
+    if user != folder.owner:
         link.close()
         return None
-    return RunConnection(process, link)
-
-
-# Server of the command socket, in a separate thread.
-
-
-#: Largest length of a request, [bytes].
-LONGEST_REQUEST = 1024
-#: Largest number of connections; a further one replaces the oldest.
-MOST_CLIENTS = 16
-
-
-@contextlib.contextmanager
-def serving(
-    listeners: Sequence[socket.socket],
-    board: RequestBoard,
-    status: StatusSource,
-    presses: Presses | None = None,
-) -> Iterator[None]:
-    """Answers all requests on the sockets while the block runs.
-
-    Args:
-        listeners: Listening sockets, which the caller closes.
-        board: Takes operator requests.
-        status: Reported in answers.
-        presses: Of a jog session; None for any other motion.
-    """
-    waker, woken = socket.socketpair()
-    server = _Server(listeners, woken, board, status, presses)
-    thread = threading.Thread(target=server.run, name="cdpr-commands", daemon=True)
-    thread.start()
-    try:
-        with prompt_threads():
-            yield
-    finally:
-        waker.close()
-        thread.join()
-        woken.close()
-
-
-class _Server:
-    def __init__(
-        self,
-        listeners: Sequence[socket.socket],
-        woken: socket.socket,
-        board: RequestBoard,
-        status: StatusSource,
-        presses: Presses | None,
-    ) -> None:
-        self._board, self._status, self._woken = board, status, woken
-        self._presses = presses
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(woken, selectors.EVENT_READ)
-        self._partial: dict[socket.socket, bytes] = {}
-        for listener in listeners:
-            listener.setblocking(False)
-            self._selector.register(listener, selectors.EVENT_READ, "listener")
-
-    def run(self) -> None:
-        """Serves until the other end of ``woken`` is closed.
-
-        If the server fails, the run is stopped, as it could no longer be stopped from outside.
-        """
-        try:
-            take_short_turns()
-            while self._serve_ready():
-                pass
-            self._send_final_status()
-        except BaseException:
-            self._board.ask_stop()
-            raise
-        finally:
-            for client in list(self._partial):
-                self._drop(client)
-            self._selector.close()
-
-    def _send_final_status(self) -> None:
-        """Sends the final status to all clients."""
-        for client in self._partial:
-            with contextlib.suppress(OSError):  # disconnected, or does not read
-                client.sendall(status_answer(self._status))
-
-    def _serve_ready(self) -> bool:
-        """Waits for sockets that are ready, and serves them; False at the end."""
-        ready = [(key.fileobj, key.data) for key, _ in self._selector.select()]
-        for ready_socket, kind in ready:
-            if ready_socket is self._woken:
-                return False
-            assert isinstance(ready_socket, socket.socket)
-            if kind == "listener":
-                self._accept(ready_socket)
-            else:
-                self._listen(ready_socket)
-        return True
-
-    def _accept(self, listener: socket.socket) -> None:
-        try:
-            client, _ = listener.accept()
-        except OSError:  # disconnected
-            return
-        if not _is_ours(client):
-            client.close()
-            return
-        if len(self._partial) >= MOST_CLIENTS:
-            self._drop(next(iter(self._partial)))
-        client.setblocking(False)  # a client that does not read must not block a stop by others
-        self._partial[client] = b""
-        self._selector.register(client, selectors.EVENT_READ, "client")
-
-    def _listen(self, client: socket.socket) -> None:
-        """Receives data and answers each complete line."""
-        if client not in self._partial:  # dropped meanwhile
-            return
-        try:
-            got = client.recv(LONGEST_REQUEST)
-            *lines, rest = (self._partial[client] + got).split(b"\n")
-            for line in lines:
-                client.sendall(answer_to(line, self._board, self._status, self._presses))
-        except OSError:  # disconnected, or does not read
-            got, rest = b"", b""
-        if not got or len(rest) > LONGEST_REQUEST:
-            self._drop(client)
-        else:
-            self._partial[client] = rest
-
-    def _drop(self, client: socket.socket) -> None:
-        del self._partial[client]
-        self._selector.unregister(client)
-        client.close()
-
-
-def _is_ours(client: socket.socket) -> bool:
-    """Whether the client is this user or root, in addition to the folder's permissions."""
-    credentials = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    _, user, _ = struct.unpack("3i", credentials)
-    return user in (os.getuid(), 0)
+    return RunConnection(process, link, is_ahead=is_ahead)

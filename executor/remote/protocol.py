@@ -186,7 +186,12 @@ class StatusSource(Protocol):
 
 
 def answer_to(
-    line: bytes, board: RequestBoard, status: StatusSource, presses: Presses | None = None
+    line: bytes,
+    board: RequestBoard,
+    status: StatusSource,
+    presses: Presses | None = None,
+    *,
+    ahead: bool = False,
 ) -> bytes:
     """Executes a request; returns the encoded answer.
 
@@ -197,9 +202,12 @@ def answer_to(
         board: Takes operator requests.
         status: Reported in the answer.
         presses: Of a jog session; None for any other motion.
+        ahead: The motion is still being prepared, and takes only a stop.
     """
     try:
         command = parse_command(line)
+        if ahead and command.command not in ("status", "stop"):
+            raise InvalidCommand("the motion is still being prepared, and takes only a stop")
         if isinstance(command, JogCommand):
             _jog(command, presses)
         else:

@@ -14,7 +14,8 @@ row by row), ``stated`` (whether it includes the errors common to all images), `
 {``distance_mm``, ``low_mm``, ``high_mm`` (its 95 % interval), ``pair``}, or null}, ``drives``
 [{``node``, ``state``, ``position_counts``, ``set_counts``, ``tension_n``}], ``events``
 [{``time_s``, ``code``, ``text``}], the newest last. An unknown number is null; before the first
-cycle ``state`` is ``preparing`` (``releasing`` during `cdpr release`) and ``drives`` is empty; at
+cycle ``state`` is ``preparing`` (``releasing`` during `cdpr release`) and ``drives`` is empty;
+before a motion opens its devices there is also ``verb``, the verb that is being prepared; at
 the end ``cause`` is the reason of a bad end. Winches that move without a path (`cdpr home`, `cdpr
 jog --cable`) have no ``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a
 percentage. A jog session has ``jog`` {``speed_mm_s`` (largest), ``position_mm``, ``quaternion``
@@ -274,7 +275,7 @@ class RunStatus(MotionStatus):
         return [asdict(event) for event in list(self._events)]
 
 
-_NO_PATH = {"path_mm": None, "path_length_mm": None, "next_stop": None}
+NO_PATH = {"path_mm": None, "path_length_mm": None, "next_stop": None}
 
 
 class WinchStatus(MotionStatus):
@@ -295,7 +296,7 @@ class WinchStatus(MotionStatus):
 
     def _position_fields(self) -> dict[str, Any]:
         row = None if self._cycles.last is None else round(self._cycles.last.index, 1)
-        return {"row": row, "rows": 100, **_NO_PATH}
+        return {"row": row, "rows": 100, **NO_PATH}
 
     def _event_data(self) -> list[dict[str, Any]]:
         began = self._cycles.began
@@ -309,7 +310,7 @@ class SessionStatus(WinchStatus):
     """Status of a jog session."""
 
     def _position_fields(self) -> dict[str, Any]:
-        return {"row": None, "rows": None, **_NO_PATH, **self._jogged()}
+        return {"row": None, "rows": None, **NO_PATH, **self._jogged()}
 
     @abstractmethod
     def _jogged(self) -> dict[str, Any]:

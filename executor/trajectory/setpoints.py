@@ -28,13 +28,15 @@ from executor.trajectory.time_scaling import TimeLaw, time_law
 from model.clearance import ClearanceModel
 from model.errors import Refused
 from model.kinematics import cables_to
+from model.plan import Plan
 from model.pose import Array, Pose, read_only
+from model.progress import SILENT, Listener
 from model.rig import Rig
 from model.scene import Load, Scene, legs_of
 from model.statics.gravity import working_tensions
 from model.statics.wrench_sets import rms_anchor_radius
 from model.winches import WinchMap
-from planner.check import check_path, parted
+from planner.check import check_path, parted, verify
 from planner.check_report import CheckReport, VerifiedPlan
 
 # Input of the loop: checked set-points and their fingerprint.
@@ -379,6 +381,16 @@ class PreparedRun:
     def duration(self) -> float:
         """Duration including dwells, [s]."""
         return (len(self.checked.table) - 1) * self.checked.table.cycle
+
+
+def prepare_plan(plan: Plan, rig: Rig, listener: Listener = SILENT) -> PreparedRun:
+    """The checked set-points of a plan, for a rig.
+
+    Raises:
+        Refused: The plan, or its executed curve, does not pass the checks.
+    """
+    with listener.waiting("checking the plan and its set-points"):
+        return prepare(verify(plan, rig), rig)
 
 
 def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:

@@ -68,6 +68,15 @@ def test_a_no_moves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.json"))
 
 
+def test_a_session_of_jogs_enables_nothing_when_the_program_that_started_it_is_gone() -> None:
+    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41990")
+    gone = ("--yes", "--end-with", 2**22 + 1)  # larger than the number of any process
+    held = call("jog", RIG, "--hold-to-run", "--one-cable", *bus, *gone)
+    assert held.code == 130
+    assert "nothing was enabled" in held.said
+    one_message(call("jog", RIG, "--by-mm", 0, 0, 1, "--no-scene", *gone), 2, "--hold-to-run")
+
+
 HELD = ("--hold-to-run", "--no-scene")
 AT, AT_WXYZ = ("--simulated-start-mm", 0, 0, 445), ("--simulated-start-wxyz",)
 

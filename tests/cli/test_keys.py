@@ -27,7 +27,8 @@ from executor.hold_to_run.presses import TIMEOUT, PressBoard
 from executor.hold_to_run.session import jog_session
 from executor.remote import client
 from executor.remote.client import StopResult, follow_run
-from executor.remote.command_socket import RunConnection, advertised, serving
+from executor.remote.command_server import serving
+from executor.remote.command_socket import RunConnection, advertised
 from executor.remote.protocol import make_line, parse_command
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, State

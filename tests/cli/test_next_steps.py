@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +16,15 @@ import pytest
 from calibration.results import write_result
 from cdpr.cli.operate.run import show
 from cdpr.cli.output import progress_bar
+from executor import service
 from executor.interlock.interlock import ReferenceStatus
+from executor.interlock.locks import SetUpLock
 from executor.recording.verdict import page_text
 from executor.remote.client import request_run as request
+from executor.remote.command_server import commands_from_start
 from executor.run_result import RunResult
 from executor.service import DriveStatus, StatusResult
+from executor.supervision import Supervisor
 from model.errors import Fault
 from model.rig import load_rig
 from model.scene import load_scene
@@ -119,7 +125,13 @@ def test_a_run_that_went_well_points_to_no_fault(
 
 REFERENCED = ReferenceStatus(counts=True, why_not=None, made=None, how=None, file=None)
 STANDING = StatusResult(
-    rig="rig", bus="bus", run=None, latched=None, being_set_up=False, reference=REFERENCED
+    rig="rig",
+    bus="bus",
+    run=None,
+    preparing=(),
+    latched=None,
+    being_set_up=False,
+    reference=REFERENCED,
 )
 
 
@@ -131,6 +143,24 @@ def test_status_says_what_has_to_be_done_before_a_run() -> None:
     both = replace(lost, latched="cable 3 is slack").next_step(rig)
     assert both.index("cdpr reset 'my rig.yaml'") < both.index("cdpr home 'my rig.yaml'")
     assert replace(lost, run=17).next_step(rig) == ""
+
+
+def test_status_names_who_prepares_a_motion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(service, "open_bus", lambda _: pytest.fail("the bus is opened"))
+    monkeypatch.setattr(SetUpLock, "tried", lambda _: nullcontext(False))
+    rig = load_rig(CONFIGS / "gachon_8_6.yaml").with_bus("udp_multicast", "239.74.9.10")
+    for channel, who in (("239.74.9.10", (os.getpid(),)), ("239.74.9.11", ())):
+        other = rig.with_bus("udp_multicast", channel)
+        with commands_from_start("run", other, Supervisor(), realtime=False):
+            result = service.status(rig)
+        assert (result.run, result.preparing) == (None, who)
+        said = [text for name, text in result.facts(Path("rig.yaml")) if name == "motion"]
+        assert said == [f"process {n} is preparing one; `cdpr stop` cancels it" for n in who]
 
 
 def test_a_drive_set_up_for_another_cycle_is_not_said_to_have_lost_power() -> None:

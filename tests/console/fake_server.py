@@ -160,6 +160,7 @@ class Fake:
         self.files = {
             "scenes": ["configs/environment_1.yaml", "configs/hall_pillar.yaml"],
             "plans": ["plans/circle.json", "plans/colliding.json"],
+            "left_out": [],
         }
         self._seq = itertools.count(1)
 

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
+import threading
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from cdpr.console.commands import PageControl
+from cdpr.console.state import BusControl
+from drivers.can_bus import BusSettings
+from executor.interlock import locks
+from executor.interlock.locks import ControlLock, state_file
+from model.errors import Refused
+from model.rig import load_rig
+from tests.cli.plans import CONFIGS
 
 
 class ControlMachine(RuleBasedStateMachine):
@@ -192,3 +204,120 @@ def test_two_consoles_at_once_never_number_a_press_alike() -> None:
         seen += [c.hold(p, hold, hold, 1) for c, p in zip(consoles, pages, strict=True)]
     assert len(set(seen)) == len(seen)
     assert None not in seen
+
+
+# Several consoles of one robot.
+
+BUS = BusSettings("udp_multicast", "239.74.9.12")
+RIG = load_rig(CONFIGS / "gachon_8_6.yaml").with_bus(BUS.interface, BUS.channel)
+
+
+class OneConsole:
+    """A console with two pages."""
+
+    def __init__(self) -> None:
+        self.pages = PageControl(lambda: 1)
+        self.bus = BusControl(RIG, self.pages, threading.Lock())
+        self.numbers = [self.pages.join(f"host {n}") for n in range(2)]
+
+
+class ConsolesMachine(RuleBasedStateMachine):
+    """Two consoles take and give control; whichever waits, the other one looks meanwhile."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder, self.patch = tempfile.TemporaryDirectory(), pytest.MonkeyPatch()
+        self.patch.setenv("XDG_STATE_HOME", self.folder.name)
+        self.patch.setattr(locks, "SHARED", Path(self.folder.name) / "none")
+        self.patch.setattr(locks, "time", self)
+        self.now = 0.0
+        self.moving = False
+        self.answers = True
+        self.consoles = [OneConsole(), OneConsole()]
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+        if self.answers:
+            self.look()
+
+    @rule()
+    def look(self) -> None:
+        for console in self.consoles:
+            console.bus.update(moving=self.moving)
+
+    @rule(moving=st.booleans(), answers=st.booleans())
+    def change(self, moving: bool, answers: bool) -> None:
+        self.moving, self.answers = moving, answers
+
+    @rule(here=st.integers(0, 1), page=st.integers(0, 1), force=st.booleans())
+    def take(self, here: int, page: int, force: bool) -> None:
+        console, other = self.consoles[here], self.consoles[1 - here]
+        number, before = console.numbers[page], other.pages.holder
+        own = console.pages.holder
+        why_not = console.bus.take(number, moving=self.moving, force=force)
+        assert bool(why_not) == (console.pages.holder != number)
+        if before is not None:
+            assert bool(why_not) == (self.moving or not force or not self.answers)
+            if why_not:
+                assert other.pages.holder == before
+                assert "has control, and keeps it" in why_not
+        elif own in (None, number) and (self.answers or own == number):
+            assert why_not == ""
+
+    @rule(here=st.integers(0, 1), page=st.integers(0, 1))
+    def give(self, here: int, page: int) -> None:
+        self.consoles[here].pages.give(self.consoles[here].numbers[page])
+
+    @invariant()
+    def one_page_has_control(self) -> None:
+        holders = [console.pages.holder for console in self.consoles]
+        assert None in holders
+
+    @invariant()
+    def the_others_know_who(self) -> None:
+        for _ in range(2):  # one sees what the other one did last
+            self.look()
+        names = {console.pages.holder_name() for console in self.consoles}
+        if any(console.pages.holder is not None for console in self.consoles):
+            assert all("on host" in (name or "") for name in names)
+        else:
+            assert names == {None}
+
+    def teardown(self) -> None:
+        for console in self.consoles:
+            console.bus.close()
+        self.patch.undo()
+        self.folder.cleanup()
+
+
+TestConsoles = ConsolesMachine.TestCase
+
+
+@pytest.mark.parametrize("file", ["control", "control-wanted"])
+def test_a_lock_of_control_that_cannot_be_made_gives_no_control(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    path = state_file(file, BUS).with_suffix(".lock")
+    path.mkdir(parents=True)
+    console = OneConsole()
+    with pytest.raises(Refused, match="it is a folder"):
+        console.bus.take(console.numbers[0], moving=False, force=True)
+    assert console.pages.holder is None
+
+
+def test_control_of_a_console_that_was_killed_is_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    lock, killed = ControlLock(BUS), ControlLock(BUS)
+    assert killed.take("page 1", force=False) == ""
+    assert lock.holder() == "page 1"
+    assert killed._held is not None
+    os.close(killed._held)  # as the system does
+    assert lock.holder() is None
+    assert lock.take("page 2", force=False) == ""
+    lock.release()

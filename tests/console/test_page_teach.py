@@ -22,7 +22,7 @@ def selected(found: Visit, group: str) -> Any:
 
 def read_files(found: Visit, **files: list[str]) -> None:
     """The page reads the lists of files again, as after every verb."""
-    found.fake.ask(set={"files": {"scenes": [], "plans": [], **files}})
+    found.fake.ask(set={"files": {"scenes": [], "plans": [], "left_out": [], **files}})
     found.fake.ask(state={"busy": {"verb": "plan", "text": ""}})
     expect(found.page.locator("#busy")).to_be_visible()
     with found.page.expect_response("**/api/files*"):
@@ -44,6 +44,22 @@ def test_a_single_file_and_a_new_file_are_selected(desk: Visit) -> None:
     desk.page.locator("input[name=plan-file][value='a.json']").check(force=True)
     read_files(desk, plans=["a.json", "b.json"], scenes=scenes)
     assert selected(desk, "plan-file") == "a.json", "the operator's choice stays"
+
+
+def test_a_list_of_files_that_is_not_complete_says_so(desk: Visit) -> None:
+    note = desk.page.locator("#files-note")
+    expect(note).to_be_hidden()
+    read_files(desk, plans=["a.json"], left_out=["b\ufffd.json"])
+    expect(note).to_contain_text("b\ufffd.json")
+    desk.page.route("**/api/files*", lambda route: route.fulfill(status=500))
+    read_files(desk, plans=["b.json"])
+    expect(note).to_contain_text("could not be listed (error 500)")
+    assert selected(desk, "plan-file") == "a.json", "the last list stays"
+    desk.page.unroute("**/api/files*")
+    read_files(desk, plans=["a.json"])
+    expect(note).to_be_hidden()
+    assert len(desk.errors) == 1, "the browser's own, on that error"
+    desk.errors.clear()
 
 
 @pytest.mark.parametrize(

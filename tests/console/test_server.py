@@ -20,7 +20,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
@@ -32,19 +34,16 @@ from cdpr.console import server
 from cdpr.console.commands import MOST_WAITING, Held, LetGo, Seen, parse_message
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
 from cdpr.console.session import Console, ConsoleFiles
-from cdpr.console.state import (
-    MOST_IN_TRANSIT,
-    StateFlow,
-    StoredState,
-    VerbOutcome,
-    _without_commands,
-)
+from cdpr.console.state import MOST_IN_TRANSIT, StateFlow, StoredState
+from cdpr.console.verbs import VerbOutcome, _outcome, _without_commands
 from cdpr.console.watch import RunWatch
+from executor.remote.command_server import commands_from_start
+from executor.remote.command_server import serving as commands
 from executor.remote.command_socket import advertised
-from executor.remote.command_socket import serving as commands
 from executor.remote.status import bus_name
 from executor.state_machine import State
-from executor.supervision import LocalRequests
+from executor.supervision import LocalRequests, Supervisor
+from model.errors import BadInput
 from model.plan import load_plan, save_plan
 from model.pose import Pose
 from model.rig import load_rig
@@ -207,9 +206,9 @@ def test_a_latch_is_shown_together_with_the_end_of_the_verb_that_left_it(
     console, latched = Served().console, StoredState("cable 4 is slack", False, None)
     monkeypatch.setattr(time, "monotonic", lambda: 1000.0)
     assert console.update()["latched"] is None
-    verbs, output = console.verbs, tmp_path / "output"
-    output.touch()
-    verbs.verb, verbs._output, verbs._process = "jog", output, subprocess.Popen(["sleep", "60"])
+    verbs = console.verbs
+    verbs.verb, verbs._process = "jog", subprocess.Popen(["sleep", "60"])
+    verbs._output = os.memfd_create("output")
     with verbs._process as process:
         assert console.update()["busy"]["verb"] == "jog"
         process.kill()
@@ -236,6 +235,87 @@ def test_hold_and_resume_are_refused_by_a_run_that_is_over(state: State) -> None
     console.close()
 
 
+def test_a_file_whose_name_is_no_text_is_left_out_of_the_lists_and_named(
+    served: Served, folder: Path
+) -> None:
+    bad = Path(os.fsdecode(os.fsencode(folder) + b"/bad\xff.json"))
+    bad.write_text('{"kind": "cdpr-plan"')
+    try:
+        code, body, _ = served.get("/api/files")
+    finally:
+        bad.unlink()
+    assert code == 200
+    listed = json.loads(body)
+    assert (listed["plans"], listed["left_out"]) == (["short.json"], ["bad\ufffd.json"])
+    assert json.loads(served.get("/api/files")[1])["left_out"] == []
+
+
+@pytest.mark.parametrize("name", ["%00", "one/%00", "x" * 5000, "one", "../secret.txt", "%ff"])
+def test_a_file_of_a_run_that_cannot_be_is_not_found(served: Served, name: str) -> None:
+    assert served.get(f"/runs/{name}")[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("host", "shown"),
+    [
+        ("127.0.0.1", "127.0.0.1"),
+        ("::1", "[::1]"),
+        ("0.0.0.0", socket.gethostname()),
+        ("::", socket.gethostname()),
+        ("localhost", "localhost"),
+    ],
+)
+def test_the_printed_address_can_be_opened(
+    host: str, shown: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    printed: list[str] = []
+    monkeypatch.setattr(server, "web_server", lambda _: SimpleNamespace(run=lambda **_: None))
+    server.run_server(Served().console, host, 0, printed.append)
+    (address,) = printed
+    parts = urlsplit(address)
+    assert address.startswith(f"http://{shown}:{parts.port}/?token=")
+    assert parts.hostname == shown.strip("[]").lower()
+
+
+@pytest.mark.parametrize(
+    ("host", "where"),
+    [("no-such-host.invalid", "--host"), ("192.0.2.1", "--host"), ("x" * 70, "--host"),
+     ("2001:db8::1", "--host"), ("127.0.0.1", "--port")],
+)  # fmt: skip
+def test_an_address_that_cannot_be_used_names_the_option(host: str, where: str) -> None:
+    with listening("127.0.0.1", 0) as taken:
+        with pytest.raises(BadInput) as caught, listening(host, taken.getsockname()[1]):
+            pass
+        assert caught.value.where == where
+
+
+def test_the_output_of_a_verb_needs_no_disk_and_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk is the cause of many failures: the page must show it."""
+    console = Served().console
+    del console.verbs.start
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr("tempfile.mkstemp", lambda **_: pytest.fail("a file is written"))
+    console.verbs.start("run", ["no-such-plan.json"])
+    process = console.verbs._process
+    assert process is not None
+    assert process.wait() == 2
+    outcome = console.update()["outcome"]
+    assert "no-such-plan.json" in outcome["text"]
+    assert sorted(tmp_path.iterdir()) == before
+    console.close()
+
+
+@pytest.mark.parametrize(("code", "text"), [(1, ""), (4, " \n"), (-9, "")])
+def test_a_verb_that_fails_without_a_message_states_its_exit_code(code: int, text: str) -> None:
+    assert _outcome("home", code, text).text == (
+        f"`cdpr home` ended with exit code {code} and no message."
+    )
+    assert _outcome("home", 0, "").text == ""
+    assert _outcome("home", 1, "why").text == "why"
+
+
 @pytest.mark.parametrize("verb", ["home", "release", "run", "jog"])
 def test_stop_ends_a_verb_that_is_still_being_prepared(verb: str) -> None:
     """It reads files and drives for seconds before it can be asked to stop."""
@@ -255,14 +335,21 @@ def test_stop_ends_a_verb_that_is_still_being_prepared(verb: str) -> None:
     console.close()
 
 
-def test_a_session_of_jogs_that_is_still_being_prepared_ends_with_the_console() -> None:
+@pytest.mark.parametrize("verb", ["home", "release", "run", "jog"])
+@pytest.mark.parametrize("state", [None, "preparing"])
+def test_a_verb_that_is_still_being_prepared_ends_with_the_console(
+    verb: str, state: str | None
+) -> None:
     console = Served().console
     del console.verbs.start
     console.watch.send = lambda *_, **__: "nothing moves"  # type: ignore[method-assign]
-    console.verbs.start("jog", ["--help"])
+    console.verbs.start(verb, ["--help"])
     process = console.verbs._process
     assert process is not None
     os.kill(process.pid, signal.SIGSTOP)
+    console.verbs.follow({"process": process.pid + 1, "state": "moving"})  # another's run
+    if state is not None:
+        console.verbs.follow({"process": process.pid, "state": state})
     console.close()
     os.kill(process.pid, signal.SIGCONT)
     assert process.wait() == -signal.SIGTERM
@@ -273,10 +360,11 @@ def test_stop_leaves_what_moves_nothing_and_what_writes_its_report_alone() -> No
     del console.verbs.start
     for verb, is_under_way in (("plan", False), ("reset", False), ("run", True)):
         console.verbs.start(verb, ["--help"])
-        console.verbs.is_under_way = is_under_way
-        assert console.stop() == "nothing moves"
         process = console.verbs._process
         assert process is not None
+        if is_under_way:
+            console.verbs.follow({"process": process.pid, "state": "moving"})
+        assert console.stop() == "nothing moves"
         assert process.wait() == 0
         console.verbs.update()
     console.close()
@@ -424,6 +512,87 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
             assert [asked("service_begin"), asked("service_end"), asked("reset")] == [""] * 3
     assert [verb for verb, _ in served.started] == ["reset"] * 2
     console.close()
+
+
+def test_a_motion_prepared_elsewhere_is_shown_and_gives_way_to_a_run() -> None:
+    console = Served().console
+    watch, rig = console.watch, console.rig
+    prepared = "a motion is being prepared; wait, or stop it"
+    with commands_from_start("run", rig, Supervisor(), realtime=False) as ahead:
+        motion = console.update()["motion"]
+        assert (motion["state"], motion["verb"], motion["process"]) == (
+            "preparing",
+            "run",
+            os.getpid(),
+        )
+        assert (watch.number, watch.why_busy()) == (0, prepared), "no press begins"
+        assert "takes only a stop" in RunWatch.send(watch, "hold")
+        moving: Any = MovesOn(motion["bus"], motion["rig"])
+        with ahead.during_motion(moving):
+            console.watch.update()
+            assert watch.number > 0
+            assert watch.why_busy() == "the robot moves; wait, or stop it"
+        watch.update()
+        assert (watch.number, watch.last.status) == (0, None)
+    console.close()
+
+
+def test_a_run_is_followed_rather_than_a_motion_in_preparation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Such as one that waits at its question while another terminal moves the robot."""
+    monkeypatch.setattr("cdpr.console.watch.SEARCH_PERIOD", 0.0)
+    console = Served().console
+    with commands_from_start("run", console.rig, Supervisor(), realtime=False):
+        motion = console.update()["motion"]
+        code = RUN_ELSEWHERE.format(bus=motion["bus"], rig=motion["rig"])
+        command, pipe = [sys.executable, "-c", code], subprocess.PIPE
+        with subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, cwd=Path(__file__).parents[2]
+        ) as run:
+            assert run.stdout is not None
+            run.stdout.readline()
+            console.watch.update()
+            assert console.watch.last.status == {"bus": motion["bus"], "rig": motion["rig"]}
+            run.communicate()
+    console.close()
+
+
+RUN_ELSEWHERE = """
+from types import SimpleNamespace
+from executor.remote.command_server import serving
+from executor.remote.command_socket import advertised
+from executor.supervision import LocalRequests, Supervisor
+status = SimpleNamespace(as_dict=lambda: {{"bus": {bus!r}, "rig": {rig!r}}})
+with advertised() as listeners, serving(listeners, LocalRequests(), status):
+    print("advertised", flush=True)
+    input()
+"""
+
+
+def test_one_page_of_all_consoles_of_a_robot_has_control(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cdpr.console.session.read_status", lambda _: pytest.fail("read"))
+    rig = load_rig(RIG).with_bus("udp_multicast", "239.74.9.13")
+    first, second = Served().console.files, Served().console.files
+    one, other = Console(replace(first, rig=rig)), Console(replace(second, rig=rig))
+    mine, theirs = one.control.join("here"), other.control.join("there")
+
+    def asked(console: Console, page: int, name: str) -> str:
+        message = parse_message(json.dumps({"kind": "command", "command": name}))
+        assert not isinstance(message, Held | LetGo)
+        return console.command(page, message)
+
+    assert asked(one, mine, "take_control") == ""
+    name = f"page {mine} on here (console {os.getpid()} of "
+    assert asked(other, theirs, "take_control").startswith(name)
+    assert asked(other, theirs, "reset") == "take control first"
+    other.update()
+    assert (other.control.holder_name() or "").startswith(name)
+    one.leave(mine)
+    one.update()
+    assert asked(other, theirs, "take_control") == ""
+    for console in (one, other):
+        console.close()
 
 
 @pytest.mark.parametrize("path", ["/", "/scene", "/api/files", "/runs/one/report.html"])

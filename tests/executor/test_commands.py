@@ -18,14 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from executor.remote.client import ask_all, final_status, no_answer, select_run, stop_runs
-from executor.remote.command_socket import (
-    LONGEST_REQUEST,
-    MOST_CLIENTS,
-    RunConnection,
-    advertised,
-    find_runs,
-    serving,
-)
+from executor.remote.command_server import LONGEST_REQUEST, MOST_CLIENTS, serving
+from executor.remote.command_socket import RunConnection, advertised, find_runs
 from executor.remote.protocol import InvalidCommand, answer_to, make_line, parse_command
 from executor.supervision import LocalRequests, OperatorRequests
 from model.errors import BadInput, Fault
@@ -222,7 +216,7 @@ def test_a_run_that_could_not_be_stopped_from_elsewhere_any_more_is_stopped(monk
     def break_down(*_: object) -> None:
         raise RuntimeError("unforeseen")
 
-    monkeypatch.setattr("executor.remote.command_socket.answer_to", break_down)
+    monkeypatch.setattr("executor.remote.command_server.answer_to", break_down)
     with find_runs() as runs:
         assert ask_all(runs, "status")[0].ended
     assert board.read().stop

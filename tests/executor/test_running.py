@@ -9,16 +9,29 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cdpr.cli.operate.supervision import STOP_SIGNALS, stop_requests
-from executor.remote.command_socket import advertised, find_runs
-from executor.supervision import LocalRequests
-from model.errors import Refused
+from executor import homing, jogging, runner, service
+from executor.hold_to_run import session
+from executor.remote import command_socket
+from executor.remote.client import StopResult, ask_all, stop_runs
+from executor.remote.command_server import commands_from_start
+from executor.remote.command_socket import advertised, find_runs, is_stopped_since, record_stop
+from executor.supervision import LocalRequests, OperatorRequests, Supervisor
+from model.errors import Refused, StoppedByOperator
+from model.rig import load_rig
+from tests.executor import fake_run
 
 #: A run as made by the command line: prints that it is advertised, ends on request.
 RUN = """
@@ -45,6 +58,7 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "runtime"))
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(command_socket, "FIXED", tmp_path / "temporary")
     return tmp_path / "runtime" / "cdpr", tmp_path / "temporary" / f"cdpr-{os.getuid()}"
 
 
@@ -52,7 +66,8 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path
 def _run() -> Iterator[subprocess.Popen[str]]:
     """A run in its own process, advertised."""
     command = [sys.executable, "-c", RUN]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=ROOT)
     deadline = threading.Timer(ENDS_WITHIN_S, process.kill)
     deadline.start()
     assert process.stdout is not None
@@ -63,8 +78,7 @@ def _run() -> Iterator[subprocess.Popen[str]]:
         deadline.cancel()
         deadline.join()
         process.kill()
-        process.wait()
-        process.stdout.close()
+        process.communicate()
 
 
 def _reached() -> list[int]:
@@ -83,6 +97,34 @@ def test_a_run_is_reached_also_from_a_terminal_without_a_run_time_folder(
         process.terminate()
         process.wait()
         assert _reached() == []
+
+
+@pytest.mark.parametrize("base", ["", "default", "apart"])
+def test_a_run_is_reached_from_a_terminal_with_another_temporary_folder(
+    tmp_path, monkeypatch, base
+):
+    """Only a run-time folder of another name keeps runs apart."""
+    monkeypatch.setattr(command_socket, "FIXED", tmp_path / "fixed")
+    default = tmp_path / "default"
+    monkeypatch.setattr(command_socket, "_default_run_time_folder", lambda: default)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / base) if base else "")
+    for name in ("fixed", "here", "there", *([base] if base else [])):
+        (tmp_path / name).mkdir()
+
+    def in_terminal(name: str) -> None:
+        monkeypatch.setenv("TMPDIR", str(tmp_path / name))
+        monkeypatch.setattr(tempfile, "tempdir", None)
+
+    in_terminal("here")
+    with advertised():
+        in_terminal("there")
+        assert _reached() == [os.getpid()]
+        monkeypatch.delenv("XDG_RUNTIME_DIR")
+        assert _reached() == ([] if base == "apart" else [os.getpid()])
+        assert is_stopped_since(0.0) is False
+        record_stop()
+        in_terminal("here")
+        assert is_stopped_since(0.0) is True
 
 
 def test_every_run_is_reached(folders):
@@ -145,6 +187,7 @@ def test_root_reaches_the_runs_of_other_users(monkeypatch):
         Path(folder).chmod(0o777)
         monkeypatch.setenv("TMPDIR", folder)
         monkeypatch.setattr(tempfile, "tempdir", None)
+        monkeypatch.setattr(command_socket, "FIXED", Path(folder))
         with _run() as process:
             assert _reached() == [process.pid]
 
@@ -277,3 +320,186 @@ def test_a_run_under_nohup_outlives_its_terminal():
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+# Motions in preparation.
+
+RIG = load_rig(ROOT / "configs/gachon_8_6.yaml")
+BOOT = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+
+def _now() -> float:
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_motion_in_preparation_is_found_for_a_stop_alone(folders, realtime):
+    supervisor, pid = Supervisor(), os.getpid()
+    with commands_from_start("home", RIG, supervisor, realtime=realtime) as commands:
+        assert _reached() == []
+        with find_runs(ahead=True) as runs:
+            assert [(run.process, run.is_ahead) for run in runs] == [(pid, True)]
+            (answer,) = ask_all(runs, "status")
+            assert answer.status is not None
+            assert (answer.status["state"], answer.status["verb"]) == ("preparing", "home")
+            assert "takes only a stop" in ask_all(runs, "hold")[0].what
+            moving: Any = SimpleNamespace(as_dict=lambda: {"state": "moving"})
+            with commands.during_motion(moving):
+                assert _reached() == [pid]
+                with find_runs(ahead=True) as found:
+                    assert [(run.process, run.is_ahead) for run in found] == [(pid, False)]
+                assert ask_all(runs, "hold")[0].status == {"state": "moving"}, "the same connection"
+                assert commands.board.read() == OperatorRequests(hold=True)
+            assert (_reached(), ask_all(runs, "status")[0].ended) == ([], True)
+    assert all([path.name for path in folder.iterdir()] == [] for folder in folders)
+
+
+def test_a_stop_during_the_preparation_stays_and_interrupts_the_program_once(folders):
+    interrupted: list[bool] = []
+    supervisor = Supervisor()
+    supervisor.on_early_stop = lambda: interrupted.append(True)  # type: ignore[method-assign]
+    moving: Any = SimpleNamespace(as_dict=dict)
+    with commands_from_start("run", RIG, supervisor, realtime=False) as commands:
+        for _ in range(2):
+            assert stop_runs().stopped == (os.getpid(),)
+        assert interrupted == [True]
+        begun = commands.during_motion(moving)
+        with pytest.raises(StoppedByOperator, match="before anything moved"):
+            begun.__enter__()
+
+
+def test_ctrl_c_by_a_stop_is_a_stop_and_ctrl_c_alone_is_ctrl_c(folders):
+    def interrupted(stops: bool) -> None:
+        with commands_from_start("run", RIG, Supervisor(), realtime=False):
+            if stops:
+                stop_runs()
+            raise KeyboardInterrupt
+
+    with pytest.raises(StoppedByOperator):
+        interrupted(True)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(False)
+
+
+@pytest.mark.parametrize("is_later", [True, False])
+def test_a_stop_reaches_a_program_that_was_started_before_it_and_answers_later(folders, is_later):
+    """Such as one that is still loading: it has no socket yet."""
+    supervisor = Supervisor()
+    supervisor.began = _now()
+    if is_later:
+        assert stop_runs() == StopResult((), ())
+    else:
+        stop_runs()
+        supervisor.began = _now() + 0.001
+    begun = commands_from_start("run", RIG, supervisor, realtime=False)
+    with pytest.raises(StoppedByOperator) if is_later else nullcontext(), begun:
+        pass
+
+
+def test_a_stop_does_not_reach_what_a_script_calls_after_it(folders):
+    stop_runs()
+    with commands_from_start("run", RIG, Supervisor(), realtime=False) as commands:
+        assert not commands.board.read().stop
+
+
+@given(began=st.floats(0.0, 1e9), at=st.floats(0.0, 1e9), boot=st.sampled_from([BOOT, "another"]))
+def test_a_recorded_stop_counts_since_then_and_since_the_computer_began(began, at, boot):
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        own = Path(folder) / "cdpr"
+        own.mkdir(mode=0o700)
+        patch.setattr("executor.remote.command_socket._own_folders", lambda: [own])
+        (own / "stopped").write_text(f"{boot} {at!r}\n")
+        assert is_stopped_since(began) == (at >= began and boot == BOOT)
+
+
+@pytest.mark.parametrize("text", ["", "x", f"{BOOT}", f"{BOOT} soon", f"{BOOT} nan", "\xff " * 200])
+def test_a_record_of_a_stop_that_is_none_stops_nothing(folders, text):
+    folders[0].mkdir(mode=0o700)
+    (folders[0] / "stopped").write_text(text)
+    assert not is_stopped_since(0.0)
+
+
+def test_the_record_of_a_stop_follows_no_link(folders, tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    folders[0].mkdir(mode=0o700)
+    (folders[0] / "stopped").symlink_to(precious)
+    record_stop()
+    assert precious.read_text() == "mine"
+    assert is_stopped_since(0.0)
+
+
+VIRTUAL = RIG.with_bus("virtual")
+VERBS: dict[str, Callable[..., Any]] = {
+    "home": partial(homing.home, VIRTUAL, at_home=True, realtime=False),
+    "jog_cable": partial(jogging.jog_cable, VIRTUAL, 1, 0.001, realtime=False),
+    "jog_session": partial(session.jog_session, VIRTUAL, None, realtime=False),
+    "cable_session": partial(session.cable_session, VIRTUAL, realtime=False),
+    "release": partial(service.release, RIG.with_bus("udp_multicast", "239.74.9.9")),
+}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_stop_before_the_answer_to_its_question_ends_every_verb(
+    folders, tmp_path, monkeypatch, verb
+):
+    """Whatever the answer is: nothing is opened, and no folder is left."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    asked: list[tuple[int, ...]] = []
+
+    def confirm(_: object) -> bool:
+        asked.append(stop_runs().stopped)
+        return True
+
+    with pytest.raises(StoppedByOperator, match="before anything moved"):
+        VERBS[verb](confirm=confirm)
+    assert asked == [(os.getpid(),)]
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("verb", ["run", "jog"])
+def test_a_stop_during_the_check_of_a_plan_ends_the_run(folders, tmp_path, monkeypatch, verb):
+    monkeypatch.chdir(tmp_path)
+    plan = fake_run.make(rate_hz=1.0, every=100, camera=False).context.plan
+    stopped: list[tuple[int, ...]] = []
+
+    def compute(*_: object) -> Any:
+        stopped.append(stop_runs().stopped)
+        return plan.document if verb == "jog" else SimpleNamespace(rig=plan.rig)
+
+    monkeypatch.setattr(runner, "prepare_plan", compute)
+    monkeypatch.setattr(jogging, "plan_straight_move", compute)
+    begin = {
+        "run": partial(runner.run, plan, plan.rig, cameras=[]),
+        "jog": partial(jogging.jog, VIRTUAL, None, to_home=True),
+    }
+    with pytest.raises(StoppedByOperator):
+        begin[verb](realtime=False)
+    assert stopped == [(os.getpid(),)]
+    assert list(tmp_path.glob("runs/*")) == []
+
+
+#: A program at a question to its operator.
+ASKS = """
+from pathlib import Path
+from cdpr.cli.operate.supervision import SignalSupervisor, has_agreed
+from executor.remote.command_server import commands_from_start
+from model.errors import StoppedByOperator
+from model.rig import load_rig
+rig = load_rig(Path("configs/gachon_8_6.yaml"))
+try:
+    with commands_from_start("run", rig, SignalSupervisor(), realtime=False):
+        print("advertised", flush=True)
+        has_agreed("Move the platform now?", "nothing was moved")
+except StoppedByOperator as error:
+    print(error.what, flush=True)
+"""
+
+
+def test_a_stop_ends_the_question_of_the_command_line(folders, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "RUN", ASKS)
+    with _run() as process:
+        assert stop_runs().stopped == (process.pid,)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "stopped before anything moved\n"

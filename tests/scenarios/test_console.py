@@ -242,7 +242,7 @@ def taught_and_run(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
     assert list((folder / "runs").glob("*/report.html"))
 
 
-def test_what_moves_continues_without_the_console_but_no_press_does(
+def test_no_press_and_no_session_of_jogs_continues_without_the_console(
     on_a_day: Callable[[Day], None],
 ) -> None:
     on_a_day(console_killed)
@@ -257,16 +257,14 @@ def console_killed(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         me.until(lambda state: me.moves([1.0, 0.0, 0.0], state))
         process.send_signal(signal.SIGKILL)
         process.wait()
-        with find_runs() as runs:
-            assert len(runs) == 1, "the session is there all the same"
         # Its record is whole when the session has ended; nothing moves in its last cycles.
-        assert stop_runs().stopped
         rows: list[str] = []
         record = folder / "runs" / "jog-session"
         until_nothing_is_active()
         rows = (record / "winches.csv").read_text().splitlines()
         events = (record / "events.jsonl").read_text()
         assert '"code": "held"' in events
+        assert "stop" not in events, "it ends by itself, in order"
         targets = [row.split(",")[3:11] for row in rows[-10:]]
         assert all(target == targets[0] for target in targets)
 

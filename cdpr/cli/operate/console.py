@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -48,9 +52,9 @@ def console(
 ) -> None:
     """Serve the operator's page: live view, jog, teach, preview, run, hold, stop.
 
-    Open the printed address in a browser. Runs are separate processes, and continue when the
-    console ends; jogging ends with it. STOP on the page is a software stop: it does not replace the
-    emergency-stop button.
+    Open the printed address in a browser. Runs are separate processes, and those that move
+    continue when the console ends; jogging ends with it. STOP on the page is a software stop: it
+    does not replace the emergency-stop button.
 
     Examples:
       cdpr console configs/gachon_8_6.yaml --scene configs/environment_1.yaml
@@ -106,12 +110,27 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
 
     def show_address(address: str) -> None:
         show_line(f"console of {files.rig.name}: {address}")
-        show_line("Ctrl-C ends the console and jogging; a run continues")
+        show_line("Ctrl-C ends the console and jogging; a run that moves continues")
 
     try:
-        run_server(shown, host, port, show_address)
+        with _closed_terminal_ends():
+            run_server(shown, host, port, show_address)
     except KeyboardInterrupt:  # the way to end it
         show_line("console ended")
+
+
+@contextmanager
+def _closed_terminal_ends() -> Iterator[None]:
+    """A closed terminal ends the server as SIGTERM does, and with it a session of jogs."""
+    before = signal.getsignal(signal.SIGHUP)
+    if before is signal.SIG_IGN:  # started with nohup: outlives its terminal
+        yield
+        return
+    signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 # `cdpr demo`: all steps from plan to report on the paper's rig, simulated.

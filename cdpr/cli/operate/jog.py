@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import typer
@@ -85,6 +87,11 @@ class HeldOptions:
         "enable the drives and follow held controls, such as those of `cdpr console`"
     )
     keys: bool = flag("as --hold-to-run, with keys: arrows for x and y, page up and down for z")
+    end_with: int | None = option(
+        "with --hold-to-run: end the session when this process, which started it, is gone",
+        metavar="PID",
+        min=1,
+    )
     one_cable: bool = flag("with --hold-to-run: wind one cable in or pay it out, homed or not")
     simulated_start_mm: Triple | None = option(
         "with --hold-to-run or --keys: initial position of the simulated platform x y z"
@@ -179,6 +186,8 @@ def jog(
         require_unused("cdpr jog", path, why)
         _one_cable(the_rig, cable, mm, limit_n, speed, drives)
         return
+    if not held.hold_to_run:
+        require_unused("cdpr jog", {"--end-with": held.end_with}, "only with --hold-to-run")
     if not (held.hold_to_run or held.keys):
         simulated_start = {
             "--simulated-start-mm": held.simulated_start_mm,
@@ -196,7 +205,8 @@ def jog(
             )
         why = "controls move one cable at a time, without a path"
         require_unused("cdpr jog", path | no_effect, why)
-        _hold_to_run(partial(cable_session, the_rig, limit=limit_n, speed=speed), the_rig, drives)
+        session = partial(cable_session, the_rig, limit=limit_n, speed=speed)
+        _hold_to_run(session, the_rig, drives, parent=held.end_with)
         return
     why = "only with --cable or --one-cable; a path uses the rig's limits"
     require_unused("cdpr jog", {"--limit-n": limit_n}, why)
@@ -210,9 +220,8 @@ def jog(
             surroundings.loaded(),
             speed=speed,
             start=held.start(the_rig),
-            on_cycle=None if keys is None else keys.take_cycle,
         )
-        _hold_to_run(session, the_rig, drives, keys)
+        _hold_to_run(session, the_rig, drives, keys, held.end_with)
         return
     by = None if distance.by_mm is None else millimetres(list(distance.by_mm))
     jogging.require_distance(by, to_home=distance.to_home)
@@ -231,15 +240,31 @@ def jog(
 
 
 def _hold_to_run(
-    session: Callable[..., object], rig: Rig, drives: DriveOptions, keys: JogKeys | None = None
+    session: Callable[..., object],
+    rig: Rig,
+    drives: DriveOptions,
+    keys: JogKeys | None = None,
+    parent: int | None = None,
 ) -> None:
-    """Runs a session of hold-to-run controls until it ends."""
+    """Runs a session of hold-to-run controls until it ends, or the process that started it."""
+    ask = drives.confirm(rig)
+
+    def is_orphan() -> bool:
+        return parent is not None and os.getppid() != parent
+
+    def take_cycle(record: CycleRecord, presses: PressBoard, progress: Any) -> None:
+        if is_orphan():
+            presses.end()
+        if keys is not None:
+            keys.take_cycle(record, presses, progress)
+
     with keys or ExitStack():
         session(
             need_real_time_rights=not drives.without_real_time,
             listener=Terminal(),
-            confirm=drives.confirm(rig),
+            confirm=lambda proposal: not is_orphan() and ask(proposal),
             supervisor=SignalSupervisor(),
+            on_cycle=take_cycle,
         )
     out.print("jogging ended" + ("" if is_simulated(rig) else "; the drives hold"))
 

@@ -8,9 +8,11 @@ import select
 import signal
 import sys
 import termios
+import threading
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -97,8 +99,25 @@ def stop_requests(board: RequestBoard) -> Iterator[None]:
         yield
 
 
+def _process_start() -> float:
+    """When this process was started, [s] of `CLOCK_BOOTTIME`."""
+    fields = Path("/proc/self/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    return int(fields[19]) / os.sysconf("SC_CLK_TCK")
+
+
 class SignalSupervisor(Supervisor):
     """Turns the operator's signals into a stop during a motion."""
+
+    def __init__(self) -> None:
+        """Of this process, whose only task is the motion."""
+        super().__init__()
+        self.began = _process_start()
+
+    def on_early_stop(self) -> None:
+        """See `Supervisor`: as Ctrl-C, which also ends a question to the operator."""
+        main = threading.main_thread().ident
+        assert main is not None
+        signal.pthread_kill(main, signal.SIGINT)
 
     def during(self, board: RequestBoard, motion: Callable[[], _T]) -> _T:
         """See `Supervisor`."""

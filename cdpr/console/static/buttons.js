@@ -25,6 +25,7 @@ const REQUIREMENTS = {
   idle: ({ state }) => {
     if (state.busy) return VERBS[state.busy.verb] ?? "A command is in progress";
     if (state.jog.ready || state.cable.ready) return VERBS.jog;
+    if (state.motion?.state === "preparing") return "A motion is being prepared";
     return isActive(state.motion) ? "The platform is in motion" : null;
   },
   moves: ({ state: { motion } }) => (motion && MOVING.includes(motion.state) ? null : "Nothing is moving"),

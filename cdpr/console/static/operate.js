@@ -52,8 +52,9 @@ export class Operate {
   /** Lists the files that can be loaded. A new file is selected, and so is a single one; otherwise the selection stays. */
   async readFiles() {
     const response = await fetch(address("/api/files")).catch(() => null);
-    if (!response?.ok) return;
-    const { scenes, plans } = await response.json();
+    if (!response?.ok) return noteFiles(`The files could not be listed${response ? ` (error ${response.status})` : ""}: this list may be old.`);
+    const { scenes, plans, left_out: leftOut } = await response.json();
+    noteFiles(leftOut.length ? `Left out, as the name is not UTF-8: ${leftOut.join(", ")}. Rename it to use it.` : "");
     for (const [group, button, names] of [["scene-file", "scene_files", scenes], ["plan-file", "plan_files", plans]]) {
       const known = this.#files[group], added = known ? names.filter((name) => !known.includes(name)) : [];
       const selected = names.length === 1 ? names[0] : added.at(-1) ?? chosen(group);
@@ -247,4 +248,9 @@ export class Operate {
       at("motion").scrollIntoView({ block: "nearest" });
     }
   }
+}
+
+function noteFiles(text) {
+  write(at("files-note"), text);
+  at("files-note").hidden = !text;
 }

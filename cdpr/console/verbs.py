@@ -1,0 +1,195 @@
+"""The verbs of `cdpr` that the console starts, one at a time, and their results."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from executor.drives import is_simulated
+from executor.recording.record_files import RUNS
+from model.errors import CdprError, Refused
+from model.pose import Pose
+from model.rig import Rig
+
+#: Length of a verb's output that is shown, [characters].
+SHOWN = 4000
+#: Exit code of a verb that the operator stopped.
+STOPPED = 130
+BEFORE_MOTION = "Stopped during the preparation: nothing was moved."
+#: Verbs after which drives move, or let go.
+MOVING = frozenset({"home", "jog", "release", "run"})
+_REPORT = re.compile(r"(\S+/report\.html)")
+_HELP = re.compile(r"docs/faults/(\w+)\.md")
+
+
+@dataclass(frozen=True, slots=True)
+class VerbOutcome:
+    """The result of a verb.
+
+    Attributes:
+        verb: Name.
+        exit_code: Of the process.
+        text: The end of its output.
+        report: Path of the run's report, if one was written.
+        fault: Code of the fault whose help page the output names.
+    """
+
+    verb: str
+    exit_code: int
+    text: str
+    report: Path | None
+    fault: str | None
+
+
+class StartedVerb:
+    """Runs one verb at a time, with output to memory: a pipe would break with the console.
+
+    A file could not be written on a full disk, nor be removed after the end of the console.
+    """
+
+    def __init__(self) -> None:
+        """Before any verb."""
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._output = -1
+        self.verb: str | None = None
+        """Name of the running verb."""
+        self.outcome: VerbOutcome | None = None
+        """Result of the last verb."""
+        self.is_under_way = False
+        """Whether the running verb's drives may move."""
+
+    def start(self, verb: str, arguments: Sequence[str]) -> None:
+        """Starts a verb without a terminal.
+
+        Raises:
+            Refused: Another verb is running.
+        """
+        with self._lock:
+            self._update()
+            if self.verb is not None:
+                raise Refused(
+                    f"`cdpr {self.verb}` is still running",
+                    where="console",
+                    next_step="wait until it ends, or stop it",
+                )
+            self._start(verb, arguments)
+
+    def fail(self, error: CdprError) -> None:
+        """Notes that the last verb's result cannot be used, unless another one was started."""
+        with self._lock:
+            if self.outcome is not None:
+                self.outcome = replace(self.outcome, exit_code=error.exit_code, text=str(error))
+
+    def follow(self, status: dict[str, Any]) -> None:
+        """Notes from a run's status whether the running verb's drives may move."""
+        with self._lock:
+            is_own = self._process is not None and self._process.pid == status["process"]
+            if is_own and status["state"] != "preparing":
+                self.is_under_way = True
+
+    def stop_before_motion(self) -> bool:
+        """Ends a verb that would move drives but is still being prepared; returns whether it did.
+
+        One that has just begun to move takes the signal as a request to stop.
+        """
+        with self._lock:
+            if self._process is None or self.verb not in MOVING or self.is_under_way:
+                return False
+            self._process.terminate()
+            return True
+
+    def update(self) -> str:
+        """The last line of the verb's output; records its end."""
+        with self._lock:
+            return self._update()
+
+    def _start(self, verb: str, arguments: Sequence[str]) -> None:
+        output = os.memfd_create(f"cdpr-{verb}")
+        if verb == "jog":  # ends with the console, also if that is killed
+            arguments = [*arguments, "--end-with", str(os.getpid())]
+        command = [sys.executable, "-c", "from cdpr.cli import main; main()", verb, *arguments]
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "NO_COLOR": "1", "COLUMNS": "100"},
+                start_new_session=True,
+            )
+        except BaseException:
+            os.close(output)
+            raise
+        self._output, self.verb, self.outcome = output, verb, None
+        self.is_under_way = False
+
+    def _update(self) -> str:
+        if self._process is None or self.verb is None:
+            return ""
+        code = self._process.poll()
+        written = os.pread(self._output, os.fstat(self._output).st_size, 0)
+        text = written.decode(encoding="utf-8", errors="replace")
+        if code is not None:
+            self.outcome = _outcome(self.verb, code, text)
+            os.close(self._output)
+            self._process = self.verb = None
+        lines = text.strip().splitlines()
+        return lines[-1].strip() if lines else ""
+
+
+def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
+    if code == -signal.SIGTERM:
+        code, text = STOPPED, f"{text}\n{BEFORE_MOTION}"
+    if code and not text.strip():
+        text = f"`cdpr {verb}` ended with exit code {code} and no message."
+    report, fault = _REPORT.findall(text), _HELP.findall(text)
+    return VerbOutcome(
+        verb=verb,
+        exit_code=code,
+        text=_without_commands(text).strip()[-SHOWN:],
+        report=Path(report[-1]) if report else None,
+        fault=fault[-1] if fault else None,
+    )
+
+
+def _without_commands(text: str) -> str:
+    """Output without the commands that a terminal would need next: the page has buttons."""
+    return re.sub(r"(?m)^\s*next:?\s+cdpr .*\n?", "", text)
+
+
+def start_options(rig: Rig, pose: Pose | None) -> list[str]:
+    """Options of `cdpr jog` that begin at a pose, where it simulates the drives itself."""
+    if pose is None or not is_simulated(rig):
+        return []
+    position = [f"{v:.4f}" for v in 1e3 * pose.position]
+    rotation = [f"{v:.9f}" for v in pose.quaternion]
+    return ["--simulated-start-mm", *position, "--simulated-start-wxyz", *rotation]
+
+
+def outcome_state(ended: VerbOutcome | None) -> dict[str, Any] | None:
+    """The last verb's result, with addresses of its report and help page."""
+    if ended is None:
+        return None
+    return {
+        "verb": ended.verb,
+        "ok": ended.exit_code == 0,
+        "stopped": ended.exit_code == STOPPED,
+        "text": ended.text,
+        "report": None if ended.report is None else _address_of(ended.report),
+        "fault_page": None if ended.fault is None else f"/help/{ended.fault}",
+    }
+
+
+def _address_of(report: Path) -> str | None:
+    """Address of a report on this server; None outside the folder of runs."""
+    path, root = report.resolve(), RUNS.resolve()
+    return f"/runs/{path.relative_to(root)}" if path.is_relative_to(root) else None
