@@ -112,7 +112,7 @@ class Drives:
     def held_at(pose: Pose, tension: float = 20.0) -> StatusResult:
         drives = tuple(DriveStatus(k, "operation enabled", 0, tension, True) for k in range(1, 9))
         counts = ReferenceStatus(counts=True, why_not=None, made="", how="jig", file="")
-        return StatusResult("rig", "bus", None, None, False, counts, drives, pose)
+        return StatusResult("rig", "bus", None, (), None, False, counts, drives, pose)
 
     def read(self) -> StatusResult:
         self.readings += 1
