@@ -466,15 +466,22 @@ def test_the_output_of_a_verb_names_no_commands_for_a_terminal() -> None:
 def test_stop_waits_for_no_other_command_of_any_page(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slow = threading.Event()
-    monkeypatch.setattr(served.console.plan, "load", lambda _: slow.wait(60) and None)
+    begun, slow = threading.Event(), threading.Event()
+
+    def load_slowly(_path: Path) -> None:
+        begun.set()
+        slow.wait(60)
+
+    monkeypatch.setattr(served.console.plan, "load", load_slowly)
     with ExitStack() as stack:
         stack.callback(slow.set)
         pages = [stack.enter_context(served.page()) for _ in range(MOST_PAGES)]
         me = pages[0]
         assert command(me, "take_control")["ok"]
         load = {"kind": "command", "id": 1, "command": "load_plan", "file": "short.json"}
-        for page in pages:  # all but the first one wait in turn, in threads of the server
+        me.send(json.dumps(load))
+        assert begun.wait(60)
+        for page in pages[1:]:  # they wait in turn, in threads of the server
             page.send(json.dumps(load))
         for page in (me, pages[-1]):
             answer = command(page, "stop")
