@@ -62,7 +62,7 @@ class CyclicBus:
         bus: can.BusABC,
         commanding: frozenset[int],
         foreign_master_message: Callable[[int, bytes | bytearray], str],
-        is_command: Callable[[int, bytes | bytearray], bool] = lambda _id, _data: True,
+        is_command: Callable[[int, bytes | bytearray], bool],
     ) -> None:
         """Takes an open bus.
 

@@ -137,7 +137,7 @@ def home(
     limit = limit_of(rig, limit)
     target = _target(rig, tension, limit)
     speed = min(speed, rig.motion.speed)
-    interlock, operator = MotionInterlock(rig), supervisor or Supervisor()
+    interlock = MotionInterlock(rig)
     made: list[HomingReference] = []
 
     def at_rest(
@@ -151,7 +151,7 @@ def home(
         from simulation.ground_truth import PowerLoss  # a real bus loads no simulator
 
         lost_power = PowerLoss.drawn(rig, 0, simulated_slack, on_a_stand=source is None)
-    with commands_from_start("home", rig, operator, realtime=realtime) as commands:
+    with commands_from_start("home", rig, supervisor, realtime=realtime) as commands:
         interlock.require_free()
         if source is not None:  # check that it delivers images before anything moves
             measure_at_rest(rig, source, 1, rig.home, commands.require_no_stop, listener)
@@ -170,7 +170,6 @@ def home(
             rehome=True,
             name="home",
             listener=listener,
-            supervisor=operator,
             commands=commands,
         )
         move_by_law(motion, at_rest)

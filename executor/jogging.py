@@ -83,8 +83,7 @@ def jog(
     """
     require_types((rig, Rig), (listener, Listener), optional=[(scene, Scene)])
     require_functions(confirm=confirm, on_event=on_event)
-    operator = supervisor or Supervisor()
-    with commands_from_start("jog", rig, operator, realtime=realtime) as commands:
+    with commands_from_start("jog", rig, supervisor, realtime=realtime) as commands:
         slow = with_speed(rig, speed)
         require_own_time(slow, realtime)
         require_distance(by, to_home=to_home)
@@ -105,7 +104,6 @@ def jog(
             listener=listener,
             confirm=confirm,
             on_event=on_event,
-            supervisor=operator,
         )
         return run_prepared(prepare_plan(plan, ready, listener), output, {}, options, commands)
 
@@ -304,8 +302,8 @@ def jog_cable(
     _require_cable(slow, cable, length)
     winch = slow.winches[cable - 1]
     limit = limit_of(slow, limit)
-    fastest, operator = slow.motion.speed, supervisor or Supervisor()
-    with commands_from_start("jog", slow, operator, realtime=realtime) as commands:
+    fastest = slow.motion.speed
+    with commands_from_start("jog", slow, supervisor, realtime=realtime) as commands:
         MotionInterlock(slow).require_free()
         require_confirmed(confirm, CableProposal(slow, cable, length, limit, fastest))
         motion = WinchMotion(
@@ -320,7 +318,6 @@ def jog_cable(
             rehome=False,
             name="jog-cable",
             listener=listener,
-            supervisor=operator,
             commands=commands,
         )
         result = move_by_law(motion, lambda _result, _true_pose, _board: None)

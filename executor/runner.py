@@ -35,7 +35,7 @@ from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import RunCourse, dated_folder
 from executor.recording.recorder import Recorder, require_readable_record
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
-from executor.remote.command_server import Commands, commands_from_start, joined
+from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import RunStatus
 from executor.run_result import RunResult
 from executor.state_machine import LoopEvent, State
@@ -71,7 +71,6 @@ class RunOptions:
     listener: Listener = SILENT
     confirm: Callable[[MotionProposal], bool] | None = None
     on_event: Callable[[RunEvent], None] | None = None
-    supervisor: Supervisor = field(default_factory=Supervisor)
 
 
 def run(
@@ -134,9 +133,8 @@ def run(
         listener=listener,
         confirm=confirm,
         on_event=on_event,
-        supervisor=supervisor or Supervisor(),
     )
-    with commands_from_start("run", rig, options.supervisor, realtime=realtime) as commands:
+    with commands_from_start("run", rig, supervisor, realtime=realtime) as commands:
         require_same_rig(plan, rig, plan_file)
         chosen = resolve_cameras(rig, cameras, is_simulated(rig))
         require_synthetic_images(chosen.values(), not realtime)
@@ -157,7 +155,7 @@ def run_prepared(
     output: Path,
     cameras: Mapping[Camera, str],
     options: RunOptions,
-    commands: Commands | None = None,
+    commands: Commands,
 ) -> RunResult:
     """Confirms, arms, moves, measures, computes the verdict, then writes the result files.
 
@@ -168,45 +166,36 @@ def run_prepared(
         output: Run folder to create.
         cameras: From `resolve_cameras`; empty for none.
         options: Of the run.
-        commands: Those taken since the start of the verb; None to take them from now on.
+        commands: Those taken since the start of the verb.
 
     Raises:
         CdprError: As for `run`.
     """
-    supervisor, realtime = options.supervisor, options.realtime
-    with joined(commands, "run", prepared.rig, supervisor, realtime=realtime) as taken:
-        taken.require_no_stop()
-        require_readable_record(prepared)
-        proposal = MotionProposal(prepared, cameras, options.clearance_stop)
-        require_confirmed(options.confirm, proposal)
-        taken.require_no_stop()
-        with options.listener.waiting("loading the report generator"):
-            _preload_results()
-        taken.require_no_stop()
-        result = _recorded(prepared, output, cameras, options, taken)
-    supervisor.finish()
+    commands.require_no_stop()
+    require_readable_record(prepared)
+    proposal = MotionProposal(prepared, cameras, options.clearance_stop)
+    require_confirmed(options.confirm, proposal)
+    commands.require_no_stop()
+    with options.listener.waiting("loading the report generator"):
+        _preload_results()
+    commands.require_no_stop()
+    result = _recorded(_Job(prepared, RunFolder.create(output), cameras, options, commands))
+    commands.supervisor.finish()
     return result
 
 
-def _recorded(
-    prepared: PreparedRun,
-    output: Path,
-    cameras: Mapping[Camera, str],
-    options: RunOptions,
-    commands: Commands,
-) -> RunResult:
+def _recorded(job: _Job) -> RunResult:
     """Moves and measures, with a run folder."""
+    prepared, folder, moved = job.prepared, job.folder, _MotionData()
     interface, simulated = prepared.rig.document.bus.interface, is_simulated(prepared.rig)
-    course = RunCourse(datetime.now(UTC), interface, simulated, not options.realtime)
-    folder = RunFolder.create(output)
-    job, moved = _Job(prepared, folder, cameras, options, commands), _MotionData()
+    course = RunCourse(datetime.now(UTC), interface, simulated, not job.options.realtime)
     try:
         folder.write_plan(prepared.plan.plan.document)
         folder.write_rig(prepared.rig.document)
         folder.write_course(course)
         with folder.held():
             _move_and_measure(job, moved)
-            result = options.supervisor.conclude(partial(_conclude, job, moved, course))
+            result = job.commands.supervisor.conclude(partial(_conclude, job, moved, course))
     except StoppedByOperator:
         moved.leave()
         raise
@@ -288,7 +277,7 @@ def _move_and_measure(job: _Job, moved: _MotionData) -> None:
     """Moves and takes images; a failure after the start of motion becomes part of the outcome."""
     board = job.commands.board
     try:
-        job.options.supervisor.during(board, partial(_with_listeners, job, board, moved))
+        job.commands.supervisor.during(board, partial(_with_listeners, job, board, moved))
     except Exception as error:
         if not moved.begun or moved.recorder is None:
             raise
@@ -354,7 +343,7 @@ def _move(
 
     def before_motion() -> None:
         moved.begun, moved.started = True, datetime.now(UTC)
-        job.options.supervisor.on_motion()
+        job.commands.supervisor.on_motion()
 
     if isinstance(board, SharedRequests):
         return _move_in_real_time(job, board, recorder, before_motion)
@@ -408,7 +397,7 @@ def _move_in_real_time(
 
 def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
     """Computes the verdict, reports it, then writes the result files."""
-    outcome, supervisor = moved.outcome, job.options.supervisor
+    outcome, supervisor = moved.outcome, job.commands.supervisor
     assert outcome is not None
     late = moved.callbacks.error if moved.callbacks is not None else ""
     if late and late not in outcome.cause:

@@ -382,18 +382,18 @@ def release(
             released, and a fault is latched.
     """
     require_other_process(rig)
-    interlock, operator = MotionInterlock(rig), supervisor or Supervisor()
-    with commands_from_start("release", rig, operator, realtime=True) as commands:
+    interlock = MotionInterlock(rig)
+    with commands_from_start("release", rig, supervisor, realtime=True) as commands:
         interlock.require_free()
         bus, braked = str(BusSettings.of(rig)), is_braked(rig)
         proposal = ReleaseProposal(rig, bus, braked, reference_status(interlock))
         require_confirmed(confirm, proposal)
         commands.require_no_stop()
-        left = operator.during(
+        left = commands.supervisor.during(
             commands.board,
             lambda: _released(rig, interlock, commands, need_real_time_rights, listener),
         )
-    operator.finish()
+    commands.supervisor.finish()
     return ReleaseResult(
         drives=tuple(drive_states(rig, left.status_words.tolist())),
         reference=reference_status(interlock, left.positions.tolist()),

@@ -23,7 +23,7 @@ from executor.remote.command_server import Commands
 from executor.remote.protocol import Presses
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
-from executor.supervision import LocalRequests, RequestBoard, Supervisor
+from executor.supervision import LocalRequests, RequestBoard
 from model.errors import Fault, Refused, StoppedByOperator
 from model.pose import Pose
 from model.progress import Listener
@@ -58,7 +58,6 @@ class WinchMotion:
         rehome: The drives are referenced again afterwards.
         name: Of the record folder in ``runs`` of a motion on a bus.
         listener: Receives progress.
-        supervisor: Turns interrupts into stops.
         commands: Those taken since the start of the verb.
     """
 
@@ -73,7 +72,6 @@ class WinchMotion:
     rehome: bool
     name: str
     listener: Listener
-    supervisor: Supervisor
     commands: Commands
 
 
@@ -109,22 +107,14 @@ def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchResult:
         KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
         CdprError: Nothing was enabled.
     """
-    return supervised(
-        motion.rig,
-        motion.supervisor,
-        motion.commands,
-        lambda: _move(motion, at_rest),
-    )
+    return supervised(motion.rig, motion.commands, partial(_move, motion, at_rest))
 
 
-def supervised(
-    rig: Rig, supervisor: Supervisor, commands: Commands, move: Callable[[], WinchResult]
-) -> WinchResult:
+def supervised(rig: Rig, commands: Commands, move: Callable[[], WinchResult]) -> WinchResult:
     """Moves while the supervisor can request a stop.
 
     Args:
         rig: The robot.
-        supervisor: Turns interrupts into stops.
         commands: Those taken since the start of the verb.
         move: Moves until the drives hold on their own.
 
@@ -133,6 +123,7 @@ def supervised(
         StoppedByOperator: The operator stopped it.
         KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
     """
+    supervisor = commands.supervisor
     commands.require_no_stop()
     result = supervisor.during(commands.board, move)
     if result.state in (State.STOPPED, State.FINISHED):

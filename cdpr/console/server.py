@@ -429,15 +429,11 @@ def listening(host: str, port: int) -> Iterator[socket.socket]:
             listener.bind((host, port))
             listener.listen(64)  # before the address is printed
         except (OSError, UnicodeError) as error:
-            is_port = getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES)
-            raise BadInput(
-                f"cannot listen on {host}:{port}: {getattr(error, 'strerror', None) or error}",
-                where="--port" if is_port else "--host",
-                why="another program uses the port, or it is reserved for root"
-                if is_port
-                else "this is not an address of this machine",
-                next_step="pass another --port, or 0 for a free one"
-                if is_port
-                else "pass an address of this machine, such as 127.0.0.1",
-            ) from None
+            where, why = "--host", "this is not an address of this machine"
+            then = "pass an address of this machine, such as 127.0.0.1"
+            if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES):
+                where, why = "--port", "another program uses the port, or it is reserved for root"
+                then = "pass another --port, or 0 for a free one"
+            what = f"cannot listen on {host}:{port}: {getattr(error, 'strerror', None) or error}"
+            raise BadInput(what, where=where, why=why, next_step=then) from None
         yield listener

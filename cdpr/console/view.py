@@ -17,6 +17,7 @@ from executor.service import StatusResult
 from executor.trajectory.setpoints import PreparedRun, prepare_plan
 from model.clearance import ClearanceModel, Nearest
 from model.errors import CdprError, Refused
+from model.files.documents import millimetres
 from model.kinematics import cable_lengths, cables_at, forward_kinematics
 from model.pages.scene import (
     Moment,
@@ -167,9 +168,7 @@ class RobotView:
             return None
         motion = self.rig.motion
         if not found.worst <= motion.start_tolerance + motion.following_error:
-            return (
-                None  # a cable is slack, slipped or was wound in alone; the nearest pose is wrong
-            )
+            return None  # the nearest pose is wrong: a cable is slack, slipped, or wound in alone
         self._pose = found.pose
         return RobotNow(self._pose, tensions.tolist(), self._near(self._pose))
 
@@ -235,10 +234,7 @@ def commanded_pose(rig: Rig, jog: dict[str, Any], robot: RobotNow) -> Pose:
         Refused: A cable has another length by the drives than commanded, beyond the tolerance at
             the start of a run.
     """
-    rotation = np.array(jog["quaternion"])
-    pose = Pose.from_quaternion(
-        np.array(jog["position_mm"]) / 1000.0, rotation / np.linalg.norm(rotation)
-    )
+    pose = Pose.from_quaternion(millimetres(jog["position_mm"]), jog["quaternion"])
     off = float(np.max(np.abs(cable_lengths(rig, pose) - cable_lengths(rig, robot.pose))))
     if off <= rig.motion.start_tolerance:
         return pose

@@ -16,6 +16,7 @@ from drivers.cia402.expected_objects import (
     count_heartbeats,
     expectations,
     found_text,
+    position_scales,
     refuse_scale,
     require_absent,
     require_answers,
@@ -136,7 +137,9 @@ def configure_drives(
         refusals.note(require_idle, network, node, to_reset, errors)
         _note_objects(rig, network, winch_map, drive, settings[drive], max_tension, refusals)
         refusals.note(count_heartbeats, network, node, profile, entries)
-    scales = wrong_scales_of(rig, network, nodes)
+    scales = wrong_scales_of(
+        rig, nodes, lambda node: position_scales(network.client(node).read_if_there)
+    )
     for wrong in scales:
         refusals.note(refuse_scale, nodes[wrong.drive], wrong)
     refusals.raise_any(UNCHANGED)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from drivers.can_errors import SETTING_UP, in_fault, moved_by_another, wrong_setting
@@ -279,13 +279,18 @@ HOW_SCALED = (
 )
 
 
-def wrong_scales_of(rig: Rig, network: SetupNetwork, nodes: Sequence[int]) -> list[WrongScale]:
-    """Drives whose stated position scale contradicts the rig file, as indices of ``nodes``."""
+def wrong_scales_of(
+    rig: Rig, nodes: Sequence[int], scales_of: Callable[[int], Mapping[str, float]]
+) -> list[WrongScale]:
+    """Drives whose `position_scales`, by node, contradict the rig file, as indices of ``nodes``.
+
+    They are not asked for where the profile says that they mean something else.
+    """
     states_scale = profile_of(rig).states_scale
     if states_scale is False:
         return []
     counts = {w.node_id: w.counts_per_rev for w in rig.document.winches}
-    scales = [position_scales(network.client(node).read_if_there) for node in nodes]
+    scales = [scales_of(node) for node in nodes]
     return wrong_scales([counts[node] for node in nodes], scales, known=bool(states_scale))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -160,7 +160,8 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
     network.discard_waiting()
     silent = network.silent_nodes(all_nodes)
     answered = tuple(node for node in all_nodes if node not in silent)
-    scaled = {answered[w.drive]: w for w in wrong_scales_of(rig, network, answered)}
+    scales = {node: position_scales(network.client(node).read_if_there) for node in answered}
+    scaled = {answered[w.drive]: w for w in wrong_scales_of(rig, answered, scales.__getitem__)}
     rows: dict[tuple[int, int], ObjectRow] = {}
     for drive, node in enumerate(all_nodes):
         if node in silent:
@@ -171,7 +172,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         reader.at_state()
         for index, form, name, why in _PROCESS_DATA:
             reader.at_setting(Setting(index, 0, form, 0, name, why), "readable")
-        reader.at_scale(rig.document.winches[drive].counts_per_rev, scaled.get(node))
+        reader.at_scale(rig.document.winches[drive].counts_per_rev, scales[node], scaled.get(node))
         reader.at_heartbeats(profile, rig.cable_count)
         settings = settings_for(rig, drive, winch_map, None)
         for setting in _last_of_each(settings):
@@ -266,12 +267,13 @@ class _Reader:
         else:
             row.note(self._node, str(count))
 
-    def at_scale(self, counts_per_turn: int, wrong: WrongScale | None) -> None:
+    def at_scale(
+        self, counts_per_turn: int, scales: Mapping[str, float], wrong: WrongScale | None
+    ) -> None:
         """Counts per motor turn that the drive reports, and whether they are wrong."""
         row = self._row(0x6092, 1, "feed constant, 6091h gear ratio, 608Fh encoder resolution", "")
         row.meaning = "position counts per motor turn: winches[].counts_per_rev"
         row.needed = row.needed or f"{counts_per_turn} per turn, if the drive has them"
-        scales = position_scales(self._client.read_if_there)
         text = ", ".join(f"{value:.10g} from {name}" for name, value in scales.items()) or "absent"
         if wrong is None:
             row.note(self._node, text)

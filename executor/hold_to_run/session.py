@@ -91,8 +91,7 @@ def jog_session(
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     require_simulated_start(slow, start)
-    operator = supervisor or Supervisor()
-    with commands_from_start("jog", slow, operator, realtime=realtime) as commands:
+    with commands_from_start("jog", slow, supervisor, realtime=realtime) as commands:
         interlock = MotionInterlock(slow)
         interlock.require_free()
         ready = interlock.referenced_rig()
@@ -107,7 +106,7 @@ def jog_session(
             need_real_time_rights,
             listener,
         )
-        supervised(ready, operator, commands, partial(session.run, commands))
+        supervised(ready, commands, partial(session.run, commands))
 
 
 def cable_session(
@@ -148,8 +147,7 @@ def cable_session(
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     limit = limit_of(slow, limit)
-    operator = supervisor or Supervisor()
-    with commands_from_start("jog", slow, operator, realtime=realtime) as commands:
+    with commands_from_start("jog", slow, supervisor, realtime=realtime) as commands:
         MotionInterlock(slow).require_free()
         require_confirmed(confirm, CablesProposal(slow, limit))
         session = _Session(
@@ -159,7 +157,7 @@ def cable_session(
             need_real_time_rights,
             listener,
         )
-        supervised(slow, operator, commands, partial(session.run, commands))
+        supervised(slow, commands, partial(session.run, commands))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -211,17 +211,19 @@ class Commands:
 
     Attributes:
         board: Takes the requests; read by the motion.
+        supervisor: Of the program; interrupted by a stop.
     """
 
     def __init__(
         self,
+        supervisor: Supervisor,
         board: LocalRequests | SharedRequests,
         server: CommandServer,
         advertise: Callable[[], None],
         end: Callable[[], None],
     ) -> None:
         """Of a verb in preparation; see `commands_from_start`."""
-        self.board = board
+        self.supervisor, self.board = supervisor, board
         self._server, self._advertise, self._end = server, advertise, end
         self.is_motion = False
         """Whether the motion has begun to open its devices."""
@@ -260,21 +262,21 @@ class Commands:
 
 @contextmanager
 def commands_from_start(
-    verb: str, rig: Rig, supervisor: Supervisor, *, realtime: bool
+    verb: str, rig: Rig, supervisor: Supervisor | None, *, realtime: bool
 ) -> Iterator[Commands]:
     """Takes requests for a verb before it checks anything.
 
     Args:
         verb: Its name on the command line.
         rig: The robot and its bus.
-        supervisor: Of the program; interrupted by a stop.
+        supervisor: Of the program; None for `KeyboardInterrupt`.
         realtime: Whether the motion has a process of its own, which shares the board.
 
     Raises:
         Refused: No stop would reach the verb.
         StoppedByOperator: A stop was requested before the motion.
     """
-    began = time.clock_gettime(time.CLOCK_BOOTTIME)
+    began, operator = time.clock_gettime(time.CLOCK_BOOTTIME), supervisor or Supervisor()
     board: LocalRequests | SharedRequests = SharedRequests() if realtime else LocalRequests()
     with ExitStack() as outer:
         if isinstance(board, SharedRequests):
@@ -283,10 +285,10 @@ def commands_from_start(
         sockets = stack.enter_context(advertised_ahead())
         status = PreparationStatus(rig, board, verb)
         server = stack.enter_context(
-            serving(sockets.listeners, board, status, on_early_stop=supervisor.on_early_stop)
+            serving(sockets.listeners, board, status, on_early_stop=operator.on_early_stop)
         )
-        commands = Commands(board, server, sockets.advertise, stack.close)
-        if is_stopped_since(supervisor.began or began):
+        commands = Commands(operator, board, server, sockets.advertise, stack.close)
+        if is_stopped_since(operator.began or began):
             board.ask_stop()
         try:
             commands.require_no_stop()
@@ -295,13 +297,3 @@ def commands_from_start(
             if not commands.is_motion:
                 commands.require_no_stop()
             raise
-
-
-@contextmanager
-def joined(
-    commands: Commands | None, verb: str, rig: Rig, supervisor: Supervisor, *, realtime: bool
-) -> Iterator[Commands]:
-    """The commands of the calling verb, or new ones; see `commands_from_start`."""
-    begun = commands_from_start(verb, rig, supervisor, realtime=realtime)
-    with begun if commands is None else nullcontext(commands) as taken:
-        yield taken

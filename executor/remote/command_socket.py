@@ -2,11 +2,11 @@
 
 A run listens on a socket named after its process in the user's run-time folders: ``123.sock``, and
 ``123-2.sock`` for a second one of the same process. A socket without a listening process was left
-by one that ended. It is advertised in every folder that another
-terminal may search, and only in folders that no other user can write to: a folder in /tmp of
-another user could contain links to this user's files, or sockets of other users. Root reaches the
-runs of all users, each in a folder private to that user. A motion in preparation has a name of its
-own: it can be stopped, and takes no other command.
+by one that ended. It is advertised in every folder that another terminal may search, and only in
+folders that no other user can write to: a folder in /tmp of another user could contain links to
+this user's files, or sockets of other users. Root reaches the runs of all users, each in a folder
+private to that user. A motion in preparation has a name of its own: it can be stopped, and takes no
+other command.
 """
 
 from __future__ import annotations
@@ -183,9 +183,9 @@ def _made_folders() -> list[Path]:
 @contextlib.contextmanager
 def _own_stem() -> Iterator[str]:
     """A name that no other run of this process has while the block runs."""
-    numbers = ("" if k == 1 else f"-{k}" for k in itertools.count(1))
+    first = str(os.getpid())
     with _naming:
-        stems = (f"{os.getpid()}{number}" for number in numbers)
+        stems = itertools.chain([first], (f"{first}-{k}" for k in itertools.count(2)))
         stem = next(stem for stem in stems if stem not in _named)
         _named.add(stem)
     try:
@@ -292,22 +292,19 @@ def find_runs(*, ahead: bool = False) -> Iterator[list[RunConnection]]:
         ahead: Also to motions that are still being prepared.
     """
     endings = (_ENDING, _ENDING_AHEAD) if ahead else (_ENDING,)
-    runs: dict[tuple[int, str], RunConnection] = {}
-    seen: set[tuple[str, int]] = set()
+    runs: dict[tuple[str, int], RunConnection] = {}
     with contextlib.ExitStack() as links:
         with _open_folders(_reachable_folders()) as folders:
             for folder in folders:
                 names = os.listdir(folder.descriptor)
                 for name, stem in _sockets(names, endings):
-                    if (stem, folder.owner) in seen:
+                    if (stem, folder.owner) in runs:
                         continue
                     run = _connect(folder, name, int(stem.partition("-")[0]))
-                    if run is None:
-                        continue
-                    seen.add((stem, folder.owner))
-                    links.callback(run.link.close)
-                    runs.setdefault((run.process, stem), run)
-        yield [runs[key] for key in sorted(runs)]
+                    if run is not None:
+                        links.callback(run.link.close)
+                        runs[stem, folder.owner] = run
+        yield [runs[key] for key in sorted(runs, key=lambda key: (runs[key].process, key))]
 
 
 def _sockets(names: Sequence[str], endings: Sequence[str]) -> Iterator[tuple[str, str]]:

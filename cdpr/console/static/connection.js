@@ -1,7 +1,9 @@
 /* The connection to the server and the age of its data, on the page's monotonic clock.
 
 Each state is acknowledged with the time on this clock, and names when it was made and when the newest acknowledgement
-arrived, on the server's. That was after it was sent: so a state's age on arrival is known, at most. No message waits here: one that cannot be sent now is never sent, and no motion continues after a reconnection. The
+arrived, on the server's. That was after it was sent: so a state's age on arrival is known, at most.
+
+No message waits here: one that cannot be sent now is never sent, and no motion continues after a reconnection. The
 server ends the press of a page whose connection is slow, by the newest state that its reports name.
 Events: "state" (a new one), "age" (every 50 ms), "stale" (data became too old), "closed", "refused" (a message that
 the server rejected; `detail` gives the reason). */
