@@ -292,6 +292,15 @@ def test_many_cables_and_a_long_name_cover_nothing(desk: Visit) -> None:
             assert desk.audit("cut") == [], (cables, width)
 
 
+def test_curves_that_do_not_yet_follow_a_narrower_window_do_not_widen_the_page(phone: Visit) -> None:
+    fill_everything(phone)
+    phone.view("live")
+    curves = phone.page.locator("#live .plotted > *")
+    expect(curves).to_have_count(3)
+    curves.evaluate_all("(all) => { for (const curve of all) curve.style.width = '900px'; }")
+    assert phone.page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
+
+
 def test_everything_has_a_name_and_is_reached_by_keyboard(desk: Visit) -> None:
     """Every control that is shown, in every view, by Tab or, for tabs and radios, by an arrow."""
     fill_everything(desk)
