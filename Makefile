@@ -146,7 +146,7 @@ schema: install  ## Write the JSON schemas of the rig, scene and plan files into
 	"$(BIN)/python" tools/schemas.py
 
 clean:  ## Remove build output and caches (never .venv or your runs)
-	rm -rf build dist site htmlcov .coverage .coverage.* .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf build dist site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find $(PACKAGES) tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean  ## Remove .venv too
