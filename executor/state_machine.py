@@ -120,6 +120,8 @@ class Machine:
 
 #: Code of the event that the drives report to be simulated.
 SIMULATED = "simulated"
+#: Code of the event that a drive lacks a function which a run would use.
+REMARK = "remark"
 
 
 @dataclass(frozen=True, slots=True)

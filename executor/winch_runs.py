@@ -22,7 +22,7 @@ from executor.recording.record_files import free_folder
 from executor.remote.command_server import Commands
 from executor.remote.protocol import Presses
 from executor.remote.status import WinchStatus
-from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.state_machine import REMARK, CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests, RequestBoard
 from model.errors import Fault, Refused, StoppedByOperator
 from model.pose import Pose
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 #: Default tension limit, as a share of the range from smallest to largest tension.
 LIMIT_SHARE = 0.6
-#: Events of every motion, and one for defect reports.
-_UNREPORTED = frozenset({"enabled", "moving", "held", "traceback"})
+#: Events of every motion, one for defect reports, and one that the listener gets as a remark.
+_UNREPORTED = frozenset({"enabled", "moving", "held", "traceback", REMARK})
 
 AtRest = Callable[[WinchResult, Pose | None, RequestBoard], HomingReference | None]
 """Called after a finished motion with its result, the simulated platform's pose and the requests;

@@ -35,7 +35,7 @@ from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedMemory
 from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import CableStatus, JogStatus, SessionStatus
-from executor.state_machine import CycleRecord
+from executor.state_machine import REMARK, CycleRecord
 from executor.supervision import RequestBoard, Supervisor
 from executor.winch_runs import limit_of, move_supervised, supervised, winch_mover
 from model.kinematics import cable_lengths
@@ -319,7 +319,8 @@ class _Session:
                 listener=self.listener,
                 showing=nullcontext(take_cycle),
                 presses=presses,
-                unreported={"moving", "traceback"},  # its user must know when drives are enabled
+                # Its user must know when drives are enabled.
+                unreported={"moving", "traceback", REMARK},
             )
 
 

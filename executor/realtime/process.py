@@ -26,7 +26,7 @@ from executor.realtime.child import (
 )
 from executor.realtime.scheduling import interrupts_blocked, one_thread
 from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedRequests, unpack_event
-from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.state_machine import REMARK, CycleRecord, LoopEvent, State
 from executor.supervision import record_failure
 from model.errors import Fault, Refused, StoppedByOperator
 from model.progress import SILENT, Listener
@@ -98,7 +98,7 @@ class RealTimeProcess:
         """Waits until the drives are armed.
 
         Args:
-            records: Takes cycles and events from now on.
+            records: Takes cycles and events from now on, and remarks on the drives.
 
         Raises:
             CdprError: Arming failed, or the operator requested a stop.
@@ -113,6 +113,7 @@ class RealTimeProcess:
                 if isinstance(message, Armed):
                     for remark in message.remarks:
                         self._listener.remark(remark)
+                        records.take_event(LoopEvent(0, 0.0, REMARK, remark))
                     return message
                 raise message.error if isinstance(message, Failed) else self._died()
 

@@ -16,7 +16,7 @@ from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import CameraRecord
 from executor.recording.tables import CycleTable, PoseTable
 from executor.safety.limits import tension_limits
-from executor.state_machine import ON_PATH
+from executor.state_machine import ON_PATH, REMARK, SIMULATED
 from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig
@@ -351,7 +351,7 @@ def _single_camera_phrase(record: CameraRecord) -> str:
 ORDINARY = frozenset(
     {
         *("enabled", "moving", "hold", "resume", "speed", "stop", "held"),
-        *("pass", "pick", "place", "leaving", "simulated", "traceback"),
+        *("pass", "pick", "place", "leaving", SIMULATED, REMARK, "traceback"),
     }
 )
 #: Codes of events with a page that do not stop a run.

@@ -90,15 +90,17 @@ def over_udp(rig: Path, plan: Path, run: Path, port: int) -> tuple[int, dict[str
 def test_a_run_with_the_drives_in_another_process_loses_no_frame(
     slow_rig: Path, short_plan: Path, tmp_path: Path
 ) -> None:
-    code, summary, last = over_udp(
-        slow_rig, short_plan, tmp_path / "run", 40000 + os.getpid() % 20000
-    )
+    rig = tmp_path / "rig.yaml"  # with drives that monitor one other each
+    rig.write_text(slow_rig.read_text() + "drives: {type: cia402, profile: nanotec-c5e}\n")
+    code, summary, last = over_udp(rig, short_plan, tmp_path / "run", 40000 + os.getpid() % 20000)
     cycle_ms = load_rig(slow_rig).document.bus.cycle_ms
     assert code == 0, summary
     assert summary["verdict"] == "PASSED"
     assert summary["lost_replies"] == 0
     said = any(event["code"] == "simulated" for event in summary["events"])
     assert summary["simulated"] is said
+    (remark,) = (event["text"] for event in summary["events"] if event["code"] == "remark")
+    assert "1016h has 1 heartbeat entry" in remark
     assert summary["fast"] is False
     assert summary["following_error_mm"]["max"] <= 0.1
     assert summary["lateness_ms"]["p50"] < cycle_ms
