@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, expect
 from tests.console.browsing import ROOT, SIZES, VIEWS, Fake, Visit, visit
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-WEBGL = True
+WEBGL = False
 STALE = re.compile("No data from the console’s server")
 
 
