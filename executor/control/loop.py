@@ -288,10 +288,13 @@ class Loop:
             lost = Alarm(StopReaction.PATH_STOP, "recorder", self._listener_error)
             alarms = (*alarms, lost)
         alarms = shared_causes(alarms, list(self._checked.rig.drive_names.values()))
+        latched = self.machine.state is State.LATCHED
+        worst = None if latched else max(alarms, key=lambda alarm: alarm.reaction, default=None)
         for alarm in alarms:
-            self._report_once(alarm)
-        if alarms and self.machine.state is not State.LATCHED:
-            self._react(max(alarms, key=lambda alarm: alarm.reaction))
+            if alarm is not worst or not self._needs_quick_stop(alarm):  # which reports its cause
+                self._report_once(alarm)
+        if worst is not None:
+            self._react(worst)
 
     def _apply_requests(self, requests: OperatorRequests) -> None:
         """Applies the operator's requests as far as the state allows."""
@@ -319,11 +322,13 @@ class Loop:
         """Begins a path stop if one is requested and possible; returns whether it did."""
         if not (requests.stop and self.machine.state in _STOPPABLE):
             return False
+        on_hold = self.machine.state is State.HOLDING and self._feed.at_rest
+        what_follows = "at rest on hold" if on_hold else f"slowing down {self.motion_phrase}"
         if requests.for_what is not None:
-            text = f"{requests.for_what.text}; slowing down {self.motion_phrase}"
+            text = f"{requests.for_what.text}; {what_follows}"
             self._report_cause(requests.for_what.code, text)
         else:
-            self._requested = f"stop requested; slowing down {self.motion_phrase}"
+            self._requested = f"stop requested; {what_follows}"
             self._report_cause("stop", self._requested)
         self._feed.stop()
         self.machine.on(Event.STOP)
@@ -331,20 +336,24 @@ class Loop:
 
     def _report_once(self, alarm: Alarm) -> None:
         """A condition that persists is reported in its first cycle."""
-        # A drive may report several faults, each once; measured values change the text.
-        has_fixed_text = alarm.code in ("drive_fault", "drive_warning")
-        what = alarm.text if has_fixed_text else str(alarm.drive)
-        if (alarm.code, what) not in self._reported:
-            self._reported.add((alarm.code, what))
+        if _identity(alarm) not in self._reported:
+            self._reported.add(_identity(alarm))
             self._report(alarm.code, alarm.text)
 
     def _react(self, alarm: Alarm) -> None:
-        if alarm.reaction is StopReaction.PATH_STOP and self.machine.state in _WITHOUT_QUICK_STOP:
+        if self._needs_quick_stop(alarm):
+            self._reported.add(_identity(alarm))
+            self._fault(alarm.code, alarm.text)
+        elif alarm.reaction is StopReaction.PATH_STOP:
             self._note_cause(f"{alarm.text}; stopped {self.motion_phrase}")
             self._feed.stop()
             self.machine.on(Event.PATH_FAULT)
-        elif alarm.reaction is not StopReaction.NOTE:
-            self._fault(alarm.code, alarm.text)
+
+    def _needs_quick_stop(self, alarm: Alarm) -> bool:
+        """Whether no stop along the path is possible or enough."""
+        if alarm.reaction is StopReaction.PATH_STOP:
+            return self.machine.state not in _WITHOUT_QUICK_STOP
+        return alarm.reaction is not StopReaction.NOTE
 
     def _fault(self, code: str, text: str) -> None:
         """Quick stop for all drives at once, latched."""
@@ -433,3 +442,9 @@ _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING, State.H
 _HELD = "at rest; the drives hold under torque"
 _BRAKED = "at rest; the brakes of the winches hold"
 _NEVER_ENABLED = "stopped before all drives were enabled; none follows set-points"
+
+
+def _identity(alarm: Alarm) -> tuple[str, str]:
+    """A drive may report several faults, each once; measured values change the text."""
+    has_fixed_text = alarm.code in ("drive_fault", "drive_warning")
+    return alarm.code, alarm.text if has_fixed_text else str(alarm.drive)

@@ -16,7 +16,7 @@ from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import CameraRecord
 from executor.recording.tables import CycleTable, PoseTable
 from executor.safety.limits import tension_limits
-from executor.state_machine import ON_PATH, REMARK, SIMULATED
+from executor.state_machine import ON_PATH, REMARK, SIMULATED, State
 from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig
@@ -27,6 +27,7 @@ PASSED, FAILED, STOPPED = "PASSED", "FAILED", "STOPPED"
 #: Final state of a run without a recorded end: its program was killed, or the disk was full.
 NOT_ENDED = "not_ended"
 _ON_PATH = {state.value for state in ON_PATH}
+_AFTER_MOTION = [state.value for state in (State.SECURING, State.LATCHED)]
 #: Tolerance for the rounding of the tables, [m].
 ROUNDING = 2e-9
 #: Distance [m] and angle [rad] of set-points from the goal at which the platform counts as there.
@@ -114,7 +115,7 @@ def judge(
         *(Check("record", False, f"{trouble}.") for trouble in troubles),
     ]
     failures = [check for check in measured if not check.passed]
-    at = f"after {_time(cycles):.1f} s and {_travelled(cycles):.0f} mm"
+    at = f"after {_motion_time(cycles):.1f} s and {_travelled(cycles):.0f} mm"
     if final_state == "finished":
         end = Check("finished", True, f"The platform reached the goal {at}.")
         if failures:
@@ -168,8 +169,10 @@ def judge_without_tables(final_state: str, cause: str, trouble: str) -> Verdict:
     return Verdict(FAILED, f"The run {word} before the goal.", (end, known))
 
 
-def _time(cycles: CycleTable) -> float:
-    return float(cycles.time[-1]) if len(cycles) else 0.0
+def _motion_time(cycles: CycleTable) -> float:
+    """Time of the last cycle before the drives were stopped or held on their own, [s]."""
+    in_motion = np.flatnonzero(~np.isin(cycles.state, _AFTER_MOTION))
+    return float(cycles.time[in_motion[-1]]) if in_motion.size else 0.0
 
 
 def _travelled(cycles: CycleTable) -> float:
@@ -369,9 +372,10 @@ def fault_codes() -> list[str]:
 
 
 def faults_among(codes: Iterable[str]) -> list[str]:
-    """Fault codes among event codes, each once, in order."""
+    """Fault codes among event codes, each once, in order; those that stop no run are last."""
     known = fault_codes()
-    return [code for code in dict.fromkeys(codes) if code in known]
+    found = [code for code in dict.fromkeys(codes) if code in known]
+    return sorted(found, key=lambda code: code in HARMLESS)
 
 
 def page_text(code: str) -> str:

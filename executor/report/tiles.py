@@ -67,7 +67,9 @@ def key_figures(summary: dict[str, Any]) -> str:
 
 
 def _path_note(summary: dict[str, Any]) -> str:
-    return f"{known(summary['travelled_mm'], 0, 'mm')} driven in {summary['duration_s']:.1f} s"
+    return (
+        f"{known(summary['travelled_mm'], 0, 'mm')} driven, {summary['duration_s']:.1f} s recorded"
+    )
 
 
 def _clearance(key: dict[str, Any] | None) -> list[str]:

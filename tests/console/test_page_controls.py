@@ -292,7 +292,9 @@ def test_many_cables_and_a_long_name_cover_nothing(desk: Visit) -> None:
             assert desk.audit("cut") == [], (cables, width)
 
 
-def test_curves_that_do_not_yet_follow_a_narrower_window_do_not_widen_the_page(phone: Visit) -> None:
+def test_curves_that_do_not_yet_follow_a_narrower_window_do_not_widen_the_page(
+    phone: Visit,
+) -> None:
     fill_everything(phone)
     phone.view("live")
     curves = phone.page.locator("#live .plotted > *")

@@ -79,9 +79,9 @@ def test_a_code_has_a_page_with_everything_in_it(code: str) -> None:
     assert page_of(code) == f"docs/faults/{code}.md"
 
 
-def test_faults_are_named_once_and_nothing_else_is() -> None:
-    codes = ["enabled", "moving", "slack", "late", "slack", "held"]
-    assert faults_among(codes) == ["slack", "late"]
+def test_faults_are_named_once_and_what_stopped_no_run_comes_last() -> None:
+    codes = ["enabled", "reply_lost", "moving", "slack", "late", "slack", "held"]
+    assert faults_among(codes) == ["slack", "late", "reply_lost"]
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,16 @@ def test_a_stopped_run_is_not_passed_and_not_a_fault(run: fake_run.FakeRun) -> N
     ]
 
 
+@pytest.mark.parametrize("after", ["securing", "latched"])
+def test_reasons_state_when_the_motion_ended(run: fake_run.FakeRun, after: str) -> None:
+    """Not when the record ended, with the drives at rest."""
+    states = list(run.cycles.state)
+    states[150:] = [after] * len(states[150:])
+    ended = replace(run, cycles=replace(run.cycles, state=tuple(states)))
+    (reason,) = summary(ended, final_state="stopped", cause="stopped")["reasons"][:1]
+    assert f"after {run.cycles.time[149]:.1f} s" in reason
+
+
 @pytest.mark.parametrize(
     ("leg", "at", "turn_deg", "where"),
     [

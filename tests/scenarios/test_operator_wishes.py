@@ -79,6 +79,17 @@ def test_a_hold_rests_on_the_path_under_power_and_a_resume_continues_to_the_goal
     assert (table.set_counts[-1] == plain.log.table().set_counts[-1]).all(), "the same goal"
 
 
+@pytest.mark.parametrize(("cycle", "said"), [(160, "slowing down"), (300, "at rest on hold")])
+def test_a_stop_says_whether_the_platform_was_at_rest(
+    prepared: PreparedRun, tmp_path: Path, cycle: int, said: str
+) -> None:
+    stage, outcome = run(prepared, tmp_path, c150=HOLD, **{f"c{cycle}": STOP})
+    assert outcome.state is State.STOPPED
+    (text,) = (event.text for event in stage.events() if event.code == "stop")
+    assert text.startswith(f"stop requested; {said}")
+    assert outcome.cause == text
+
+
 def test_speeds_are_kept_and_change_smoothly(prepared: PreparedRun, tmp_path: Path) -> None:
     stage, outcome = run(prepared, tmp_path, c100=speed(50), c250=speed(10), c400=speed(100))
     assert outcome.state is State.FINISHED

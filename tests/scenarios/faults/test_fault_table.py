@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
+from itertools import permutations
 from pathlib import Path
 
 import pytest
 
 from drivers.can_bus import BusSettings
+from executor.recording.run_folder import RunEvent
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
 from tests.scenarios.faults.bench import SimulatedBench, live, once, simulated
@@ -46,6 +49,17 @@ def test_in_simulated_time(prepared: PreparedRun, tmp_path: Path, name: str) -> 
         ended = bench.run()
         cycle = prepared.checked.table.cycle
         assert complaints(fault, bench, ended, bench.cause, cycle) == []
+        assert twice(bench.events()) == []
+
+
+def twice(events: Sequence[RunEvent]) -> list[str]:
+    """Events that another one of the same moment says as well."""
+    return [
+        event.text
+        for event, other in permutations(events, 2)
+        if (event.code, event.time_s) == (other.code, other.time_s)
+        and other.text.startswith(event.text)
+    ]
 
 
 @pytest.mark.slow
