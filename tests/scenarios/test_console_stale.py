@@ -26,7 +26,7 @@ FIGURES = "#value-x"
 
 @pytest.fixture
 def browser() -> Iterator[Browser]:
-    with browser_at(chromium()) as browser:
+    with browser_at(chromium(), webgl=False) as browser:
         yield browser
 
 
