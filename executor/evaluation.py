@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
@@ -22,7 +22,7 @@ from executor.recording.clearance import (
     tension_noise,
 )
 from executor.recording.mcap import write_mcap
-from executor.recording.record_files import RunCourse
+from executor.recording.record_files import AGAIN, RunCourse
 from executor.recording.run_folder import (
     CLEARANCE,
     COURSE,
@@ -61,6 +61,7 @@ CLEARANCE_RATE = 10.0
 _FROM_OTHERS = (FUSED, MCAP, REPORT)
 #: Files that it writes again where they exist.
 _RENEWED = (CHECKSUMS, REPORT)
+_MAKE_ROOM = "make the folder writable, or free some space"
 _File = tuple[str, Callable[[], object]]
 """A file's name, and the function that writes it."""
 
@@ -114,7 +115,8 @@ def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
     """Evaluates a run from the files in its folder, also of a program that was killed.
 
     Raises:
-        BadInput: A file of it was changed.
+        BadInput: A file of it was changed, or is missing though the run ended and cannot be made
+            again.
     """
     rig, plan, course = folder.rig(), folder.plan(), folder.course()
     cycles = folder.cycles_cut_short(rig.cable_count)
@@ -131,6 +133,13 @@ def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
     else:
         clearance = _clearance(rig, plan.scene, cycles, CameraRecords())
         if plan.scene.obstacles and np.isfinite(poses.position).any():
+            if any((folder.path / name).is_file() for name in (SUMMARY, CHECKSUMS)):
+                raise BadInput(
+                    f"{CLEARANCE} is missing and cannot be made again",
+                    where=str(folder.path),
+                    why="no other table holds the clearance that the cameras measured",
+                    next_step=AGAIN,
+                )
             troubles.append("The clearance that the cameras measured is not on record")
     has_images = any((folder.path / PICTURES).glob("**/*.jpg"))  # the first image of each is kept
     if has_images and not folder.has(POSES):
@@ -232,25 +241,26 @@ def write_end(
     ]
     if result is not None:
         files += _files(folder, result)
-    return _written(files, given_up)
+    return _reasons(folder, _written(files, given_up))
 
 
 def write_results(folder: RunFolder, result: EvaluatedRun) -> None:
     """Writes the missing files of an evaluated run's folder, and its report.
 
     Raises:
-        Fault: A file could not be written.
+        Fault: A file could not be written; it names the file that is the cause.
     """
     files = _files(folder, result)
     todo = [file for file in files if file[0] in _RENEWED or not folder.has(file[0])]
     missing = _written(todo, lambda: False)
     if missing:
-        name, why = next(iter(missing.items()))
+        name, error = next(iter(missing.items()))
+        unwritable = error.why and error.where == str(folder.path / name)
         raise Fault(
             f"not written: {', '.join(missing)}",
             where=str(folder.path),
-            why=f"{name}: {why}",
-            next_step="make the folder writable, or free some space",
+            why=f"{name}: {_reasons(folder, missing)[name]}",
+            next_step=_MAKE_ROOM if unwritable else error.next_step,
         )
 
 
@@ -290,22 +300,32 @@ def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:
     ]
 
 
-def _written(files: Sequence[_File], given_up: Callable[[], bool]) -> dict[str, str]:
-    """Writes each; returns those that failed, and why."""
-    missing = {}
+def _written(files: Sequence[_File], given_up: Callable[[], bool]) -> dict[str, CdprError]:
+    """Writes each; returns the errors of those that failed."""
+    missing: dict[str, CdprError] = {}
     for name, write in files:
         try:
             if name in _FROM_OTHERS and given_up():
-                missing[name] = "interrupted"
+                missing[name] = Fault("interrupted")
             elif name in (SUMMARY, CHECKSUMS) and missing.keys() - {*_FROM_OTHERS}:
                 missing[name] = next(iter(missing.values()))  # they mark a folder with its tables
             else:
                 write()
         except CdprError as error:
-            missing[name] = error.why or error.what
+            missing[name] = error
         except Exception as error:  # out of memory, or a defect: continue with the other files
-            missing[name] = f"{type(error).__name__}: {error}".rstrip(": ")
+            missing[name] = Fault(f"{type(error).__name__}: {error}".rstrip(": "))
     return missing
+
+
+def _reasons(folder: RunFolder, missing: Mapping[str, CdprError]) -> dict[str, str]:
+    """Why each file is missing; names the file that is the cause, if that is another one."""
+    own = {"", *(str(folder.path / name) for name in missing)}
+    reasons = {}
+    for name, error in missing.items():
+        cause = "" if error.where in own else f"{error.where}: "
+        reasons[name] = cause + (error.why or error.what)
+    return reasons
 
 
 def _complete_events(folder: RunFolder, events: Sequence[RunEvent]) -> None:

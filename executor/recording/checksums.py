@@ -2,7 +2,8 @@
 
 Written when a run ends, and compared whenever its folder is opened: a file that was edited, damaged
 or mixed up with that of another run is named. It proves nothing against one who also rewrites the
-checksums. Images and the report are left out; runs of earlier versions have none.
+checksums. Images and the report are left out; runs of earlier versions have none. A file that is
+missing counts as changed, unless `cdpr report` makes it again (`REBUILT`).
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ _RECORD = re.compile(
     r"(plan|rig|run|summary)\.json|events\.jsonl|run\.mcap"
     r"|(cycles|clearance|fused|poses|poses-.+)\.csv"
 )
+#: Files among them that `cdpr report` makes again.
+REBUILT = frozenset({"summary.json", "clearance.csv", "fused.csv", "run.mcap"})
 
 
 def write_checksums(folder: Path) -> None:
@@ -37,10 +40,10 @@ def write_checksums(folder: Path) -> None:
 
 
 def require_unchanged(folder: Path) -> None:
-    """Requires the files of a run to be as they were written; missing ones are not considered.
+    """Requires the files of a run to be as they were written; any of `REBUILT` may be missing.
 
     Raises:
-        BadInput: One was changed, or the checksums cannot be read; all are named.
+        BadInput: One was changed or is missing, or the checksums cannot be read; all are named.
     """
     path = folder / CHECKSUMS
     if not path.is_file():
@@ -50,13 +53,15 @@ def require_unchanged(folder: Path) -> None:
         found = _LINE.fullmatch(line)
         if found is None or not _RECORD.fullmatch(found[2]):
             raise BadInput("not a checksum", where=f"{path}:{number}", next_step=AGAIN)
-        if (folder / found[2]).is_file() and _checksum(folder / found[2]) != found[1]:
+        if not (folder / found[2]).is_file():
+            changed += [f"{found[2]} (missing)"] if found[2] not in REBUILT else []
+        elif _checksum(folder / found[2]) != found[1]:
             changed.append(found[2])
     if changed:
         raise BadInput(
             f"changed after the run: {', '.join(changed)}",
             where=str(folder),
-            why=f"edited, damaged, or of another run: its checksum in {CHECKSUMS} differs",
+            why=f"edited, damaged, removed, or of another run, according to {CHECKSUMS}",
             next_step=f"{AGAIN}; to use it as it is, remove {CHECKSUMS}",
         )
 

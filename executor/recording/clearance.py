@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -19,8 +20,9 @@ from tracking.clearance import MeasuredClearance, clearance_at
 
 _MM = 1e3
 _FACTS = 8
-"""Columns before those of the obstacles, which are read by index: obstacles may be named
-``planned_x`` and ``x``."""
+"""Columns before those of the obstacles, which are read by index."""
+_UNIT = re.compile(r"_mm( \(obstacle \d+\))?\Z")
+"""End of the name of an obstacle's column, with its number if the name alone is not unique."""
 
 
 #: A measurement this far in time from a moment is one of that moment, [s].
@@ -125,9 +127,14 @@ class ClearanceTable:
             texts("obstacle", self.obstacle),
             numbers("planned_distance_mm", self.planned_distance, _MM),
         ]
+        taken = {column.name for column in columns}
         for i, name in enumerate(self.obstacles):
-            columns.append(numbers(f"{name}_mm", self.distances[:, i], _MM))
-            columns.append(numbers(f"planned_{name}_mm", self.planned_distances[:, i], _MM))
+            pair = f"{name}_mm", f"planned_{name}_mm"
+            # An obstacle may be named ``distance``, or ``planned_x`` beside ``x``.
+            end = "" if taken.isdisjoint(pair) else f" (obstacle {i + 1})"
+            taken |= {*pair}
+            columns.append(numbers(pair[0] + end, self.distances[:, i], _MM))
+            columns.append(numbers(pair[1] + end, self.planned_distances[:, i], _MM))
         write_table(path, columns)
 
     @classmethod
@@ -147,7 +154,7 @@ class ClearanceTable:
             body=table.texts("body"),
             obstacle=table.texts("obstacle"),
             planned_distance=table.floats("planned_distance_mm", _MM),
-            obstacles=tuple(table.names[i].removesuffix("_mm") for i in table.pairs_from(_FACTS)),
+            obstacles=tuple(_UNIT.sub("", table.names[i]) for i in table.pairs_from(_FACTS)),
             distances=table.matrix_at(table.pairs_from(_FACTS), _MM),
             planned_distances=table.matrix_at(range(_FACTS + 1, len(table.names), 2), _MM),
         )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from executor.recording.record_files import LARGEST_RECORDED
+from executor.recording.record_files import AGAIN, LARGEST_RECORDED
 from model.errors import BadInput
 from model.files.documents import write_atomic
 from model.files.reading import TABLE_LIMIT, CsvFile, read_text
@@ -204,7 +204,7 @@ class TableFile:
     def columns(self) -> dict[str, NDArray[Any]]:
         """All columns by name, each shape (n,) and read-only; their types depend on the names only.
 
-        Of columns with the same name the first is returned.
+        Of columns with the same name, in tables of earlier versions, the first is returned.
 
         Raises:
             BadInput: A value is not of its column's type, or beyond ±1e15.
@@ -241,5 +241,5 @@ class TableFile:
             what,
             where=str(self._path),
             why="the file was edited or truncated after the run",
-            next_step="restore the file, or run the plan again into a new folder",
+            next_step=AGAIN,
         )

@@ -87,7 +87,7 @@ def _pictures(
     folder: RunFolder, poses: PoseTable, start: int, camera: str = ""
 ) -> Iterator[Message]:
     for time, name in zip(poses.time.tolist(), poses.picture, strict=True):
-        if name:
+        if name and folder.has_picture(name):
             picture = CompressedImage(
                 timestamp=stamp_of(start, time),
                 frame_id=frame_of(camera),
@@ -109,7 +109,7 @@ def write_mcap(
     """Writes ``run.mcap``; its times are the start of the run plus run time.
 
     Args:
-        folder: Run folder; its images are included.
+        folder: Run folder; its images are included, as far as they exist.
         context: Of the run.
         cycles: All cycles.
         poses: Pose of every image, or why there is none.

@@ -28,7 +28,7 @@ from model.files.documents import keep_names, write_atomic
 from model.files.reading import TABLE_LIMIT, parse_json, read_bytes, read_json, read_text
 from model.files.validation import problems_of
 
-AGAIN = "restore the file, or run the plan again into a new folder"
+AGAIN = "restore the file from a copy, or run the plan again into a new folder"
 
 #: No run has a larger number; squares of these are finite.
 LARGEST_RECORDED = 1e15

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from executor.recording.checksums import require_unchanged
+from executor.recording.checksums import REBUILT, require_unchanged
 from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import (
     AGAIN,
@@ -36,9 +36,8 @@ from model.plan import Plan, load_plan, save_plan
 from model.rig import Rig, rig_from_document
 
 PLAN, RIG, COURSE = "plan.json", "rig.json", "run.json"
-SUMMARY, EVENTS = "summary.json", "events.jsonl"
+SUMMARY, EVENTS, POSES, POSES_OF = "summary.json", "events.jsonl", "poses.csv", "poses-{}.csv"
 CYCLES, CLEARANCE, FUSED = "cycles.csv", "clearance.csv", "fused.csv"
-POSES, POSES_OF = "poses.csv", "poses-{}.csv"
 MCAP, REPORT, PICTURES = "run.mcap", "report.html", "pictures"
 NEEDED = (PLAN, RIG, CYCLES, POSES, CLEARANCE, SUMMARY, EVENTS)
 #: Written before anything moves.
@@ -105,12 +104,9 @@ class RunFolder:
             BadInput: The path exists, or its parent is not a folder or is read-only.
         """
         if path.exists() or path.is_symlink():
-            raise BadInput(
-                "exists already",
-                where=str(path),
-                why="a run never writes into another run's folder",
-                next_step="choose another folder or remove this one",
-            )
+            why = "a run never writes into another run's folder"
+            then = "choose another folder or remove this one"
+            raise BadInput("exists already", where=str(path), why=why, next_step=then)
         above = next(folder for folder in path.absolute().parents if folder.exists())
         if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
             raise _not_made(path, f"{above} is not a writable folder")
@@ -125,10 +121,9 @@ class RunFolder:
         if not path.is_dir():
             then = "give the folder that `cdpr run -o` created"
             raise BadInput("no such run folder", where=str(path), next_step=then)
-        missing = [name for name in NEEDED if not (path / name).is_file()]
-        if missing:
-            raise cls(path)._incomplete(missing)
         require_unchanged(path)
+        if missing := cls(path)._missing(NEEDED):
+            raise cls(path)._incomplete(missing)
         return cls(path)
 
     @classmethod
@@ -136,25 +131,34 @@ class RunFolder:
         """The folder of a run that ended, or of one whose program was killed.
 
         Raises:
-            BadInput: There is no such folder, it is not a run folder, or the run is still active.
+            BadInput: There is no such folder, it is not a run folder, the run is still active, or
+                files of a run that ended were changed, or are missing and not among `REBUILT`.
         """
-        if (path / SUMMARY).is_file() or not all((path / name).is_file() for name in BEGUN):
+        folder = cls(path)
+        if folder.is_whole or folder._missing(BEGUN):
             return cls.open(path)  # ended, of an earlier version, or raises with what is missing
-        if cls(path).is_active():
-            raise cls(path)._incomplete([])
         require_unchanged(path)
-        return cls(path)
+        if folder._lost() or folder.is_active():
+            raise folder._incomplete(folder._lost())
+        return folder
+
+    def _missing(self, names: Sequence[str]) -> list[str]:
+        return [name for name in names if not (self.path / name).is_file()]
+
+    def _lost(self) -> list[str]:
+        """Missing files of a run that ended, which no other file can replace."""
+        return [] if self._missing([SUMMARY]) else sorted({*self._missing(NEEDED)} - REBUILT)
 
     def _incomplete(self, missing: Sequence[str]) -> BadInput:
         what = f"incomplete run folder: {', '.join(missing)} missing"
-        why = "the run was interrupted"
+        why, then = "the run was interrupted", f"`cdpr report {self.path}` makes the missing files"
         if self.is_active():
             what, why, then = "the run is still in progress", "", "wait, or see `cdpr monitor`"
-        elif all((self.path / name).is_file() for name in BEGUN):
-            then = f"`cdpr report {self.path}` makes them from what was recorded"
-        else:
+        elif self._missing(BEGUN):
             why += ", or this is another kind of folder"
             then = "give a folder that `cdpr run -o` created, or run the plan again"
+        elif self._lost():
+            why, then = "removed after the run; no other file holds the same data", AGAIN
         return BadInput(what, where=str(self.path), why=why, next_step=then)
 
     def has(self, name: str) -> bool:
@@ -167,7 +171,7 @@ class RunFolder:
     @property
     def is_whole(self) -> bool:
         """Whether every file of a finished run exists."""
-        return all((self.path / name).is_file() for name in NEEDED)
+        return not self._missing(NEEDED)
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -233,8 +237,7 @@ class RunFolder:
         try:
             document = RigDocument.model_validate(read_json(self.path / RIG, AGAIN))
         except ValidationError as error:
-            problems = problems_of(error, RigDocument, {})
-            raise InvalidFile(str(self.path / RIG), problems) from None
+            raise InvalidFile(str(self.path / RIG), problems_of(error, RigDocument, {})) from None
         return rig_from_document(document)
 
     def write_cycles(self, table: CycleTable) -> None:
@@ -255,12 +258,11 @@ class RunFolder:
         Raises:
             BadInput: A complete line cannot be read.
         """
-        if not (self.path / CYCLES).is_file():
-            return no_cycles(cable_count)
-        lines = whole_lines(self.path / CYCLES)
+        path = self.path / CYCLES
+        lines = whole_lines(path) if path.is_file() else []
         if not lines:
             return no_cycles(cable_count)
-        return self._with_cables(CycleTable.of_lines(self.path / CYCLES, lines), cable_count)
+        return self._with_cables(CycleTable.of_lines(path, lines), cable_count)
 
     def _with_cables(self, table: CycleTable, cables: int) -> CycleTable:
         if table.cable_count != cables:
@@ -311,11 +313,9 @@ class RunFolder:
     def poses_by_camera(self) -> dict[str, PoseTable]:
         """Reads the poses of each of several cameras; empty for a single camera."""
         begin, end = POSES_OF.split("{}")
-        names = [path.name for path in self.path.glob(POSES_OF.format("*"))]
-        return {
-            name.removeprefix(begin).removesuffix(end): PoseTable.read_csv(self.path / name)
-            for name in sorted(names)
-        }
+        files = sorted(self.path.glob(POSES_OF.format("*")))
+        names = [file.name.removeprefix(begin).removesuffix(end) for file in files]
+        return dict(zip(names, map(PoseTable.read_csv, files), strict=True))
 
     def write_clearance(self, table: ClearanceTable) -> None:
         """Writes ``clearance.csv``."""
@@ -402,6 +402,10 @@ class RunFolder:
             raise self._not_written(name, error) from None
         return name
 
+    def has_picture(self, name: str) -> bool:
+        """Whether an image that was kept still exists; archives often lack them."""
+        return os.path.isfile(self.path / name)  # False for a name that cannot be a path
+
     def picture(self, name: str) -> bytes:
         """The JPEG of a name from `write_picture`.
 
@@ -414,11 +418,8 @@ class RunFolder:
                 raise FileNotFoundError(0, f"it is not in {PICTURES}")
             return read_bytes(file, PICTURE_LIMIT)
         except OSError as error:
-            raise BadInput(
-                "the image cannot be read",
-                where=str(self.path / name),
-                why=error.strerror or str(error),
-            ) from None
+            what, why = "the image cannot be read", error.strerror or str(error)
+            raise BadInput(what, where=str(self.path / name), why=why) from None
 
     def _append(self, name: str, text: str, *, fsync: bool) -> None:
         try:

@@ -8,7 +8,7 @@ from typing import Any
 
 from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import AGAIN
-from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.run_folder import PICTURES, RunEvent, RunFolder
 from executor.recording.tables import CycleTable, PoseTable
 from model.errors import BadInput
 from model.pages.page import prose
@@ -68,6 +68,18 @@ def _require_agreement(run: RunData) -> None:
             why="files of different runs are mixed",
             next_step=AGAIN,
         )
+
+
+def missing_images(folder: RunFolder) -> str:
+    """States how many images are missing of those that the run kept; empty for none.
+
+    Raises:
+        BadInput: A table of poses is missing or was changed.
+    """
+    tables = (folder.poses(), *folder.poses_by_camera().values())
+    kept = {name for table in tables for name in table.picture if name}
+    missing = sum(not folder.has_picture(name) for name in kept)
+    return f"images missing from {PICTURES}/: {missing} of {len(kept)}" if missing else ""
 
 
 # Markdown of the pages about faults.

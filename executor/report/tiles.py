@@ -11,9 +11,9 @@ import numpy as np
 from drivers.cameras.live import is_too_large
 from executor.recording.tables import PoseTable
 from executor.recording.verdict import faults_among, page_of, page_text
-from executor.report.run_data import RunData, markdown
+from executor.report.run_data import RunData, markdown, missing_images
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
-from model.pages.page import known, list_table, prose, table, tile, tiles
+from model.pages.page import known, list_table, paragraph, prose, table, tile, tiles
 from model.scene import legs_of
 from tracking.clearance import INTERVAL
 
@@ -322,13 +322,16 @@ _QUALITY = 80
 
 
 def frames(run: RunData) -> str:
-    """Up to six images, evenly spread over the kept ones; empty without images."""
-    kept = [i for i, name in enumerate(run.poses.picture) if name]
+    """Up to six images, evenly spread over the kept ones, and how many are missing."""
+    missing = missing_images(run.folder)
+    note = paragraph(f"{missing[0].upper()}{missing[1:]}.") if missing else ""
+    names = run.poses.picture
+    kept = [i for i, name in enumerate(names) if name and run.folder.has_picture(name)]
     if not kept:
-        return ""
+        return note
     indices = np.unique(np.linspace(0, len(kept) - 1, min(COUNT, len(kept))).astype(int))
     figures = "".join(_figure(run, kept[k]) for k in indices.tolist())
-    return f'<div class="frames">{figures}</div>'
+    return f'{note}<div class="frames">{figures}</div>'
 
 
 def _figure(run: RunData, row: int) -> str:

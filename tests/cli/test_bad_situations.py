@@ -356,7 +356,7 @@ def test_a_report_needs_a_whole_run_folder(tmp_path: Path, finished_run: Path) -
     (broken / "cycles.csv").unlink()
     with nothing_written(tmp_path):
         answer = call("report", broken)
-    one_message(answer, 2, "cycles.csv missing")
+    one_message(answer, 2, "cycles.csv (missing)")
 
 
 @pytest.mark.parametrize("name", ["cycles.csv", "clearance.csv", "poses.csv", "summary.json"])

@@ -32,6 +32,7 @@ from executor.drives import is_simulated
 from executor.evaluation import rewrite_report
 from executor.proposals import MotionProposal
 from executor.recording.run_folder import RunFolder
+from executor.report.run_data import missing_images
 from executor.runner import RunResult
 from model.errors import BadInput
 from model.plan import load_plan
@@ -199,8 +200,11 @@ def report(
       cdpr report runs/first
     """
     folder = RunFolder.open_cut_short(run)
-    with Terminal(quiet=as_json).waiting("writing the report"):
+    terminal = Terminal(quiet=as_json)
+    with terminal.waiting("writing the report"):
         rewrite_report(folder)
+    if missing := missing_images(folder):
+        terminal.remark(missing)
     if as_json:
         show_json(folder.summary())
         return

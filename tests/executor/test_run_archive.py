@@ -1,0 +1,262 @@
+"""A run folder whose files were moved, lost or archived without its images."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+import cdpr
+from executor.evaluation import rewrite_report
+from executor.recording.clearance import ClearanceTable
+from executor.recording.record_files import RunCourse
+from executor.recording.run_folder import RunFolder
+from model.errors import BadInput, Fault
+from tests.cli.program import call, one_message
+from tests.executor import fake_run
+
+KEPT = ("plan.json", "rig.json", "run.json", "events.jsonl", "cycles.csv", "poses.csv")
+
+
+def finished(path: Path, *, camera: bool) -> RunFolder:
+    """A finished run with every file, made by the writers of a run."""
+    run = fake_run.make(rate_hz=2.0, every=20, camera=camera)
+    folder = fake_run.write(run, path, pictures=camera)
+    cycles = len(run.cycles)
+    folder.write_course(
+        RunCourse(run.context.started, "virtual", True, True, "finished", "", cycles)
+    )
+    rewrite_report(RunFolder.open_cut_short(path))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return finished(tmp_path_factory.mktemp("filmed") / "run", camera=True)
+
+
+@pytest.fixture(scope="module")
+def blind(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return finished(tmp_path_factory.mktemp("blind") / "run", camera=False)
+
+
+def without(folder: RunFolder, path: Path, *names: str) -> RunFolder:
+    """A copy in which files or folders are missing."""
+    shutil.copytree(folder.path, path)
+    for name in names:
+        target = path / name
+        shutil.rmtree(target) if target.is_dir() else target.unlink()
+    return RunFolder(path)
+
+
+def assert_checksums_hold(folder: Path) -> None:
+    lines = (folder / "SHA256SUMS").read_text().splitlines()
+    stated = {name: digest for digest, name in (line.split("  ") for line in lines)}
+    assert {*KEPT, "clearance.csv", "fused.csv", "run.mcap", "summary.json"} <= stated.keys()
+    for name, digest in stated.items():
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest, name
+
+
+def images_in_mcap(path: Path) -> int:
+    with path.open("rb") as stream:
+        return sum(1 for _ in make_reader(stream).iter_messages(topics=["/pictures"]))
+
+
+# Images.
+
+
+@pytest.mark.parametrize("others", [(), ("report.html",), ("report.html", "fused.csv", "run.mcap")])
+@pytest.mark.parametrize("lost", [1, 3, None])
+def test_an_archive_without_images_has_a_report_with_one_remark(
+    filmed: RunFolder, tmp_path: Path, others: tuple[str, ...], lost: int | None
+) -> None:
+    names = [name for name in filmed.poses().picture if name]
+    gone = names[:lost]
+    folder = without(filmed, tmp_path / "run", *others, *(gone if lost else ["pictures"]))
+    answer = call("report", folder.path)
+    assert answer.code == 0, answer
+    words = f"images missing from pictures/: {len(gone)} of {len(names)}"
+    assert answer.err.count("remark") == 1
+    assert words in answer.err
+    page = folder.report.read_text(encoding="utf-8")
+    assert words[1:] in page
+    assert page.count("data:image/jpeg") == min(6, len(names) - len(gone))
+    assert 'src="data:image/jpeg;base64,"' not in page
+    left = len(names) if "run.mcap" not in others else len(names) - len(gone)
+    assert images_in_mcap(folder.mcap) == left
+    assert_checksums_hold(folder.path)
+    assert json.loads(call("report", folder.path, "--json").out) == filmed.summary()
+
+
+def test_a_run_with_all_its_images_is_reported_without_a_remark(filmed: RunFolder) -> None:
+    answer = call("report", filmed.path)
+    assert (answer.code, answer.err) == (0, "")
+    assert "missing from" not in filmed.report.read_text(encoding="utf-8")
+
+
+# What could not be written, and why.
+
+
+def test_a_file_that_cannot_be_read_is_named_where_others_are_made_from_it(
+    filmed: RunFolder, tmp_path: Path
+) -> None:
+    folder = without(filmed, tmp_path / "run", "run.mcap")
+    path = folder.path / "poses.csv"
+    name = next(name for name in filmed.poses().picture if name)
+    path.write_text(path.read_text().replace(name, "rig.json", 1))  # outside of the images
+    (folder.path / "SHA256SUMS").unlink()
+    with pytest.raises(Fault) as caught:
+        rewrite_report(RunFolder.open_cut_short(folder.path))
+    assert "run.mcap" in caught.value.what
+    assert str(folder.path / "rig.json") in caught.value.why
+    assert "writable" not in caught.value.next_step
+
+
+def test_a_full_disk_is_named_with_what_to_do(
+    blind: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(**_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    folder = without(blind, tmp_path / "run", "fused.csv")
+    monkeypatch.setattr("model.files.documents.tempfile.mkstemp", full)
+    with pytest.raises(Fault) as caught:
+        rewrite_report(RunFolder.open_cut_short(folder.path))
+    assert caught.value.why == "fused.csv: No space left on device"
+    assert caught.value.next_step == "make the folder writable, or free some space"
+
+
+# Missing tables.
+
+
+READERS: tuple[Callable[[Path], object], ...] = (cdpr.load_run, cdpr.report, RunFolder.open)
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_a_listed_file_that_nothing_replaces_is_named_wherever_a_run_is_read(
+    filmed: RunFolder, tmp_path: Path, name: str
+) -> None:
+    for number, others in enumerate([(), ("summary.json",), ("report.html", "fused.csv")]):
+        folder = without(filmed, tmp_path / str(number), name, *others)
+        before = {path.name for path in folder.path.iterdir()}
+        for read in READERS:
+            with pytest.raises(BadInput, match=rf"{re.escape(name)} \(missing\)") as caught:
+                read(folder.path)
+            assert "restore the file from a copy" in caught.value.next_step
+        assert {path.name for path in folder.path.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", ["cycles.csv", "poses.csv"])
+def test_advice_for_a_missing_table_without_checksums_is_not_the_same_command(
+    filmed: RunFolder, tmp_path: Path, name: str
+) -> None:
+    folder = without(filmed, tmp_path / "run", name, "SHA256SUMS")
+    answer = call("report", folder.path)
+    one_message(answer, 2, f"{name} missing", "restore the file from a copy")
+    assert "cdpr report" not in answer.err
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [("clearance.csv",), ("summary.json",), ("clearance.csv", "summary.json", "run.mcap")],
+)
+def test_what_is_made_from_the_record_is_made_again_with_the_same_verdict(
+    blind: RunFolder, tmp_path: Path, lost: tuple[str, ...]
+) -> None:
+    folder = without(blind, tmp_path / "run", *lost)
+    with pytest.raises(BadInput, match="incomplete run folder") as caught:
+        cdpr.load_run(folder.path)
+    assert f"cdpr report {folder.path}" in caught.value.next_step
+    assert call("report", folder.path).code == 0
+    assert_checksums_hold(folder.path)
+    assert cdpr.load_run(folder.path).verdict == blind.summary()["verdict"] == "PASSED"
+    if "summary.json" not in lost:
+        assert folder.summary() == blind.summary()
+    assert call("report", folder.path).code == 0
+
+
+def test_a_clearance_made_again_is_that_of_the_encoders(blind: RunFolder, tmp_path: Path) -> None:
+    once = without(blind, tmp_path / "once", "clearance.csv")
+    rewrite_report(RunFolder.open_cut_short(once.path))
+    table, cycles = once.clearance(), once.cycles()
+    assert {*table.source} == {"encoder"}
+    assert table.obstacles == blind.clearance().obstacles
+    assert np.isin(np.round(table.time, 6), np.round(cycles.time, 6)).all()
+
+
+@pytest.mark.parametrize("others", [(), ("SHA256SUMS",), ("summary.json",)])
+def test_a_clearance_that_cameras_measured_is_not_replaced_by_that_of_the_encoders(
+    filmed: RunFolder, tmp_path: Path, others: tuple[str, ...]
+) -> None:
+    """As long as the folder shows that the run had it."""
+    folder = without(filmed, tmp_path / "run", "clearance.csv", *others)
+    before = {path.name for path in folder.path.iterdir()}
+    answer = call("report", folder.path)
+    one_message(answer, 2, "clearance.csv", "cameras measured", "restore the file from a copy")
+    assert {path.name for path in folder.path.iterdir()} == before
+
+
+def test_a_run_of_an_earlier_version_needs_neither_its_course_nor_checksums(
+    filmed: RunFolder, tmp_path: Path
+) -> None:
+    folder = without(filmed, tmp_path / "run", "run.json", "SHA256SUMS", "fused.csv")
+    assert call("report", folder.path).code == 0
+    assert cdpr.load_run(folder.path).passed
+
+
+# Columns of obstacles.
+
+NAMES = st.builds(
+    "".join,
+    st.lists(
+        st.sampled_from(
+            ["planned_", "distance", "at_most", "uncertainty", "wall", "_mm", " (obstacle 2)"]
+        ),
+        min_size=1,
+        max_size=4,
+    ),
+)
+
+
+@given(names=st.lists(NAMES, min_size=1, max_size=5, unique=True))
+def test_no_two_columns_have_one_name_whatever_obstacles_are_called(
+    tmp_path_factory: pytest.TempPathFactory, names: list[str]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "clearance.csv"
+    one, near = np.array([1.0]), np.arange(2.0, 2.0 + len(names))[None]
+    table = ClearanceTable(
+        one, ("tag",), one, one, one, ("b",), (names[0],), one, tuple(names), near, -near
+    )
+    table.write_csv(path)
+    with path.open(newline="") as stream:
+        header = next(csv.reader(stream))
+        (row,) = csv.DictReader(stream, fieldnames=header)
+    assert len({*header}) == len(header)
+    assert [row[name] for name in header[2:5]] == ["1000.000000"] * 3
+    read = ClearanceTable.read_csv(path)
+    assert read.obstacles == table.obstacles
+    np.testing.assert_array_equal(read.distances, near)
+    np.testing.assert_array_equal(read.planned_distances, -near)
+
+
+@given(names=st.lists(st.sampled_from("abcdefgh"), min_size=1, unique=True))
+def test_usual_obstacles_give_their_names_to_their_columns(
+    tmp_path_factory: pytest.TempPathFactory, names: list[str]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "usual.csv"
+    none, nowhere = np.empty(0), np.empty((0, len(names)))
+    ClearanceTable(
+        none, (), none, none, none, (), (), none, tuple(names), nowhere, nowhere
+    ).write_csv(path)
+    header = path.read_text().strip().split(",")
+    assert header[8:] == [part for name in names for part in (f"{name}_mm", f"planned_{name}_mm")]
