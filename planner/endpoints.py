@@ -230,11 +230,24 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
             why="they act in too few directions: the structure matrix has not full rank there",
             next_step=f"move the {name}, or change the rig's outlets and anchors",
         )
+    values: dict[str, float | str] = {"margin_n": margin, "required_n": reserve}
+    if margin >= 0.0:
+        raise BadInput(
+            f"at the {name} the cables can hold the platform, but the capacity margin is"
+            f" {margin:.2f} N, less than the planner's reserve of {reserve:.2f} N",
+            where=f"scene {name}",
+            why=f"with less than {MARGIN_RESERVE:.1%} of max_tension_n, wrench feasibility between"
+            " poses is seldom proved",
+            next_step=f"move the {name} to a larger margin (`cdpr workspace` maps it), lower the"
+            " load, widen the tension limits, or give waypoints to `cdpr.plan_from_waypoints`,"
+            " which keeps no reserve",
+            values=values,
+        )
     raise BadInput(
         f"at the {name} the cables cannot hold the platform: the capacity margin is"
         f" {margin:.2f} N, required {reserve:.2f} N",
         where=f"scene {name}",
         why="weight, payload and disturbances need tensions outside min_tension_n..max_tension_n",
         next_step=f"move the {name} inward, lower the load, or widen the tension limits",
-        values={"margin_n": margin, "required_n": reserve},
+        values=values,
     )

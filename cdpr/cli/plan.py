@@ -26,14 +26,17 @@ from executor.recording.resume import passing, scene_after
 from model.errors import BadInput
 from model.files.documents import millimetres
 from model.files.output import require_new_file
+from model.files.plan_file import OptimalPlannerDocument, PlanDocument
 from model.files.scene_file import StopDocument
 from model.plan import plan_as_dict, plan_facts, save_plan
 from model.pose import Pose
 from model.rig import load_rig
 from model.scene import load_scene
+from planner.path import LEAST_ROUNDS_WITH_LIMIT
 from planner.planning import plan_path
 from planner.rrt.variants import ConeDraw, FailureRate, Focus, Steer
 from planner.settings import (
+    LEAST_ROUNDS,
     OBJECTIVES,
     Mode,
     Objective,
@@ -148,8 +151,21 @@ def plan(
     file = quote(str(output))
     run_it = f"cdpr run {file} --rig {quote(str(rig))}{more} -o RUNDIR"
     next_step = f"cdpr check {file}, then {run_it}"
-    facts = [*begun, *plan_facts(document), ("next", next_step)]
+    facts = [*begun, *plan_facts(document), *_least_rounds(document), ("next", next_step)]
     present(as_json, {"plan": str(output), **plan_as_dict(document)}, f"plan {output}", facts)
+
+
+def _least_rounds(document: PlanDocument) -> list[tuple[str, str]]:
+    """One line where the budget was spent before the least number of rounds was done."""
+    planner, spent = document.planner, (document.statistics.search_time_s or 0.0) * 1e3
+    if not isinstance(planner, OptimalPlannerDocument) or planner.budget_ms is None:
+        return []
+    least = LEAST_ROUNDS if planner.longest_mm is None else LEAST_ROUNDS_WITH_LIMIT
+    legs = len(planner.rounds)
+    if min(planner.rounds) > least or spent < planner.budget_ms * legs:
+        return []
+    wanted = math.ceil(spent / legs / 10.0) * 100
+    return [("rounds", f"only the minimum; --budget-ms {wanted} allows about ten times as many")]
 
 
 def _weights(texts: Sequence[str]) -> dict[str, float]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from model.scene import Scene
+from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 from planner.workspace.compute import Maps
 from planner.workspace.figures import (
     SETTINGS,
@@ -68,7 +69,9 @@ def _lead(question: Question) -> str:
     rotated = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform rotated"
     return (
         f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
-        f" {question.length * 1e3:.1f} mm in the condition number{rotated}."
+        f" {question.length * 1e3:.1f} mm in the condition number{rotated}. At start, stops and"
+        f" goal `cdpr plan` keeps {CLEARANCE_RESERVE * 1e3:g} mm and a capacity margin of"
+        f" {MARGIN_RESERVE * rig.max_tension:.3g} N beyond what is mapped as allowed."
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -69,3 +70,14 @@ def test_a_limit_that_no_path_keeps_is_one_message_and_no_file(tmp_path: Path) -
         limit = ("--longest-mm", "600", "--rounds", "10")
         answer = call("plan", RIG, SCENE, "-o", tmp_path / "plan.json", *limit)
     one_message(answer, 1, "600.0 mm", "--cost length")
+
+
+def test_a_budget_that_only_the_least_rounds_exceed_is_reported(tmp_path: Path) -> None:
+    scarce = call("plan", RIG, SCENE, "-o", tmp_path / "a.json", "--budget-ms", "0.01")
+    wanted = re.search(r"only the minimum; --budget-ms (\d+) ", scarce.said)
+    assert wanted is not None, scarce
+    for longer in (["--budget-ms", "1000"], ["--rounds", "12"]):
+        answer = call("plan", RIG, SCENE, "-o", tmp_path / f"{longer[0]}.json", *longer)
+        assert answer.code == 0, answer
+        assert "only the minimum" not in answer.said
+    assert json.loads((tmp_path / "a.json").read_text())["planner"]["rounds"] == [12]

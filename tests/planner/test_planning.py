@@ -18,9 +18,15 @@ from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Rig, rig_from_document
 from model.scene import empty_scene
 from planner.check import verify
+from planner.costs import capacity_margins
 from planner.endpoints import require_usable_ends
-from planner.planning import make_plan
-from planner.settings import CLEARANCE_RESERVE, PlannerSettings
+from planner.planning import make_plan, plan_from_waypoints
+from planner.settings import (
+    CLEARANCE_RESERVE,
+    MARGIN_RESERVE,
+    OptimalSettings,
+    PlannerSettings,
+)
 
 QUICK = PlannerSettings(mode="paper")
 
@@ -170,6 +176,27 @@ def test_a_start_nearer_than_the_clearance_asked_for_states_both_figures(
 def test_a_load_too_heavy_for_the_cables_is_bad_input(gachon, scene_with) -> None:
     with pytest.raises(BadInput, match="cannot hold the platform"):
         make_plan(gachon, scene_with(load={"payload_kg": 60.0}), QUICK)
+
+
+def test_an_end_that_only_lacks_the_reserve_is_not_called_infeasible(gachon, scene_with) -> None:
+    """The check accepts such a path: tensions within the limits exist."""
+    reserve, low, high = MARGIN_RESERVE * gachon.max_tension, 0.0, 60.0
+    ends = {"goal": {"position_mm": [0.0, 0.0, 446.0]}}
+    margin = -np.inf
+    while not 0.2 * reserve < margin < 0.8 * reserve:
+        payload = (low + high) / 2.0
+        scene = scene_with(load={"payload_kg": payload}, **ends)
+        margin = capacity_margins(gachon, scene, scene.start.position[None, :], np.eye(3))[0]
+        low, high = (payload, high) if margin > 0.8 * reserve else (low, payload)
+    with pytest.raises(BadInput, match="start the cables can hold the platform") as caught:
+        make_plan(gachon, scene, OptimalSettings())
+    assert (
+        f"{margin:.2f} N, less than the planner's reserve of {reserve:.2f} N" in caught.value.what
+    )
+    assert caught.value.values == pytest.approx({"margin_n": margin, "required_n": reserve})
+    assert "outside" not in caught.value.why
+    own = plan_from_waypoints(gachon, scene, [scene.start, scene.goal])
+    assert verify(own).report.proved_capacity_margin >= 0.0
 
 
 def test_cables_that_act_in_too_few_directions_are_named(
