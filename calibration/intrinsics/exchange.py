@@ -26,25 +26,21 @@ from model.cameras import camera_from
 from model.errors import BadInput
 from model.files.camera_file import FISHEYE, CameraDocument
 from model.files.documents import read_text, read_yaml, write_atomic
+from model.files.validation import parse_yaml
 from model.pose import Array, rotation_vector_from_matrix
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
 
-_ROS_MODELS = {"plumb_bob": ("pinhole", 5), "rational_polynomial": ("pinhole", 8)}
-_ROS_FISHEYE = ("equidistant", "fisheye")
 _MODELS = {
-    **dict.fromkeys(("plumb_bob", "rational_polynomial", "radial-tangential", "radtan"), "pinhole"),
-    **dict.fromkeys(_ROS_FISHEYE, FISHEYE),
+    "plumb_bob": ("pinhole", 5),
+    "rational_polynomial": ("pinhole", 8),
+    **dict.fromkeys(("radial-tangential", "radtan"), ("pinhole", 4)),
+    **dict.fromkeys(("equidistant", "fisheye"), (FISHEYE, 4)),
 }
-"""Our lens by the `distortion_model` of ROS's and EuRoC's files."""
-_KALIBR_MODELS = {"radtan": ("pinhole", 4), "equidistant": ("fisheye", 4), "none": ("pinhole", 0)}
-_MRCAL_MODELS = {
-    "LENSMODEL_PINHOLE": 0,
-    "LENSMODEL_OPENCV4": 4,
-    "LENSMODEL_OPENCV5": 5,
-    "LENSMODEL_OPENCV8": 8,
-    "LENSMODEL_OPENCV12": 12,
-}
+"""Our lens and its coefficients by the `distortion_model` of ROS's and EuRoC's files."""
+_KALIBR_MODELS = {"radtan": ("pinhole", 4), "equidistant": (FISHEYE, 4), "none": ("pinhole", 0)}
+_MRCAL_MODELS = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}
+_ANY = ("pinhole", 14)  # without a model: as many coefficients as OpenCV has
 _SMALL, _TEXT_LIMIT = 1_000_000, 32_000_000
 """Largest files in characters, OpenCV's and any; mrcal's may include all corners."""
 _BAD_NUMBERS = (TypeError, ValueError, OverflowError, RecursionError, AttributeError)
@@ -82,10 +78,8 @@ def ros_text(camera: CameraDocument) -> str:
     """
     lens = [*camera.distortion, *([0.0] * (5 - len(camera.distortion)))]
     if camera.lens == FISHEYE:
-        model, lens = _ROS_FISHEYE[0], list(camera.distortion)
-    elif len(lens) in (5, 8):
-        model = next(name for name, (_, count) in _ROS_MODELS.items() if count == len(lens))
-    else:
+        model, lens = "equidistant", list(camera.distortion)
+    elif not (model := {5: "plumb_bob", 8: "rational_polynomial"}.get(len(lens), "")):
         raise BadInput(
             f"ROS has no lens model with {len(lens)} coefficients",
             where=f"camera {camera.name}",
@@ -197,9 +191,8 @@ def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None
 def _with_lens(camera: CameraDocument, found: Mapping[str, Any], path: Path) -> CameraDocument:
     errors = ("lens_covariance", "pose_by_lens", "pose_covariance", "error_mm")
     kept = {k: v for k, v in camera.model_dump(mode="json").items() if k not in errors}
-    plain = kept | {key: found[key] for key in _KEYS}
     try:
-        return CameraDocument.model_validate(plain)
+        return CameraDocument.model_validate(kept | {key: found[key] for key in _KEYS})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
@@ -208,11 +201,10 @@ def _with_lens(camera: CameraDocument, found: Mapping[str, Any], path: Path) -> 
 
 def _remarks(camera: CameraDocument, found: Mapping[str, Any], path: Path) -> list[str]:
     """What is assumed about a file, and what remains to be done after its import."""
-    remarks = []
-    if found["assumed"]:
-        remarks.append(f"{path.name} states no distortion_model; plumb_bob is assumed, as by ROS")
     what = f"the pose of camera {camera.name!r} was found with another lens"
-    remarks.append(f"{what}; calibrate it with `cdpr calibrate extrinsics`")
+    remarks = [f"{what}; calibrate it with `cdpr calibrate extrinsics`"]
+    if found["assumed"]:
+        remarks.insert(0, f"{path.name} has no distortion_model; plumb_bob is assumed, as by ROS")
     if camera.error_mm is not None:
         what = f"error_mm, {camera.error_mm:g}, was stated for another lens and is left out"
         remarks.append(f"{what}; state it again before clearance is measured")
@@ -237,19 +229,30 @@ def _found(path: Path, entry: str | None) -> dict[str, Any]:
 
 def _content(text: str, path: Path) -> tuple[Mapping[Any, Any], bool]:
     """The keys of a YAML, JSON or XML file, and whether OpenCV has written it."""
-    if not text.lstrip().startswith(("%YAML", "<?xml")) and "!!opencv-matrix" not in text:
-        plain = read_yaml(path).data
-        if not isinstance(plain, Mapping):
-            raise _unusable(path, "it has no keys")
-        matrix = plain.get("camera_matrix")
-        return plain, isinstance(matrix, Mapping) and "type_id" in matrix
-    if len(text) > _SMALL:
+    is_opencv = text.lstrip().startswith(("%YAML", "<?xml")) or "!!opencv-matrix" in text
+    if is_opencv and len(text) > _SMALL:
         raise _unusable(path, f"it is longer than {_SMALL} characters")
+    reader = _opencv_xml if text.lstrip().startswith("<") else _opencv_yaml
     try:
-        return (_opencv_xml(text) if text.lstrip().startswith("<") else _opencv_yaml(text)), True
+        plain = reader(text) if is_opencv else _message(text, path)
     except (*_BAD_NUMBERS, LookupError, yaml.YAMLError, ElementTree.ParseError) as error:
-        what = " ".join(str(error).split())
-        raise _unusable(path, f"it is damaged: {what}"[:200]) from None
+        raise _unusable(path, f"it is damaged: {' '.join(str(error).split())}"[:200]) from None
+    if not isinstance(plain, Mapping):
+        raise _unusable(path, "it has no keys")
+    matrix = plain.get("camera_matrix")
+    return plain, is_opencv or (isinstance(matrix, Mapping) and "type_id" in matrix)
+
+
+def _message(text: str, path: Path) -> Any:
+    """The data of a YAML file, or of messages that agree, as `ros2 topic echo` prints them."""
+    parts = text.rstrip().removesuffix("\n---").split("\n---\n")
+    if len(parts) == 1:
+        return read_yaml(path).data
+    messages = [plain for part in parts if (plain := parse_yaml(part + "\n").data) is not None]
+    alike = [m | {"header": None} if isinstance(m, dict) else m for m in messages]  # has the time
+    if any(message != alike[0] for message in alike):
+        raise _unusable(path, f"it has {len(alike)} messages that differ; keep one of them")
+    return messages[0]
 
 
 def write_rig_with_camera(
@@ -294,14 +297,10 @@ def _ros_matrix(values: np.ndarray[Any, Any]) -> dict[str, Any]:
     return {"rows": rows, "cols": columns, "data": [float(x) for x in values.ravel()]}
 
 
-def _opencv_yaml(text: str) -> Mapping[str, Any]:
+def _opencv_yaml(text: str) -> Any:
     """Parses without OpenCV, whose own reader crashes on damaged files."""
     body = text.lstrip().replace("!!opencv-matrix", "")
-    body = body.partition("\n")[2] if body.startswith("%") else body
-    plain = yaml.safe_load(body)
-    if not isinstance(plain, Mapping):
-        raise ValueError("it has no keys")
-    return plain
+    return yaml.safe_load(body.partition("\n")[2] if body.startswith("%") else body)
 
 
 def _opencv_xml(text: str) -> Mapping[str, Any]:
@@ -328,12 +327,16 @@ def _from_keys(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> dict[str
             raise _unusable(path, f"its camera_model is {model!r}; pinhole can be read")
     else:
         raise _unusable(path, "it has none of the keys camera_matrix, K, intrinsics, cam0")
-    kind, is_assumed = _lens_of(keys, path, is_opencv)
-    return _numbers(path, size, matrix, _at(keys, lens, path), kind) | {"assumed": is_assumed}
+    (kind, count), is_assumed = _lens_of(keys, path, is_opencv)
+    numbers = _at(keys, lens, path)
+    if numbers[count:].any():  # some drivers add zeros
+        model = keys.get("distortion_model", kind)
+        raise _unusable(path, f"{model} has {count} coefficients, not {len(numbers)}")
+    return _numbers(path, size, matrix, numbers[:count], kind) | {"assumed": is_assumed}
 
 
-def _lens_of(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> tuple[str, bool]:
-    """Our name of the lens, and whether it is assumed.
+def _lens_of(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> tuple[tuple[str, int], bool]:
+    """Our name of the lens and its coefficients at most, and whether it is assumed.
 
     OpenCV's sample has ``fisheye_model`` or nothing; ROS's reader assumes plumb_bob where a file
     states no model. Source: camera_calibration_parsers, parse_yml.cpp.
@@ -341,25 +344,22 @@ def _lens_of(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> tuple[str,
     stated = keys.get("distortion_model")
     model = _MODELS.get(str(stated).strip())
     if stated is not None and model is None:
-        known = ", ".join(_MODELS)
-        raise _unusable(path, f"its distortion_model is {stated!r}; {known} can be read")
+        raise _unusable(path, f"distortion_model is {stated!r}; {', '.join(_MODELS)} can be read")
     if "fisheye_model" in keys:
-        own = FISHEYE if _at(keys, "fisheye_model", path).any() else "pinhole"
-        if model not in (None, own):
+        own = _MODELS["fisheye"] if _at(keys, "fisheye_model", path).any() else _ANY
+        if model is not None and model[0] != own[0]:
             raise _unusable(path, f"distortion_model {stated!r} contradicts its fisheye_model")
-        return own, False
+        return model or own, False
     if model is None and "camera_matrix" not in keys:
         raise _unusable(path, f"distortion_model is missing: one of {', '.join(_MODELS)}")
-    return model or "pinhole", model is None and not is_opencv
+    return model or _ANY, model is None and not is_opencv
 
 
 def _at(keys: Mapping[Any, Any], key: str, path: Path, where: str = "") -> Array:
     """The numbers of a key: one, a list, or the data of a matrix, shape (n,)."""
     if key not in keys:
         raise _unusable(path, f"{where}{key} is missing: {_FORMS[key]}")
-    node = keys[key]
-    if isinstance(node, Mapping):
-        node = node.get("data")
+    node = keys[key].get("data") if isinstance(keys[key], Mapping) else keys[key]
     try:
         numbers = np.ravel(np.asarray(node, np.float64))
     except _BAD_NUMBERS:
@@ -434,7 +434,6 @@ def _numbers(path: Path, size: Array, matrix: Array, lens: Array, kind: str) -> 
         if abs(matrix[1]) > 1e-9:
             raise _unusable(path, "camera_matrix has a skew, which rig files do not support")
         matrix = matrix[[0, 4, 2, 5]]
-    lens = lens if kind != FISHEYE or lens[4:].any() else lens[:4]  # ROS's T265 adds a 0
     pixels = [int(side) if side.is_integer() else side for side in size.tolist()]
     values = (*pixels, *matrix.tolist(), lens.tolist(), kind)
     return dict(zip(_KEYS, values, strict=True)) | {"assumed": False}

@@ -243,6 +243,13 @@ _ARUCO = {
     for name in dir(cv2.aruco)
     if name.startswith("DICT_") and name.isupper()
 }
+_SMOOTHED, _SMOOTHED_LIMITS = 0.28, (1.0, 8.0)
+"""Smoothing of the brightness around a corner: standard deviation as a share of the distance to the
+nearest marker, and its limits, [px]."""
+_REACH, _STEPS, _SETTLED = 4.0, 8, 0.01
+"""Half width of the window in standard deviations, Newton steps, and the largest last one, [px]."""
+_LEAST_CURVATURE = 1.0
+"""Of a saddle, in squared grey levels; noise has less."""
 DICTIONARIES = tuple(sorted(_ARUCO))
 """Names of the dictionaries of ArUco markers, such as 4X4_50."""
 
@@ -307,11 +314,15 @@ class Charuco:
         )
         if np.size(numbers) < LEAST_POINTS:  # None when nothing is detected
             return None
+        # OpenCV's corners are refined in windows that contain parts of markers.
+        rough = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+        to_markers = rough[:, None] - np.reshape(squares, (-1, 2))
+        better, found = _saddles(image, rough, np.linalg.norm(to_markers, axis=2).min(axis=1))
         points = np.asarray(self._board.getChessboardCorners(), dtype=np.float64)
-        chosen = points[np.ravel(numbers)]
-        if _in_a_line(chosen):
+        chosen = points[np.ravel(numbers)[found]]
+        if len(chosen) < LEAST_POINTS or _in_a_line(chosen):
             return None
-        return DetectedBoard(chosen, np.asarray(corners, dtype=np.float64).reshape(-1, 2), twice)
+        return DetectedBoard(chosen, better[found], twice)
 
     def describe_other(self, image: Image) -> str:
         """OpenCV's other pattern, else tags and markers that the image shows."""
@@ -368,6 +379,43 @@ class Charuco:
     @cached_property
     def _detector(self) -> cv2.aruco.CharucoDetector:
         return cv2.aruco.CharucoDetector(self._board)
+
+
+def _saddles(image: Image, rough: Array, gaps: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Saddle points of the smoothed brightness, by Newton's method.
+
+    Squares and their blur are point-symmetric about a corner, so neither blur nor smoothing moves
+    its saddle point, as long as the smoothing does not reach the markers.
+
+    Args:
+        image: Grey image.
+        rough: Approximate corners, shape (n, 2), [px].
+        gaps: Distance from each to the nearest marker, shape (n,), [px].
+
+    Returns:
+        The points, shape (n, 2), [px], and whether each is a saddle nearer than the marker, (n,).
+    """
+    widths = np.clip(_SMOOTHED * gaps, *_SMOOTHED_LIMITS)[:, None]
+    window = np.arange(-(reach := int(np.ceil(_REACH * widths.max()))), reach + 1)
+    last = np.array(image.shape[::-1])[:, None] - 1
+    found = rough
+    for _ in range(_STEPS):
+        pixels = np.round(found).astype(int)[:, :, None] + window
+        x, y = np.clip(pixels, 0, last).transpose(1, 0, 2)
+        brightness = image[y[:, :, None], x[:, None, :]].astype(np.float64)
+        apart = (pixels - found[:, :, None]) / widths[:, None]
+        weight = np.exp(-(apart**2) / 2.0)
+        weight /= weight.sum(axis=2, keepdims=True)
+        orders = np.stack([weight, weight * apart, weight * (apart**2 - 1.0)])
+        by_x, by_y = orders.transpose(2, 1, 0, 3)
+        # Derivatives, in widths: rows by y and columns by x, of the orders 0 to 2.
+        slopes = by_y @ brightness @ by_x.transpose(0, 2, 1)
+        x, y, xx, xy, yy = (slopes[:, *at] for at in ((0, 1), (1, 0), (0, 2), (1, 1), (2, 0)))
+        curvature = np.minimum(xx * yy - xy**2, -_LEAST_CURVATURE)
+        step = np.column_stack([xy * y - yy * x, xy * x - xx * y]) / curvature[:, None] * widths
+        found = np.clip(found + step, rough - gaps[:, None], rough + gaps[:, None])
+    is_saddle = (np.abs(step).max(axis=1) < _SETTLED) & (curvature < -_LEAST_CURVATURE)
+    return found, is_saddle
 
 
 def _in_a_line(points: Array) -> bool:

@@ -100,6 +100,15 @@ ROS_OLD = PLAIN.replace(
     "{rows: 1, cols: 5, data: [-0.28, 0.07, 0.0002, 0.00002, 0.5]}",
 )
 T265 = ROS_OLD.replace("0.5]", "0.0]") + "distortion_model: equidistant\n"
+MESSAGE = """header: {stamp: {sec: 1, nanosec: 2}, frame_id: cam}
+height: 480
+width: 752
+distortion_model: plumb_bob
+d: [-0.28, 0.07, 0.0002, 0.00002, 0.5]
+k: [461.5, 0.0, 362.5, 0.0, 460.25, 246.0, 0.0, 0.0, 1.0]
+---
+"""
+LATER = MESSAGE.replace("sec: 1", "sec: 3")
 FOREIGN = {
     "equidistant": ("%YAML:1.0\n---\n" + CAMERA.replace("MODEL", "equidistant"), "fisheye", FOUR),
     "fisheye": ("%YAML:1.0\n---\n" + CAMERA.replace("MODEL", "fisheye"), "fisheye", FOUR),
@@ -112,6 +121,10 @@ FOREIGN = {
     "a fisheye with a fifth 0": (T265, "fisheye", FOUR),
     "a flat list": (PLAIN + "distortion_model: plumb_bob\n", "pinhole", FIVE),
     "EuRoC": (EUROC, "pinhole", FOUR),
+    "a message": (MESSAGE, "pinhole", FIVE),
+    "three messages": (MESSAGE + LATER + MESSAGE, "pinhole", FIVE),
+    "a comment before": ("# from the lab\n---\n" + MESSAGE, "pinhole", FIVE),
+    "plumb_bob with zeros": (MESSAGE.replace("0.5]", "0.5, 0, 0, 0.0]"), "pinhole", FIVE),
 }
 """Files as other programs write them, with our lens and its coefficients."""
 
@@ -132,7 +145,7 @@ def test_files_are_read_as_other_programs_write_them(rig, tmp_path, name: str) -
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        (CAMERA.replace("MODEL", "omnidirectional"), "its distortion_model is 'omnidirectional'; "),
+        (CAMERA.replace("MODEL", "omnidirectional"), "distortion_model is 'omnidirectional'; "),
         (CAMERA.replace("MODEL", "plumb_bob") + "fisheye_model: 1\n", "contradicts its fisheye_"),
         (PLAIN.replace("distortion_co", "co"), "distortion_coefficients is missing: a list of num"),
         (PLAIN.replace("[-0.28, 0.07", "[a, b"), "distortion_coefficients is not a list of num"),
@@ -143,6 +156,12 @@ def test_files_are_read_as_other_programs_write_them(rig, tmp_path, name: str) -
         (EUROC.replace("distortion_model", "model"), "distortion_model is missing: one of plumb_"),
         (OPENVINS.replace("intrinsics", "k"), "cam0: intrinsics is missing: fx, fy, cx, cy"),
         ("K: {data: 3}\nwidth: 3\nheight: 4\nroi: [1]\nd: []", "distortion_model is missing"),
+        (MESSAGE + LATER.replace("752", "640"), "it has 2 messages that differ; keep one"),
+        (MESSAGE + "height: [\n", "it is damaged: not valid"),
+        (MESSAGE + "height\n", "it has 2 messages that differ"),
+        (MESSAGE.replace("0.5]", "0, 0, 0, 0.1]"), "plumb_bob has 5 coefficients, not 8"),
+        (T265.replace("0.0]", "0.1]"), "equidistant has 4 coefficients, not 5"),
+        (EUROC.replace("0.00002]", "0.00002, 0.1]"), "radial-tangential has 4 coefficients, not 5"),
         ("sensor_type: imu\n", "it has none of the keys camera_matrix, K, intrinsics, cam0"),
         ("{'lensmodel': 'LENSMODEL_PINHOLE', 'imagersize': [9, 9]}", "intrinsics is missing: fx"),
     ],
