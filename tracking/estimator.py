@@ -362,16 +362,16 @@ class PlatformEstimator:
     ) -> list[int]:
         """Numbers of tags that are on the platform, but not where its pose puts them.
 
-        A detected one is on the platform if it is near the place of one of its tags: a second print
+        A detected one is on the platform if it is near one of its tags as projected: a second print
         is farther away than a tag's side.
         """
         pose = bundle.camera_from_body
         facing = [t.pose.position for t in self._rig.platform_tags if self._faces(t, pose)]
-        places = project_undistorted(self._camera, pose.apply(np.array(facing).reshape(-1, 3)))
+        centres = project_undistorted(self._camera, pose.apply(np.array(facing).reshape(-1, 3)))
         found = set(bundle.displaced)
         for view in detected:
             seen = view.seen.corners
-            gaps = np.linalg.norm(places - np.mean(seen, axis=0), axis=1)
+            gaps = np.linalg.norm(centres - np.mean(seen, axis=0), axis=1)
             if np.any(gaps < np.linalg.norm(seen[1] - seen[0])):
                 found.add(view.tag.id)
         return sorted(found - {view.tag.id for view in used})
