@@ -22,7 +22,7 @@ from tracking.detection.diagnostics import edge_faults
 from tracking.detection.tags import carries_tag, modules_across, tag_corners
 from tracking.edges.refine import refine
 from tracking.measurement import NoPose, Observation, PoseMeasurement, largest_deviations
-from tracking.pnp import BundlePose, TagView, refine_pnp, solve_pnp, square_poses
+from tracking.pnp import BundlePose, TagView, displaced_tag, fit_inliers, solve_pnp, square_poses
 from tracking.rolling_shutter import FitByRows, RecentMotion, RollingShutter
 from tracking.shared_errors import SharedErrors
 
@@ -148,6 +148,13 @@ UNCERTAIN = "the position's uncertainty is"
 """Message about a pose from edges that are too soft, too few or too far away."""
 UNSHARP = "are too blurred to be measured"
 """Message about tags that are decoded, but whose edges are not found."""
+CONTRADICT = "its tags contradict each other"
+"""Message about tags that are not where the rig file has them."""
+CAUSE = (
+    "compare size_mm (prints are often scaled to the page), id and pose of its tags with the rig"
+    " file"
+)
+"""Likely cause of it."""
 
 
 def rejection_reason(
@@ -156,7 +163,8 @@ def rejection_reason(
     bundle: BundlePose,
     prior: Pose | None,
     measured: int,
-    tag_error_px: float,
+    expected: float,
+    elsewhere: Sequence[int],
 ) -> str:
     """Why a pose is rejected; empty when it is accepted.
 
@@ -167,17 +175,21 @@ def rejection_reason(
         prior: Pose expected from camera measurements, in the same frame; it resolves the ambiguity
             of a single tag.
         measured: Number of edges found on these tags and on those that were left out.
-        tag_error_px: Standard deviation of the tags' corners on the platform, [px].
+        expected: Squared error of an edge with that of the tags on the platform, in variances.
+        elsewhere: Numbers of tags on the platform that are not where the pose puts them.
     """
+    used = ", ".join(str(view.tag.id) for view in views)
+    if len(elsewhere) >= len(views):
+        others = ", ".join(map(str, elsewhere))
+        return f"{CONTRADICT}: {others} against {used}; {CAUSE}"
     left_out = measured - sum(int(view.seen.edges.sum()) for view in views)
-    expected = 1.0 + tag_error_px**2 * float(np.mean(bundle.certainties))
     misfit = bundle.cost / max(1, bundle.freedom) / expected
     some_left_out = left_out > limits.left_out_share * measured
     if misfit > (limits.doubt if some_left_out else limits.contradiction):
         out = f", with {left_out} of {measured} left out" if left_out else ""
         return (
-            f"its tags contradict each other: the misfit of their edges is {misfit:.0f} times the"
-            f" expected one{out}"
+            f"{CONTRADICT}: the misfit of their edges is {misfit:.0f} times the expected one{out};"
+            f" {CAUSE}"
         )
     if bundle.reprojection > limits.reprojection_px:
         return (
@@ -187,7 +199,7 @@ def rejection_reason(
     if len(views) == 1 and bundle.second_best_cost - bundle.cost < limits.single_tag_margin:
         near = prior is not None and prior.angle_to(bundle.camera_from_body) < 0.1
         if not near:
-            return f"only tag {views[0].tag.id} is detected, and it allows two poses"
+            return f"only tag {used} is detected, and it allows two poses"
     largest, _ = largest_deviations(bundle.covariance)
     if not largest <= limits.position_deviation:
         return (
@@ -195,37 +207,6 @@ def rejection_reason(
             f" the limit is {limits.position_deviation * 1e3:g} mm"
         )
     return ""
-
-
-# Outlier edges.
-
-
-#: An edge is an outlier if its error exceeds this many times the median error.
-FAR = 4.5
-
-
-def without_outliers(views: list[TagView], bundle: BundlePose) -> list[TagView] | None:
-    """Views without outlier edges, or None if there are no outliers."""
-    errors = bundle.edge_errors
-    measured = np.array([view.seen.edges for view in views])
-    usual = max(1.0, float(np.median(errors[measured])) / 1.18)  # median of Rayleigh's distribution
-    off = measured & (errors > FAR * usual)
-    if not off.any():
-        return None
-    kept = []
-    for view, wrong in zip(views, off, strict=True):
-        edges = view.seen.edges & ~wrong
-        if edges.sum() < 2:
-            continue
-        keep = np.repeat(edges, 2)
-        seen = replace(
-            view.seen,
-            edges=edges,
-            whitening=read_only(view.seen.whitening * keep[:, None]),
-            target=read_only(view.seen.target * keep),
-        )
-        kept.append(TagView(view.tag, seen))
-    return kept
 
 
 class PlatformEstimator:
@@ -322,15 +303,16 @@ class PlatformEstimator:
             by_rows = self._by_rows.fitted(time, views, start, self._fitted)
             fitted = None if by_rows is None else (by_rows.views, by_rows.bundle)
         if fitted is None:
-            return NoPose(time, "no tag of the platform fits a pose", seen)
+            return NoPose(time, f"no tag of the platform fits a pose; {CAUSE}", seen)
         faced = [v for v in views if self._faces(v.tag, fitted[1].camera_from_body)]
         edges = sum(int(view.seen.edges.sum()) for view in faced)
         views, bundle = fitted
-        stated, likely = self._tag_error_px(bundle)
+        stated = (self._rig.tag_error or 0.0) * self._scale(bundle)
         reprojection = math.hypot(self._settings.reprojection_px, stated)
         limits = replace(self._settings, reprojection_px=reprojection)
-        reason = rejection_reason(limits, views, bundle, prior, edges, likely)
-        reason = reason or self._other_place(detected, views, bundle.camera_from_body)
+        elsewhere = self._elsewhere(detected, views, bundle)
+        likely = self._expected_error(bundle)
+        reason = rejection_reason(limits, views, bundle, prior, edges, likely, elsewhere)
         faults = edge_faults(image, self._camera, [view.seen for view in views], self._modules)
         if reason or faults.unusable:
             return NoPose(time, "; ".join(filter(None, (reason, str(faults)))), seen)
@@ -362,31 +344,37 @@ class PlatformEstimator:
         also = f"; detected instead: {', '.join(map(str, others))}" if others else ""
         return f"no platform tag ({self._rig.tag_family} {wanted}) detected{also}"
 
-    def _tag_error_px(self, bundle: BundlePose) -> tuple[float, float]:
-        """Stated 95 % error of the tags at this distance, and its likely standard deviation, [px].
+    def _scale(self, bundle: BundlePose) -> float:
+        """Pixels per metre at the platform's distance."""
+        distance = float(np.linalg.norm(bundle.camera_from_body.position))
+        return float(self._camera.matrix[0, 0]) / distance
 
-        The likely one is that of a careful print where none is stated.
+    def _expected_error(self, bundle: BundlePose) -> float:
+        """Mean squared error of an edge, in its variances, with the stated error of the tags.
+
+        Where none is stated, that of a careful print.
         """
-        scale = self._camera.matrix[0, 0] / float(np.linalg.norm(bundle.camera_from_body.position))
-        stated = self._rig.tag_error or 0.0
-        return stated * scale, max(stated / Z_95, LIKELY_TAG_ERROR) * scale
+        likely = max((self._rig.tag_error or 0.0) / Z_95, LIKELY_TAG_ERROR) * self._scale(bundle)
+        return 1.0 + likely**2 * float(np.mean(bundle.certainties))
 
-    def _other_place(self, detected: Sequence[TagView], used: Sequence[TagView], pose: Pose) -> str:
-        """Why the pose of a single tag is rejected: another one is near, but not where it puts it.
+    def _elsewhere(
+        self, detected: Sequence[TagView], used: Sequence[TagView], bundle: BundlePose
+    ) -> list[int]:
+        """Numbers of tags that are on the platform, but not where its pose puts them.
 
-        A second print of a tag is farther away than a tag's side.
+        A detected one is on the platform if it is near one of its tags as projected: a second print
+        is farther away than a tag's side.
         """
-        if len(used) > 1:
-            return ""
+        pose = bundle.camera_from_body
+        facing = [t.pose.position for t in self._rig.platform_tags if self._faces(t, pose)]
+        centres = project_undistorted(self._camera, pose.apply(np.array(facing).reshape(-1, 3)))
+        found = set(bundle.displaced)
         for view in detected:
-            if view.tag.id == used[0].tag.id or not self._faces(view.tag, pose):
-                continue
             seen = view.seen.corners
-            side = np.linalg.norm(seen[1] - seen[0])
-            there = project_undistorted(self._camera, pose.apply(tag_corners(view.tag)))
-            if np.linalg.norm(np.mean(there - seen, axis=0)) < side:
-                return f"its tags contradict each other: {used[0].tag.id} and {view.tag.id}"
-        return ""
+            gaps = np.linalg.norm(centres - np.mean(seen, axis=0), axis=1)
+            if np.any(gaps < np.linalg.norm(seen[1] - seen[0])):
+                found.add(view.tag.id)
+        return sorted(found - {view.tag.id for view in used})
 
     def _find_predicted(self, image: Image, pose: Pose, known: set[int]) -> list[TagView]:
         """Tags that the detector missed, searched at their positions predicted by a pose.
@@ -412,17 +400,16 @@ class PlatformEstimator:
         return bool(-camera_from_tag.rotation[:, 2] @ away > np.cos(self._settings.view_angle))
 
     def _fitted(self, views: list[TagView], start: Pose) -> tuple[list[TagView], BundlePose] | None:
-        """The pose from all views, without oblique tags and outlier edges."""
+        """The pose from all views, without oblique and displaced tags and outlier edges."""
         views = [view for view in views if self._faces(view.tag, start)]
-        for _ in range(4):
-            solve = solve_pnp if len(views) == 1 else refine_pnp  # a single tag has a mirror pose
-            bundle = solve(self._camera, views, start) if views else None
-            if bundle is None:
-                return None
-            kept = without_outliers(views, bundle)
-            if kept is None:
-                return views, bundle
-            views, start = kept, bundle.camera_from_body
+        displaced: tuple[int, ...] = ()
+        while views and (fitted := fit_inliers(self._camera, views, start)) is not None:
+            pose, limit = fitted[1].camera_from_body, self._expected_error(fitted[1])
+            worst = displaced_tag(self._camera, views, pose, limit, self._settings.contradiction)
+            if worst is None or len(views) == 1:
+                return fitted[0], replace(fitted[1], displaced=displaced)
+            views = [view for view in views if view is not worst]
+            displaced += (worst.tag.id,)
         return None
 
     def _covariance(self, bundle: BundlePose, views: Sequence[TagView]) -> Array:

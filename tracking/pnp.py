@@ -57,6 +57,7 @@ class BundlePose:
         corner_errors: RMS error of each tag's corners, shape (t,), [px]; of partly hidden tags, of
             the measured edges.
         certainties: Information of each tag's edges, shape (t,), [1/px²].
+        displaced: Numbers of tags left out because they are not where the pose puts them.
     """
 
     camera_from_body: Pose
@@ -67,6 +68,7 @@ class BundlePose:
     edge_errors: Array
     corner_errors: Array
     certainties: Array
+    displaced: tuple[int, ...] = ()
 
     def misfit(self, expected: float) -> float:
         """Ratio of the edges' actual variance to the stated one, from their misfit.
@@ -247,6 +249,81 @@ def square_poses(camera: Camera, view: TagView) -> list[Pose]:
         if np.all(np.isfinite(pose.matrix())):
             poses.append(pose)
     return poses
+
+
+# Outlier edges and displaced tags.
+
+
+#: An edge is an outlier if its error exceeds this many times the median error.
+FAR = 4.5
+#: An intact square is elsewhere if the error of an edge exceeds this many expected deviations. A
+#: rolling shutter in unknown motion causes 9 of them, a size that is 1 % wrong 13 or more.
+ELSEWHERE = 10.0
+
+
+def _without_outliers(views: list[TagView], bundle: BundlePose) -> list[TagView] | None:
+    """Views without outlier edges, or None if there are no outliers."""
+    errors = bundle.edge_errors
+    measured = np.array([view.seen.edges for view in views])
+    usual = max(1.0, float(np.median(errors[measured])) / 1.18)  # median of Rayleigh's distribution
+    off = measured & (errors > FAR * usual)
+    if not off.any():
+        return None
+    kept = []
+    for view, wrong in zip(views, off, strict=True):
+        edges = view.seen.edges & ~wrong
+        if edges.sum() < 2:
+            continue
+        keep = np.repeat(edges, 2)
+        seen = replace(
+            view.seen,
+            edges=edges,
+            whitening=read_only(view.seen.whitening * keep[:, None]),
+            target=read_only(view.seen.target * keep),
+        )
+        kept.append(TagView(view.tag, seen))
+    return kept
+
+
+def fit_inliers(
+    camera: Camera, views: list[TagView], start: Pose
+) -> tuple[list[TagView], BundlePose] | None:
+    """The views without outlier edges and their pose near another; None if nothing fits."""
+    for _ in range(4):
+        solve = solve_pnp if len(views) == 1 else refine_pnp  # a single tag has a mirror pose
+        bundle = solve(camera, views, start) if views else None
+        if bundle is None:
+            return None
+        kept = _without_outliers(views, bundle)
+        if kept is None:
+            return views, bundle
+        views, start = kept, bundle.camera_from_body
+    return None
+
+
+def displaced_tag(
+    camera: Camera, views: Sequence[TagView], pose: Pose, expected: float, contradiction: float
+) -> TagView | None:
+    """The tag with the largest errors whose square is intact, but not where a pose puts it.
+
+    What hides an edge of a tag or is mistaken for one does not leave a square. A tag of another
+    size, number or pose is a square: its edges fit each other at some pose, but not at this one.
+
+    Args:
+        camera: The camera.
+        views: Tags with all their measured edges.
+        pose: ``camera_from_body``.
+        expected: Squared error of an edge, in variances.
+        contradiction: Limit of the misfit of a tag's own edges, in `expected`.
+    """
+    errors = _edge_sizes(_Squares.of(camera, views).errors(pose))
+    off = np.any(errors > ELSEWHERE * np.sqrt(expected), axis=1)
+    for index in map(int, np.argsort(-errors.sum(axis=1))):
+        view = views[index]
+        alone = solve_pnp(camera, [view]) if off[index] else None
+        if alone is not None and alone.cost <= contradiction * expected * max(1, alone.freedom):
+            return view
+    return None
 
 
 def _cross(a: Array, b: Array) -> Array:

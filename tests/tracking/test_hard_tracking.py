@@ -14,6 +14,7 @@ from model.rig import Camera, Rig, Tag
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
+from tracking.camera_model import Image
 from tracking.estimator import TrackerSettings, find_consensus
 from tracking.measurement import NoPose, PoseMeasurement, predict
 from tracking.pnp import TagView
@@ -232,6 +233,64 @@ def test_the_stated_error_of_tags_widens_the_limit_of_their_residuals(
     image = SyntheticCamera(replace(rig, platform_tags=off), scene, camera).render(HERE)
     unstated = Tracker(replace(rig, tag_error=None), camera).observe(image, 0.0)
     assert isinstance(unstated, NoPose)
-    assert "reprojection error" in unstated.reason
+    assert "contradict each other" in unstated.reason
     stated = Tracker(replace(rig, tag_error=2e-3), camera).observe(image, 0.0)
     assert isinstance(stated, PoseMeasurement)
+
+
+def restated(rig: Rig, sizes: dict[int, float]) -> Rig:
+    """The rig with other sizes in its file, [m]."""
+    tags = (replace(tag, size=sizes.get(tag.id, tag.size)) for tag in rig.platform_tags)
+    return replace(rig, platform_tags=tuple(tags))
+
+
+@pytest.fixture(scope="module")
+def sharp(rig: Rig, camera: Camera, empty: Scene) -> list[tuple[Image, Pose]]:
+    """Images of poses at which the camera sees two or three tags."""
+    rng, images = np.random.default_rng(1), []
+    for number in range(12):
+        turn = matrix_from_rotation_vector(rng.normal(size=3) * 0.1)
+        truth = Pose(rng.uniform([-0.2, -0.2, 0.2], [0.2, 0.2, 0.6]), turn)
+        optics = Optics(noise=1.5, blur=(0.6, 0.3, 1.0, 1.5)[number % 4])
+        eye = SyntheticCamera(rig, empty, camera, seed=number, optics=optics)
+        images.append((eye.render(truth, number), truth))
+    return images
+
+
+@pytest.mark.parametrize("stated_mm", [92, 94, 95, 97, 98, 100, 102])
+def test_tags_of_another_size_than_stated_give_no_pose(
+    rig: Rig, camera: Camera, sharp: list[tuple[Image, Pose]], stated_mm: float
+) -> None:
+    """As prints scaled to the page are; a single tag would be measured at another distance."""
+    wrong = restated(rig, {tag.id: stated_mm / 1e3 for tag in rig.platform_tags})
+    for image, _ in sharp:
+        found = Tracker(wrong, camera).observe(image, 0.0)
+        assert isinstance(found, NoPose)
+        assert "compare size_mm" in found.reason
+
+
+@pytest.mark.parametrize("number", [301, 303, 305])
+@pytest.mark.parametrize("stated_mm", [93, 97, 100])
+def test_one_tag_of_another_size_is_left_out_or_gives_no_pose(
+    rig: Rig, camera: Camera, sharp: list[tuple[Image, Pose]], number: int, stated_mm: float
+) -> None:
+    wrong = restated(rig, {number: stated_mm / 1e3})
+    for image, truth in sharp:
+        found = Tracker(wrong, camera).observe(image, 0.0)
+        if isinstance(found, PoseMeasurement):
+            error = error_of(found, truth)
+            assert error @ np.linalg.solve(found.covariance, error) < 35.0  # 6 on average
+        else:
+            assert "compare size_mm" in found.reason
+
+
+@pytest.mark.parametrize("swapped", [(301, 303), (301, 305), (303, 305)])
+def test_tags_whose_numbers_are_swapped_give_no_pose(
+    rig: Rig, camera: Camera, sharp: list[tuple[Image, Pose]], swapped: tuple[int, int]
+) -> None:
+    other = dict([swapped, swapped[::-1]])
+    tags = tuple(replace(tag, id=other.get(tag.id, tag.id)) for tag in rig.platform_tags)
+    for image, _ in sharp:
+        found = Tracker(replace(rig, platform_tags=tags), camera).observe(image, 0.0)
+        assert isinstance(found, NoPose)
+        assert re.search("contradict each other|inconsistent|fits", found.reason)
