@@ -257,7 +257,7 @@ def square_poses(camera: Camera, view: TagView) -> list[Pose]:
 #: An edge is an outlier if its error exceeds this many times the median error.
 FAR = 4.5
 #: An intact square is elsewhere if the error of an edge exceeds this many expected deviations. A
-#: rolling shutter in unknown motion causes 9 of them, a size that is 1 % wrong 13 or more.
+#: rolling shutter in unknown motion causes 9 of them, a size that is 1 % wrong mostly 13 or more.
 ELSEWHERE = 10.0
 
 
