@@ -44,8 +44,6 @@ class Route:
 # bisected towards the smallest value that keeps the limit; the best path within the limit is kept.
 
 
-LEAST_ROUNDS_WITH_LIMIT = 80
-"""Done whatever the clock says: λ changes only every few rounds."""
 _ROUNDS = 6
 """Between changes of λ."""
 _MOST = 64.0

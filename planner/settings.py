@@ -166,8 +166,14 @@ OBJECTIVES = {
 # Anytime searches: objective and budget.
 
 
-LEAST_ROUNDS = 12
-"""Done whatever the clock says, so that a busy machine finds a path too."""
+LEAST_ROUNDS, LEAST_ROUNDS_WITH_LIMIT = 12, 80
+"""Done whatever the clock says, so that a busy machine finds a path too; with a limit of the length
+its price changes only every few rounds."""
+
+
+def least_rounds(has_limit: bool) -> int:
+    """Rounds that a search does at least, with a limit of the length or without."""
+    return LEAST_ROUNDS_WITH_LIMIT if has_limit else LEAST_ROUNDS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

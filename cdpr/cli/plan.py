@@ -32,16 +32,15 @@ from model.plan import plan_as_dict, plan_facts, save_plan
 from model.pose import Pose
 from model.rig import load_rig
 from model.scene import load_scene
-from planner.path import LEAST_ROUNDS_WITH_LIMIT
 from planner.planning import plan_path
 from planner.rrt.variants import ConeDraw, FailureRate, Focus, Steer
 from planner.settings import (
-    LEAST_ROUNDS,
     OBJECTIVES,
     Mode,
     Objective,
     PlannerName,
     PlanningOptions,
+    least_rounds,
     settings_from_options,
 )
 
@@ -160,9 +159,11 @@ def _least_rounds(document: PlanDocument) -> list[tuple[str, str]]:
     planner, spent = document.planner, (document.statistics.search_time_s or 0.0) * 1e3
     if not isinstance(planner, OptimalPlannerDocument) or planner.budget_ms is None:
         return []
-    least = LEAST_ROUNDS if planner.longest_mm is None else LEAST_ROUNDS_WITH_LIMIT
     legs = len(planner.rounds)
-    if min(planner.rounds) > least or spent < planner.budget_ms * legs:
+    if (
+        min(planner.rounds) > least_rounds(has_limit=planner.longest_mm is not None)
+        or spent < planner.budget_ms * legs
+    ):
         return []
     wanted = math.ceil(spent / legs / 10.0) * 100
     return [("rounds", f"only the minimum; --budget-ms {wanted} allows about ten times as many")]

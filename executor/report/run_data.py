@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,13 +71,13 @@ def _require_agreement(run: RunData) -> None:
         )
 
 
-def missing_images(folder: RunFolder) -> str:
+def missing_images(folder: RunFolder, tables: Iterable[PoseTable]) -> str:
     """States how many images are missing of those that the run kept; empty for none.
 
-    Raises:
-        BadInput: A table of poses is missing or was changed.
+    Args:
+        folder: Of the run.
+        tables: Its poses, and those of each of several cameras.
     """
-    tables = (folder.poses(), *folder.poses_by_camera().values())
     kept = {name for table in tables for name in table.picture if name}
     missing = sum(not folder.has_picture(name) for name in kept)
     return f"images missing from {PICTURES}/: {missing} of {len(kept)}" if missing else ""

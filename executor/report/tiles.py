@@ -323,7 +323,7 @@ _QUALITY = 80
 
 def frames(run: RunData) -> str:
     """Up to six images, evenly spread over the kept ones, and how many are missing."""
-    missing = missing_images(run.folder)
+    missing = missing_images(run.folder, (run.poses, *run.alone.values()))
     note = paragraph(f"{missing[0].upper()}{missing[1:]}.") if missing else ""
     names = run.poses.picture
     kept = [i for i, name in enumerate(names) if name and run.folder.has_picture(name)]

@@ -39,8 +39,8 @@ from planner.anytime.random import uniform
 from planner.anytime.state import BEST, KEPT, AnytimeSearch, Handle, new_search
 from planner.costs import KinematicCost
 from planner.kernels.jit import kernel, leaf
-from planner.path import LEAST_ROUNDS_WITH_LIMIT, LengthLimit, Progress, Route
-from planner.settings import LEAST_ROUNDS, OptimalSettings
+from planner.path import LengthLimit, Progress, Route
+from planner.settings import OptimalSettings, least_rounds
 from planner.wrench.translation import edge_held
 
 _TRIALS, _SLOW_TRIALS = 400, 100
@@ -399,7 +399,7 @@ def _is_over(
     problem: PathProblem, settings: OptimalSettings, search: AnytimeSearch, spent: float
 ) -> bool:
     rounds, begun = int(search.totals[0]), int(search.totals[5])
-    least = LEAST_ROUNDS if settings.longest == math.inf else LEAST_ROUNDS_WITH_LIMIT
+    least = least_rounds(has_limit=settings.longest < math.inf)
     if problem.terms[LEAST_MARGIN] == ASK_PROOF:
         least = LEAST_WITH_PROOFS
     return settings.is_over(rounds, spent, begun + least)

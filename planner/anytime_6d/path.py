@@ -25,13 +25,13 @@ from planner.anytime_6d.problem import RotatingProblem, build_objective, move_le
 from planner.collision.world import build_robot, build_world
 from planner.costs import KinematicCost
 from planner.edge_checks import REASONS
-from planner.path import LEAST_ROUNDS_WITH_LIMIT, LengthLimit, Progress, Route
+from planner.path import LengthLimit, Progress, Route
 from planner.settings import (
     CLEARANCE_RESERVE,
-    LEAST_ROUNDS,
     MARGIN_RESERVE,
     TurningSettings,
     Weights,
+    least_rounds,
 )
 from planner.space import PoseSpace
 from planner.wrench.capacity import build_load
@@ -305,7 +305,7 @@ def _apply_limit(limit: LengthLimit, search: RotatingSearch, weights: Weights) -
 def _is_over(settings: TurningSettings, search: RotatingSearch, spent: float) -> bool:
     if settings.weights.is_length and search.cost <= search.shortest * (1.0 + 1e-12):
         return True
-    least = LEAST_ROUNDS if settings.longest == math.inf else LEAST_ROUNDS_WITH_LIMIT
+    least = least_rounds(has_limit=settings.longest < math.inf)
     return settings.is_over(search.rounds, spent, least)
 
 

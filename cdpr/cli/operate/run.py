@@ -203,7 +203,8 @@ def report(
     terminal = Terminal(quiet=as_json)
     with terminal.waiting("writing the report"):
         rewrite_report(folder)
-    if missing := missing_images(folder):
+    tables = (folder.poses(), *folder.poses_by_camera().values())
+    if missing := missing_images(folder, tables):
         terminal.remark(missing)
     if as_json:
         show_json(folder.summary())
