@@ -47,7 +47,7 @@ class Route:
 _ROUNDS = 6
 """Between changes of λ."""
 _MOST = 64.0
-"""λ at which practically only the length counts, in units of the objective."""
+"""λ at which practically only the length counts, for weights of scale 1."""
 
 
 class LengthLimit:

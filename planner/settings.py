@@ -153,6 +153,15 @@ class Weights:
         """Whether only the length counts."""
         return self.kinematic + self.clearance + self.capacity == 0.0
 
+    @property
+    def scale(self) -> float:
+        """The largest weight, where 1 N of margin counts as 1 mm; 1 for the named objectives."""
+        return max(self.length, self.kinematic, self.clearance, self.capacity * 1e3)
+
+    def normalized(self) -> Weights:
+        """The same objective with a scale of 1, as searches have absolute tolerances of cost."""
+        return Weights(*(getattr(self, entry.name) / self.scale for entry in fields(self)))
+
 
 OBJECTIVES = {
     "length": Weights(length=1.0),
@@ -161,9 +170,6 @@ OBJECTIVES = {
     "capacity": Weights(capacity=1e-3, length=_TIE),
 }
 """Weights of the named objectives."""
-
-
-# Anytime searches: objective and budget.
 
 
 LEAST_ROUNDS, LEAST_ROUNDS_WITH_LIMIT = 12, 80
@@ -216,7 +222,8 @@ class AnytimeSettings:
         return rounds >= least and spent >= self.budget
 
     def report(self, progress: Progress, rounds: int, spent: float, cost: float) -> None:
-        """Reports progress, in rounds where their number is given, else in seconds."""
+        """Reports progress in rounds, where given, or seconds, and a normalized cost as weighed."""
+        cost *= self.weights.scale
         if self.rounds is not None:
             progress(float(rounds), float(self.rounds), cost)
         else:
@@ -251,15 +258,9 @@ class AnytimeSettings:
         )
 
 
-# Settings of the search that keeps the orientation of the start.
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OptimalSettings(AnytimeSettings):
     """Settings of the search that keeps the orientation of the start."""
-
-
-# Settings of the search that may rotate the platform.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -414,8 +415,7 @@ def _require_objective(name: str) -> None:
 def _weights(given: Mapping[str, float]) -> Weights:
     for name in given:
         _require_objective(name)
-    numbers = {name: real_number(f"the weight of {name}", x) for name, x in given.items()}
-    return Weights(**numbers)
+    return Weights(**{name: real_number(f"the weight of {name}", x) for name, x in given.items()})
 
 
 def _paper_settings(options: PlanningOptions) -> PlannerSettings:

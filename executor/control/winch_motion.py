@@ -261,13 +261,14 @@ class WinchRecord:
     Attributes:
         folder: Its path.
         cycles: Number of recorded cycles.
+        events: Number of recorded events.
     """
 
     def __init__(
         self, folder: Path, events: _RecordFile, winches: _RecordFile, flusher: ThreadPoolExecutor
     ) -> None:
         """Uses open files and a flushing thread, which the caller closes."""
-        self.folder, self.cycles = folder, 0
+        self.folder, self.cycles, self.events = folder, 0, 0
         self._events, self._winches, self._flusher = events, winches, flusher
         self._began = float("inf")  # until there is a cycle
         self._flushed, self._flushing = float("-inf"), Future[None]()
@@ -299,6 +300,7 @@ class WinchRecord:
         Raises:
             Fault: The disk is full or gone.
         """
+        self.events += 1
         row = {"time_s": round(self._time(event.at), 6), "code": event.code, "text": event.text}
         self._events.add(json.dumps(row, ensure_ascii=False))
 
@@ -313,7 +315,7 @@ class WinchRecord:
 
 @contextmanager
 def recording(folder: Path) -> Iterator[WinchRecord]:
-    """Makes the folder; removes it again if no cycle was recorded.
+    """Makes the folder; removes it again if the block is refused before it recorded anything.
 
     Raises:
         BadInput: It cannot be made.
@@ -334,6 +336,7 @@ def recording(folder: Path) -> Iterator[WinchRecord]:
         record = WinchRecord(folder, events, winches, flusher)
         try:
             yield record
-        finally:
-            if record.cycles == 0:
+        except CdprError:
+            if record.cycles == record.events == 0:
                 shutil.rmtree(folder, ignore_errors=True)
+            raise

@@ -401,16 +401,22 @@ class Recorder:
         self.last, self.state = record.at, record.state
         self.log.add(record)
         self._status.take_cycle(record)
+        failure: CdprError | None = None
         if record.state in ON_PATH:
             for code, text in self._announcements.due(record.index):
                 self._announce(text)
-                self.take_event(LoopEvent(record.cycle, record.at, code, text))
+                try:
+                    self.take_event(LoopEvent(record.cycle, record.at, code, text))
+                except CdprError as error:
+                    failure = failure or error
         if record.cycle % self.every == 0:
             self._progress(record.index)
             if self._trigger is not None:
                 encoder_pose = self.log.encoder_pose(record)
                 self._trigger(record.at - self._began, record.at, true_pose, encoder_pose)
         self.writer.take_cycles(record.at)
+        if failure is not None:
+            raise failure
 
     def take_event(self, event: LoopEvent) -> None:
         """Records an event.

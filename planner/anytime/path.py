@@ -322,7 +322,7 @@ def optimal_route(
     Raises:
         NoSolution: There is no path, none was found, or none is short enough.
     """
-    problem = problem_of(rig, scene, settings.weights, kinematic)
+    problem = problem_of(rig, scene, settings.weights.normalized(), kinematic)
     start, goal = np.array(scene.start.position), np.array(scene.goal.position)
     search = new_search(start, goal, settings.seed)
     _load(problem, search)
@@ -380,7 +380,7 @@ def _apply_limit(
     problem: PathProblem, search: AnytimeSearch, settings: OptimalSettings, limit: LengthLimit
 ) -> None:
     """Passes the best path to the limit and applies the price it sets."""
-    path, weights = best_path(search), settings.weights
+    path, weights = best_path(search), settings.weights.normalized()
     if path is None:
         return
 
@@ -406,12 +406,11 @@ def _is_over(
 
 
 def _least(search: AnytimeSearch, settings: OptimalSettings) -> float:
-    """A lower bound of the cost; known only where the length alone counts."""
-    weights = settings.weights
-    if not weights.is_length:
+    """A lower bound of the normalized cost; known only where the length alone counts."""
+    if not settings.weights.is_length:
         return -math.inf
     straight = float(np.linalg.norm(search.ends[1] - search.ends[0]))
-    return weights.length * straight * (1.0 + 1e-12)
+    return straight * (1.0 + 1e-12)
 
 
 def best_path(search: AnytimeSearch) -> Array | None:

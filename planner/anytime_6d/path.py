@@ -252,19 +252,20 @@ def turning_route(
         BadInput: The scene has no rotation limits.
         NoSolution: No path was found, or none is short enough.
     """
-    problem = turning_problem(rig, scene, settings.weights, kinematic)
+    weights = settings.weights.normalized()
+    problem = turning_problem(rig, scene, weights, kinematic)
     space = PoseSpace(rig)
     start, goal = space.coordinates(scene.start), space.coordinates(scene.goal)
-    _load(RotatingSearch(problem, start, goal, settings.seed), settings.weights)
+    _load(RotatingSearch(problem, start, goal, settings.seed), weights)
     search, began = RotatingSearch(problem, start, goal, settings.seed), clock()
     limit = None
     if settings.longest < math.inf:
-        limit = LengthLimit(settings.longest, _unit(settings.weights, kinematic))
+        limit = LengthLimit(settings.longest, _unit(weights, kinematic))
     spent = 0.0
     while not _is_over(settings, search, spent):
         search.advance()
         if limit is not None:
-            _apply_limit(limit, search, settings.weights)
+            _apply_limit(limit, search, weights)
         spent = clock() - began
         if progress is not None and search.rounds % _REPORT_EVERY == 0:
             settings.report(progress, search.rounds, spent, search.cost)

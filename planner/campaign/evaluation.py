@@ -26,6 +26,7 @@ from planner.campaign.studies import (
     FIGURE_9,
     MEASURED,
     STUDIES,
+    Change,
     Results,
     batches,
     findings,
@@ -90,9 +91,9 @@ def about(rig: Rig, scenes: Sequence[Scene], seeds: int, results: Results) -> di
 
 
 def write_campaign(folder: Path, results: Results, described: dict[str, Any]) -> None:
-    """Writes figures, tables, findings and the page of a campaign into a folder."""
+    """Writes tables, figures, findings and the page of a campaign into a folder."""
+    write_atomic(folder / "trials.csv", trials_csv(results))  # first: the rest is made from it
     save_figures(results, folder)
-    write_atomic(folder / "trials.csv", trials_csv(results))
     write_atomic(folder / "summary.csv", summary_csv(results))
     write_atomic(folder / "findings.json", findings_json(results, described))
     write_atomic(folder / "index.html", page(results, described))
@@ -150,9 +151,21 @@ _FIGURES = ("mean", "standard_deviation", "interval_low", "interval_high")
 
 
 def findings_json(results: Results, about: dict[str, Any]) -> str:
-    """The claims, the findings, and facts about the campaign."""
-    listed = [{**asdict(finding), "verdict": finding.verdict} for finding in findings(results)]
+    """The claims, the findings, and facts about the campaign; null where a change is unknown."""
+    listed = [
+        {**asdict(finding), "change": _known(finding.change), "verdict": finding.verdict}
+        for finding in findings(results)
+    ]
     return json.dumps({"about": about, "findings": listed}, indent=1, allow_nan=False) + "\n"
+
+
+def _known(change: Change) -> dict[str, Any]:
+    """A change as JSON."""
+    each, mean, low, high = (
+        [None if math.isnan(x) else x for x in row]
+        for row in (change.each, [change.mean], [change.low], [change.high])
+    )
+    return {"each": each, "mean": mean[0], "low": low[0], "high": high[0]}
 
 
 def _case(study: str, case: Case) -> tuple[str, ...]:

@@ -108,7 +108,9 @@ def _figure_9_table(results: Results, ends: Any) -> str:
                 row = [environment, sampler, cost]
                 for quantity in (*COUNTED, *MEASURED):
                     s = summary(results.values(FIGURE_9, case, arm, quantity))
-                    row.append(f"{s.mean:.4g} ± {s.deviation:.3g}\n({s.low:.4g} to {s.high:.4g})")
+                    interval = f"({s.low:.4g} to {s.high:.4g})"
+                    figures = f"{s.mean:.4g} ± {s.deviation:.3g}\n{interval}"
+                    row.append(figures if s.count else "no path")
                 rows.append(row)
     head = ["environment", "sampler", "minimises"]
     title = f"Own box, {ends} ends: mean ± standard deviation (interval of the mean)"
@@ -136,7 +138,7 @@ def _readings(results: Results) -> str:
         (c.name, [results.change(READINGS, box, "scene", arms, "nodes") for box in (OWN, WIDE)])
         for c, arms in found
     ]
-    changes.sort(key=lambda entry: entry[1][0][0].mean)
+    changes.sort(key=lambda entry: np.nan_to_num(entry[1][0][0].mean, nan=np.inf))
     rows = [
         [name, *(f"{change_text(m)}\ndeviation {percent(d.mean)}" for m, d in by_box)]
         for name, by_box in changes
@@ -167,13 +169,19 @@ def _reading() -> str:
 
 
 def percent(part: float) -> str:
-    """A change, such as -20.5 %, with a true minus sign."""
+    """A change, such as -20.5 %, with a true minus sign; "unknown" for NaN."""
+    if np.isnan(part):
+        return "unknown"
     return f"{part * 100.0:+.1f} %".replace("-", "\N{MINUS SIGN}")
 
 
 def change_text(change: Change) -> str:
-    """A change with its interval."""
-    return f"{percent(change.mean)} ({percent(change.low)} to {percent(change.high)})"
+    """A change with its interval, and the number of environments if it is not of all."""
+    known, total = int(np.sum(~np.isnan(change.each))), len(change.each)
+    if not known:
+        return percent(change.mean)
+    text = f"{percent(change.mean)} ({percent(change.low)} to {percent(change.high)})"
+    return text if known == total else f"{text}, in {known} of {total} environments"
 
 
 def _paragraph(text: str) -> str:

@@ -204,8 +204,8 @@ class Change:
     """Relative difference of a figure between two planners.
 
     Attributes:
-        each: In each environment.
-        mean: Over the environments.
+        each: In each environment; NaN where too few seeds found a path with both.
+        mean: Over the other environments; NaN without any, as are both ends of its interval.
         low: Lower end of the 95 % bootstrap interval of `mean`.
         high: Its upper end.
     """
@@ -217,7 +217,9 @@ class Change:
 
 
 def summary(values: Array) -> Summary:
-    """Figures of a sample, shape (k,), k ≥ 1."""
+    """Figures of a sample, shape (k,); NaN for an empty one."""
+    if not len(values):
+        return Summary(0, np.nan, np.nan, np.nan, np.nan)
     means = values[_resampled(len(values))].mean(axis=1)
     low, high = (float(x) for x in np.percentile(means, _LEVELS))
     deviation = float(values.std(ddof=1)) if len(values) > 1 else 0.0
@@ -231,22 +233,28 @@ def change_of_means(pairs: Sequence[tuple[Array, Array]]) -> Change:
         pairs: One per environment; the samples of a pair have the same seeds in the same order,
             shape (k,) each, and are resampled together, as random ends correlate them.
     """
-    return _change(pairs, _mean)
+    return _change(pairs, _mean, 1)
 
 
 def change_of_deviations(pairs: Sequence[tuple[Array, Array]]) -> Change:
     """Change of the standard deviation; see `change_of_means`."""
-    return _change(pairs, _deviation)
+    return _change(pairs, _deviation, 2)
 
 
-def _change(pairs: Sequence[tuple[Array, Array]], figure: Callable[[Array], Array]) -> Change:
-    each = [float(figure(one[None])[0] / figure(other[None])[0] - 1.0) for one, other in pairs]
-    resampled = np.zeros(_RESAMPLES)
+def _change(
+    pairs: Sequence[tuple[Array, Array]], figure: Callable[[Array], Array], least: int
+) -> Change:
+    """The change of a figure that needs a sample of at least this size."""
+    each, resampled = np.full(len(pairs), np.nan), []
     for k, (one, other) in enumerate(pairs):
-        rows = _resampled(len(one), k)
-        resampled += figure(one[rows]) / figure(other[rows]) - 1.0
-    low, high = (float(x) for x in np.percentile(resampled / len(pairs), _LEVELS))
-    return Change(tuple(each), float(np.mean(each)), low, high)
+        if len(one) >= least:
+            rows = _resampled(len(one), k)
+            each[k] = figure(one[None])[0] / figure(other[None])[0] - 1.0
+            resampled.append(figure(one[rows]) / figure(other[rows]) - 1.0)
+    if not resampled:
+        return Change(tuple(each.tolist()), np.nan, np.nan, np.nan)
+    low, high = (float(x) for x in np.percentile(sum(resampled) / len(resampled), _LEVELS))
+    return Change(tuple(each.tolist()), float(np.mean(each[~np.isnan(each)])), low, high)
 
 
 def _mean(samples: Array) -> Array:
@@ -255,8 +263,6 @@ def _mean(samples: Array) -> Array:
 
 
 def _deviation(samples: Array) -> Array:
-    if samples.shape[1] < 2:
-        return np.full(len(samples), np.nan)
     deviations: Array = np.maximum(samples.std(axis=1, ddof=1), 1e-300)
     return deviations
 
@@ -313,7 +319,7 @@ class Results:
             one, other = (self._groups[study, case, arm] for arm in arms)
             both = [(a, b) for a, b in zip(one, other, strict=True) if a.found and b.found]
             values = [[t.value(quantity) for t in pair] for pair in both]
-            columns = np.array(values).T
+            columns = np.array(values, dtype=np.float64).reshape(-1, 2).T
             pairs.append((columns[0], columns[1]))
         return change_of_means(pairs), change_of_deviations(pairs)
 
@@ -349,6 +355,8 @@ class Finding:
     def verdict(self) -> str:
         """Whether the claim holds here, in words."""
         change = self.change
+        if np.isnan(change.mean):
+            return "too few paths to compare"
         if change.high < self.claimed:
             return "reached"
         if self.claimed and change.mean <= self.claimed:

@@ -5,15 +5,24 @@ from __future__ import annotations
 import resource
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from executor.recording.recorder import BEHIND, RecordWriter
+from executor.recording.recorder import BEHIND, Recorder, RecordWriter
 from executor.recording.run_folder import RunEvent, RunFolder
+from executor.remote.status import RunStatus
+from executor.state_machine import CycleRecord, State
+from executor.supervision import LocalRequests
+from executor.trajectory.dwell import Dwell
 from model.errors import CdprError, Fault
+from model.files.scene_file import SceneDocument
+from model.rig import load_rig
+from model.scene import scene_from_document
 
 CYCLE = 0.01
+CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 class Log:
@@ -151,3 +160,42 @@ def test_what_is_not_a_fault_of_the_disk_is_one_of_the_record(
         writer.take_cycles(0.0)
     with pytest.raises(Fault, match="MemoryError"):
         writer.take_event(RunEvent(0.0, "stop", "stop requested"))
+
+
+def test_a_full_disk_hides_nothing_else_of_a_cycle(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two events are due in it; the first fault lost the second, and the image."""
+
+    def full(_folder: RunFolder, event: RunEvent) -> None:
+        raise Fault(f"{event.code} cannot be written: No space left on device")
+
+    rig = load_rig(CONFIGS / "gachon_8_6.yaml")
+    goal = {"position_mm": [0, 0, 445]}
+    stops = [{"name": name, "dwell_s": 0.0, **goal} for name in ("one", "two")]
+    data = {"schema_version": 1, "name": "s", "start": goal, "goal": goal, "stops": stops}
+    scene = scene_from_document(SceneDocument.model_validate(data))
+    table = SimpleNamespace(dwells=(Dwell(0, 0), Dwell(0, 0)))
+    prepared: Any = SimpleNamespace(rig=rig, scene=scene, checked=SimpleNamespace(table=table))
+    done: list[str] = []
+    recorder = Recorder(
+        prepared,
+        folder,
+        RunStatus(prepared, folder.path, LocalRequests(), simulated_time=True),
+        trigger=lambda *_: done.append("image"),
+        every=1,
+        progress=lambda _row: done.append("progress"),
+        announce=lambda _text: done.append("announced"),
+    )
+    monkeypatch.setattr(RunFolder, "append_event", full)
+    monkeypatch.setattr(recorder.log, "encoder_pose", lambda _record: None)
+    monkeypatch.setattr(recorder.writer, "take_cycles", lambda _at: done.append("cycle"))
+    counts = tuple(winch.home_counts for winch in rig.winches)
+    zeros = (0,) * rig.cable_count
+    record = CycleRecord(
+        0, 5.0, State.MOVING, 0.0, 1.0, counts, counts, zeros, zeros, 0, 0, 0, 0.0, 0.0
+    )
+    with pytest.raises(Fault, match="pass cannot be written"):
+        recorder.take_cycle(record, None)
+    assert [event.code for event in recorder.log.events] == ["pass", "pass"]
+    assert done == ["announced", "announced", "progress", "image", "cycle"]

@@ -1,4 +1,4 @@
-"""The record of a motion without a path: every cycle, and no folder without cycles."""
+"""The record of a motion without a path: every cycle and event, and no folder without either."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 from executor.control.winch_motion import recording
 from executor.state_machine import CycleRecord, LoopEvent, State
-from model.errors import BadInput, Fault
+from model.errors import BadInput, Fault, Refused
 
 
 def record(cycle: int) -> CycleRecord:
@@ -119,11 +119,20 @@ def test_a_disk_that_hangs_holds_no_cycle_up(
         hangs.set()
 
 
-def test_nothing_is_left_of_what_did_not_move(tmp_path: Path) -> None:
-    with recording(tmp_path / "home") as kept:
-        kept.take_event(LoopEvent(0, 1.0, "stop", "stop requested"))
+def test_nothing_is_left_of_what_was_refused(tmp_path: Path) -> None:
+    with pytest.raises(Refused), recording(tmp_path / "home"):
+        raise Refused("the bus is latched")
     assert not (tmp_path / "home").exists()
     (tmp_path / "home").mkdir()
     with pytest.raises(BadInput, match="cannot be written"), recording(tmp_path / "home"):
         pytest.fail("it would write into another's folder")
+    assert (tmp_path / "home").exists()
+
+
+def test_an_event_that_could_not_be_written_keeps_its_folder_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full_from_the_start(monkeypatch, "events.jsonl")
+    with pytest.raises(Fault), recording(tmp_path / "home") as kept:
+        kept.take_event(LoopEvent(0, 1.0, "drive_silent", "cable 4 (drive 4): no answer"))
     assert (tmp_path / "home").exists()

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from executor.cameras.client import static_pose
 from executor.control.preconditions import counted_here, require_below, with_reduced_limits
 from executor.control.winch_laws import CableStep, PretensionLaw, WinchLaw, wind_in_speed
 from executor.control.winch_loop import LawMotion, WinchesHere
-from executor.control.winch_motion import WinchResult, move_winches, require_held
+from executor.control.winch_motion import WinchResult, move_winches, recording, require_held
 from executor.drives import current_pose
+from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at, referenced
 from executor.jogging import plan_straight_move
@@ -86,6 +88,8 @@ class Bench:
     board: LocalRequests = field(default_factory=LocalRequests)
     records: list[CycleRecord] = field(default_factory=list)
     events: list[LoopEvent] = field(default_factory=list)
+    take_event: Callable[[LoopEvent], None] = lambda _event: None
+    folder: Path = Path("nowhere")
     tensions: list[Array] = field(default_factory=list)
 
     def take_up(self, reach: float = 0.02) -> WinchResult:
@@ -100,12 +104,16 @@ class Bench:
             self.tensions.append(self.rehearsal.tensions)
             self.script(self, record.cycle)
 
+        def on_event(event: LoopEvent) -> None:
+            self.events.append(event)
+            self.take_event(event)
+
         return move_winches(
             mover(self.as_set_up, law, self.group, self.board),
             self.rig,
             self.interlock or MotionInterlock(self.rig),
-            Records(on_cycle, self.events.append),
-            record=Path("nowhere"),
+            Records(on_cycle, on_event),
+            record=self.folder,
             rehome=self.rehome,
             at_rest=lambda result, _true_pose: self.at_rest(result),
         )
@@ -548,6 +556,38 @@ def test_a_record_that_is_full_by_then_leaves_the_cause_and_the_latch() -> None:
         assert bench.events[-1].code == "not_held"
     with pytest.raises(Refused, match="lost its torque: switch on disabled"):
         interlock.require_free()
+
+
+@pytest.mark.parametrize("program_ends", [False, True])
+def test_the_record_that_the_latch_names_stays_where_no_cycle_began(
+    tmp_path: Path, program_ends: bool
+) -> None:
+    """The bus fails, or the program is terminated, between arming and the first cycle."""
+    rig = load_rig(RIG)
+    bus = rig.document.bus.model_copy(update={"interface": "socketcan", "channel": "can9"})
+    kept_rig = rig_from_document(rig.document.model_copy(update={"bus": bus}))
+
+    class Latching(MotionInterlock):
+        def begin(self, *arguments: Any, **options: Any) -> None:
+            super().begin(*arguments, **options)
+            if program_ends:
+                raise KeyboardInterrupt
+            bench.group.send_cycle = fails_on_the_bus
+
+    def fails_on_the_bus(*_: object) -> None:
+        raise BusDown("the interface is down", "can9")
+
+    expected = pytest.raises(KeyboardInterrupt) if program_ends else nullcontext()
+    with after_power_loss(lost(1, on_a_stand=True)) as bench, expected:
+        with recording(tmp_path / "home") as record:
+            bench.interlock, bench.folder = Latching(kept_rig), record.folder
+            bench.take_event = record.take_event
+            assert bench.take_up().state is State.LATCHED
+        assert not bench.records
+        assert "the interface is down" in RunFolder(record.folder).events()[0].text
+    latched = FaultLatch(BusSettings("socketcan", "can9")).read()
+    assert latched is not None
+    assert Path(latched.folder).is_dir()
 
 
 def test_a_stop_before_anything_is_enabled_leaves_all_as_it_was() -> None:

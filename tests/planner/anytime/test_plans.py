@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 from itertools import count, pairwise
 
 import numpy as np
@@ -213,6 +214,43 @@ def test_progress_is_reported_in_seconds_or_rounds(gachon, ready_scene) -> None:
         assert done == sorted(done)
         assert done[-1] <= most
     assert all(cost < 1.0 for _, _, cost in reported)
+
+
+SUM = Weights(length=0.35, kinematic=1.0, capacity=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("weights", "longest", "factors"),
+    [
+        (OBJECTIVES["length"], math.inf, [1e-11, 1e3]),
+        (OBJECTIVES["kinematic"], 0.68, [1e-3, 1e3]),
+        (OBJECTIVES["capacity"], 0.68, [1e-3, 1e3]),
+        (SUM, 0.68, [2.0**-30, 2.0**30]),
+    ],
+)
+def test_only_the_ratios_of_the_weights_matter(
+    gachon, ready_scene, weights, longest, factors
+) -> None:
+    """As `kinematic=1000`, the limit was not kept; as `length=1e-11`, the path stayed longer."""
+
+    def path_and_costs(factor):
+        scaled, costs = Weights(*(factor * weight for weight in astuple(weights))), []
+        settings = OptimalSettings(weights=scaled, rounds=120, longest=longest)
+        ticks = count()
+        document = make_plan(
+            gachon,
+            ready_scene("environment_2"),
+            settings,
+            progress=lambda _done, _most, cost: costs.append(cost / factor),
+            clock=lambda: next(ticks),
+        )
+        return document.waypoints, costs
+
+    path, costs = path_and_costs(1.0)
+    for factor in factors:
+        scaled_path, scaled_costs = path_and_costs(factor)
+        assert scaled_path == path
+        assert scaled_costs == pytest.approx(costs, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -186,6 +187,25 @@ def test_the_best_path_that_is_no_longer_keeps_the_limit(
     assert limited.planner.longest_mm == pytest.approx(1.02e3 * shortest)
     with pytest.raises(NoSolution, match="no path of at most"):
         planned("kinematic", 20, longest=0.95 * shortest)
+
+
+@pytest.mark.parametrize(
+    ("weights", "longest", "factor"),
+    [
+        (OBJECTIVES["length"], np.inf, 0.5),
+        (OBJECTIVES["length"], np.inf, 1e-12),
+        (OBJECTIVES["kinematic"], 0.64, 1e3),
+    ],
+)
+def test_only_the_ratios_of_the_weights_matter(
+    weights: Weights, longest: float, factor: float
+) -> None:
+    """With a small weight of the length alone, the first path already counted as the shortest."""
+    paths = [
+        make_plan(GACHON, WIDE, TurningSettings(weights=scaled, rounds=40, longest=longest))
+        for scaled in (weights, Weights(*(factor * weight for weight in astuple(weights))))
+    ]
+    assert paths[0].waypoints == paths[1].waypoints
 
 
 def test_a_longest_path_must_be_a_length() -> None:

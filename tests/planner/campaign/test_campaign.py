@@ -16,7 +16,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from planner.campaign.evaluation import findings_json, summary_csv, trials_csv
+from planner.campaign.evaluation import findings_json, summary_csv, trials_csv, write_campaign
 from planner.campaign.page import page, save_figures
 from planner.campaign.studies import (
     FIGURE_9,
@@ -279,6 +279,28 @@ def test_the_page_has_every_claim_with_its_verdict_and_every_picture(results, tm
     assert "gachon <8 & 6>" in reader.text
     reported = json.loads(findings_json(results, about))
     assert len(reported["findings"]) == len(findings(results))
+
+
+@pytest.mark.parametrize("paths", [0, 1])
+def test_a_campaign_in_which_few_searches_found_a_path_is_written(results, tmp_path, paths) -> None:
+    """In the first environment, or in all with random ends, at most one seed found a path."""
+    lacking = Results(
+        replace(t, found=False, path=PathFigures())
+        if t.seed >= paths and ("1" in t.case.environment or t.case.ends == "random")
+        else t
+        for t in results.trials
+    )
+    about = {"seeds": SEEDS, "boxes": {OWN: "its own", WIDE: "wider"}}
+    write_campaign(tmp_path, lacking, about)
+    assert len((tmp_path / "trials.csv").read_text().splitlines()) == len(results.trials) + 1
+    text = (tmp_path / "index.html").read_text()
+    assert "in 2 of 3 environments" in text
+    assert "nan" not in text
+    found = json.loads((tmp_path / "findings.json").read_text())["findings"]
+    unknown = [f for f in found if f["change"]["mean"] is None]
+    assert {f["verdict"] for f in unknown} == {"too few paths to compare"}
+    assert {f["ends"] for f in unknown} == {"random"}
+    assert all(f["change"]["each"][1] is not None for f in found if f["ends"] == "scene")
 
 
 CLUSTER = """
