@@ -21,7 +21,7 @@ from calibration.extrinsics.result import (
 )
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
 from calibration.geometry.calibrate import RigCalibration, fit_rig
-from calibration.geometry.parameters import DEFAULT_DEVIATIONS
+from calibration.geometry.parameters import DEFAULT_DEVIATIONS, checked_deviations
 from calibration.geometry.quality import RigQuality, judge_rig
 from calibration.geometry.report import rig_page
 from calibration.geometry.result import RigResult, rig_result
@@ -64,9 +64,18 @@ from calibration.tag_map.result import (
 )
 from calibration.targets.boards import Board, read_corners
 from executor.kernels import ready_to_measure
-from model.errors import BadInput, Fault, Refused, path_of, require_types, sequence_of
+from model.errors import (
+    BadInput,
+    Fault,
+    Refused,
+    path_of,
+    positive_number,
+    require_types,
+    sequence_of,
+    truth_value,
+)
 from model.kinematics import NoCable
-from model.pose import Pose, read_only
+from model.pose import Pose, point_of, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 
@@ -105,6 +114,7 @@ def calibrate_camera(
         BadInput: Image sizes differ, or too few images show the board.
     """
     require_types((board, Board), (listener, Listener))
+    wanted, distance = _required(wanted, distance)
     require_file_name(name, "`name=`")
     source = folder if isinstance(folder, ImageSet) else open_images(path_of(folder))
     to = Destination.of(output)
@@ -138,11 +148,18 @@ def calibrate_camera_from_corners(
     Raises:
         BadInput: The file cannot be read, or as in `fit_corners`.
     """
+    wanted, distance = _required(wanted, distance)
     require_file_name(name, "`name=`")
     to = Destination.of(output)
     to.require_free("camera", name)
-    found = fit_corners(read_corners(corners), size, lens, str(corners))
+    found = fit_corners(read_corners(path_of(corners)), size, lens, str(corners))
     return _judged_camera(found, name, wanted, distance, to)
+
+
+def _required(wanted: float, distance: float | None) -> tuple[float, float | None]:
+    """Required error and working distance, checked, [m]."""
+    needed = positive_number("wanted", wanted, "m")
+    return needed, None if distance is None else positive_number("distance", distance, "m")
 
 
 def _judged_camera(
@@ -184,6 +201,7 @@ def locate_camera(
         BadInput: There are no tags, or too few images that show them.
     """
     require_types((rig, Rig), (listener, Listener), optional=[(survey, Survey)])
+    wanted = positive_number("wanted", wanted, "m")
     taken_by = rig.camera(camera)
     require_file_name(taken_by.name, "cameras")
     if poses is None or isinstance(poses, Mapping):
@@ -237,6 +255,7 @@ def locate_tags(
         BadInput: There are no tags, or too few images that show them.
     """
     require_types((rig, Rig), (listener, Listener))
+    wanted = positive_number("wanted", wanted, "m")
     taken_by = rig.camera(camera)
     require_file_name(rig.name, "name")
     require_tags(rig, fixed_tag)
@@ -256,7 +275,7 @@ def locate_tags(
 def measure_readout(
     rig: Rig,
     camera: Camera,
-    source: Path,
+    source: str | Path,
     *,
     rate: float | None = None,
     speed: float | None = None,
@@ -280,9 +299,12 @@ def measure_readout(
         BadInput: There are no tags, or the images do not determine the readout.
     """
     require_types((rig, Rig), (camera, Camera), (listener, Listener))
+    wanted = positive_number("wanted", wanted, "m")
+    rate = None if rate is None else positive_number("rate", rate, "Hz")
+    speed = rig.motion.speed if speed is None else positive_number("speed", speed, "m/s")
     require_file_name(camera.name, "cameras")
     require_tags(rig, None)
-    pictures, to = open_timed_images(source, camera, rate), Destination.of(output)
+    pictures, to = open_timed_images(path_of(source), camera, rate), Destination.of(output)
     to.require_free("readout", camera.name)
     ready_to_measure(listener)
     with pictures.reported("detecting tags", listener) as images:
@@ -290,7 +312,6 @@ def measure_readout(
         observations = observe_tags(images, rig, camera, numbers, pictures.unused)
     times = {name: float(name.split(" s ")[0]) for name in observations.squares}
     found = fit_readout(rig, camera, observations, times)
-    speed = rig.motion.speed if speed is None else speed
     verdict = judge_readout(found, wanted, speed)
     result = readout_result(found, verdict, speed, to.on)
     page = readout_page(found, verdict, result.date)
@@ -340,18 +361,30 @@ def calibrate_rig(
         BadInput: The data cannot be read, are too few, or do not fit the rig file.
     """
     require_types((rig, Rig), (listener, Listener))
+    wanted = positive_number("wanted", wanted, "m")
+    deviations = checked_deviations(deviations)
+    length_deviation = positive_number("length_deviation", length_deviation, "m")
+    swivel_deviation = positive_number("swivel_deviation", swivel_deviation, "rad")
+    imu_deviation = positive_number("imu_deviation", imu_deviation, "rad")
+    tilt = positive_number("tilt", tilt, "rad", or_zero=True)
+    of_poses = [
+        positive_number("a pose deviation", one, "m, rad")
+        for one in sequence_of("pose_deviations", pose_deviations)
+    ]
+    if len(of_poses) != 2:
+        raise BadInput(f"pose_deviations must be two numbers [m, rad], not {len(of_poses)}")
+    measured_point = read_only(point_of("reflector", reflector))
     require_file_name(name, "`name=`")
     given = [data] if isinstance(data, str | PathLike) else sequence_of("data", data)
     paths = [path_of(one) for one in given]
     counted, measured = rig_measurements(rig, paths)
-    length, turn = pose_deviations
     measured = replace(
-        measured.with_added_deviation(np.array([length] * 3 + [turn] * 3)),
-        reflector=read_only(reflector),
+        measured.with_added_deviation(np.repeat(of_poses, 3)),
+        reflector=measured_point,
         swivel_deviation=swivel_deviation,
         imu_deviation=imu_deviation,
     )
-    if without_poses:
+    if truth_value("without_poses", without_poses):
         measured = measured.without_poses()
     to = Destination.of(output)
     to.require_free("rig", name)

@@ -16,6 +16,7 @@ from model.plan import Plan
 from model.progress import SILENT, Listener
 from model.rig import Rig
 from model.scene import Scene
+from planner.settings import whole_number
 
 
 def open_camera(
@@ -33,7 +34,7 @@ def open_camera(
         HardwareMissing: The live camera does not open.
     """
     require_types((rig, Rig))
-    taken_by, path = rig.camera(camera), Path(str(source))
+    taken_by, path = rig.camera(camera), path_of(str(source))
     if path.is_dir():
         return ImageFolder(path, taken_by)
     if path.is_file():
@@ -77,6 +78,8 @@ def track(
     """
     require_types((rig, Rig), (listener, Listener), optional=((scene, Scene), (plan, Plan)))
     require_functions(stopped=stopped, keep=keep)
+    if pictures is not None:
+        pictures = whole_number("pictures", pictures, least=1)
     if isinstance(source, Mapping):
         sources = [f"{name}={one}" for name, one in source.items()]
     else:

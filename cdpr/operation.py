@@ -24,7 +24,7 @@ from model.errors import (
 )
 from model.files.scene_file import StopDocument
 from model.plan import Plan, plan_from_document, require_same_rig
-from model.pose import Array, Pose
+from model.pose import Array, Pose, point_of
 from model.progress import SILENT, Listener
 from model.rig import Rig
 from model.scene import Scene
@@ -196,25 +196,13 @@ def workspace_map(
     volume = None if volume is None else truth_value("volume", volume)
     if workers is not None:
         workers = whole_number("workers", workers, least=1, most=MOST_WORKERS)
-    corners = {"lower": _corner("lower", lower), "upper": _corner("upper", upper)}
+    corners = {
+        name: None if corner is None else point_of(name, corner)
+        for name, corner in (("lower", lower), ("upper", upper))
+    }
     grids = workspace_grids(rig, planes, volume=volume, step=step, **corners)
     question = Question.about(rig, scene, rotation, characteristic_length)
     return map_workspace(question, grids, workers=workers, listener=listener)
-
-
-def _corner(name: str, given: ArrayLike | None) -> Array | None:
-    if given is None:
-        return None
-    try:
-        corner = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        corner = np.empty(0)
-    if corner.shape != (3,) or not np.isfinite(corner).all():
-        raise BadInput(
-            f"{name} must be three finite numbers, x, y and z in metres; it is {given!r}",
-            where="workspace_map",
-        )
-    return corner
 
 
 def _plane(given: object) -> tuple[int, float]:

@@ -5,14 +5,14 @@ Libraries may be missing: modules that need one are imported where used, after `
 
 from __future__ import annotations
 
-import getpass
 import os
 import platform
+import pwd
 import resource
 import socket
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from executor.realtime.scheduling import CAP_IPC_LOCK, CAP_SYS_NICE, PRIORITY, has_capability
-from model.errors import BadInput, CdprError
+from model.errors import BadInput, CdprError, without_passwords
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 
@@ -42,6 +42,7 @@ PACKAGES = (
 LIBRARIES = {
     "pydantic": "pydantic",
     "yaml": "pyyaml",
+    "typer": "typer",
     "rich": "rich",
     "numpy": "numpy",
     "numba": "numba",
@@ -52,9 +53,11 @@ LIBRARIES = {
     "canopen": "canopen",
     "msgpack": "msgpack",
     "daqp": "daqp",
+    "foxglove": "foxglove-sdk",
     "mcap": "mcap",
     "matplotlib": "matplotlib",
 }
+"""Distributions that ours requires, by the module that each installs."""
 
 
 LIMITS = Path("/etc/security/limits.d/cdpr.conf")
@@ -87,13 +90,14 @@ def check_machine() -> list[MachineCheck]:
 
 
 def check_rig(rig: Rig, camera: str | None = None) -> list[MachineCheck]:
-    """Checks the rig's drive files, its bus and its first camera.
+    """Checks the rig's tag detector, drive files, bus and first camera.
 
     Args:
         rig: The robot.
         camera: Index, device or address of a camera to open; None to open none.
     """
-    return [*rig_drives(rig), *rig_bus(rig), *rig_cameras(rig, camera)]
+    detector = libraries({"pyapriltags": "pyapriltags"} if rig.tag_detector == "apriltag" else {})
+    return [*detector, *rig_drives(rig), *rig_bus(rig), *rig_cameras(rig, camera)]
 
 
 def python_version() -> MachineCheck:
@@ -116,10 +120,14 @@ def own_packages() -> list[MachineCheck]:
     return checks
 
 
-def libraries() -> list[MachineCheck]:
-    """Whether every library can be imported, and its version."""
+def libraries(packages: Mapping[str, str] = LIBRARIES) -> list[MachineCheck]:
+    """Whether every library can be imported, and its version.
+
+    Args:
+        packages: Distributions by module, as `LIBRARIES`.
+    """
     checks = []
-    for module, package in LIBRARIES.items():
+    for module, package in packages.items():
         try:
             import_module(module)
             checks.append(MachineCheck(package, True, version(package)))
@@ -206,7 +214,8 @@ def rig_cameras(rig: Rig, source: str | None) -> list[MachineCheck]:
         LiveCamera(source, camera).close()
     except CdprError as error:
         return [MachineCheck(f"camera {camera.name}", False, error.what, error.next_step)]
-    text = f"{source} opens and delivers images of {camera.width} x {camera.height} px{gamma}"
+    size = f"{camera.width} x {camera.height} px"
+    text = f"{without_passwords(source)} opens and delivers images of {size}{gamma}"
     return [MachineCheck(f"camera {camera.name}", True, text)]
 
 
@@ -323,8 +332,10 @@ def memory_check(limit: int, *, privileged: bool) -> MachineCheck:
 
 
 def _allow(item: str, value: int | str) -> str:
-    line = f"{getpass.getuser()} - {item} {value}"
-    return f"echo '{line}' | sudo tee -a {LIMITS}, then log out and in again"
+    user = f":{os.getuid()}"  # by its number, as in a container
+    with suppress(KeyError):
+        user = pwd.getpwuid(os.getuid()).pw_name
+    return f"echo '{user} - {item} {value}' | sudo tee -a {LIMITS}, then log out and in again"
 
 
 # The objects of the drives.

@@ -28,12 +28,16 @@ from model.errors import (
     BadInput,
     Refused,
     StoppedByOperator,
+    positive_number,
+    real_number,
     require_functions,
     require_types,
+    sequence_of,
 )
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
+from planner.settings import whole_number
 from tracking.shared_errors import require_stated_errors
 
 #: Largest reach, [m], and speed, [m/s], of winding in.
@@ -121,14 +125,18 @@ def home(
         Fault: It ended with a fault, which is latched; all drives stopped together and hold.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
-    in_process = is_simulated(rig)
-    require_types((listener, Listener), optional=[(pose, Pose)])
+    require_types((rig, Rig), (listener, Listener), optional=[(pose, Pose)])
     require_functions(confirm=confirm)
+    in_process = is_simulated(rig)
     require_own_time(rig, realtime)
-    given = [camera] if isinstance(camera, str | int | np.integer) else camera or []
-    sources = [str(source) for source in given]
+    if isinstance(camera, str | int | np.integer):
+        camera = [str(camera)]
+    sources = [str(source) for source in sequence_of("camera", () if camera is None else camera)]
     require_one_pose(at_home, pose, sources)
-    _require_slow(reach, speed, pictures)
+    reach, speed = real_number("reach", reach, "m"), real_number("speed", speed, "m/s")
+    pictures = whole_number("pictures", pictures, least=FEWEST_IMAGES, most=MOST_IMAGES)
+    simulated_slack = positive_number("simulated_slack", simulated_slack, "m", or_zero=True)
+    _require_slow(reach, speed)
     source = choose_one_camera(rig, sources, in_process) if sources else None
     if source is not None:
         require_stated_errors(rig, source[:1], "set a reference")
@@ -209,7 +217,7 @@ def require_one_pose(at_home: bool, pose: Pose | None, cameras: Sequence[str]) -
         )
 
 
-def _require_slow(reach: float, speed: float, pictures: int) -> None:
+def _require_slow(reach: float, speed: float) -> None:
     """Requires the bounds of the command line for every caller.
 
     Raises:
@@ -223,12 +231,6 @@ def _require_slow(reach: float, speed: float, pictures: int) -> None:
                 where="home",
                 next_step=f"give a smaller {name}",
             )
-    if not FEWEST_IMAGES <= pictures <= MOST_IMAGES:
-        raise BadInput(
-            f"{pictures} images: must be from {FEWEST_IMAGES} to {MOST_IMAGES}",
-            where="home",
-            next_step="give another number of images",
-        )
 
 
 def _stated_pose(rig: Rig, pose: Pose | None) -> Pose:
@@ -255,7 +257,7 @@ def _target(rig: Rig, tension: float | None, limit: float) -> float:
     Raises:
         Refused: It leaves no headroom below the limit.
     """
-    target = 2.0 * rig.min_tension if tension is None else tension
+    target = 2.0 * rig.min_tension if tension is None else real_number("tension", tension, "N")
     if not rig.min_tension <= target <= 0.8 * limit:
         raise Refused(
             f"a pretension of {target:g} N must be from {rig.min_tension:g} N to 80 % of the"

@@ -23,12 +23,19 @@ from executor.runner import RunOptions, RunResult, run_prepared
 from executor.supervision import Supervisor
 from executor.trajectory.setpoints import prepare_plan
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
-from model.errors import BadInput, Refused, path_of, require_functions, require_types
+from model.errors import (
+    BadInput,
+    Refused,
+    path_of,
+    real_number,
+    require_functions,
+    require_types,
+)
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument
 from model.jit import KernelSet, compilation
 from model.plan import plan_from_document
-from model.pose import Array, Pose, largest_rotations
+from model.pose import Array, Pose, largest_rotations, point_of
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
 from model.scene import Scene, empty_scene, scene_from_document
@@ -85,6 +92,7 @@ def jog(
     require_functions(confirm=confirm, on_event=on_event)
     with commands_from_start("jog", rig, supervisor, realtime=realtime) as commands:
         slow = with_speed(rig, speed)
+        by = None if by is None else point_of("by", by)
         require_own_time(slow, realtime)
         require_distance(by, to_home=to_home)
         around = empty_scene(slow) if scene is None else scene.changed(stops=())
@@ -114,6 +122,7 @@ def with_speed(rig: Rig, speed: float) -> Rig:
     Raises:
         BadInput: The speed is outside the range of a jog.
     """
+    speed = real_number("speed", speed, "m/s")
     if not 0.0 < speed <= FASTEST:
         raise BadInput(
             f"the speed of {speed:g} m/s must be above 0 and at most {FASTEST:g} m/s",

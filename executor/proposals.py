@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 from drivers.can_bus import IN_PROCESS
 from executor.interlock.fault_latch import LatchedFault
 from executor.interlock.interlock import MotionInterlock, ReferenceStatus, reference_status
-from model.errors import BadInput, StoppedByOperator, is_truth_value, require_functions
+from model.errors import (
+    BadInput,
+    StoppedByOperator,
+    is_truth_value,
+    require_functions,
+    without_passwords,
+)
 from model.pose import Pose
 from model.rig import Camera, Rig
 from model.scene import Scene
@@ -62,6 +68,10 @@ def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal)
         )
     if not answer:
         raise StoppedByOperator(proposal.otherwise, next_step="run it again and confirm")
+
+
+def _shown(camera: Camera, source: str) -> str:
+    return f"{camera.name} ({without_passwords(source)})"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +131,7 @@ class MotionProposal:
         """Cameras in use, and those of the rig file that are not."""
         names = {camera.name for camera in self.cameras}
         unused = [one.name for one in self.prepared.rig.cameras if one.name not in names]
-        used = ", ".join(f"{camera.name} ({source})" for camera, source in self.cameras.items())
+        used = ", ".join(_shown(*one) for one in self.cameras.items())
         parts = [used] if used else []
         parts += [f"not used: {', '.join(unused)}"] if unused else []
         return "; ".join(parts) or "none"
@@ -165,11 +175,7 @@ class HomingProposal:
         """See `Proposal`."""
         source, bus = self.camera, self.rig.document.bus
         fastest, reach = self.fastest * 1000.0, self.reach * 1000.0
-        measured = (
-            f"measured, camera {source[0].name} ({source[1]})"
-            if source
-            else "stated, held by a jig"
-        )
+        measured = f"measured, camera {_shown(*source)}" if source else "stated, held by a jig"
         return [
             ("rig", self.rig.name),
             ("pretension", f"{self.target:g} N per cable, at most {self.limit:g} N"),

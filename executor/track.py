@@ -18,7 +18,7 @@ from executor.kernels import ready_to_measure
 from executor.recording.mcap import write_track_mcap
 from executor.trajectory.setpoints import prepare
 from model.clearance import ClearanceModel
-from model.errors import BadInput, CdprError
+from model.errors import BadInput, CdprError, path_of
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -118,12 +118,12 @@ class TrackResult:
             BadInput: A file cannot be written.
             Fault: The disk is full or gone.
         """
-        path = Path(path)
+        path = path_of(path)
         for name, logged in self.by_camera.items():
             write_pose_log(own_file(path, name), logged, with_clearance=self.with_clearance)
         write_pose_log(path, self.pictures, with_clearance=self.with_clearance)
         if mcap is not None:
-            write_track_mcap(Path(mcap), self.pictures, self.by_camera, self.began)
+            write_track_mcap(path_of(mcap), self.pictures, self.by_camera, self.began)
 
 
 def own_file(path: Path, name: str) -> Path:
@@ -303,7 +303,7 @@ def _opened(
             )
         timed_poses = _poses_in_time(rig, camera, plan)
         return _rendered(rig, scene, camera, timed_poses), len(timed_poses)
-    path = Path(source)
+    path = path_of(source)
     if path.is_dir():
 
         def skipped(name: str, why: str) -> None:

@@ -24,7 +24,7 @@ from executor.remote.protocol import Presses
 from executor.remote.status import WinchStatus
 from executor.state_machine import REMARK, CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests, RequestBoard
-from model.errors import Fault, Refused, StoppedByOperator
+from model.errors import Fault, Refused, StoppedByOperator, real_number
 from model.pose import Pose
 from model.progress import Listener
 from model.rig import Rig
@@ -83,6 +83,7 @@ def limit_of(rig: Rig, limit: float | None) -> float:
     """
     if limit is None:
         return rig.min_tension + LIMIT_SHARE * (rig.max_tension - rig.min_tension)
+    limit = real_number("limit", limit, "N")
     if not rig.min_tension < limit <= rig.max_tension:
         raise Refused(
             f"the tension limit of {limit:g} N is not above {rig.min_tension:g} N and at most"

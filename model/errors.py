@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from numbers import Real
@@ -11,6 +12,22 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 T = TypeVar("T")
+
+
+_PASSWORD = re.compile(
+    r"(?<=:/)(/?[^\s:/?#@]*:)(?:[^\n/?#]*|(?!\d{1,5}[/?#])\S*)@"
+    r"|((?:pass(?:word|wort|wd)?|pwd)=)[^\s&/?#'\")]+",
+    re.IGNORECASE,
+)
+
+
+def without_passwords(text: str) -> str:
+    """A text with ``***`` for the passwords of the addresses in it.
+
+    They are the ``PASSWORD`` of ``rtsp://USER:PASSWORD@HOST``, also with characters that should be
+    escaped, and of ``?password=PASSWORD``, as camera makers spell it.
+    """
+    return _PASSWORD.sub(lambda found: f"{found[1]}***@" if found[1] else f"{found[2]}***", text)
 
 
 class CdprError(Exception):
@@ -22,6 +39,8 @@ class CdprError(Exception):
         why: The likely cause, where known.
         next_step: What the user can do now.
         values: The numbers behind the text, by name (unit in the name).
+
+    Passwords of addresses are left out of all texts.
     """
 
     code: ClassVar[str] = "fault"
@@ -36,11 +55,10 @@ class CdprError(Exception):
         next_step: str = "",
         values: dict[str, float | str] | None = None,
     ) -> None:
-        super().__init__(what)
-        self.what = what
-        self.where = where
-        self.why = why
-        self.next_step = next_step
+        self.what, self.where, self.why, self.next_step = map(
+            without_passwords, (what, where, why, next_step)
+        )
+        super().__init__(self.what)
         self.values = dict(values or {})
 
     def __str__(self) -> str:
@@ -202,23 +220,67 @@ def real_number(name: str, value: object, unit: str = "") -> float:
     """A number of any type, such as NumPy's, as a float; the caller checks its range.
 
     Raises:
-        BadInput: It is a text, a list or another object.
+        BadInput: It is a text, a list or another object, or too large.
     """
     single = value.item() if getattr(value, "shape", None) == () else value  # type: ignore[attr-defined]
     if isinstance(single, bool) or not isinstance(single, Real):
         raise _unusable(name, f"a number [{unit}]" if unit else "a number", value)
-    return float(single)
+    try:
+        return float(single)
+    except OverflowError:
+        raise BadInput(f"{name} is too large a number") from None
+
+
+def positive_number(
+    name: str, value: object, unit: str = "1", *, or_zero: bool = False, most: float = 1e9
+) -> float:
+    """A positive number of any type as a float.
+
+    Args:
+        name: As the message names it.
+        value: The number.
+        unit: Of the number.
+        or_zero: Whether it may be 0.
+        most: The largest allowed.
+
+    Raises:
+        BadInput: It is not such a number, or NaN.
+    """
+    number = real_number(name, value, unit)
+    if not (0.0 < number <= most or (or_zero and number == 0.0)):
+        least = "0 or more" if or_zero else "above 0"
+        raise _unusable(name, f"a number [{unit}] {least}, at most {most:g}", value)
+    return number
 
 
 def path_of(value: object) -> Path:
     """A path, from text or a path object.
 
     Raises:
-        BadInput: It is something else, such as None, a number or bytes.
+        BadInput: It is empty, or something else, such as None, a number or bytes.
     """
     if not isinstance(value, str | PathLike) or not isinstance(fspath(value), str):
         raise _unusable("the path", "a str or a pathlib.Path", value)
-    return Path(fspath(value))
+    require_not_empty("the path", text := fspath(value))
+    return Path(text)
+
+
+def require_not_empty(name: str, text: str) -> None:
+    """Requires a text; an empty path would mean the current folder.
+
+    Args:
+        name: As the message names it.
+        text: What is given for it.
+
+    Raises:
+        BadInput: It is empty.
+    """
+    if not text:
+        raise BadInput(
+            f"{name} is empty",
+            why="a variable of the shell or the program has no value",
+            next_step="give a value; the current folder is '.'",
+        )
 
 
 def _unusable(name: str, expected: str, value: object) -> BadInput:

@@ -58,7 +58,7 @@ def use_folder(version: str) -> Path | None:
                 delete_unused(folder.parent, time.time())
         with tempfile.TemporaryFile(dir=folder):
             return folder
-    except OSError:  # read-only or full: compiled code is then not cached
+    except (OSError, RuntimeError):  # read-only, full, or no home: machine code is not cached
         return None
 
 

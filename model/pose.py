@@ -29,6 +29,27 @@ def read_only(values: ArrayLike) -> Array:
     return array
 
 
+def point_of(name: str, given: ArrayLike) -> Array:
+    """A point or a displacement, shape (3,), [m].
+
+    Args:
+        name: Of the argument.
+        given: What a script passes for it.
+
+    Raises:
+        BadInput: It is something else, or a coordinate is not finite.
+    """
+    try:
+        point = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        point = np.empty(0)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise BadInput(
+            f"{name} must be three finite numbers, x, y and z in metres; it is {given!r}"
+        )
+    return point
+
+
 class ReadOnly:
     """Base of frozen dataclasses whose arrays are read-only: so are those of their copies.
 

@@ -48,7 +48,7 @@ from calibration.targets.boards import Board, Charuco, DetectedBoard
 from calibration.targets.grids import TagGrid
 from executor.kernels import ready_to_measure
 from model.cameras import Z_95
-from model.errors import BadInput
+from model.errors import BadInput, positive_number
 from model.pose import Array, Pose, lever_arm_matrix, matrix_from_rotation_vector, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
@@ -370,6 +370,7 @@ def locate_camera_by_another(
         BadInput: Both are one camera, the board has no unique orientation, a source is a live
             camera, or too few pairs.
     """
+    wanted = positive_number("wanted", wanted, "m")
     if camera.name == reference.name:
         raise BadInput(
             f"camera {camera.name!r} cannot be located relative to itself",

@@ -28,7 +28,7 @@ from calibration.results import Issue
 from calibration.tag_map.observations import TagObservations, platform_pose, platform_views
 from model.cameras import Z_95
 from model.errors import BadInput, InvalidFile, Problem
-from model.files.reading import CsvFile
+from model.files.csv_table import CsvTable
 from model.pose import Array, Pose, read_only
 from model.rig import Camera, Rig
 from tracking.pnp import moved, moved_by_pixels
@@ -278,28 +278,25 @@ def read_poses(path: Path) -> dict[str, Pose]:
     """Reads ``world_from_platform`` by image; rows without a pose are left out.
 
     Raises:
-        BadInput: The file cannot be read.
+        BadInput: The file cannot be read, or a column or a value is missing.
         InvalidFile: With every invalid row.
     """
-    file = CsvFile(path)
-    header = [name.strip() for name in file.rows[0]] if file.rows else []
-    if missing := [name for name in COLUMNS if name not in header]:
-        raise InvalidFile(str(path), [Problem("", f"no column {', '.join(missing)}", 1, 1)])
+    table = CsvTable(path)
+    names, *columns = (table.texts(name) for name in COLUMNS)
+    states = table.texts("status") if "status" in table.names else None
     poses: dict[str, Pose] = {}
     problems = []
-    for line, row in zip(file.lines[1:], file.rows[1:], strict=True):
-        texts = dict(zip(header, row, strict=False))
-        picture = Path(texts.get("picture", "")).name
-        values = [texts.get(name, "").strip() for name in COLUMNS[1:]]
-        kept = "status" not in header or (picture and texts["status"].strip() == "ok")
+    for row, (name, *values) in enumerate(zip(names, *columns, strict=True)):
+        picture = Path(name).name
+        kept = states is None or (picture and states[row] == "ok")
         if not kept or not any(values):  # a log's row without a pose, or without a kept image
             continue
         found = _pose(values)
         if isinstance(found, str):
-            problems.append(Problem(picture, found, line, 1))
+            problems.append(Problem(picture, found, table.line(row), 1))
         elif not picture or picture in poses:
             what = "this image appears twice" if picture else "no image is named"
-            problems.append(Problem(picture, what, line, 1))
+            problems.append(Problem(picture, what, table.line(row), 1))
         else:
             poses[picture] = found
     if problems:

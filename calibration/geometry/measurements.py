@@ -291,7 +291,7 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
     if _has(table, r"swivel_\d+_deg"):
         swivels = np.radians(table.of([f"swivel_{i}_deg" for i in range(1, cables + 1)]))
     return RigMeasurements(
-        names=tuple(f"{path}, line {k + 2}" for k in range(n)),
+        names=tuple(f"{path}, line {table.line(k)}" for k in range(n)),
         counts=read_only(counts),
         tensions=read_only(tensions),
         positions=read_only(positions),

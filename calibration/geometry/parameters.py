@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from model.errors import BadInput, positive_number
 from model.pose import Array, read_only
 from model.rig import Rig
 
@@ -39,6 +40,22 @@ DEFAULT_DEVIATIONS: Mapping[str, float] = MappingProxyType(
 """Standard deviation of a rig file's values: [m], [rad]; drum_scale and stiffness are relative."""
 _GROUPS = (*DEFAULT_DEVIATIONS, "cable_stiffness", "imu_mounting")
 """All groups, in order; cable_stiffness, instead of stiffness, and imu_mounting are opt-in."""
+
+
+def checked_deviations(given: Mapping[str, float]) -> dict[str, float]:
+    """Standard deviations by group, as a script passes them.
+
+    Raises:
+        BadInput: They are not a mapping, a group is unknown, or a number is not positive.
+    """
+    if not isinstance(given, Mapping):
+        raise BadInput(f"deviations must be a mapping by group, it is {given!r}")
+    unknown = [group for group in given if group not in _GROUPS]
+    if unknown:
+        raise BadInput(
+            f"no parameter group {unknown[0]!r}", next_step=f"name some of: {', '.join(_GROUPS)}"
+        )
+    return {group: positive_number(f"deviation of {group}", x) for group, x in given.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

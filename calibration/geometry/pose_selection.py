@@ -12,7 +12,7 @@ from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.model import RigModel
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from model.clearance import ClearanceModel
-from model.errors import NoSolution, require_types
+from model.errors import NoSolution, positive_number, require_types
 from model.files.documents import PoseDocument
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument, StopDocument
@@ -270,7 +270,11 @@ def measurement_poses(
     count = whole_number("count", count, least=1)
     candidates = whole_number("candidates", candidates, least=1)
     settings = TurningSettings(weights=OBJECTIVES["length"], seed=seed, rounds=ROUNDS)
-    room = RESERVE_SHARE * (rig.max_tension - rig.min_tension) if reserve is None else reserve
+    tilt = positive_number("tilt", tilt, "rad", or_zero=True)
+    turn = positive_number("turn", turn, "rad", or_zero=True)
+    dwell = positive_number("dwell", dwell, "s", or_zero=True, most=3600.0)
+    room = RESERVE_SHARE * (rig.max_tension - rig.min_tension)
+    room = room if reserve is None else positive_number("reserve", reserve, "N", or_zero=True)
     of_poses = (0.3e-3,) * 3 + (radians(0.05),) * 3
     requirements = PoseRequirements(count, tilt, turn, candidates, room, 0.1e-3, of_poses)
     with listener.waiting("choosing poses"):

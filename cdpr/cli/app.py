@@ -23,7 +23,14 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from cdpr.cli.arguments import as_command, flag
-from model.errors import AlreadyExists, BadInput, CdprError, Fault
+from model.errors import (
+    AlreadyExists,
+    BadInput,
+    CdprError,
+    Fault,
+    require_not_empty,
+    without_passwords,
+)
 from model.files.reading import shown
 
 
@@ -154,11 +161,33 @@ def _help_of(verb: Callable[..., None]) -> str:
 
 
 class _VerbCommand(TyperCommand):
-    """A verb whose points are always typed as X Y Z."""
+    """A verb whose points are always typed as X Y Z, and whose values are never empty."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """As in Typer, after joining each point into one word."""
-        return super().parse_args(ctx, joined_points(args))
+        """As in Typer, after joining each point into one word.
+
+        Raises:
+            BadInput: A value is empty, such as an unset variable of the shell.
+        """
+        words = joined_points(args)
+        try:
+            rest = super().parse_args(ctx, list(words))
+        except Exception as error:  # Typer's messages repeat what was typed
+            if isinstance(text := getattr(error, "message", None), str):
+                error.message = without_passwords(text)  # type: ignore[attr-defined]
+            raise
+        if not ctx.resilient_parsing:  # then a word is still being completed
+            self._require_values(ctx, words)
+        return rest
+
+    def _require_values(self, ctx: Any, words: list[str]) -> None:
+        """Checks the words: `Path` turns an empty one into the current folder."""
+        typed, _, _ = self.make_parser(ctx).parse_args(words)
+        for parameter in self.params:
+            given = typed.get(parameter.name or "")
+            for value in given if isinstance(given, (list, tuple)) else [given]:
+                if isinstance(value, str):
+                    require_not_empty(max(parameter.opts, key=len), value)
 
 
 def joined_points(arguments: Sequence[str]) -> list[str]:
@@ -249,10 +278,16 @@ def main() -> None:
 
 
 def _replace_closed_streams() -> None:
-    """Discards what is written to a stream that was closed before the start (``2>&-``)."""
-    if None in (sys.stdout, sys.stderr):
-        nothing = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115  # to the end
-        sys.stdout, sys.stderr = sys.stdout or nothing, sys.stderr or nothing
+    """Opens `os.devnull` for streams that were closed before the start (``<&-``, ``2>&-``).
+
+    In order of their numbers, so that each gets its own: a file or a socket that is opened later
+    would get it, here or in a child process, and receive what is meant for the terminal.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115  # to the end
+            os.set_inheritable(stream.fileno(), True)
+            setattr(sys, name, stream)
 
 
 def _escape_unprintable() -> None:
@@ -312,9 +347,9 @@ def _print_defect(error: Exception) -> None:
     with tempfile.NamedTemporaryFile(
         "w", prefix="cdpr-error-", suffix=".txt", delete=False, encoding="utf-8"
     ) as file:
-        file.write("".join(traceback.format_exception(error)))
+        file.write(without_passwords("".join(traceback.format_exception(error))))
     print(
-        f"error: {type(error).__name__}: {error}\n"
+        f"error: {type(error).__name__}: {without_passwords(str(error))}\n"
         "  why: this is a defect in cdpr, not in your input\n"
         f"  next: please report it with the file {file.name}",
         file=sys.stderr,

@@ -55,7 +55,7 @@ from executor.remote.client import stop_runs
 from executor.remote.status import bus_name
 from executor.service import StatusResult
 from executor.service import status as read_status
-from model.errors import CdprError
+from model.errors import CdprError, without_passwords
 from model.files.documents import write_atomic
 from model.pose import Pose
 from model.rig import Rig
@@ -181,7 +181,7 @@ class Console:
             "rig": rig.name,
             "bus": bus_name(rig),
             "simulated": is_simulated(rig),
-            "homes_by": self.files.cameras[0] if self.files.cameras else None,
+            "homes_by": without_passwords(self.files.cameras[0]) if self.files.cameras else None,
             "home_mm": np.round(1e3 * rig.home.position, 1).tolist(),
             **stored_state(self._stored),
             "busy": None if verb is None else {"verb": verb, "text": self._line},

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from model.errors import BadInput, Fault, HardwareMissing
+from model.errors import BadInput, Fault, HardwareMissing, without_passwords
 from model.rig import Camera
 
 # The newest image of a camera that delivers them faster than they are used.
@@ -345,8 +345,9 @@ class LiveCamera:
 
 
 def live_name(camera: str, source: str) -> str:
-    """Name and source of a camera, such as ``side (0)``."""
-    return source if camera == source else f"{camera} ({source})"
+    """Name and source of a camera for people, such as ``side (0)``; without a password."""
+    shown = without_passwords(source)
+    return shown if camera == source else f"{camera} ({shown})"
 
 
 def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from executor.cameras.process import CameraProcess, CameraSample, FrameRequest, sample_without_pose
 from executor.recording.record_files import CameraRecord
-from model.errors import CdprError, Fault, Refused
+from model.errors import CdprError, Fault, Refused, without_passwords
 from model.kinematics import structure_matrix
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Rig
@@ -71,11 +71,11 @@ class CameraClient:
 
         Args:
             process: Takes and measures the images.
-            source: Of the images, for messages.
+            source: Of the images, for messages and records; its password is left out.
             live_image: Descriptor of the memory of `executor.cameras.live_image`; None for none.
         """
         self._live_image = live_image
-        self.name, self.source = process.name, source
+        self.name, self.source = process.name, without_passwords(source)
         self.samples: list[CameraSample] = []
         """Its samples, in order."""
         self.failed: CdprError | None = None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from model.errors import BadInput
+from model.errors import BadInput, require_not_empty, sequence_of
 from model.rig import Camera, Rig
 
 SYNTHETIC = "synthetic"
@@ -117,7 +117,8 @@ def resolve_cameras(rig: Rig, wanted: CameraChoice, in_process: bool) -> dict[Ca
         return choose_cameras(rig, [str(wanted)], False, in_process)
     if isinstance(wanted, Mapping):
         wanted = [f"{name}={source}" for name, source in wanted.items()]
-    return choose_cameras(rig, [str(source) for source in wanted], not wanted, in_process)
+    sources = [str(source) for source in sequence_of("cameras", wanted)]
+    return choose_cameras(rig, sources, not sources, in_process)
 
 
 def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Camera, str]:
@@ -154,9 +155,11 @@ def parse_camera_sources(
         where: Origin of the sources, for messages.
 
     Raises:
-        BadInput: A camera is unknown, named twice, or not named.
+        BadInput: A source is empty, or a camera is unknown, named twice, or not named.
     """
     names = [camera.name for camera in rig.cameras]
+    for source in sources:
+        require_not_empty("the image source", source)
     if len(sources) == 1 and _is_unnamed(sources[0], names):
         return {rig.camera(wanted): sources[0]}
     if wanted is not None:
@@ -167,27 +170,44 @@ def parse_camera_sources(
         )
     chosen: dict[Camera, str] = {}
     for source in sources:
-        name, sign, address = source.partition("=")
-        if name in names and not address:
-            raise BadInput(
-                f"camera {name!r} has no source",
-                where=where,
-                next_step=f"write {name}=0, or its image source",
-            )
-        if not sign or "://" in name:
-            raise BadInput(
-                f"the source {source!r} does not name its camera",
-                where=where,
-                next_step=f"write NAME={source}, NAME one of: {', '.join(names)}",
-            )
-        camera = rig.camera(name)
+        camera, address = parse_named_source(rig, source, where)
         if camera in chosen:
             raise BadInput(
-                f"camera {name!r} has two sources", where=where, next_step="name each camera once"
+                f"camera {camera.name!r} has two sources",
+                where=where,
+                next_step="name each camera once",
             )
-        _require_own(address, chosen, name, where)
+        _require_own(address, chosen, camera.name, where)
         chosen[camera] = address
     return chosen
+
+
+def parse_named_source(rig: Rig, source: str, where: str) -> tuple[Camera, str]:
+    """The camera and the image source of ``NAME=SOURCE``.
+
+    Args:
+        rig: The robot with its cameras.
+        source: The text.
+        where: Its origin, for messages.
+
+    Raises:
+        BadInput: A part is missing, or the camera is unknown.
+    """
+    names = [camera.name for camera in rig.cameras]
+    name, sign, address = source.partition("=")
+    if name in names and not address:
+        raise BadInput(
+            f"camera {name!r} has no source",
+            where=where,
+            next_step=f"write {name}=0, or its image source",
+        )
+    if not sign or "://" in name:
+        raise BadInput(
+            f"the source {source!r} does not name its camera",
+            where=where,
+            next_step=f"write NAME={source}, NAME one of: {', '.join(names)}",
+        )
+    return rig.camera(name), address
 
 
 def _is_unnamed(source: str, names: list[str]) -> bool:

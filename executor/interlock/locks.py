@@ -35,9 +35,21 @@ _KINDS = {
 
 
 def state_folders() -> tuple[Path, ...]:
-    """The state folder, which may not exist yet; then the user's own, where it was before."""
+    """The state folder, which may not exist yet; then the user's own, where it was before.
+
+    Raises:
+        Refused: The user has no home folder, such as one without a name in a container.
+    """
     base = os.environ.get("XDG_STATE_HOME")
-    own = (Path(base) if base else Path.home() / ".local" / "state") / "cdpr"
+    try:
+        own = (Path(base) if base else Path.home() / ".local" / "state") / "cdpr"
+    except RuntimeError as error:
+        raise Refused(
+            "there is no folder for latched faults and homing references",
+            where="XDG_STATE_HOME",
+            why=str(error),
+            next_step="set HOME or XDG_STATE_HOME to a folder of this user that is kept",
+        ) from None
     return (SHARED, own) if SHARED.is_dir() else (own,)
 
 

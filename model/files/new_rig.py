@@ -15,8 +15,8 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from model.errors import BadInput
+from model.files.csv_table import CsvTable
 from model.files.documents import Name, NonNegative, Number, Positive
-from model.files.reading import CsvFile
 
 Answers = Mapping[str, Any]
 CABLES_MOST = 24
@@ -373,26 +373,13 @@ def read_coordinates(path: Path) -> dict[str, Any]:
     Raises:
         BadInput: The file cannot be read, a column is missing, or a value is not a number.
     """
-    table = CsvFile(path)
-    hint = f"begin with the line {','.join(CSV_COLUMNS)}, then one line per cable"
-    header = [word.strip() for word in table.rows[0]] if table.rows else []
-    missing = [name for name in CSV_COLUMNS if name not in header]
-    if missing:
-        raise BadInput(f"the column {missing[0]} is missing", where=str(path), next_step=hint)
-    count = len(table.rows) - 1
-    if not 6 <= count <= CABLES_MOST:
-        what = f"{count} cables; a rig has from 6 to {CABLES_MOST}"
-        raise BadInput(what, where=str(path), next_step="give one line per cable, 6 or more")
-    columns = [header.index(name) for name in CSV_COLUMNS]
-    points = []
-    for line, row in zip(table.lines[1:], table.rows[1:], strict=True):
-        try:
-            points.append([_number(Number)(row[column].strip()) for column in columns])
-        except (IndexError, ValueError) as error:
-            what = "a value is missing" if isinstance(error, IndexError) else str(error)
-            raise BadInput(what, where=f"{path}:{line}", next_step=hint) from None
+    table = CsvTable(path)
+    points = table.of(CSV_COLUMNS).tolist()
+    if not 6 <= len(points) <= CABLES_MOST:
+        what = f"{len(points)} cables; a rig has from 6 to {CABLES_MOST}"
+        raise table.bad(what, "give one line per cable, 6 or more")
     return {
-        "cables": count,
+        "cables": len(points),
         "outlets_mm": [point[:3] for point in points],
         "anchors_mm": [point[3:] for point in points],
     }

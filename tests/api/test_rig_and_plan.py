@@ -6,9 +6,11 @@ import copy
 import math
 import pickle
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -289,6 +291,72 @@ def test_a_path_in_place_of_an_object_is_refused_with_what_loads_it(
     assert step in caught.value.next_step
 
 
+NUMBERS_OF_A_FIT = ("wanted", "length_deviation", "swivel_deviation", "imu_deviation", "tilt")
+
+
+@pytest.mark.parametrize("number", [-1e-3, math.nan, math.inf, 1e300, "1", None])
+def test_a_number_that_cannot_be_is_refused_before_anything_is_read(
+    rig: cdpr.Rig, scene: cdpr.Scene, number: Any
+) -> None:
+    """A fit takes minutes, and the result is not written."""
+    board = cdpr.Chessboard(9, 6, 0.02)
+    calls = {
+        f"{name} must be": partial(cdpr.calibrate_rig, rig, "absent", **{name: number})
+        for name in NUMBERS_OF_A_FIT
+    }
+    for text, call in {
+        **calls,
+        "deviation of outlets must be": partial(
+            cdpr.calibrate_rig, rig, "absent", deviations={"outlets": number}
+        ),
+        "no parameter group 'outlet'": partial(
+            cdpr.calibrate_rig, rig, "absent", deviations={"outlet": 1e-3}
+        ),
+        "a pose deviation must be": partial(
+            cdpr.calibrate_rig, rig, "absent", pose_deviations=(1e-3, number)
+        ),
+        "must be two numbers": partial(cdpr.calibrate_rig, rig, "absent", pose_deviations=(1e-3,)),
+        "reflector must be": partial(cdpr.calibrate_rig, rig, "absent", reflector=(0, 0, math.nan)),
+        "wanted must be": partial(cdpr.calibrate_camera, "absent", board, wanted=number),
+        "wanted must": partial(cdpr.locate_camera, rig, "absent", wanted=number),
+        "wanted mus": partial(cdpr.locate_tags, rig, "absent", wanted=number),
+        "dwell must be": partial(cdpr.measurement_poses, rig, scene, dwell=number),
+        "tilt must b": partial(cdpr.measurement_poses, rig, scene, tilt=number),
+    }.items():
+        with pytest.raises(cdpr.BadInput, match=text):
+            call()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda rig: cdpr.track(rig, ""),
+        lambda rig: cdpr.track(rig, "synthetic", overlay=""),
+        lambda rig: cdpr.open_camera(rig, ""),
+        lambda rig: cdpr.locate_tags(rig, ""),
+        lambda rig: cdpr.locate_camera(rig, ""),
+        lambda rig: cdpr.locate_camera(rig, "absent", poses=""),
+        lambda rig: cdpr.calibrate_camera("", cdpr.Chessboard(9, 6, 0.02)),
+        lambda rig: cdpr.calibrate_camera(".", cdpr.Chessboard(9, 6, 0.02), output=""),
+        lambda rig: cdpr.calibrate_rig(rig, ""),
+        lambda rig: cdpr.calibrate_rig(rig, [""]),
+        lambda rig: cdpr.home(rig, camera=""),
+        lambda _: cdpr.load_rig(""),
+        lambda _: cdpr.load_run(""),
+        lambda _: cdpr.report(""),
+    ],
+)
+def test_an_empty_path_is_not_the_current_folder(
+    rig: cdpr.Rig, call: Callable[..., object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(CONFIGS.parent / "examples/rig_session/pictures", tmp_path / "here")
+    monkeypatch.chdir(tmp_path / "here")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(cdpr.BadInput, match="is empty"):
+        call(rig)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 WRONG: list[Any] = [
     *(None, True, 3, -1, 1.5, math.nan, math.inf, 10**30, "x", "", b"x", object(), print),
     *([], [None], ["x"], [[1], [2, 3]], {}, {"x": 1}, {"length": "1"}, {"z": 0.4}, ("z", 0.4)),
@@ -312,6 +380,22 @@ def calls_with_a_wrong_argument(name: str) -> Callable[[cdpr.Rig, cdpr.Scene, An
             return lambda rig, scene, x: cdpr.workspace_map(rig, scene, **{**quick, argument: x})
         case "changed":
             return lambda _, scene, x: scene.changed(**{argument: x})
+        case "calibrate_rig" | "locate_camera" | "locate_tags" | "track":
+            return lambda rig, _, x: getattr(cdpr, verb)(rig, "absent", **{argument: x})
+        case "calibrate_camera":
+            board = cdpr.Chessboard(9, 6, 0.02)
+            return lambda *given: cdpr.calibrate_camera("absent", board, **{argument: given[-1]})
+        case "measurement_poses":
+            quick = {"count": 1, "candidates": 1}
+            return lambda rig, scene, x: cdpr.measurement_poses(
+                rig, scene, **{**quick, argument: x}
+            )
+        case "home":
+            refused = {"confirm": lambda _: False, "at_home": True}
+            return lambda rig, _, x: cdpr.home(rig, **{**refused, argument: x})
+        case "jog":
+            refused = {"confirm": lambda _: False, "by": (0.0, 0.0, 0.001)}
+            return lambda rig, _, x: cdpr.jog(rig, None, **{**refused, argument: x})
         case "rig":
             return lambda rig, _, x: getattr(rig, argument)(x)
         case _:
@@ -327,6 +411,13 @@ def calls_with_a_wrong_argument(name: str) -> Callable[[cdpr.Rig, cdpr.Scene, An
         *("waypoints waypoints", "waypoints stops", "waypoints author"),
         *("workspace_map " + name for name in ("slices", "step", "rotation", "workers")),
         *("changed start", "changed goal", "changed clearance"),
+        *("calibrate_rig " + name for name in (*NUMBERS_OF_A_FIT, "deviations")),
+        *("calibrate_rig pose_deviations", "calibrate_rig reflector"),
+        *("calibrate_camera wanted", "calibrate_camera distance"),
+        *("locate_camera wanted", "locate_tags wanted", "track pictures", "track overlay"),
+        *("measurement_poses " + name for name in ("tilt", "turn", "dwell")),
+        *("home " + name for name in ("tension", "limit", "reach", "speed", "pictures")),
+        *("home simulated_slack", "home camera", "jog speed", "jog by"),
         *("rig at", "rig clipped"),
         *("load_rig", "load_scene", "load_plan", "load_run", "load_calibration", "report"),
     ],

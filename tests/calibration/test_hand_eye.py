@@ -178,7 +178,6 @@ def test_a_log_of_a_run_is_read_as_far_as_it_has_poses_and_images(tmp_path: Path
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("picture,x_mm\n", "no column y_mm, z_mm, qw, qx, qy, qz"),
         (HEAD + "a.png,1,2,x,1,0,0,0\n", "2:1: a.png: 1, 2, x, 1, 0, 0, 0 are not seven numbers"),
         (HEAD + "a.png,1,2,nan,1,0,0,0\n", "not finite"),
         (HEAD + "a.png,1,2,3,1,1,0,0\n", "length 1"),
@@ -248,3 +247,25 @@ def test_a_focal_length_that_is_off_is_in_the_interval_of_the_pose(calibrated: R
     scatter = by_another_lens(unknown, change)
     assert scatter.by_lens is None
     assert not (np.abs(gap) <= scatter.half_widths[:3]).all()
+
+
+LOG_HEAD = HEAD.replace("\n", ",status\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "no values"),
+        ("picture,x_mm\na.png,1\n", "column 'y_mm' is missing"),
+        (LOG_HEAD + "a.png,1,2,3,1,0,0,0,ok\n\nb.png,4,5,300,1,0,0,0\n", "line 4 has 8 values"),
+        (LOG_HEAD + "a.png,1,2,3,1,0,0,0,ok,1\n", "line 2 has 10 values for 9 columns"),
+        (HEAD + "a.png,1,2,3\n", "line 2 has 4 values for 8 columns"),
+        (HEAD.replace("qx", "qw") + "a.png,1,2,3,1,0,0,0\n", "'qw' appears twice"),
+    ],
+)
+def test_rows_and_columns_that_are_missing_are_named(tmp_path: Path, text: str, named: str) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text(text)
+    with pytest.raises(BadInput) as caught:
+        read_poses(path)
+    assert named in str(caught.value)

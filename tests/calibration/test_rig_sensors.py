@@ -314,3 +314,20 @@ def test_the_program_finds_and_applies_them(
     new = tmp_path / "new.yaml"
     assert call("calibrate", "apply", path, result, "-o", new).code == 0
     assert load_rig(new).cable_stiffness == pytest.approx(document["cable_stiffness_n"])
+
+
+@given(st.lists(st.integers(0, 3), min_size=20, max_size=20))
+@settings(max_examples=20, deadline=None)
+def test_a_sample_is_named_by_its_line_in_the_file(
+    tmp_path_factory: pytest.TempPathFactory, blank: list[int]
+) -> None:
+    """The operator deletes the line that a message names."""
+    path = tmp_path_factory.getbasetemp() / "samples.csv"
+    lines = [",".join(f"actual_{i}_counts" for i in range(1, 9))]
+    for k, empty in enumerate(blank):
+        lines += [""] * empty + [",".join([str(k)] * 8)]
+    path.write_text("\n".join(lines) + "\n")
+    found = read_rig_data(path, 8)
+    for name, counts in zip(found.names, found.counts, strict=True):
+        number = int(name.rpartition(", line ")[2])
+        assert lines[number - 1] == ",".join([f"{counts[0]:.0f}"] * 8)

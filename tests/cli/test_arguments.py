@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import os
@@ -9,12 +10,16 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 import yaml
 
 from cdpr.cli import arguments
+from cdpr.cli.app import VERBS, LazyGroup
+from cdpr.cli.arguments import as_command
 from model.errors import BadInput
 from tests.cli.plans import CONFIGS, RIG, write_short_plan
 from tests.cli.program import call, nothing_written, one_message
@@ -236,3 +241,157 @@ def test_a_terminal_of_ascii_only_shows_what_it_can(monkeypatch: pytest.MonkeyPa
     assert end.value.code == 2
     out.flush()
     assert b"\\xe9\\u2192.json: no such file" in out.buffer.getvalue()  # type: ignore[attr-defined]
+
+
+def _parts(kind: Any) -> set[Any]:
+    """The types in an annotation, such as that of a list or of a value that may be left out."""
+    return {kind}.union(*(_parts(one) for one in get_args(kind)))
+
+
+def words_with_one_empty() -> list[tuple[str, tuple[str, ...]]]:
+    """For each path and text of each verb: how it is typed, and a command in which it is empty."""
+    found = []
+    for group in (LazyGroup(), *(LazyGroup().loaded(v.name) for v in VERBS if v.verbs)):
+        assert isinstance(group, LazyGroup)
+        before = () if group.name in (None, "cdpr") else (group.name,)
+        for verb in (verb for verb in group.verbs if not verb.verbs):
+            command: Any = group.loaded(verb.name)
+            module, _, function = verb.target.partition(":")
+            declared = as_command(getattr(import_module(f"cdpr.cli.{module}"), function))
+            kinds = {
+                name: get_args(one.annotation)[0]
+                for name, one in inspect.signature(declared).parameters.items()
+            }
+            for empty in command.params:
+                if not {Path, str} & _parts(kinds.get(empty.name)):
+                    continue
+                typed = max(empty.opts, key=len)
+                words = [*before, verb.name]
+                for one in command.params:
+                    if one is empty or one.required:
+                        words += [max(one.opts, key=len)] if one.opts[0].startswith("-") else []
+                        words += [""] if one is empty else ["1"] * abs(one.nargs)
+                found.append((typed, tuple(words)))
+    return found
+
+
+def test_an_empty_value_of_any_verb_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As from an unset variable of the shell; `Path("")` would be the current folder."""
+    monkeypatch.chdir(tmp_path)
+    commands = words_with_one_empty()
+    assert len(commands) > 90
+    for typed, words in commands:
+        with nothing_written(tmp_path):
+            one_message(call(*words), 2, f"{typed} is empty")
+
+
+@pytest.mark.parametrize("words", [("track", "RIG", "", "-o", "t.csv"), ("track", "RIG", "front=")])
+def test_an_empty_source_is_not_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    folder = tmp_path / "here"
+    shutil.copytree(CONFIGS.parent / "examples/rig_session/pictures", folder)
+    monkeypatch.chdir(folder)
+    rig = CONFIGS / "gachon_8_6_rehearsal.yaml"
+    with nothing_written(folder):
+        answer = call(*(rig if word == "RIG" else word for word in words), "-o", "t.csv")
+    one_message(answer, 2)
+
+
+@pytest.mark.parametrize("beside", ["side", "side=", "front", "=side"])
+def test_another_camera_without_a_source_is_not_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, beside: str
+) -> None:
+    document = yaml.safe_load(RIG.read_text())
+    document["cameras"].append({**document["cameras"][0], "name": "side"})
+    (tmp_path / "two.yaml").write_text(yaml.safe_dump(document))
+    folder = tmp_path / "here"
+    shutil.copytree(CONFIGS.parent / "examples/rig_session/pictures", folder)
+    monkeypatch.chdir(folder)
+    words = ("calibrate", "extrinsics", "../two.yaml", folder, "--camera", "front")
+    with nothing_written(folder):
+        answer = call(*words, "--beside", beside)
+    one_message(answer, 2)
+    assert "source" in answer.said or "no camera ''" in answer.said
+
+
+SECRET = "s3cret"
+ADDRESS = f"rtsp://user:{SECRET}@127.0.0.1:9/stream"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("track", RIG, ADDRESS, "-o", "t.csv"),
+        ("track", RIG, f"nobody={ADDRESS}", "-o", "t.csv"),
+        ("track", RIG, "0", "-o", "t.csv", "--scene", ADDRESS),
+        ("track", RIG, ADDRESS, ADDRESS, "-o", "t.csv"),
+        ("track", RIG, "-o", "t.csv", "--pictures", ADDRESS, "0"),
+        ("doctor", RIG, "--camera", ADDRESS),
+        ("doctor", RIG, ADDRESS),
+        ("calibrate", "extrinsics", RIG, ADDRESS),
+        ("calibrate", "extrinsics", RIG, "0", "--beside", ADDRESS),
+        ("run", "plan.json", "--rig", RIG, "--yes", "-o", "run", "--camera", ADDRESS),
+        ("run", "plan.json", "--rig", RIG, "--fast", "-o", "run", "--camera", ADDRESS),
+        ("home", RIG, "--camera", ADDRESS, "--yes"),
+    ],
+)
+def test_the_password_of_a_camera_is_never_printed(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    words: tuple[str | Path, ...],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_short_plan(tmp_path / "plan.json")
+    answer = call(*words)
+    assert answer.code != 0
+    native = capfd.readouterr()  # of OpenCV and FFmpeg
+    assert SECRET not in answer.out + answer.err + native.out + native.err
+    written = (path for path in tmp_path.rglob("*") if path.is_file())
+    assert not any(SECRET.encode() in path.read_bytes() for path in written)
+
+
+STANDARD = """
+import json, os, subprocess, sys
+from cdpr.cli.app import _replace_closed_streams
+_replace_closed_streams()
+child = "import os; [os.fstat(number) for number in range(3)]"
+code = subprocess.run([sys.executable, "-c", child]).returncode
+files = [stream.fileno() for stream in (sys.stdin, sys.stdout, sys.stderr)]
+os.write(int(sys.argv[1]), json.dumps([code, files, open(os.devnull).fileno()]).encode())
+"""
+
+
+@pytest.mark.parametrize("closed", ["", "<&-", ">&-", "2>&-", "<&- 2>&-", "<&- >&- 2>&-"])
+def test_no_file_takes_the_number_of_a_closed_stream(tmp_path: Path, closed: str) -> None:
+    """What is meant for the terminal would go to it, such as the set-points of a bus."""
+    reading, writing = os.pipe()
+    subprocess.run(
+        ["sh", "-c", f'exec "$0" "$@" {closed}', sys.executable, "-c", STANDARD, str(writing)],
+        pass_fds=[writing],
+        cwd=CONFIGS.parent,
+        check=True,
+    )
+    os.close(writing)
+    with open(reading) as answer:
+        code, files, other = json.load(answer)
+    assert (code, files) == (0, [0, 1, 2])
+    assert other > 2
+
+
+def test_without_standard_input_a_question_has_no_answer(tmp_path: Path) -> None:
+    program = f"import sys; sys.path.insert(0, {str(CONFIGS.parent)!r})"
+    program += "; from cdpr.cli import main; main()"
+    done = subprocess.run(
+        ["sh", "-c", 'exec "$0" -c "$1" new x.yaml <&-', sys.executable, program],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2, done
+    assert "no answer to the question" in done.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import json
+import pwd
 import resource
+import sys
+import tomllib
+from dataclasses import replace
+from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
 
 from drivers import can_bus
 from drivers.cameras import live as cameras
 from drivers.can_bus import BusSettings, KernelInterface, can_interfaces, parse_interfaces
 from executor import doctor
 from executor.doctor import MachineCheck, kernel_bus, memory_check, priority_check
+from model.rig import load_rig
 from simulation.drives.eds_file import profile_path, read_eds
 from tests.cli.plans import RIG
 from tests.cli.program import call
@@ -260,3 +267,33 @@ def test_drives_need_the_rig_and_a_profile_that_is_there(tmp_path: Path) -> None
     answer = call("doctor", with_profile(tmp_path, "epos5"), "--drives")
     assert answer.code == 2
     assert "epos4" in answer.said
+
+
+def test_every_required_library_is_checked_under_the_module_that_it_installs() -> None:
+    project = tomllib.loads((RIG.parents[1] / "pyproject.toml").read_text())["project"]
+    required = {Requirement(one).name for one in project["dependencies"]}
+    assert sorted(doctor.LIBRARIES.values()) == sorted(required)
+    installed = packages_distributions()
+    for module, package in doctor.LIBRARIES.items():
+        assert package in [name.lower() for name in installed[module]]
+
+
+def test_the_detector_of_the_rig_is_checked_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyapriltags", None)
+    rig = load_rig(RIG)
+    assert all(check.good for check in doctor.check_rig(rig) if "apriltag" in check.name)
+    checks = doctor.check_rig(replace(rig, tag_detector="apriltag"))
+    (missing,) = (check for check in checks if check.name == "pyapriltags")
+    assert not missing.good
+
+
+def test_a_user_without_a_name_is_named_by_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container; `limits.conf` takes ``:UID``."""
+    for name in ("LOGNAME", "USER", "LNAME", "USERNAME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("os.getuid", lambda: 54321)
+    with pytest.raises(KeyError):
+        pwd.getpwuid(54321)
+    assert "echo ':54321 - memlock unlimited'" in memory_check(65536, privileged=False).fix

@@ -167,10 +167,12 @@ def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:
     one_message(low, 2, "--max-tension-n", "more than the smallest tension, 5 N")
     table.write_text(table.read_text().replace("864.7443", "high"))
     high = call("new", tmp_path / "rig.yaml", "--from", table)
-    one_message(high, 2, f"{table}:2", "'high' is not a number")
+    one_message(high, 2, str(table), "line 2", "'high' is not a finite number")
+    table.write_text(table.read_text().replace("\n", ",1\n", 1))
+    one_message(call("new", tmp_path / "rig.yaml", "--from", table), 2, "line 2 has 6 values")
     table.write_text("outlet_x_mm\n1\n")
     one_message(
-        call("new", tmp_path / "rig.yaml", "--from", table), 2, "column outlet_y_mm is missing"
+        call("new", tmp_path / "rig.yaml", "--from", table), 2, "column 'outlet_y_mm' is missing"
     )
     few = call("new", tmp_path / "rig.yaml", "--from", cables_csv(tmp_path, 5))
     one_message(few, 2, "5 cables", "from 6 to 24", "one line per cable, 6 or more")

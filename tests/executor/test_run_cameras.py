@@ -24,6 +24,7 @@ from executor.cameras.process import (
     FrameRequest,
     sample_without_pose,
 )
+from executor.proposals import HomingProposal
 from executor.remote.client import camera_line
 from model.clearance import ClearanceModel
 from model.errors import BadInput, Fault
@@ -370,3 +371,12 @@ def test_the_names_of_the_images_name_the_camera(tmp_path: Path) -> None:
     (tmp_path / "secret").touch()
     with pytest.raises(BadInput, match="cannot be read"):
         folder.picture("pictures/../../secret")
+
+
+def test_the_password_of_a_camera_is_neither_sent_nor_recorded_nor_shown() -> None:
+    client = CameraClient(Scripted("front", [0]), "rtsp://user:s3cret@h/x")  # type: ignore[arg-type]
+    assert client.as_dict(0.0)["source"] == client.record().source == "rtsp://user:***@h/x"
+    facts = HomingProposal(
+        _RIG, 10.0, 50.0, 0.05, 0.002, 0.002, (_RIG.cameras[0], "rtsp://user:s3cret@h/x")
+    ).facts()
+    assert dict(facts)["pose"] == "measured, camera front (rtsp://user:***@h/x)"

@@ -18,6 +18,7 @@ from executor.interlock import locks as state_folder
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.locks import LARGEST_FILE, SetUpLock, read_state_file, state_file
 from executor.interlock.reference import ReferenceFile
+from model import jit as machine_code
 from model.errors import Refused
 from tests.cli.plans import RIG
 from tests.cli.program import call
@@ -233,3 +234,14 @@ def test_a_serial_adapter_is_the_same_bus_by_each_of_its_names(tmp_path: Path) -
     for speed in ("", "@115200"):
         names = {BusSettings("slcan", f"{name}{speed}").canonical for name in (device, by_id)}
         assert names == {f"slcan {device}{speed}"}
+
+
+def test_a_user_without_a_home_is_told_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one without a name, in a container: its latched faults would have no place."""
+    for name in ("HOME", "XDG_STATE_HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("os.getuid", lambda: 54321)
+    with pytest.raises(Refused) as refusal:
+        state_file("latched", BUS)
+    assert "XDG_STATE_HOME" in refusal.value.next_step
+    assert machine_code.use_folder("0123456789abcdef") is None

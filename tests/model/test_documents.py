@@ -5,15 +5,17 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import pickle
+import re
 import tempfile
 from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from model.errors import BadInput
+from model.errors import BadInput, without_passwords
 from model.files.documents import content_hash, write_atomic
 
 json_values = st.recursive(
@@ -124,3 +126,45 @@ def test_a_folder_that_may_not_be_written_is_reported(
         write_atomic(tmp_path / "file.json", "new")
     assert caught.value.why == "Permission denied"
     assert "write permission" in caught.value.next_step
+
+
+PART = st.text(
+    st.characters(min_codepoint=33, max_codepoint=126, exclude_characters="/?#@:[]"), min_size=3
+)
+
+
+@given(
+    st.sampled_from(("rtsp", "http", "RTSPS")),
+    PART,
+    st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1),
+    PART,
+    st.sampled_from(("", ":554", "/stream", ":554/cam@1?x=1", "/?a=b@c")),
+)
+def test_no_password_of_an_address_is_in_a_message(
+    scheme: str, user: str, password: str, host: str, rest: str
+) -> None:
+    assume(not re.match(r"\d{1,5}[/?#]", password) and not re.search(r"[/?#].*\s", password))
+    address = f"{scheme}://{user}:{password}@{host}{rest}"
+    for text in (address, f"front={address}", f"camera front ({address})"):
+        shown = without_passwords(text)
+        assert f":{password}@" not in shown or password == "***"
+        assert f"{scheme}://{user}:***@" in shown
+    error = pickle.loads(pickle.dumps(BadInput(address, where=address, why=address)))
+    assert f":{password}@" not in f"{error} {error.as_dict()} {error.args}" or password == "***"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "rtsp://10.0.0.5:554/cam@1", "rtsp://user@host/x", "http://[fe80::1]:80/x", "0",
+        "/dev/video0", "front=http://h:80/?x=1", "a folder/with user:name@host.png",
+    ],
+)  # fmt: skip
+def test_an_address_without_a_password_is_shown_as_it_is(text: str) -> None:
+    assert without_passwords(text) == text
+
+
+@pytest.mark.parametrize("key", ["password", "passwd", "pass", "pwd", "PWD"])
+def test_a_password_among_the_parameters_of_an_address_is_left_out(key: str) -> None:
+    shown = without_passwords(f"http://h/video?user=me&{key}=s3cret&channel=1")
+    assert shown == f"http://h/video?user=me&{key}=***&channel=1"

@@ -31,7 +31,7 @@ from cdpr.cli.calibrate.results import CAMERA, PICTURES, SOURCE, ResultOptions, 
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CALIBRATION, RIG, calibrated_rig
 from cdpr.cli.output import err, show_line
-from executor.cameras.sources import require_camera_source
+from executor.cameras.sources import parse_named_source, require_camera_source
 from executor.supervision import LocalRequests
 from model.errors import BadInput
 from model.files.output import make_folder
@@ -221,12 +221,12 @@ def extrinsics(
                 where="calibrate extrinsics",
                 next_step="pass --poses for the rig's motion, or --beside for another camera",
             )
-        name, _, other = beside.partition("=")
+        another, other = parse_named_source(the_rig, beside, "--beside")
         made = locate_camera_by_another(
             the_rig,
             the_camera,
-            the_rig.camera(name),
-            (_opener(source, the_camera, pictures), _opener(other, the_rig.camera(name), pictures)),
+            another,
+            (_opener(source, the_camera, pictures), _opener(other, another, pictures)),
             board=printed.made() if printed != BoardOptions() else None,
             wanted=wanted_mm / 1e3,
             output=result.to,
