@@ -16,6 +16,7 @@ from scipy.special import ndtr, stdtrit
 
 from model.cameras import Z_95
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
+from model.pose import moved as moved
 from model.rig import Camera, Tag
 from tracking.camera_model import project_undistorted
 from tracking.detection.tags import CORNER_SIGNS, tag_corners
@@ -393,11 +394,6 @@ def _refined(squares: _Squares, pose: Pose) -> Pose:
         if damping > 1e8:
             break
     return pose
-
-
-def moved(pose: Pose, step: Array) -> Pose:
-    """The pose after a shift [m] and rotation [rad] along the outer frame's axes, shape (6,)."""
-    return Pose(pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation)
 
 
 def _result(
