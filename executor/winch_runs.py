@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from executor.control.winch_loop import LawMotion, MakeLaw, WinchesHere, WinchMover
 from executor.control.winch_motion import WinchRecord, WinchResult, move_winches, recording
 from executor.drives import abandoned_drives_fault, is_simulated, unreferenced_drives_of
+from executor.hold_to_run.presses import PressBoard
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.kernels import ready_for_simulating_process
@@ -20,7 +21,6 @@ from executor.realtime.scheduling import Clock, SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import free_folder
 from executor.remote.command_server import Commands
-from executor.remote.protocol import Presses
 from executor.remote.status import WinchStatus
 from executor.state_machine import REMARK, CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests, RequestBoard
@@ -177,7 +177,7 @@ def move_supervised(
     *,
     listener: Listener,
     showing: AbstractContextManager[Callable[[CycleRecord], None]],
-    presses: Presses | None = None,
+    presses: PressBoard | None = None,
     unreported: Collection[str] = _UNREPORTED,
     rehome: bool = False,
     at_rest: Callable[[WinchResult, Pose | None], HomingReference | None] = lambda _, __: None,

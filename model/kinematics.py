@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput, Fault
-from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
+from model.pose import Array, Pose, matrix_from_rotation_vector, moved, read_only
 from model.statics.wrench_sets import rms_anchor_radius
 
 if TYPE_CHECKING:
@@ -272,7 +272,7 @@ def _levenberg_marquardt(
         jacobian = -structure_matrix(rig, pose).T * scale
         normal = jacobian.T @ jacobian
         step = scale * np.linalg.solve(normal + damping * np.eye(6), -(jacobian.T @ residual))
-        candidate = _moved(pose, step)
+        candidate = moved(pose, step)
         trial = _residual(rig, candidate, lengths)
         if trial is not None and trial @ trial <= residual @ residual:
             pose, residual, damping = candidate, trial, max(damping / 10.0, LEAST_DAMPING)
@@ -296,8 +296,3 @@ def _residual(rig: Rig, pose: Pose, lengths: Array) -> Array | None:
         return cable_lengths(rig, pose) - lengths
     except NoCable:  # the trial pose puts an anchor inside a pulley
         return None
-
-
-def _moved(pose: Pose, step: Array) -> Pose:
-    """The pose after a small twist, shape (6,): translation [m], rotation in the world [rad]."""
-    return Pose(pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation)

@@ -312,6 +312,17 @@ def interpolate(start: Pose, end: Pose, fraction: float) -> Pose:
     return Pose(position, start.rotation @ matrix_from_rotation_vector(fraction * turn))
 
 
+def moved(pose: Pose, step: Array) -> Pose:
+    """The pose after a shift [m] and rotation [rad] along the outer frame's axes, shape (6,)."""
+    return Pose(pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation)
+
+
+def step_between(before: Pose, after: Pose) -> Array:
+    """Shift [m] and rotation [rad] along the outer frame's axes, shape (6,); inverts `moved`."""
+    turn = rotation_vector_from_matrix(after.rotation @ before.rotation.T)
+    return np.concatenate([after.position - before.position, turn])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PlatformMotion:
     """A steady motion of the platform.
@@ -327,8 +338,8 @@ class PlatformMotion:
     @classmethod
     def between(cls, before: Pose, after: Pose, seconds: float) -> PlatformMotion:
         """The motion from one pose to another in a non-zero time."""
-        turn = rotation_vector_from_matrix(after.rotation @ before.rotation.T)
-        return cls((after.position - before.position) / seconds, turn / seconds)
+        twist = step_between(before, after) / seconds
+        return cls(twist[:3], twist[3:])
 
     def moved(self, pose: Pose, seconds: float) -> Pose:
         """The pose at a later or earlier time."""

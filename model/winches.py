@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from model.kinematics import cable_lengths
-from model.pose import Array, read_only
+from model.pose import Array, Pose, read_only
 from model.rig import Rig
+from model.scene import Load
 from model.statics.gravity import working_tensions
 
 
@@ -29,6 +30,7 @@ class WinchMap:
         Raises:
             TensionInfeasible: The rig cannot hold its platform at home.
         """
+        self._rig = rig
         self.stiffness: Array = rig.cable_stiffness if stiffness is None else stiffness
         self.behind_outlet = read_only([w.drum_to_outlet for w in rig.winches])
         self.counts_per_metre = read_only([w.counts_per_metre for w in rig.winches])
@@ -56,6 +58,16 @@ class WinchMap:
         paid_out = unstrained - self.home_unstrained
         counts: Array = self.home_counts + self.counts_per_metre * paid_out
         return counts
+
+    def counts_at(self, pose: Pose, load: Load | None = None) -> Array:
+        """Rounded drive positions at a pose under the working tensions, shape (m,), [counts].
+
+        Raises:
+            TensionInfeasible: The cables cannot hold the weight at this pose.
+        """
+        tensions = working_tensions(self._rig, pose, load).tensions
+        lengths = cable_lengths(self._rig, pose)
+        return np.asarray(np.rint(self.counts(self.unstrained(lengths, tensions))))
 
     def unstrained_from_counts(self, counts: Array) -> Array:
         """Unstrained lengths of whole cables at drive positions, shape (..., m), [m]."""

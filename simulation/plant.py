@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from model.errors import Fault
 from model.kinematics import Cables, cables_at
-from model.pose import Array, Pose, matrix_from_rotation_vector, read_only, skew
+from model.pose import Array, Pose, moved, read_only, skew
 from model.rig import Rig
 from model.scene import Load
 from model.statics.gravity import STANDARD_GRAVITY, working_tensions
@@ -362,10 +362,10 @@ class Plant:
         slope = float(gradient @ step)
         share = 1.0
         for _ in range(40):
-            moved = _moved(pose, share * step)
-            cables, tensions = self._pulled(moved)
-            if self._suspension.energy(moved, tensions) <= before + 1e-4 * share * slope + slack:
-                return moved, cables, tensions
+            trial = moved(pose, share * step)
+            cables, tensions = self._pulled(trial)
+            if self._suspension.energy(trial, tensions) <= before + 1e-4 * share * slope + slack:
+                return trial, cables, tensions
             share /= 2.0
         raise self._lost(
             "the search for the equilibrium does not converge", self._suspension.unstrained
@@ -387,8 +387,3 @@ def load_kernels() -> None:
     point, one = np.zeros((1, 3)), np.ones(1)
     hanging = Hanging(point, point, 0.0, point, one, one, 1.0, np.zeros(3))
     hang_still(hanging, one, np.zeros(3), np.eye(3), np.ones(1), 1.0, FORCE_TOLERANCE, 0)
-
-
-def _moved(pose: Pose, step: Array) -> Pose:
-    rotation = matrix_from_rotation_vector(step[3:]) @ pose.rotation
-    return Pose(pose.position + step[:3], rotation)

@@ -15,11 +15,9 @@ import numpy as np
 
 from drivers.can_bus import SentFrame, receive_frame, transmit
 from drivers.can_errors import BusDown
-from model.kinematics import cables_at
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Load
-from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 from simulation.drives.power import Motor
 from simulation.ground_truth import (
@@ -251,7 +249,7 @@ class SimulatedRig(ABC, Generic[Drive]):
         self.plant = Plant(rig_as_built(rig), start_pose, load, stiffness_as_built(rig))
         self.cycles = 0
         per_newton = self._torque_per_newton()
-        start = _counts_at(rig, start_pose, load)
+        start = WinchMap(rig).counts_at(start_pose, load)
         self._drive_train = DriveTrain(rig, self.plant, start, per_newton, self._friction())
         self.drives: tuple[Drive, ...] = ()
         self.drives = tuple(
@@ -395,10 +393,3 @@ class SimulatedRig(ABC, Generic[Drive]):
     def _send(self, can_id: int, data: Frame) -> None:
         with suppress(BusDown):  # no node is reached
             transmit(self._bus, SentFrame(can_id, data))
-
-
-def _counts_at(rig: Rig, pose: Pose, load: Load | None) -> Array:
-    """Rounded drive positions for a pose according to the rig file, shape (m,), [counts]."""
-    winches = WinchMap(rig)
-    tensions = working_tensions(rig, pose, load).tensions
-    return np.rint(winches.counts(winches.unstrained(cables_at(rig, pose).lengths, tensions)))

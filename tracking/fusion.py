@@ -17,9 +17,9 @@ from model.pose import (
     Array,
     Pose,
     interpolate,
-    matrix_from_rotation_vector,
+    moved,
     read_only,
-    rotation_vector_from_matrix,
+    step_between,
 )
 from tracking.measurement import NoPose, Observation, PoseMeasurement, extrapolate
 from tracking.pose_log import LoggedPicture
@@ -117,17 +117,11 @@ def _apart(name: str, poses: Mapping[str, PoseMeasurement]) -> float:
     """Median squared Mahalanobis distance of a pose from the others."""
     mine, distances = poses[name], []
     for other in (one for key, one in poses.items() if key != name):
-        gap = _between(mine.pose, other.pose)
+        gap = step_between(mine.pose, other.pose)
         spread = mine.covariance + other.covariance + mine.shared + other.shared
         spread = spread + 2.0 * np.diag(UNSTATED_ERROR**2)
         distances.append(float(gap @ np.linalg.solve(spread, gap)))
     return float(np.median(distances)) if len(distances) > 1 else distances[0]
-
-
-def _between(first: Pose, second: Pose) -> Array:
-    """Shift [m] and rotation [rad], world axes, from one pose to the other, shape (6,)."""
-    turn = rotation_vector_from_matrix(second.rotation @ first.rotation.T)
-    return np.concatenate([second.position - first.position, turn])
 
 
 def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
@@ -136,12 +130,11 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
         return first
     weights = [np.linalg.inv(one.covariance) for one in poses]
     covariance = np.linalg.inv(np.sum(weights, axis=0))
-    steps = [w @ _between(first.pose, one.pose) for w, one in zip(weights, poses, strict=True)]
+    steps = [w @ step_between(first.pose, one.pose) for w, one in zip(weights, poses, strict=True)]
     step = covariance @ np.sum(steps, axis=0)
-    rotation = matrix_from_rotation_vector(step[3:]) @ first.pose.rotation
     return replace(
         first,
-        pose=Pose(first.pose.position + step[:3], rotation),
+        pose=moved(first.pose, step),
         covariance=read_only((covariance + covariance.T) / 2.0),
         tags=tuple(sorted({number for one in poses for number in one.tags})),
         reprojection=float(np.sqrt(np.mean([one.reprojection**2 for one in poses]))),
@@ -310,14 +303,14 @@ class _Difference:
     @classmethod
     def first(cls, measured: Measured, encoder: Pose) -> _Difference:
         covariance = measured.covariance + np.diag(DRIVE_NOISE**2)
-        mean = _between(encoder, measured.pose)
+        mean = step_between(encoder, measured.pose)
         return cls(measured.time, mean, covariance, measured.time, 0)
 
     def after(self, measured: Measured, encoder: Pose) -> _Difference:
         """Updated with a measurement, unless it is an outlier."""
         drifted = self._drifted(measured.time)
         noise = measured.covariance + np.diag(DRIVE_NOISE**2)
-        new = _between(encoder, measured.pose) - self.mean
+        new = step_between(encoder, measured.pose) - self.mean
         spread = drifted + noise
         if float(new @ np.linalg.solve(spread, new)) > GATE:
             if self.outliers + 1 >= OUTLIERS:
@@ -330,8 +323,7 @@ class _Difference:
 
     def applied(self, encoder: Pose, time: float) -> Fused:
         """The encoder pose corrected by the difference."""
-        turn = matrix_from_rotation_vector(self.mean[3:])
-        pose = Pose(encoder.position + self.mean[:3], turn @ encoder.rotation)
+        pose = moved(encoder, self.mean)
         covariance = self._drifted(time) + np.diag(DRIVE_NOISE**2)
         return Fused(time, pose, read_only(covariance), time - self.used)
 

@@ -395,11 +395,6 @@ def _refined(squares: _Squares, pose: Pose) -> Pose:
     return pose
 
 
-def moved(pose: Pose, step: Array) -> Pose:
-    """The pose after a shift [m] and rotation [rad] along the outer frame's axes, shape (6,)."""
-    return Pose(pose.position + step[:3], matrix_from_rotation_vector(step[3:]) @ pose.rotation)
-
-
 def _result(
     squares: _Squares, views: Sequence[TagView], pose: Pose, cost: float, rival: float
 ) -> BundlePose:

@@ -20,9 +20,9 @@ from model.pose import (
     Array,
     PlatformMotion,
     Pose,
-    matrix_from_rotation_vector,
+    moved,
     read_only,
-    rotation_vector_from_matrix,
+    step_between,
 )
 from model.rig import Camera, Rig
 from tracking.camera_model import pixels_of, project_undistorted
@@ -162,8 +162,7 @@ def pose_by_motion(camera: Camera, views: Sequence[TagView], camera_from_body: P
         if fitted is None:
             return np.full((6, 6), np.inf)
         there = camera.world_from_camera.compose(fitted.camera_from_body)
-        slopes[:3, k] = there.position - pose.position
-        slopes[3:, k] = rotation_vector_from_matrix(there.rotation @ pose.rotation.T)
+        slopes[:, k] = step_between(pose, there)
     return slopes / _STEP
 
 
@@ -231,7 +230,7 @@ class RollingShutter:
                 break
             pose, slopes = self._in_world(found[1]), self._slopes(*found)
             change = slopes @ np.concatenate([motion.velocity, motion.turning])
-            at_rest = _without(pose, change)
+            at_rest = moved(pose, -change)
         by_motion = self._recent.covariance(time)
         if found is None or by_motion is None:
             found, by_motion = fit(views, start), self._unknown
@@ -245,9 +244,3 @@ class RollingShutter:
 
     def _slopes(self, views: list[TagView], bundle: BundlePose) -> Array:
         return pose_by_motion(self._camera, views, bundle.camera_from_body)
-
-
-def _without(pose: Pose, change: Array) -> Pose:
-    """A pose without a small change of position and rotation vector, shape (6,)."""
-    turn = matrix_from_rotation_vector(-change[3:])
-    return Pose(pose.position - change[:3], turn @ pose.rotation)

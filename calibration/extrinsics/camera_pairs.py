@@ -49,7 +49,7 @@ from calibration.targets.grids import TagGrid
 from executor.kernels import ready_to_measure
 from model.cameras import Z_95
 from model.errors import BadInput, positive_number
-from model.pose import Array, Pose, lever_arm_matrix, matrix_from_rotation_vector, read_only
+from model.pose import Array, Pose, lever_arm_matrix, matrix_from_rotation_vector, moved, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from tracking.camera_model import (
@@ -58,7 +58,7 @@ from tracking.camera_model import (
     undistort_pixels,
     undistorted_slopes,
 )
-from tracking.pnp import moved, moved_by_pixels, pose_slopes
+from tracking.pnp import moved_by_pixels, pose_slopes
 from tracking.shared_errors import pixels_by_lens, split_extrinsics
 
 LEAST_PAIRS = 4

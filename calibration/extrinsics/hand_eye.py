@@ -29,9 +29,9 @@ from calibration.tag_map.observations import TagObservations, platform_pose, pla
 from model.cameras import Z_95
 from model.errors import BadInput, InvalidFile, Problem
 from model.files.csv_table import CsvTable
-from model.pose import Array, Pose, read_only
+from model.pose import Array, Pose, moved, read_only
 from model.rig import Camera, Rig
-from tracking.pnp import moved, moved_by_pixels
+from tracking.pnp import moved_by_pixels
 from tracking.shared_errors import pixels_by_lens
 
 LEAST_POSES = 8

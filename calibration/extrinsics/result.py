@@ -20,7 +20,7 @@ from model.cameras import Z_95
 from model.files.camera_file import PoseCovariance, PoseSlopes
 from model.files.documents import AnyNonNegative, PoseDocument, Vector
 from model.files.rig_file import RigDocument
-from model.pose import Array, Pose, rotation_vector_from_matrix, skew
+from model.pose import Array, Pose, skew, step_between
 from model.rig import Camera, Rig
 
 
@@ -189,8 +189,7 @@ class ExtrinsicsResult(ResultDocument):
     def changes_to(self, other: Self) -> dict[str, float]:
         """Shift and rotation of the other result's camera, along the world's axes."""
         mine, theirs = self.world_from_camera.pose(), other.world_from_camera.pose()
-        turn = rotation_vector_from_matrix(theirs.rotation @ mine.rotation.T)
-        numbers = np.concatenate([theirs.position - mine.position, turn]) * SCALES
+        numbers = step_between(mine, theirs) * SCALES
         return dict(zip(AXES, numbers.tolist(), strict=True))
 
     def apart_mm(self, other: Self) -> float:
@@ -372,11 +371,10 @@ def extrinsics_facts(found: ExtrinsicCalibration, before: Pose) -> list[tuple[st
 
 def moved_rows(before: Pose, after: Pose) -> list[tuple[str, str]]:
     """Human-readable difference between two poses."""
-    shift = (after.position - before.position) * 1e3
-    turn = np.degrees(rotation_vector_from_matrix(after.rotation @ before.rotation.T))
+    step = step_between(before, after) * SCALES
     return [
-        ("moved", f"{before.distance_to(after) * 1e3:.2f} mm ({_listed(shift)})"),
-        ("rotated", f"{np.degrees(before.angle_to(after)):.3f}° ({_listed(turn)})"),
+        ("moved", f"{before.distance_to(after) * 1e3:.2f} mm ({_listed(step[:3])})"),
+        ("rotated", f"{np.degrees(before.angle_to(after)):.3f}° ({_listed(step[3:])})"),
     ]
 
 

@@ -18,12 +18,12 @@ from calibration.statistics import chi_squared_bound, widened
 from calibration.tag_map.observations import TagObservations
 from model.cameras import Z_95
 from model.errors import BadInput
-from model.pose import Array, Pose, read_only, rotation_vector_from_matrix, skew
+from model.pose import Array, Pose, moved, read_only, skew, step_between
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import project_undistorted, undistorted_slopes
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
-from tracking.pnp import TagView, moved, solve_pnp
+from tracking.pnp import TagView, solve_pnp
 from tracking.shared_errors import change_of_inverse
 
 # Survey errors and their effect on pixels.
@@ -134,8 +134,7 @@ def locate_by_frame_tags(
     changes = []
     for k in range(len(tags) if len(tags) >= MANY_TAGS else 0):
         other = _fit(camera, tags[:k] + tags[k + 1 :], best).inverse()
-        turn = rotation_vector_from_matrix(other.rotation @ pose.rotation.T)
-        changes.append(np.concatenate([other.position - pose.position, turn]))
+        changes.append(step_between(pose, other))
     if changes:
         covariance = widened(covariance, np.array(changes))
     if by_lens is not None and camera.lens_covariance is not None:

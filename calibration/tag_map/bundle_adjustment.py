@@ -17,10 +17,10 @@ from scipy.optimize import least_squares
 from calibration.extrinsics.result import widths_of
 from calibration.tag_map.observations import TagObservations, TagViews, moved_tags
 from model.errors import BadInput
-from model.pose import Array, Pose, read_only, skew
+from model.pose import Array, Pose, moved, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.detection.tags import tag_corners
-from tracking.pnp import TagView, moved, solve_pnp
+from tracking.pnp import TagView, solve_pnp
 
 # Joint fit of camera poses and tag poses: initial poses, fit, outliers.
 

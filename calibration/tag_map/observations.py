@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibration.results import data_hash
 from calibration.statistics import duplicate_reason, is_duplicate_view
 from model.errors import BadInput
-from model.pose import Array, Pose
+from model.pose import Array, Pose, moved
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, project_undistorted
 from tracking.detection.detector import Detection, make_detector
@@ -21,7 +21,7 @@ from tracking.detection.diagnostics import diagnose_tags
 from tracking.detection.tags import CORNER_SIGNS, modules_across
 from tracking.edges.refine import RefinedTag, refine
 from tracking.estimator import TrackerSettings
-from tracking.pnp import BundlePose, TagView, moved, solve_pnp
+from tracking.pnp import BundlePose, TagView, solve_pnp
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ from model.errors import BadInput
 from model.files.camera_file import TagDocument
 from model.files.documents import AnyNonNegative, PoseDocument, Positive
 from model.files.rig_file import RigDocument
-from model.pose import Array, Pose, rotation_vector_from_matrix
+from model.pose import Array, step_between
 from model.rig import Tag
 from tracking.detection.tags import tag_corners
 
@@ -46,7 +46,7 @@ class TagsResult(ResultDocument):
         changes: dict[str, float] = {}
         for tag in self.platform:
             if tag.id in others:
-                changes |= _named(tag.id, _difference(others[tag.id], tag.pose()))
+                changes |= _named(tag.id, step_between(tag.pose(), others[tag.id]))
         return changes
 
     def apart_mm(self, other: Self) -> float:
@@ -132,11 +132,6 @@ def _named(number: int, values: Array) -> dict[str, float]:
     """Six pose parameters of a tag, [m, rad], by name with unit."""
     scaled = (values * SCALES).tolist()
     return {f"tag_{number}_{axis}": value for axis, value in zip(AXES, scaled, strict=True)}
-
-
-def _difference(pose: Pose, from_: Pose) -> Array:
-    turn = rotation_vector_from_matrix(pose.rotation @ from_.rotation.T)
-    return np.concatenate([pose.position - from_.position, turn])
 
 
 def _plain(tag: TagDocument) -> Tag:

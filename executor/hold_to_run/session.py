@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Protocol
 
-import numpy as np
-
 from executor.control.winch_motion import WinchResult
 from executor.drives import (
     drives_of,
@@ -38,12 +36,10 @@ from executor.remote.status import CableStatus, JogStatus, SessionStatus
 from executor.state_machine import REMARK, CycleRecord
 from executor.supervision import RequestBoard, Supervisor
 from executor.winch_runs import limit_of, move_supervised, supervised, winch_mover
-from model.kinematics import cable_lengths
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig
-from model.scene import Load, Scene, empty_scene
-from model.statics.gravity import working_tensions
+from model.scene import Scene, empty_scene
 from model.winches import WinchMap
 
 #: A session without a held control ends after this time, [s]: cables relax.
@@ -224,7 +220,7 @@ class _PlatformJogs:
             rig=rig.document,
             cables=rig.cable_count,
             cycle=rig.cycle,
-            begin=_counts_at(rig, self.start, load),
+            begin=tuple(map(int, WinchMap(rig).counts_at(self.start, load))),
             presses=presses.memory,
             pieces=memory,
             reference=MotionInterlock(rig).require_ready(),
@@ -322,10 +318,3 @@ class _Session:
                 # Its user must know when drives are enabled.
                 unreported={"moving", "traceback", REMARK},
             )
-
-
-def _counts_at(rig: Rig, pose: Pose, load: Load) -> tuple[int, ...]:
-    """Set-points of the drives at a pose."""
-    winches, tensions = WinchMap(rig), working_tensions(rig, pose, load).tensions
-    counts = winches.counts(winches.unstrained(cable_lengths(rig, pose), tensions))
-    return tuple(int(count) for count in np.rint(counts))

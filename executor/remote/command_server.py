@@ -20,10 +20,11 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
+from executor.hold_to_run.presses import PressBoard
 from executor.realtime.scheduling import prompt_threads, take_short_turns
 from executor.realtime.shared_memory import SharedRequests
 from executor.remote.command_socket import advertised_ahead, is_stopped_since
-from executor.remote.protocol import Presses, StatusSource, answer_to, status_answer
+from executor.remote.protocol import StatusSource, answer_to, status_answer
 from executor.remote.status import NO_PATH, MotionStatus
 from executor.supervision import LocalRequests, RequestBoard, Supervisor
 from model.errors import StoppedByOperator
@@ -40,7 +41,7 @@ def serving(
     listeners: Sequence[socket.socket],
     board: RequestBoard,
     status: StatusSource,
-    presses: Presses | None = None,
+    presses: PressBoard | None = None,
     on_early_stop: Callable[[], None] | None = None,
 ) -> Iterator[CommandServer]:
     """Answers all requests on the sockets while the block runs.
@@ -72,7 +73,7 @@ class _Answers:
     """See `serving`."""
 
     status: StatusSource
-    presses: Presses | None
+    presses: PressBoard | None
     on_early_stop: Callable[[], None] | None = None
 
     def to(self, line: bytes, board: RequestBoard) -> bytes:
@@ -104,7 +105,7 @@ class CommandServer:
             listener.setblocking(False)
             self._selector.register(listener, selectors.EVENT_READ, "listener")
 
-    def answer_for(self, status: StatusSource, presses: Presses | None) -> None:
+    def answer_for(self, status: StatusSource, presses: PressBoard | None) -> None:
         """From now on answers for a motion, over the same connections; see `serving`."""
         self._answers = _Answers(status, presses)
 
@@ -240,7 +241,9 @@ class Commands:
             )
 
     @contextmanager
-    def during_motion(self, status: StatusSource, presses: Presses | None = None) -> Iterator[None]:
+    def during_motion(
+        self, status: StatusSource, presses: PressBoard | None = None
+    ) -> Iterator[None]:
         """From the opening of devices to the end of the motion, after which no request is taken.
 
         Args:

@@ -20,8 +20,8 @@ from typing import Annotated, Any, Literal, Protocol
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
+from executor.hold_to_run.presses import PressBoard
 from executor.supervision import FASTEST, SLOWEST, RequestBoard
-from model.pose import Array
 
 
 class _Request(BaseModel):
@@ -116,44 +116,6 @@ Command = RunCommand | FeedCommand | JogCommand
 _COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="command")])
 
 
-class Presses(Protocol):
-    """Takes reports of jog controls; see `executor.hold_to_run.presses.PressBoard`."""
-
-    def hold(
-        self,
-        number: int,
-        direction: Array,
-        *,
-        in_platform: bool,
-        step: float | None,
-        percent: int,
-        age: float,
-    ) -> bool:
-        """Reports a held control that moves the platform; returns False if that press is over."""
-        ...
-
-    def hold_cable(
-        self,
-        number: int,
-        cable: int,
-        *,
-        pays_out: bool,
-        step: float | None,
-        percent: int,
-        age: float,
-    ) -> bool:
-        """Reports a held control that moves one cable; returns False if that press is over."""
-        ...
-
-    def let_go(self, number: int) -> None:
-        """Reports a released control."""
-        ...
-
-    def end(self) -> None:
-        """Requests the end of the session."""
-        ...
-
-
 class InvalidCommand(ValueError):
     """The received line is not a command; with the reason."""
 
@@ -189,7 +151,7 @@ def answer_to(
     line: bytes,
     board: RequestBoard,
     status: StatusSource,
-    presses: Presses | None = None,
+    presses: PressBoard | None = None,
     *,
     ahead: bool = False,
 ) -> bytes:
@@ -230,7 +192,7 @@ def _line(answer: dict[str, Any]) -> bytes:
 
 
 def _request(
-    command: RunCommand | FeedCommand, board: RequestBoard, presses: Presses | None
+    command: RunCommand | FeedCommand, board: RequestBoard, presses: PressBoard | None
 ) -> None:
     if presses is not None and command.command not in ("status", "stop"):
         raise InvalidCommand(
@@ -245,7 +207,7 @@ def _request(
         board.ask_hold(command.command == "hold")
 
 
-def _jog(command: JogCommand, presses: Presses | None) -> None:
+def _jog(command: JogCommand, presses: PressBoard | None) -> None:
     if presses is None:
         raise InvalidCommand("this run takes no jogs")
     if isinstance(command, EndCommand):
@@ -261,7 +223,7 @@ def _jog(command: JogCommand, presses: Presses | None) -> None:
             raise InvalidCommand(f"press {command.press} is over")
 
 
-def _hold(command: HeldCommand, presses: Presses) -> bool:
+def _hold(command: HeldCommand, presses: PressBoard) -> bool:
     step = None if command.step_mm is None else command.step_mm / 1000.0
     age = command.age_ms / 1000.0
     if command.cable is not None:

@@ -33,7 +33,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -42,10 +42,13 @@ from executor.recording.run_folder import RunEvent
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import RequestBoard
 from executor.trajectory.setpoints import PreparedRun
-from model.pose import Pose
 from model.rig import Rig
 from tracking.clearance import MeasuredClearance
 from tracking.measurement import PoseMeasurement
+
+if TYPE_CHECKING:
+    from executor.hold_to_run.cables import CableTravel
+    from executor.hold_to_run.line import JogProver
 
 #: Number of newest events reported.
 EVENTS_SHOWN = 12
@@ -317,30 +320,11 @@ class SessionStatus(WinchStatus):
         """Progress of the jogs."""
 
 
-class JogProgress(Protocol):
-    """Progress of a jog session."""
-
-    @property
-    def pose(self) -> Pose:
-        """Last commanded pose, ``world_from_platform``."""
-        ...
-
-    @property
-    def room(self) -> float:
-        """Checked length ahead, [m]."""
-        ...
-
-    @property
-    def limit(self) -> str:
-        """Why the checked line ends; empty while it may continue."""
-        ...
-
-
 class JogStatus(SessionStatus):
     """Status of a session that jogs the platform."""
 
     def __init__(
-        self, rig: Rig, board: RequestBoard, progress: JogProgress, *, simulated_time: bool
+        self, rig: Rig, board: RequestBoard, progress: JogProver, *, simulated_time: bool
     ) -> None:
         """A session in preparation."""
         super().__init__(rig, board, simulated_time=simulated_time)
@@ -358,40 +342,11 @@ class JogStatus(SessionStatus):
         return {"jog": jog}
 
 
-class CableProgress(Protocol):
-    """Progress of a session of single cables."""
-
-    @property
-    def tension_limit(self) -> float:
-        """Largest tension of any cable, [N]."""
-        ...
-
-    @property
-    def cable(self) -> int:
-        """Number of the cable that moved last, from 1; 0 for none."""
-        ...
-
-    @property
-    def by_press(self) -> float:
-        """Length paid out by the latest press, [m]."""
-        ...
-
-    @property
-    def by_session(self) -> list[float]:
-        """Length paid out of each cable, [m]."""
-        ...
-
-    @property
-    def limit(self) -> str:
-        """Why the cable slows down or stops; empty without a limit nearby."""
-        ...
-
-
 class CableStatus(SessionStatus):
     """Status of a session that jogs one cable at a time."""
 
     def __init__(
-        self, rig: Rig, board: RequestBoard, progress: CableProgress, *, simulated_time: bool
+        self, rig: Rig, board: RequestBoard, progress: CableTravel, *, simulated_time: bool
     ) -> None:
         """A session in preparation."""
         super().__init__(rig, board, simulated_time=simulated_time)

@@ -158,11 +158,15 @@ def _y_range(chart: Chart) -> tuple[float, float]:
     return (0.0 if at_zero else low - room), high + room
 
 
+def round_step(least: float) -> float:
+    """The smallest of 1, 2 or 5 times a power of ten that is not below ``least``."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(f * power for f in (1.0, 2.0, 5.0, 10.0) if f * power >= least * (1 - 1e-9))
+
+
 def ticks(low: float, high: float, most: int = 6) -> list[float]:
     """Round numbers between two ends, steps of 1, 2 or 5 times a power of ten."""
-    rough = (high - low) / most
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(f * power for f in (1.0, 2.0, 5.0, 10.0) if f * power >= rough * (1 - 1e-9))
+    step = round_step((high - low) / most)
     first = math.ceil(low / step - 1e-9)
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 

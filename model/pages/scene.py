@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from model.pages.charts import round_step
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
@@ -141,9 +141,7 @@ def grid_floor(points: Array) -> tuple[Stroke, float]:
     It is at z = 0, or below the lowest point where one is below that.
     """
     low, high = points.min(axis=0), points.max(axis=0)
-    rough = float((high - low)[:2].max()) / 12.0
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(f * power for f in (1.0, 2.0, 5.0, 10.0) if f * power >= rough * (1 - 1e-9))
+    step = round_step(float((high - low)[:2].max()) / 12.0)
     first, last = np.floor(low[:2] / step) * step, np.ceil(high[:2] / step) * step
     level = min(0.0, float(low[2]))
     xs, ys = (

@@ -105,6 +105,5 @@ def working_tensions(rig: Rig, pose: Pose, load: Load | None = None) -> TensionS
         weight_wrench(rig, pose, load),
         rig.min_tension,
         rig.max_tension,
-        method="least_norm",
         reference=wanted,
     )

@@ -3,19 +3,16 @@
 All tensions that balance a wrench are ``particular + null_basis @ z``. With as many cables as
 degrees of freedom there is one; with one cable more, z is in an interval; with two more, in a
 convex polygon that is computed exactly. Beyond that, a quadratic program finds the tensions nearest
-to a reference.
-
-`least_norm` and `centroid` are continuous in the pose and the wrench as long as the feasible set
-has an interior; `barycentre` (mean of the corners) jumps where a corner splits in two.
+to a reference. They are continuous in the pose and the wrench as long as the feasible set has an
+interior.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
 from math import hypot
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,16 +32,12 @@ from model.statics.wrench_sets import (
 # The solution of a tension problem, and the error where there is none.
 
 
-TensionMethod = Literal["least_norm", "centroid", "barycentre"]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class TensionSolution:
     """Tensions that balance a wrench within limits; the arrays are read-only.
 
     Attributes:
         tensions: shape (m,), [N].
-        method: Criterion of choice among all that balance the wrench.
         structure_matrix: shape (6, m); force rows [-], moment rows [m].
         external_wrench: shape (6,), [N, N·m], gravity included.
         t_min: shape (m,), [N].
@@ -52,7 +45,6 @@ class TensionSolution:
     """
 
     tensions: NDArray[np.float64]
-    method: TensionMethod
     structure_matrix: NDArray[np.float64]
     external_wrench: NDArray[np.float64]
     t_min: NDArray[np.float64]
@@ -140,9 +132,6 @@ Point = tuple[float, float]
 HalfPlane = tuple[float, float, float]
 """(a, b, c) for the side ``a x + b y + c >= 0``."""
 
-SMALLEST_AREA = 1e-12
-"""Ratio of area to squared extent below which a polygon is treated as a segment or a point."""
-
 
 def square(reach: float) -> list[Point]:
     """Return the square |x|, |y| <= reach, counter-clockwise."""
@@ -173,39 +162,6 @@ def _cut(polygon: list[Point], sides: list[float]) -> list[Point]:
             kept.append((x1, y1))
         x0, y0, side0 = x1, y1, side1
     return kept
-
-
-def area_centroid(polygon: list[Point]) -> Point:
-    """Return the centroid of the area, or the midpoint of a polygon without area."""
-    x0, y0 = polygon[0]
-    doubled_area = sum_x = sum_y = extent = 0.0
-    for (x1, y1), (x2, y2) in pairwise(polygon[1:]):
-        ux, uy, vx, vy = x1 - x0, y1 - y0, x2 - x0, y2 - y0
-        cross = ux * vy - uy * vx
-        doubled_area += cross
-        sum_x += cross * (ux + vx)
-        sum_y += cross * (uy + vy)
-        extent = max(extent, ux * ux + uy * uy, vx * vx + vy * vy)
-    if doubled_area <= SMALLEST_AREA * extent:
-        return _middle_of_length(polygon)
-    return x0 + sum_x / (3.0 * doubled_area), y0 + sum_y / (3.0 * doubled_area)
-
-
-def _middle_of_length(polygon: list[Point]) -> Point:
-    """Return the midpoint of the two corners farthest apart."""
-    pairs = ((p, q) for i, p in enumerate(polygon) for q in polygon[i:])
-    (x1, y1), (x2, y2) = max(pairs, key=lambda pair: _distance(*pair))
-    return (x1 + x2) / 2.0, (y1 + y2) / 2.0
-
-
-def corner_mean(polygon: list[Point]) -> Point:
-    """Return the mean of the corners; coincident corners count once."""
-    extent = max(_distance(polygon[0], point) for point in polygon)
-    corners: list[Point] = []
-    for point in polygon:
-        if all(_distance(point, other) > SMALLEST_AREA * extent for other in corners):
-            corners.append(point)
-    return sum(x for x, _ in corners) / len(corners), sum(y for _, y in corners) / len(corners)
 
 
 def nearest_on_boundary(polygon: list[Point], target: Point) -> Point:
@@ -260,7 +216,6 @@ def solve_tensions(
     t_min: ArrayLike,
     t_max: ArrayLike,
     *,
-    method: TensionMethod = "centroid",
     reference: ArrayLike = 0.0,
 ) -> TensionSolution:
     """Return tensions within the limits with ``structure_matrix @ tensions + external_wrench = 0``.
@@ -270,48 +225,29 @@ def solve_tensions(
         external_wrench: shape (6,), [N, N·m], world frame, gravity included.
         t_min: Smallest tensions, shape (m,), or one number, [N].
         t_max: Largest tensions, shape (m,), or one number, [N].
-        method: ``least_norm``: nearest to the reference; ``centroid`` and ``barycentre``: centre
-            of area and mean of the corners of the feasible set, for at most two redundant cables.
-        reference: Reference tensions for ``least_norm``, shape (m,), or one number, [N].
+        reference: The tensions are the nearest to these, shape (m,), or one number, [N].
 
     Raises:
         TensionInfeasible: No such tensions exist; with the shortfall.
-        BadInput: A shape is wrong, a value is not finite, limits are crossed, or the method is
-            unknown or not defined for this number of cables.
-
-    Source: Mikelsons, Bruckmann, Hiller & Schramm, "A real-time capable force calculation
-        algorithm for redundant tendon-based parallel manipulators", 2008 (centroid).
+        BadInput: A shape is wrong, a value is not finite, or limits are crossed.
     """
     matrix = checked_structure_matrix(structure_matrix)
     wrench = checked_wrench(external_wrench, "external wrench")
     if matrix.ndim != 2 or wrench.ndim != 1:
         raise BadInput("solve_tensions accepts one pose and one wrench")
     low, high = checked_limits(t_min, t_max, matrix.shape[1])
-    _check_method(method, matrix.shape[1])
     wanted = checked_per_cable(reference, matrix.shape[1], "reference")
     balance = _balance(matrix, wrench, low, high)
-    z = _choice(balance, method, wanted)
+    z = _choice(balance, wanted)
     if z is None:
         round_off = ROUND_OFF * max(float(np.abs(low).max()), float(np.abs(high).max()))
         _raise_unless_round_off(matrix, wrench, low, high, round_off)
-        z = _choice(balance.relaxed(2.0 * round_off), method, wanted)
+        z = _choice(balance.relaxed(2.0 * round_off), wanted)
         if z is None:
             raise Fault("two methods disagree on whether tensions exist that balance the wrench")
     # This clips only round-off; wrench_residual shows its effect.
     tensions = np.minimum(np.maximum(balance.tensions(z), low), high)
-    return TensionSolution(tensions, method, matrix.copy(), wrench.copy(), low.copy(), high.copy())
-
-
-def _check_method(method: str, cable_count: int) -> None:
-    known = get_args(TensionMethod)
-    if method not in known:
-        raise BadInput(f"unknown tension method '{method}'", next_step=f"use one of {known}")
-    if method != "least_norm" and cable_count > WRENCH_SIZE + 2:
-        raise BadInput(
-            f"the method '{method}' is defined for at most {WRENCH_SIZE + 2} cables,"
-            f" not {cable_count}",
-            next_step="use 'least_norm'",
-        )
+    return TensionSolution(tensions, matrix.copy(), wrench.copy(), low.copy(), high.copy())
 
 
 def _balance(
@@ -327,24 +263,22 @@ def _balance(
     return _Balance(particular, right[WRENCH_SIZE:].T, low, high)
 
 
-def _choice(
-    balance: _Balance, method: TensionMethod, wanted: NDArray[np.float64]
-) -> ArrayLike | None:
+def _choice(balance: _Balance, wanted: NDArray[np.float64]) -> ArrayLike | None:
     """Return the chosen null-space coordinates, shape (m - 6,), or None when there are none."""
     freedom = balance.null_basis.shape[1]
     if freedom == 0:
         return np.zeros(0) if balance.holds(np.zeros(0)) else None
     target = wanted @ balance.null_basis
-    if method == "least_norm" and balance.holds(target):
+    if balance.holds(target):
         return target
     if freedom == 1:
-        return _in_interval(balance, method, float(target[0]))
+        return _in_interval(balance, float(target[0]))
     if freedom == 2:
-        return _in_polygon(balance, method, target)
+        return _in_polygon(balance, target)
     return _by_quadratic_program(balance, target)
 
 
-def _in_interval(balance: _Balance, method: TensionMethod, target: float) -> ArrayLike | None:
+def _in_interval(balance: _Balance, target: float) -> ArrayLike | None:
     slopes = balance.null_basis[:, 0]
     tight = np.abs(slopes) <= DEPENDENT_COLUMNS
     below, above = balance.low - balance.particular, balance.high - balance.particular
@@ -354,19 +288,13 @@ def _in_interval(balance: _Balance, method: TensionMethod, target: float) -> Arr
     start, end = float(ends[0].max()), float(ends[1].min())
     if start > end:
         return None
-    return [min(max(target, start), end) if method == "least_norm" else (start + end) / 2.0]
+    return [min(max(target, start), end)]
 
 
-def _in_polygon(
-    balance: _Balance, method: TensionMethod, target: NDArray[np.float64]
-) -> ArrayLike | None:
+def _in_polygon(balance: _Balance, target: NDArray[np.float64]) -> ArrayLike | None:
     polygon = clipped(square(_reach(balance)), _half_planes(balance))
     if not polygon:
         return None
-    if method == "centroid":
-        return area_centroid(polygon)
-    if method == "barycentre":
-        return corner_mean(polygon)
     return nearest_on_boundary(polygon, (float(target[0]), float(target[1])))
 
 

@@ -31,7 +31,6 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "model/plan.py",
         "model/rig.py",
         "model/statics/tension_distribution.py",
-        "model/statics/feasibility.py",
         "planner/campaign/page.py",
         "planner/workspace/files.py",
         "planner/workspace/figures.py",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linprog
 
 Array = NDArray[np.float64]
 
@@ -70,3 +71,20 @@ def flat_matrix(cables: int = 8) -> Array:
     """Return a matrix without full rank: every cable meets the platform in one point."""
     outlets = np.random.default_rng(7).uniform(-1.0, 1.0, (cables, 3))
     return structure_matrix(outlets, np.zeros((cables, 3)), np.zeros(3))
+
+
+def largest_smallest_tension(matrix: Array) -> float:
+    """Return the largest s with tensions of at most 1 and at least s that balance each other.
+
+    It is above zero exactly where the pose has wrench closure, if the matrix has full rank.
+    """
+    cables = matrix.shape[1]
+    answer = linprog(
+        np.append(np.zeros(cables), -1.0),
+        A_eq=np.column_stack([matrix, np.zeros(6)]),
+        b_eq=np.zeros(6),
+        A_ub=np.column_stack([-np.eye(cables), np.ones(cables)]),
+        b_ub=np.zeros(cables),
+        bounds=[(0.0, 1.0)] * cables + [(None, None)],
+    )
+    return float(-answer.fun)
