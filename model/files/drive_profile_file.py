@@ -111,8 +111,13 @@ class Expected(Document):
 class TorqueLimit(Document):
     """The object that limits torque where there is no 6072h; it holds a current."""
 
-    object: ObjectName = Field(description="32 bits; the current limit")
-    rated: ObjectName = Field(description="32 bits; the current at rated torque, in the same unit")
+    object: ObjectName = Field(description="the current limit")
+    rated: ObjectName | None = Field(
+        default=None,
+        description="the current at rated torque, in the same unit; left out, the limit is in per"
+        " mille of it, as 6073h",
+    )
+    bytes: Literal[2, 4] = Field(default=4, description="size of the current limit; 2 for 6073h")
 
 
 class ProfileDocument(Document):
