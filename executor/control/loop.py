@@ -92,8 +92,7 @@ class Loop:
         """
         require_capabilities(self._group.capabilities, self._checked.cycle)
         require_unchanged(self._checked)
-        seen = self._master.read_positions()
-        self._held_before = seen.holding
+        self._held_before = (seen := self._master.read_positions()).holding
         self._take_positions()
         require(seen)
         self._require_at_start()
