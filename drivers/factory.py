@@ -40,6 +40,23 @@ def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
     return tuple(state_of(word) is DriveState.QUICK_STOP_ACTIVE for word in status_words)
 
 
+def without_torque(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
+    """Nodes of drives that do not hold their cables under torque.
+
+    None for ODrives: they hold by closed brakes.
+
+    Args:
+        rig: The robot.
+        status_words: Reported status word of each drive.
+    """
+    if rig.document.drives.type == "odrive":
+        return ()
+    from drivers.cia402.state_machine import HOLDS, state_of
+
+    rows = zip(rig.winches, status_words, strict=True)
+    return tuple(winch.node_id for winch, word in rows if state_of(word) not in HOLDS)
+
+
 def cycles_until_reported(rig: Rig) -> int:
     """Cycles from the one that sends a set-point to the one that reports the position it commands.
 

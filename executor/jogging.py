@@ -143,9 +143,8 @@ def measured_pose(rig: Rig, scene: Scene) -> Pose:
     """
     reference = MotionInterlock(rig).require_ready()
     seen = read_snapshot(rig, rig.home, scene.load)
-    positions = seen.positions.tolist()
-    require_still_referenced(rig, reference, seen.restarted, positions)
-    return current_pose(rig, np.array(positions, dtype=np.float64), scene.load)
+    require_still_referenced(rig, reference, seen.restarted, seen)
+    return current_pose(rig, seen.positions.astype(np.float64), scene.load)
 
 
 def plan_straight_move(

@@ -140,7 +140,7 @@ class MotionProposal:
         """The homing reference in use, if it is not the rig file's own."""
         interlock = MotionInterlock(self.prepared.rig)
         reference = interlock.kept_reference()
-        if reference is None:
+        if reference is None or not reference.made:
             return []
         return [("reference", f"{reference.made}, {reference.how}; {interlock.file.path}")]
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.can_bus import BusSettings, open_bus
 from drivers.drive_group import CycleStatus
-from drivers.factory import drive_states, read_drives
+from drivers.factory import drive_states, read_drives, without_torque
 from drivers.plausibility import HOMING_OPTIONS
 from executor.control.standstill import (
     FaultReset,
@@ -248,6 +248,9 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
     if reference.counts and restarted:
         names = ", ".join(rig.drive_names[node] for node in restarted)
         why = f"{names}: {RESTARTED}"
+        reference = replace(reference, counts=False, why_not=why)
+    released = without_torque(rig, seen.status_words.tolist())
+    if reference.counts and (why := interlock.why_released(seen.restarted, released)):
         reference = replace(reference, counts=False, why_not=why)
     columns = zip(
         rig.winches,

@@ -352,14 +352,15 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
         if code in OUT_OF_RANGE and setting.equivalent and setting.value != setting.equivalent[0]:
             _write(network, node, replace(setting, value=setting.equivalent[0]), remarks)
             return
-        if code in NOT_NOW or not (setting.optional or code in READ_ONLY):
-            raise
         if setting.transient and code in READ_ONLY:
             return  # a fixed object, whose final value is checked later
+        may_hold = code in READ_ONLY or (code in NOT_NOW and not setting.transient)
+        if not (setting.optional or may_hold):
+            raise
         fixed = _fixed_value(network, node, setting)
         if fixed is not None and setting.is_kept(fixed):
             return
-        if not setting.optional or (fixed is not None and not setting.instead):
+        if code in NOT_NOW or not setting.optional or (fixed is not None and not setting.instead):
             raise
         if setting.instead:
             lost = "there is no" if code in OBJECT_DOES_NOT_EXIST else "the drive refuses"

@@ -29,6 +29,7 @@ from drivers.cia402.expected_objects import (
     wrong_scales_of,
 )
 from drivers.cia402.object_dictionary import (
+    CURRENT_LIMIT,
     HEARTBEAT_CONSUMERS,
     Setting,
     settings_for,
@@ -309,7 +310,9 @@ class _Reader:
             return
         if len(data) != setting.size:
             text = f"{len(data)} bytes, not {setting.size}"
-            row.note(self._node, text, "wrong", "compare with the drive's manual")
+            is_limit = setting.name == CURRENT_LIMIT
+            change = "profile: `bytes` of torque_limit" if is_limit else "see the drive's manual"
+            row.note(self._node, text, "wrong", change)
         else:
             row.note(self._node, setting.text(struct.unpack(setting.form, data)[0]))
         if setting.per_mille_of is not None:

@@ -29,6 +29,9 @@ SYNCHRONOUS = range(241)
 TORQUE_RESERVE = 1.2
 """Torque limit relative to the largest tension: the following-error monitor must trip first."""
 
+LOWEST, HIGHEST = 0.99, 1.1
+"""Share of a ramp that a drive may keep where it rounds to its own steps: hardly less steep."""
+
 _UNSIGNED_MAX = {"<B": 0xFF, "<H": 0xFFFF, "<I": 0xFFFFFFFF}
 
 
@@ -49,6 +52,7 @@ class Setting:
         mask: Bits compared when it is read back; 0 for all.
         equivalent: Values with the same effect, all accepted; the first one is written where the
             drive refuses ``value`` as out of its range.
+        rounded: The drive may keep a nearby value, from `LOWEST` to `HIGHEST` times this one.
         per_mille_of: The value is in per mille of this object's value.
     """
 
@@ -63,6 +67,7 @@ class Setting:
     instead: str = ""
     mask: int = 0
     equivalent: range = range(0)
+    rounded: bool = False
     per_mille_of: tuple[int, int] | None = None
 
     def data(self) -> bytes:
@@ -88,11 +93,13 @@ class Setting:
 
     def is_kept(self, data: bytes) -> bool:
         """Whether the drive holds the value, or one with the same effect."""
-        if len(data) == self.size and int.from_bytes(data, "little") in self.equivalent:
+        found = int.from_bytes(data, "little")
+        is_near = self.rounded and LOWEST * self.value <= found <= HIGHEST * self.value
+        if len(data) == self.size and (found in self.equivalent or is_near):
             return True
         if len(data) != struct.calcsize(self.form) or not self.mask:
             return data == self.data()
-        return not (int.from_bytes(data, "little") ^ self.value) & self.mask
+        return not (found ^ self.value) & self.mask
 
     def of_rated(self, rated: int) -> Setting:
         """The setting with its value in the unit of ``per_mille_of``, whose value is ``rated``."""
@@ -108,7 +115,7 @@ class Setting:
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
-HEARTBEAT_CONSUMERS = 0x1016
+HEARTBEAT_CONSUMERS, CURRENT_LIMIT = 0x1016, "current limit"
 SOFTWARE_LIMITS = 0x607D
 
 
@@ -354,7 +361,10 @@ def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> 
         Setting(0x605A, 0, "<h", 6, "quick stop option code", "ramp down, then hold under torque"),
         *_options(),
         *_offsets(),
-        _capped(QUICK_STOP_RAMP, "quick stop deceleration", ramp, "at rest within one cycle"),
+        replace(
+            _capped(QUICK_STOP_RAMP, "quick stop deceleration", ramp, "at rest within one cycle"),
+            rounded=True,
+        ),
         _capped(0x6065, "following error window", window, "motion.following_error_mm"),
         Setting(FOLLOWING_TIMEOUT, 0, "<H", timeout, "following error time out", "one cycle"),
     )
@@ -427,10 +437,9 @@ def _torque_limit(per_mille: int, profile: ProfileDocument) -> Setting:
     limit = profile.torque_limit
     if limit is None:
         return Setting(0x6072, 0, "<H", per_mille, "max torque", why)
-    rated = object_key(limit.rated)
-    return Setting(
-        *(*object_key(limit.object), "<I", per_mille, "current limit", why), per_mille_of=rated
-    )
+    rated = None if limit.rated is None else object_key(limit.rated)
+    where, form = object_key(limit.object), "<H" if limit.bytes == 2 else "<I"
+    return Setting(*where, form, per_mille, CURRENT_LIMIT, why, per_mille_of=rated)
 
 
 def _capped(index: int, name: str, value: float, why: str) -> Setting:

@@ -8,7 +8,7 @@ torque on), and with any fault latched.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -78,13 +78,13 @@ class Loop:
         self.holding = True
         """Every cable was held at the drives' last reply."""
 
-    def arm(self, require: Callable[[Sequence[int]], None] = lambda _positions: None) -> None:
+    def arm(self, require: Callable[[CycleStatus], None] = lambda _seen: None) -> None:
         """Checks the drives' capabilities, the set-points, and that the platform is at their start.
 
         From here on cycles must continue (`SyncMaster.cycle_until`) until `run` is called.
 
         Args:
-            require: Further check of the drive positions [counts]; raises on failure.
+            require: Further check of the drives' state; raises on failure.
 
         Raises:
             Refused: A check failed; nothing was enabled.
@@ -92,9 +92,9 @@ class Loop:
         """
         require_capabilities(self._group.capabilities, self._checked.cycle)
         require_unchanged(self._checked)
-        self._held_before = self._master.read_positions().holding
+        self._held_before = (seen := self._master.read_positions()).holding
         self._take_positions()
-        require(self.positions)
+        require(seen)
         self._require_at_start()
         self._sender.armed = True
 

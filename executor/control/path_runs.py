@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
 
-from drivers.drive_group import DriveGroup
+from drivers.drive_group import CycleStatus, DriveGroup
+from drivers.factory import without_torque
 from executor.control.loop import Loop
 from executor.control.preconditions import require_still_referenced
 from executor.control.sync_master import SyncMaster
@@ -100,10 +101,9 @@ class PathMotion:
             on_event=on_event,
         )
 
-    def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
+    def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
         """See `MotionTask`."""
-        restarted = drives.group.restarted
-        require_still_referenced(drives.rig, self.reference, restarted, positions)
+        require_still_referenced(drives.rig, self.reference, drives.group.restarted, seen)
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
         """See `MotionTask`."""
@@ -249,13 +249,15 @@ def run_in_real_time(
             raise
         started = datetime.now(UTC)
         ended = process.run()
+        last = recorder.log.last
         try:
             interlock.end(
                 ended.state,
                 ended.cause,
                 recorder.folder.path,
                 holding=ended.holding,
-                positions=recorder.log.last_positions,
+                positions=last.actual if last else None,
+                released=without_torque(prepared.rig, last.words) if last else (),
             )
         except CdprError as error:  # the motion is over: its record is still completed
             text = f"{error.what} ({error.where}: {error.why})"

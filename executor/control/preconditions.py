@@ -6,9 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivers.drive_group import Capabilities, DriveSnapshot
+from drivers.drive_group import Capabilities, CycleStatus, DriveSnapshot
+from drivers.factory import without_torque
 from drivers.plausibility import HOME
-from executor.interlock.reference import RESTARTED, HomingReference, moved_since
+from executor.interlock.reference import (
+    RESTARTED,
+    HomingReference,
+    moved_since,
+    released_since,
+)
 from executor.trajectory.setpoints import CheckedSetpoints
 from model.errors import Refused
 from model.kinematics import cable_lengths
@@ -102,25 +108,26 @@ def require_still_referenced(
     rig: Rig,
     reference: HomingReference | None,
     restarted: Sequence[int],
-    positions: Sequence[int],
+    seen: CycleStatus | DriveSnapshot,
 ) -> None:
-    """Requires drives without absolute encoders to have kept their reference.
+    """Requires the drives to have kept their reference.
 
-    Such a drive silently loses its configuration and position with its power. So it must
-    still have its configuration, and be at its last known position.
+    A drive without an absolute encoder silently loses its configuration and position with its
+    power. So it must still have its configuration, and be at its last known position. Any drive
+    that was left holding its cable must still hold it.
 
     Args:
         rig: The robot.
         reference: Homing reference of its drives; None where it needs none.
         restarted: Nodes found without this program's configuration.
-        positions: Of the drives, [counts].
+        seen: State of the drives before any is enabled.
 
     Raises:
-        Refused: A drive was power-cycled or moved since; nothing was enabled.
+        Refused: A drive was power-cycled or moved, or lost its torque, since; nothing was enabled.
     """
     if reference is None:
         return
-    moved = moved_since(rig, reference, positions)
+    moved = moved_since(rig, reference, seen.positions.tolist())
     for drive, (winch, off) in enumerate(zip(rig.winches, moved, strict=True)):
         if not winch.absolute and winch.node_id in restarted:
             raise _lost(rig, drive, f"it was {RESTARTED}")
@@ -128,6 +135,16 @@ def require_still_referenced(
             raise _lost(
                 rig, drive, f"it is {off * 1000:.1f} mm of cable from its last known position"
             )
+    released = without_torque(rig, seen.status_words.tolist())
+    if dropped := released_since(rig, reference, restarted, released):
+        raise Refused(
+            f"the homing reference is lost: {dropped}",
+            where="arming",
+            why="their cables were released under tension, and may have slipped or come off a"
+            " pulley",
+            next_step=f"check cables and platform, then home the drives again: {HOME};"
+            " nothing was enabled",
+        )
 
 
 def _lost(rig: Rig, drive: int, how: str) -> Refused:

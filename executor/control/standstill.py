@@ -7,11 +7,12 @@ if anything interrupts it, all drives are commanded to stop.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
+from drivers.factory import without_torque
 from executor.control.preconditions import require_capabilities
 from executor.control.sync_master import ReplyTimeout, SyncMaster, changed_states, late_fault
 from executor.interlock.interlock import MotionInterlock
@@ -58,7 +59,7 @@ class Standstill(ABC):
 
     error: CdprError | None
 
-    def arm(self, require: Callable[[Sequence[int]], None] = lambda _positions: None) -> None:
+    def arm(self, require: Callable[[CycleStatus], None] = lambda _seen: None) -> None:
         """Reads the drive positions; see `executor.control.loop.Loop.arm`.
 
         Raises:
@@ -66,8 +67,7 @@ class Standstill(ABC):
             HardwareMissing: A drive does not answer.
         """
         require_capabilities(self._group.capabilities, self._rig.cycle)
-        self._master.read_positions()
-        require(self.positions)
+        require(self._master.read_positions())
 
     @property
     def positions(self) -> tuple[int, ...]:
@@ -182,7 +182,7 @@ class Release(Standstill):
 
     where = "release"
 
-    def arm(self, require: Callable[[Sequence[int]], None] = lambda _positions: None) -> None:
+    def arm(self, require: Callable[[CycleStatus], None] = lambda _seen: None) -> None:
         """See `Standstill`; drives beyond their position limits are not enabled, even for this."""
         super().arm(require)
         self._group.require_releasable()
@@ -282,8 +282,8 @@ class StandstillMotion:
         """See `MotionTask`."""
         return self.kind(drives.rig, master, requests, on_cycle)
 
-    def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
-        """See `MotionTask`; any positions are allowed."""
+    def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
+        """See `MotionTask`; any state is allowed."""
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
         """See `MotionTask`; nothing moves."""
@@ -337,6 +337,7 @@ def release_drives(
     record = interlock.file.path.parent
     armed = process.arm(Unrecorded())
     on_armed(armed.denied)
+    interlock.found_released(armed.restarted, armed.released)
     interlock.begin(record, interlock.still_counts(armed.positions))
     ended = _CUT_SHORT
     try:
@@ -357,6 +358,7 @@ def release_drives(
         record,
         holding=is_braked(rig),
         positions=left.positions.tolist(),
+        released=without_torque(rig, left.status_words.tolist()),
         release_reason=_RELEASED,
     )
     return left
@@ -393,6 +395,7 @@ def reset_drives(interlock: MotionInterlock, process: RealTimeProcess) -> Drives
     if ended.state is not State.FINISHED:
         raise ended.error or Fault(ended.cause, where="reset")
     left = process.read_status()
+    interlock.found_released(armed.restarted, armed.released)
     if ended.holding and not armed.restarted:
         interlock.confirm_held(left.positions.tolist())
     return DrivesReset(left, armed.restarted)

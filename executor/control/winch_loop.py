@@ -138,8 +138,8 @@ class LawMotion:
         law = self.make_law(rig, master.read_positions().positions.tolist())
         return WinchLoop(rig, law, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
 
-    def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
-        """See `MotionTask`; any positions are allowed."""
+    def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
+        """See `MotionTask`; any state is allowed."""
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
         """See `MotionTask`; no pose is needed without a path."""

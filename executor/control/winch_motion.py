@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.drive_group import CycleStatus
+from drivers.factory import without_torque
 from executor.control.loop import SETTLING
 from executor.control.winch_loop import WinchMover
 from executor.interlock.interlock import MotionInterlock
@@ -143,6 +144,7 @@ def move_winches(
     armed = mover.arm(last)
     if armed.denied:
         last.take_event(LoopEvent(0, 0.0, "no_real_time", armed.denied))
+    interlock.found_released(armed.restarted, armed.released)
     interlock.begin(record, interlock.still_counts(armed.positions), rehome=rehome)
     ended, found = _CUT_SHORT, None
     try:
@@ -160,7 +162,8 @@ def move_winches(
             if reference is not None:
                 interlock.take(reference)
     finally:
-        not_recorded = _record_end(interlock, ended, record, _last_positions(last.cycles, found))
+        left = _last_state(last.cycles, found)
+        not_recorded = _record_end(rig, interlock, ended, record, left)
     if not_recorded:
         last.report_event("recorder", not_recorded)
         result = replace(result, state=State.LATCHED, cause=result.cause or not_recorded)
@@ -185,19 +188,32 @@ def _not_held(ended: Ended, found: CycleStatus | None, cause: str) -> Ended:
     return replace(ended, state=State.LATCHED, cause=cause, holding=holding)
 
 
-def _last_positions(last: Sequence[CycleRecord], found: CycleStatus | None) -> Sequence[int] | None:
-    """Last known positions of the drives, [counts]; None if unknown."""
+def _last_state(
+    last: Sequence[CycleRecord], found: CycleStatus | None
+) -> tuple[Sequence[int], Sequence[int]] | None:
+    """Last known positions [counts] and status words of the drives; None if unknown."""
     if found is not None:
-        return [int(position) for position in found.positions]
-    return last[-1].actual if last else None
+        return found.positions.tolist(), found.status_words.tolist()
+    return (last[-1].actual, last[-1].words) if last else None
 
 
 def _record_end(
-    interlock: MotionInterlock, ended: Ended, record: Path, positions: Sequence[int] | None
+    rig: Rig,
+    interlock: MotionInterlock,
+    ended: Ended,
+    record: Path,
+    left: tuple[Sequence[int], Sequence[int]] | None,
 ) -> str:
     """Records the end in the interlock; returns why that failed, else nothing."""
     try:
-        interlock.end(ended.state, ended.cause, record, holding=ended.holding, positions=positions)
+        interlock.end(
+            ended.state,
+            ended.cause,
+            record,
+            holding=ended.holding,
+            positions=left[0] if left else None,
+            released=without_torque(rig, left[1]) if left else (),
+        )
     except CdprError as error:
         return f"{error.what} ({error.where}: {error.why})"
     return ""

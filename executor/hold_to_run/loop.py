@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drivers.drive_group import CycleStatus
 from executor.control.cycle import Feed, targets_at
 from executor.control.loop import Loop
 from executor.control.preconditions import require_still_referenced
@@ -185,10 +186,9 @@ class JogMotion:
             on_event=on_event,
         )
 
-    def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
+    def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
         """See `MotionTask`."""
-        restarted = drives.group.restarted
-        require_still_referenced(drives.rig, self.reference, restarted, positions)
+        require_still_referenced(drives.rig, self.reference, drives.group.restarted, seen)
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
         """See `MotionTask`; no true pose is needed."""

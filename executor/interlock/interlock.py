@@ -6,7 +6,7 @@ the rig file.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from executor.interlock.reference import (
     counting_hash,
     moved_since,
     referenced,
+    released_since,
 )
 from executor.state_machine import State
 from model.errors import Refused
@@ -54,12 +55,11 @@ class MotionInterlock:
             Refused: It is required but missing, lost, or made for another rig file.
         """
         reference = self.kept_reference()
-        if reference is None:
+        if reference is not None and reference.lost:
+            raise self._lost_refusal(reference)
+        if reference is None or not reference.made:
             self._require_absolute()
             return None
-        if reference.lost:
-            why = f"{reference.lost}; homed {reference.made}"
-            raise self._refusal("the homing reference is lost", why)
         if reference.rig_hash != counting_hash(self._rig):
             why = f"homed {reference.made} for {reference.rig}; geometry or winches differ"
             raise self._refusal("the drives were homed for another rig file", why)
@@ -94,42 +94,77 @@ class MotionInterlock:
         return self._rig if reference is None else referenced(self._rig, reference)
 
     def require_ready(self) -> HomingReference | None:
-        """Requires a free bus, and drives referenced for this rig.
+        """Requires a free bus, and drives referenced for this rig; returns their reference.
 
         Raises:
             Refused: One of both does not hold.
         """
         self.require_free()
         reference = self.kept_reference()
-        if reference is None:
-            self._require_absolute()
-        elif reference.lost:
-            raise self._refusal("the homing reference is lost", reference.lost)
-        elif reference.home_counts != [winch.home_counts for winch in self._rig.winches]:
+        if reference is not None and reference.lost:
+            raise self._lost_refusal(reference)
+        if reference is None or not reference.made:
+            return self._never_homed(reference)
+        if reference.home_counts != [winch.home_counts for winch in self._rig.winches]:
             what = "the run was prepared with a different homing reference"
             raise self._refusal(what, f"the drives were homed {reference.made}")
         return reference
 
     def still_counts(self, positions: Sequence[int]) -> HomingReference | None:
         """The reference, if it is valid for drives at these positions [counts]; else None."""
-        reference = self._readable()
+        try:
+            reference = self.kept_reference()
+            if reference is None or not (reference.made or reference.lost):
+                reference = self._never_homed(reference)
+        except Refused:
+            return None
         if reference is None or reference.lost or len(reference.stands_at) != len(positions):
             return None
         moved = max(moved_since(self._rig, reference, positions))
         return reference if moved <= self._rig.motion.start_tolerance else None
 
     def found_restarted(self, nodes: Iterable[int]) -> None:
-        """Marks the reference of power-cycled drives as lost.
+        """Marks the reference of power-cycled drives as lost; absolute encoders need not hold.
 
         This is written at once, as nothing else records it after the next configuration.
 
         Raises:
             Refused: It cannot be written.
         """
-        restarted = {winch.node_id for winch in self._rig.winches if not winch.absolute} & {*nodes}
+        found = {*nodes}
+        restarted = {winch.node_id for winch in self._rig.winches if not winch.absolute} & found
         if restarted:
             names = [name for node, name in self._rig.drive_names.items() if node in restarted]
             self._lose(f"{', '.join(names)}: {RESTARTED}")
+        reference = self._readable()
+        if reference is not None and not found <= {*reference.released}:
+            released = sorted(found.union(reference.released))
+            self.file.write(reference.model_copy(update={"released": released}))
+
+    def found_released(self, restarted: Collection[int], released: Collection[int]) -> None:
+        """Marks the reference as lost if drives left holding are found without torque.
+
+        Args:
+            restarted: Nodes found without this program's configuration.
+            released: Nodes found without torque.
+
+        Raises:
+            Refused: It cannot be written.
+        """
+        if why := self.why_released(restarted, released):
+            self._lose(why)
+
+    def why_released(self, restarted: Collection[int], released: Collection[int]) -> str:
+        """Why the reference is lost, where drives left holding are without torque; else empty.
+
+        Args:
+            restarted: Nodes found without this program's configuration.
+            released: Nodes found without torque.
+        """
+        reference = self._readable()
+        if reference is None:
+            return ""
+        return released_since(self._rig, reference, restarted, released)
 
     def confirm_held(self, positions: Sequence[int]) -> None:
         """Stores the positions [counts] of drives that held throughout: the reference stays valid.
@@ -143,12 +178,15 @@ class MotionInterlock:
             and not reference.lost
             and len(reference.stands_at) == len(positions)
         ):
-            self.file.write(reference.model_copy(update={"stands_at": list(positions)}))
+            update = {"stands_at": list(positions), "released": []}
+            self.file.write(reference.model_copy(update=update))
 
     def begin(
         self, record: Path, reference: HomingReference | None, *, rehome: bool = False
     ) -> None:
         """Engages the latch before a motion; it stays if the motion does not finish.
+
+        From here on the drives are expected to hold, even if this program is killed.
 
         Args:
             record: Path of the motion's record.
@@ -156,7 +194,7 @@ class MotionInterlock:
             rehome: The drives will be homed again; the present reference is discarded.
 
         Raises:
-            Refused: The bus is latched, or the latch cannot be written.
+            Refused: The bus is latched, or latch or reference cannot be written.
         """
         if not self._is_kept:
             return
@@ -164,7 +202,10 @@ class MotionInterlock:
         self._counted_from = None if rehome else reference
         try:
             if rehome:
-                self._lose("homing did not finish")
+                if reference is None or reference.made:
+                    self._lose("homing did not finish")
+            elif reference is not None and reference.released:
+                self.file.write(reference.model_copy(update={"released": []}))
         except BaseException:
             self._latch.disengage()
             raise
@@ -179,8 +220,10 @@ class MotionInterlock:
             self.file.write(reference)
 
     def cancel(self) -> None:
-        """Disengages the latch when nothing moved after all."""
+        """Disengages the latch when nothing was enabled after all."""
         if self._is_kept:
+            if self._counted_from is not None:
+                self.file.write(self._counted_from)
             self._latch.disengage()
 
     def end(
@@ -191,6 +234,7 @@ class MotionInterlock:
         *,
         holding: bool,
         positions: Sequence[int] | None,
+        released: Sequence[int] = (),
         release_reason: str = "",
     ) -> None:
         """Ends a motion: frees the bus if it ended well, else latches the fault.
@@ -201,6 +245,7 @@ class MotionInterlock:
             record: Path of its record.
             holding: Every cable was held to the end.
             positions: Positions of the drives, [counts]; None when unknown.
+            released: Nodes left without torque: by their brakes, or never enabled.
             release_reason: Why cables were released on purpose; recorded as loss of the reference.
 
         Raises:
@@ -211,20 +256,44 @@ class MotionInterlock:
             return
         try:
             lost = release_reason or f"drives released cables under tension ({cause})"
-            self._note_end(lost, holding, positions)
+            self._note_end(lost, holding, positions, released)
         except Refused as error:
             self._latch.settle(self._rig.name, State.LATCHED, cause or error.what, record)
             raise
+        self._counted_from = None
         self._latch.settle(self._rig.name, state, cause, record)
 
-    def _note_end(self, lost: str, holding: bool, positions: Sequence[int] | None) -> None:
+    def _note_end(
+        self,
+        lost: str,
+        holding: bool,
+        positions: Sequence[int] | None,
+        released: Sequence[int],
+    ) -> None:
         """Updates the reference after a motion."""
         if not holding:
             reference = self._readable() or as_in_the_file(self._rig)
             self.file.write(reference.model_copy(update={"lost": reference.lost or lost}))
         elif self._counted_from is not None and positions is not None:
-            update = {"stands_at": list(positions)}
+            update = {"stands_at": list(positions), "released": list(released)}
             self.file.write(self._counted_from.model_copy(update=update))
+
+    def _never_homed(self, kept: HomingReference | None) -> HomingReference | None:
+        """The reference of absolute encoders as in the rig file; None on a virtual bus.
+
+        Args:
+            kept: The one on file, which may be of another rig file; None without a file.
+
+        Raises:
+            Refused: Not all encoders are absolute.
+        """
+        self._require_absolute()
+        if not self._is_kept:
+            return None
+        reference = as_in_the_file(self._rig)
+        if kept is None:
+            return reference
+        return reference.model_copy(update={"released": kept.released})
 
     def _lose(self, why: str) -> None:
         """Marks any reference on file as lost; the first reason is kept."""
@@ -268,6 +337,10 @@ class MotionInterlock:
                 "the position of an encoder that is not absolute (winches[].encoder in the"
                 " rig file) is arbitrary after power-up",
             )
+
+    def _lost_refusal(self, reference: HomingReference) -> Refused:
+        homed = f"homed {reference.made}" if reference.made else "the drives were never homed"
+        return self._refusal("the homing reference is lost", f"{reference.lost}; {homed}")
 
     def _refusal(self, what: str, why: str) -> Refused:
         return Refused(what, where=f"reference {self.file.path}", why=why, next_step=AGAIN)
@@ -321,7 +394,7 @@ def reference_status(
     return ReferenceStatus(
         counts=not why,
         why_not=why or None,
-        made=kept.made if kept else None,
-        how=kept.how if kept else None,
+        made=kept.made if kept and kept.made else None,
+        how=kept.how if kept and kept.made else None,
         file=str(path) if path.exists() else None,
     )

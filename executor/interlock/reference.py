@@ -2,12 +2,15 @@
 
 It is stored beside the latch of the bus (`executor.interlock.locks`). `cdpr home` writes it; every
 motion ends by updating the drive positions in it, or by marking it lost if cables were released.
+It also states which drives were left without torque on purpose: any other one that no longer holds
+its cable has released it meanwhile. For that purpose alone, absolute encoders that were never homed
+have one too, with the counts of the rig file.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Literal
 
@@ -22,13 +25,15 @@ from model.files.documents import Document, PoseDocument, content_hash, document
 from model.kinematics import cable_lengths
 from model.pose import Array, Pose
 from model.rig import Rig, rig_from_document
-from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
 AGAIN = f"home the drives: {HOME}; nothing was moved"
 
 #: Why a drive lost its configuration, and with it the reference of an incremental encoder.
 RESTARTED = "power-cycled, or `bus.cycle_ms` was changed, after homing"
+
+#: Why drives at rest lost their reference, though they kept their power and position.
+RELEASED = "left holding by the last motion, but without torque now, as after an emergency stop"
 
 
 class HomingReference(Document):
@@ -37,13 +42,18 @@ class HomingReference(Document):
     schema_version: Literal[1]
     rig: str
     rig_hash: str = Field(description="of the rig data that the counts depend on")
-    made: str = Field(description="time of homing, ISO 8601, UTC")
+    made: str = Field(
+        description="time of homing, ISO 8601, UTC; empty for absolute encoders never homed"
+    )
     how: str
     pose: PoseDocument = Field(description="of the platform at that time")
     uncertainty_mm: float = Field(description="of the pose, one standard deviation; 0 if stated")
     home_counts: Annotated[list[int], Field(min_length=1)]
     tensions_n: list[float]
     stands_at: list[int] = Field(description="drive positions at the end of the last motion")
+    released: list[int] = Field(
+        default=[], description="nodes left without torque on purpose, or since power-up"
+    )
     lost: str = Field(default="", description="why it is no longer valid")
 
 
@@ -78,10 +88,21 @@ def reference_at(
 
 
 def as_in_the_file(rig: Rig) -> HomingReference:
-    """The reference of absolute encoders as in the rig file."""
-    home = np.array([winch.home_counts for winch in rig.winches], dtype=np.float64)
-    tensions = working_tensions(rig, rig.home).tensions
-    return reference_at(rig, rig.home, home, tensions, "as in the rig file", 0.0)
+    """The reference of absolute encoders never homed, whose drives need not hold yet."""
+    home = [winch.home_counts for winch in rig.winches]
+    return HomingReference(
+        schema_version=1,
+        rig=rig.name,
+        rig_hash=counting_hash(rig),
+        made="",
+        how="as in the rig file",
+        pose=PoseDocument.of(rig.home),
+        uncertainty_mm=0.0,
+        home_counts=home,
+        tensions_n=[],
+        stands_at=home,
+        released=[winch.node_id for winch in rig.winches],
+    )
 
 
 def counting_hash(rig: Rig) -> str:
@@ -114,6 +135,29 @@ def moved_since(rig: Rig, reference: HomingReference, positions: Sequence[int]) 
         0.0 if winch.absolute else abs((at - left) / winch.counts_per_metre)
         for winch, at, left in rows
     ]
+
+
+def released_since(
+    rig: Rig, reference: HomingReference, restarted: Collection[int], released: Collection[int]
+) -> str:
+    """Why the reference is lost, if drives that were left holding no longer hold; else empty.
+
+    Absolute encoders may be power-cycled.
+
+    Args:
+        rig: The robot.
+        reference: Of its drives.
+        restarted: Nodes found without this program's configuration.
+        released: Nodes found without torque.
+    """
+    names = [
+        rig.drive_names[winch.node_id]
+        for winch in rig.winches
+        if winch.node_id in released
+        and winch.node_id not in reference.released
+        and not (winch.absolute and winch.node_id in restarted)
+    ]
+    return f"{', '.join(names)}: {RELEASED}" if names else ""
 
 
 class ReferenceFile:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -11,6 +11,7 @@ from multiprocessing.connection import Connection
 from typing import Protocol
 
 from drivers.drive_group import CycleStatus, DriveGroup
+from drivers.factory import without_torque
 from executor.control.sync_master import SyncMaster
 from executor.realtime.scheduling import RealClock, real_time, require_real_time
 from executor.realtime.shared_memory import (
@@ -80,7 +81,7 @@ class Procedure(Protocol):
         """Last reported positions of the drives, from arming on, [counts]."""
         ...
 
-    def arm(self, require: Callable[[Sequence[int]], None]) -> None:
+    def arm(self, require: Callable[[CycleStatus], None]) -> None:
         """Arms the drives; see `executor.control.loop.Loop.arm`.
 
         Raises:
@@ -122,8 +123,8 @@ class MotionTask(Protocol):
         """
         ...
 
-    def require(self, drives: ReadyDrives, positions: Sequence[int]) -> None:
-        """Checks the drive positions [counts] when arming.
+    def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
+        """Checks the state of the drives when arming.
 
         Raises:
             Refused: The check failed; nothing was enabled.
@@ -207,12 +208,14 @@ class Armed:
         denied: What the system denied; empty if nothing.
         positions: Of the drives, [counts].
         restarted: Nodes found without this program's configuration.
+        released: Nodes that do not hold their cables under torque.
         remarks: Missing capabilities of the drives, a sentence each.
     """
 
     denied: str
     positions: tuple[int, ...]
     restarted: tuple[int, ...] = ()
+    released: tuple[int, ...] = ()
     remarks: tuple[str, ...] = ()
 
 
@@ -305,9 +308,12 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
                 drives, master, requests=supervised.read, on_cycle=on_cycle, on_event=on_event
             )
             loop.arm(partial(motion.require, drives))
+            assert master.status is not None
+            released = without_torque(drives.rig, master.status.status_words.tolist())
             if drives.group.capabilities.simulated and drives.true_pose is None:  # on a real bus
                 on_event(LoopEvent(0, 0.0, SIMULATED, "the drives report that they are simulated"))
-            _send(link, Armed(denied, loop.positions, drives.restarted, drives.remarks))
+            armed = Armed(denied, loop.positions, drives.restarted, released, drives.remarks)
+            _send(link, armed)
             message = master.cycle_until(lambda: _poll(link))
         except Exception:
             master.leave_disabled()

@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import wait
 
+from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus
 from executor.realtime.child import (
     CYCLE_SLOTS,
@@ -28,7 +29,7 @@ from executor.realtime.scheduling import interrupts_blocked, one_thread
 from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedRequests, unpack_event
 from executor.state_machine import REMARK, CycleRecord, LoopEvent, State
 from executor.supervision import record_failure
-from model.errors import Fault, Refused, StoppedByOperator
+from model.errors import CdprError, Fault, HardwareMissing, Refused, StoppedByOperator
 from model.progress import SILENT, Listener
 
 #: Interval of reading the rings and of the heartbeat, [s].
@@ -70,6 +71,13 @@ def real_time_process(
             process.close()
     finally:
         job.close()
+
+
+def _event_code(error: CdprError) -> str:
+    """Code of the event for an error that ended the motion before it began."""
+    if isinstance(error, HardwareMissing):
+        return "drive_silent"
+    return error.code if isinstance(error, BusFault) else "broken"
 
 
 class RealTimeProcess:
@@ -145,7 +153,10 @@ class RealTimeProcess:
             message.error if isinstance(message, Failed) else self._died() if over else self._hung()
         )
         self._take_in(self._records)
-        self.report_event("real_time_lost", error.what)
+        if isinstance(message, Failed):
+            self.report_event(_event_code(error), error.what)
+        else:
+            self.report_event("real_time_lost", error.what)
         doubt = self._look_again()  # they should hold on their own without SYNC
         if doubt:
             self.report_event("not_held", doubt)

@@ -80,6 +80,8 @@ class RunLog:
         )
         self._chunks: list[Cycles] = []
         self._count = 0
+        self.last: CycleRecord | None = None
+        """The last cycle; None before the first."""
         self.events: list[RunEvent] = []
         """All events, in order."""
 
@@ -90,6 +92,7 @@ class RunLog:
             self._chunks.append(np.empty(_CHUNK, self._format))
         self._chunks[-1][row] = self._packed(record)
         self._count += 1
+        self.last = record
 
     def _packed(self, record: CycleRecord) -> tuple[object, ...]:
         state = _STATES.index(record.state)
@@ -100,13 +103,6 @@ class RunLog:
     def __len__(self) -> int:
         """Number of cycles."""
         return self._count
-
-    @property
-    def last_positions(self) -> tuple[int, ...] | None:
-        """Last reported positions of the drives, [counts]; None before the first cycle."""
-        if not self._count:
-            return None
-        return tuple(self._cycles(self._count - 1, self._count)["actual"][0].tolist())
 
     def _cycles(self, first: int, end: int) -> Cycles:
         """Cycles from ``first`` up to ``end``."""

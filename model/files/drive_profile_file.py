@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, JsonValue, model_validator
 
 from model.files.documents import Document, Finding
 
@@ -76,9 +76,17 @@ def _is_code(text: str) -> str:
     return text
 
 
-ObjectName = Annotated[str, AfterValidator(_is_object)]
-KnownObject = Annotated[str, AfterValidator(_is_known)]
-CodePattern = Annotated[str, AfterValidator(_is_code)]
+def _in_schema(**keys: JsonValue) -> Any:
+    """Keys of the JSON schema for what a validator checks with a message of its own."""
+    return Field(json_schema_extra=keys)
+
+
+ObjectName = Annotated[str, AfterValidator(_is_object), _in_schema(pattern=f"^{_OBJECT.pattern}$")]
+KnownObject = Annotated[str, AfterValidator(_is_known), _in_schema(enum=[*OBJECTS])]
+MissingObject = Annotated[
+    str, AfterValidator(_is_known), _in_schema(enum=[key for key in OBJECTS if key not in NEEDED])
+]
+CodePattern = Annotated[str, AfterValidator(_is_code), _in_schema(pattern=f"^{_CODE.pattern}$")]
 Text = Annotated[str, Field(min_length=1)]
 
 
@@ -111,8 +119,13 @@ class Expected(Document):
 class TorqueLimit(Document):
     """The object that limits torque where there is no 6072h; it holds a current."""
 
-    object: ObjectName = Field(description="32 bits; the current limit")
-    rated: ObjectName = Field(description="32 bits; the current at rated torque, in the same unit")
+    object: ObjectName = Field(description="the current limit")
+    rated: ObjectName | None = Field(
+        default=None,
+        description="the current at rated torque, in the same unit; left out, the limit is in per"
+        " mille of it, as 6073h",
+    )
+    bytes: Literal[2, 4] = Field(default=4, description="size of the current limit; 2 for 6073h")
 
 
 class ProfileDocument(Document):
@@ -122,7 +135,7 @@ class ProfileDocument(Document):
     sources: Annotated[list[Text], Field(min_length=1)] = Field(
         description="source of every fact in this file"
     )
-    absent: list[KnownObject] = Field(default=[], description="objects missing in the drive")
+    absent: list[MissingObject] = Field(default=[], description="objects missing in the drive")
     ranges: dict[KnownObject, Range] = Field(
         default={}, description="values that objects accept, where narrower than the standard"
     )

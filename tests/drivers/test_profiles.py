@@ -937,3 +937,85 @@ def test_every_profile_names_its_sources() -> None:
     for name in profile_names():
         assert load_profile(name).sources, name
     assert issubclass(InvalidFile, CdprError)
+
+
+class HoldingDrive(ScriptedDrive):
+    """Refuses 6060h while it holds; some makes change the mode only without torque."""
+
+    def _write(self, key: tuple[int, int], data: bytes) -> int:
+        if key == (0x6060, 0) and self.values[0x6041, 0] == 0x0217:
+            return 0x08000022
+        return super()._write(key, data)
+
+
+@pytest.mark.parametrize("to_reset", [True, False])
+def test_a_mode_that_cannot_be_written_under_torque_must_be_the_required_one(
+    rig: Rig, to_reset: bool
+) -> None:
+    bus = ScriptedBus(HoldingDrive(node, eds_of("cia402")) for node in range(1, 9))
+    set_up(rig, bus)
+    for drive in bus.drives.values():
+        drive.values[0x6041, 0] = 0x0217
+    assert set_up(rig, bus, to_reset=to_reset) == (), "after a motion the drives hold in this mode"
+    bus.drives[4].mode_late = 100
+    with pytest.raises(Refused, match="6061h"):
+        set_up(rig, bus, to_reset=to_reset)
+    bus.drives[4].values[0x6060, 0], bus.drives[4].mode_late = 1, 0
+    with pytest.raises(Refused, match="present device state") as caught:
+        set_up(rig, bus, to_reset=to_reset)
+    assert "drive 4, object 6060h:00" in caught.value.where
+
+
+@pytest.mark.parametrize(
+    ("share", "allowed"),
+    [
+        (0.98, False),
+        (0.9899, False),
+        (0.9902, True),
+        (1.0001, True),
+        (1.0999, True),
+        (1.101, False),
+    ],
+)
+def test_a_drive_may_round_the_ramp_of_its_quick_stop(
+    rig: Rig, share: float, allowed: bool
+) -> None:
+    """An amplifier in steps of 128 counts/s^2 keeps 1272000 for 1272174."""
+    bus = eight_of("cia402")
+    (ramp,) = [s.value for s in settings_for(rig, 3, WinchMap(rig)) if s.index == 0x6085]
+    bus.drives[4].keeps[0x6085, 0] = round(share * ramp)
+    if allowed:
+        assert set_up(rig, bus) == ()
+        return
+    with pytest.raises(Refused, match=f"{ramp} is required"):
+        set_up(rig, bus)
+
+
+def with_max_current(bus: ScriptedBus) -> None:
+    """6073h as in the standard instead of 6072h: 16 bits, per mille of rated current (6075h)."""
+    for drive in bus.drives.values():
+        drive.objects[0x6073, 0] = drive.objects.pop((0x6072, 0))
+        drive.values[0x6073, 0] = 1000
+        drive.objects[0x6075, 0], drive.values[0x6075, 0] = drive.objects[0x6085, 0], 4200
+
+
+@pytest.mark.parametrize(
+    ("keys", "limit"), [("", 1200), (', rated: "6075h:00"', 5040)], ids=["per mille", "as rated"]
+)
+def test_a_current_limit_of_16_bits_is_set(rig: Rig, tmp_path: Path, keys: str, limit: int) -> None:
+    """1200 per mille: 100 N at rated torque, 100 N allowed, a fifth in reserve."""
+    line = f'torque_limit: {{object: "6073h:00", bytes: 2{keys}}}\nabsent: ["6072h:00"]'
+    theirs, bus = with_profile(rig, lab_profile(tmp_path, line)), eight_of("cia402")
+    with_max_current(bus)
+    assert examined(theirs, bus).good
+    set_up(theirs, bus)
+    assert {drive.values[0x6073, 0] for drive in bus.drives.values()} == {limit}
+
+
+def test_a_current_limit_of_another_size_names_the_key_for_it(rig: Rig, tmp_path: Path) -> None:
+    line = 'torque_limit: {object: "6073h:00", rated: "6075h:00"}\nabsent: ["6072h:00"]'
+    theirs, bus = with_profile(rig, lab_profile(tmp_path, line)), eight_of("cia402")
+    with_max_current(bus)
+    (row,) = [row for row in examined(theirs, bus).rows if row.verdict == "wrong"]
+    assert row.object.startswith("6073h:00")
+    assert row.change == "profile: `bytes` of torque_limit"

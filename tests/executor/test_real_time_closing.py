@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from drivers.can_errors import BusDown
 from executor.realtime import process as real_time_process
-from executor.realtime.child import Armed, Ended
+from executor.realtime.child import Armed, Ended, Failed
 from executor.realtime.shared_memory import SharedRequests
-from executor.state_machine import State
+from executor.state_machine import LoopEvent, State
+from model.errors import Fault, HardwareMissing
 
 
 class Still:
@@ -30,6 +33,57 @@ def arms_and_ends(_job: Any, link: Connection, _supervisor: int) -> None:
     except EOFError:
         return
     link.send(Ended(State.FINISHED, "", holding=True, true_pose=None))
+
+
+SILENT = "all 8 drives stopped answering before the motion began"
+
+
+def falls_silent(_job: Any, link: Connection, _supervisor: int) -> None:
+    link.send(Armed("", None))  # type: ignore[arg-type]
+    link.send(Failed(HardwareMissing(SILENT)))
+
+
+def loses_the_bus(_job: Any, link: Connection, _supervisor: int) -> None:
+    link.send(Armed("", None))  # type: ignore[arg-type]
+    link.send(Failed(BusDown("the interface is down", "bus can0")))
+
+
+def breaks(_job: Any, link: Connection, _supervisor: int) -> None:
+    link.send(Armed("", None))  # type: ignore[arg-type]
+    link.send(Failed(Fault("the real-time process failed: ValueError: 3")))
+
+
+def dies(_job: Any, link: Connection, _supervisor: int) -> None:
+    link.send(Armed("", None))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("serve", "code"),
+    [
+        (falls_silent, "drive_silent"),
+        (loses_the_bus, "bus_down"),
+        (breaks, "broken"),
+        (dies, "real_time_lost"),
+    ],
+)
+def test_a_motion_that_did_not_begin_is_recorded_with_its_own_cause(
+    monkeypatch: pytest.MonkeyPatch, serve: Callable[..., None], code: str
+) -> None:
+    monkeypatch.setattr(real_time_process, "serve", serve)
+    board, events = SharedRequests(), list[LoopEvent]()
+    records: Any = SimpleNamespace(take_event=events.append)
+    motion_on_board: Any = (Still(), print, board)
+    try:
+        with real_time_process.real_time_process(
+            *motion_on_board, need_real_time=False, check_drives=lambda: "drive 3 is in fault"
+        ) as process:
+            process.arm(records)
+            ended = process.run()
+    finally:
+        board.close()
+    assert [event.code for event in events] == [code, "not_held"]
+    assert (ended.state, ended.holding) == (State.LATCHED, False)
+    assert events[0].text in ended.cause
 
 
 @pytest.mark.parametrize("goes", [True, False])

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from drivers.drive_group import DriveSnapshot
 from drivers.plausibility import require_within_limits
 from executor.control.preconditions import require_still_referenced
 from executor.homing import use_rig_file_counts
-from executor.interlock.interlock import MotionInterlock
+from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.interlock.reference import HomingReference, reference_at
 from executor.proposals import ForgetProposal
 from executor.state_machine import State
@@ -65,7 +67,7 @@ def test_the_next_step_without_one_names_the_ways_to_state_the_pose() -> None:
     with pytest.raises(Refused) as unhomed:
         MotionInterlock(rig).reference()
     with pytest.raises(Refused) as moved:
-        require_still_referenced(rig, reference_of(rig), (1,), [0] * 8)
+        require_still_referenced(rig, reference_of(rig), (1,), seen_at(rig))
     with pytest.raises(Refused) as beyond:
         require_within_limits(rig, [2**31 - 1] * 8)
     for caught in (unhomed, moved, beyond):
@@ -193,7 +195,7 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     left = reference_of(rig)
     absolute.file.write(left)
     absolute.found_restarted((4,))
-    assert absolute.kept_reference() == left
+    assert absolute.kept_reference() == left.model_copy(update={"released": [4]})
 
 
 @pytest.mark.parametrize("ended", [State.STOPPED, State.LATCHED])
@@ -254,20 +256,139 @@ def test_a_file_that_cannot_be_read_is_not_ignored(content: str) -> None:
     assert interlock.reference() is not None
 
 
-def positions_at(rig: Rig, off_mm: float = 0.0) -> list[int]:
-    positions = [1000] * rig.cable_count
+HOLDING, DISABLED = 0x0217, 0x0250
+
+
+def seen_at(rig: Rig, off_mm: float = 0.0, words: Mapping[int, int] = {}) -> DriveSnapshot:
+    """Drives that hold, except for those with other ``words``, by node."""
+    positions = np.full(rig.cable_count, 1000, dtype=np.int64)
     positions[3] += round(off_mm / 1000.0 * rig.winches[3].counts_per_metre)
-    return positions
+    states = np.array([words.get(w.node_id, HOLDING) for w in rig.winches], dtype=np.int64)
+    return DriveSnapshot(positions, np.zeros_like(positions), states, (), ())
 
 
 def test_a_drive_that_was_switched_on_again_or_moved_by_hand_is_found_out() -> None:
     rig = rig_with("incremental")
     reference = reference_of(rig)
-    require_still_referenced(rig, reference, (), positions_at(rig, 0.9))
+    require_still_referenced(rig, reference, (), seen_at(rig, 0.9))
     with pytest.raises(Refused, match=r"cable 4 \(drive 4\) is lost: it is 1\.1 mm"):
-        require_still_referenced(rig, reference, (), positions_at(rig, 1.1))
+        require_still_referenced(rig, reference, (), seen_at(rig, 1.1))
     with pytest.raises(Refused, match=r"cable 4 \(drive 4\) is lost: it was power-cycled"):
-        require_still_referenced(rig, reference, (4,), positions_at(rig))
+        require_still_referenced(rig, reference, (4,), seen_at(rig))
     absolute = rig_with("absolute")
-    require_still_referenced(absolute, reference, (4,), positions_at(absolute, 50.0))
-    require_still_referenced(rig, None, (4,), positions_at(rig, 50.0))
+    require_still_referenced(absolute, reference, (4,), seen_at(absolute, 50.0))
+    require_still_referenced(rig, None, (4,), seen_at(rig, 50.0))
+
+
+ALL = tuple(range(1, 9))
+
+
+@pytest.mark.parametrize("encoder", ["absolute", "incremental"])
+@pytest.mark.parametrize("brake", [True, False])
+@pytest.mark.parametrize("word", [DISABLED, 0x0218, 0x0231, 0x0233])
+def test_a_drive_that_lost_its_torque_since_it_held_has_released_its_cable(
+    encoder: str, brake: bool, word: int
+) -> None:
+    """As after an emergency stop between two motions, at unchanged positions."""
+    rig = rig_with(encoder, brake=brake)
+    require_still_referenced(rig, reference_of(rig), (), seen_at(rig))
+    for nodes in ((4,), ALL):
+        with pytest.raises(Refused, match=r"lost: .*cable 4 \(drive 4\).*without torque") as caught:
+            require_still_referenced(
+                rig, reference_of(rig), (), seen_at(rig, words=dict.fromkeys(nodes, word))
+            )
+        assert "cdpr home" in caught.value.next_step
+
+
+def _end(interlock: MotionInterlock, **how: Any) -> None:
+    interlock.end(State.FINISHED, "", Path("run"), **{"holding": True, "positions": [0] * 8} | how)
+
+
+@pytest.mark.parametrize("homed", [True, False])
+def test_absolute_encoders_may_be_power_cycled_but_not_dropped(homed: bool) -> None:
+    rig = described = rig_with("absolute")
+    if homed:
+        MotionInterlock(rig).file.write(reference_of(rig))
+        rig = MotionInterlock(rig).referenced_rig()
+    dropped = seen_at(rig, words=dict.fromkeys(ALL, DISABLED))
+
+    def ready() -> HomingReference | None:
+        return MotionInterlock(rig).require_ready()
+
+    if not homed:  # after the first power-up and a reset
+        require_still_referenced(rig, ready(), (), dropped)
+    interlock = MotionInterlock(rig)
+    interlock.begin(Path("run"), ready())
+    _end(interlock)
+    require_still_referenced(rig, ready(), (), seen_at(rig))
+    with pytest.raises(Refused, match="without torque"):
+        require_still_referenced(rig, ready(), (), dropped)
+    require_still_referenced(rig, ready(), ALL, dropped)
+    MotionInterlock(rig).found_restarted(ALL)  # this motion did not begin: they are configured now
+    require_still_referenced(rig, ready(), (), dropped)
+    assert MotionInterlock(described).why_unreferenced([0] * 8) == ""
+
+
+def test_drives_released_behind_their_brakes_need_not_hold_until_they_are_enabled_again() -> None:
+    rig = rig_with("incremental", brake=True)
+    MotionInterlock(rig).file.write(reference_of(rig))
+    rig = MotionInterlock(rig).referenced_rig()
+    interlock = MotionInterlock(rig)
+    released = seen_at(rig, words=dict.fromkeys(ALL, 0x0231))
+
+    def still_referenced() -> None:
+        require_still_referenced(rig, interlock.require_ready(), (), released)
+
+    interlock.begin(Path("release"), interlock.require_ready())
+    _end(interlock, released=ALL, positions=released.positions.tolist())
+    still_referenced()
+    interlock.begin(Path("run"), interlock.require_ready())
+    interlock.cancel()  # as when the operator does not confirm
+    still_referenced()
+    interlock.begin(Path("run"), interlock.require_ready())
+    _end(interlock, released=ALL, positions=released.positions.tolist())  # never enabled
+    still_referenced()
+    interlock.begin(Path("run"), interlock.require_ready())  # killed: they may have been enabled
+    MotionInterlock(rig).found_released((), ALL)  # as a reset finds them
+    with pytest.raises(Refused, match=r"reference is lost") as caught:
+        MotionInterlock(rig).reference()
+    assert "without torque" in caught.value.why
+
+
+def test_a_motion_from_released_drives_does_not_make_the_reference_good_again() -> None:
+    rig = rig_with("incremental")
+    interlock, left = MotionInterlock(rig), reference_of(rig)
+    interlock.file.write(left)
+    interlock.found_released((), ())
+    assert interlock.kept_reference() == left
+    interlock.found_released((), ALL)
+    interlock.begin(Path("run"), interlock.still_counts(left.stands_at))
+    _end(interlock, positions=left.stands_at)
+    interlock.confirm_held(left.stands_at)
+    assert "without torque" in MotionInterlock(rig).why_unreferenced()
+
+
+@pytest.mark.parametrize("encoder", ["absolute", "incremental"])
+def test_drives_that_were_never_homed_are_not_said_to_have_been(encoder: str) -> None:
+    interlock = MotionInterlock(rig_with(encoder))
+    interlock.begin(Path("run"), None)
+    interlock.end(State.LATCHED, "emergency stop", Path("run"), holding=False, positions=None)
+    assert reference_status(interlock).made is None
+    why = interlock.why_unreferenced()
+    assert why.endswith("(emergency stop); the drives were never homed")
+
+
+def test_drives_that_were_never_homed_count_as_in_the_rig_file_whatever_it_was_before() -> None:
+    interlock = MotionInterlock(rig_with("absolute"))
+    interlock.begin(Path("run"), interlock.require_ready())
+    _end(interlock)
+    changed = MotionInterlock(rig_with("absolute", drum_mm_per_rev=200.0, home_counts=77))
+    assert changed.reference() is None
+    found = changed.require_ready()
+    assert found is not None
+    assert found.home_counts == [77] * 8
+    assert str(reference_status(changed)) == "none: absolute encoders match the rig file"
+    relative = MotionInterlock(rig_with("incremental"))
+    for ask in (relative.reference, relative.require_ready):
+        with pytest.raises(Refused, match="never homed"):
+            ask()

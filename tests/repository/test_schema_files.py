@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
+from model.files.drive_profile_file import NEEDED
 from tools.schemas import DOCUMENTS, schema_text, write_schemas
 
 SCHEMAS = Path(__file__).parents[2] / "docs" / "schema"
@@ -31,3 +33,20 @@ def test_a_ready_file_names_its_schema_for_editors(path: Path) -> None:
     key, _, target = path.read_text(encoding="utf-8").splitlines()[0].partition("$schema=")
     assert key == "# yaml-language-server: "
     assert (path.parent / target).resolve() in {schema.resolve() for schema in SCHEMAS.iterdir()}
+
+
+def test_the_schema_of_profiles_knows_the_names_of_objects_and_codes() -> None:
+    """An editor that accepts what the program refuses misleads whoever writes a profile."""
+    schema = DOCUMENTS["drive-profile"].model_json_schema()
+    keys, parts = schema["properties"], schema["$defs"]
+    known = keys["ranges"]["propertyNames"]["enum"]
+    missing = keys["absent"]["items"]["enum"]
+    assert set(known) - set(missing) == set(NEEDED)
+    assert {"6066h:00", "6072h:00"} <= set(missing)
+    for pattern, right, wrong in (
+        (keys["warnings"]["items"]["pattern"], "33xxh", ("3180", "33XXh", "33xxh:00")),
+        (parts["Expected"]["properties"]["object"]["pattern"], "60A8h:00", ("60a8h:00", "60A8h")),
+        (parts["TorqueLimit"]["properties"]["object"]["pattern"], "6073h:00", ("6073:00",)),
+    ):
+        assert re.search(pattern, right)
+        assert not any(re.search(pattern, text) for text in wrong)

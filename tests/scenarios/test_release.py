@@ -170,3 +170,37 @@ def test_ctrl_c_during_release_stops_all_and_says_what_is_left(
     assert latched is not None
     assert "stopped while releasing the drives" in latched.cause
     assert "next:" not in latched.cause
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_an_emergency_stop_between_two_programs_loses_the_reference(
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
+) -> None:
+    channel = f"239.74.163.34:{20000 + (os.getpid() * 29) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(slow_rig.read_text().replace("encoder: absolute, ", ""))
+    jog = ("jog", rig, "--by-mm", "0", "0", "1", "--no-scene", "--without-real-time", "--yes")
+
+    def reference() -> dict[str, object]:
+        return json.loads(call("status", rig, *bus, "--json").out)["reference"]  # type: ignore[no-any-return]
+
+    with drives_on(channel, slow_run) as rehearsal:
+        assert call("reset", rig, *bus, "--yes").code == 0
+        stood = [round(drive.motor.position) for drive in rehearsal.drives]
+        homed = as_in_the_file(_on(channel, rig))
+        update = {"made": "2026-01-01T00:00:00+00:00", "stands_at": stood, "released": []}
+        MotionInterlock(_on(channel, rig)).file.write(homed.model_copy(update=update))
+        hold(rehearsal.drives)
+        assert reference()["counts"] is True
+        for drive in rehearsal.drives:
+            drive.state = DriveState.SWITCH_ON_DISABLED
+        assert "without torque now" in str(reference()["why_not"])
+        refused = call(*jog, *bus, "-o", tmp_path / "jog")
+        assert refused.code == 3, refused
+        assert "cdpr home RIG" in refused.err.replace("\n", " ")
+        assert {drive.state for drive in rehearsal.drives} == {DriveState.SWITCH_ON_DISABLED}
+        assert call("reset", rig, *bus, "--yes").code == 0
+        hold(rehearsal.drives)  # again, but the cables were slack meanwhile
+        assert "without torque now" in str(reference()["why_not"])
