@@ -8,8 +8,6 @@ from math import radians
 from os import PathLike
 from pathlib import Path
 
-import numpy as np
-
 from calibration.extrinsics.hand_eye import locate_by_motion
 from calibration.extrinsics.result import (
     ExtrinsicCalibration,
@@ -345,7 +343,8 @@ def calibrate_rig(
             taken as known. ``cable_stiffness`` instead of ``stiffness`` fits each cable, and
             ``imu_mounting`` the mounting of an IMU.
         length_deviation: Of a cable's length from the encoders, [m].
-        pose_deviations: Of poses, added to those of their file, [m] and [rad].
+        pose_deviations: Of poses beyond those of their file, [m] and [rad], such as of the
+            camera's pose: an error of all samples alike, which their number does not reduce.
         without_poses: Use drive positions only, as without a camera.
         reflector: Measured point of positions without rotations, platform frame, [m].
         swivel_deviation: Of measured swivel angles, [rad].
@@ -379,7 +378,7 @@ def calibrate_rig(
     paths = [path_of(one) for one in given]
     counted, measured = rig_measurements(rig, paths)
     measured = replace(
-        measured.with_added_deviation(np.repeat(of_poses, 3)),
+        measured.with_added_deviation(*of_poses),
         reflector=measured_point,
         swivel_deviation=swivel_deviation,
         imu_deviation=imu_deviation,

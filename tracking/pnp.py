@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from model.cameras import Z_95
-from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
+from model.pose import Array, Pose, matrix_from_rotation_vector, moved, read_only
 from model.rig import Camera, Tag
 from tracking.camera_model import project_undistorted
 from tracking.detection.tags import CORNER_SIGNS, tag_corners

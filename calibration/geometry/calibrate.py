@@ -128,8 +128,9 @@ def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, po
     model, geometry = RigModel(parameters, measured), parameters.geometry(values)
     lengths, rig = model.counted.lengths(geometry), rig_with(parameters.rig, geometry)
     if not posed:
-        solutions = poses_from_lengths(rig, lengths)
-        return np.array([float(np.sqrt(np.mean(one.residual**2))) for one in solutions])
+        found = poses_from_lengths(rig, lengths, measured.without_poses(), alone=True)
+        apart = model.residuals(values, *found)[:, : rig.cable_count]
+        return np.asarray(np.sqrt(np.mean(apart**2, axis=1)))
     rotations = measured.first_rotations(rig)
     arms = measured.measured_points(np.zeros((len(rotations), 3)), rotations)
     found = poses_near(rig, lengths, measured.positions - arms, rotations, steps=8)
@@ -247,20 +248,22 @@ class RigCalibration:
             return None
         return float(np.sqrt(np.mean(self.uncertainty.half_widths[columns] ** 2)))
 
-    def position_error(self, positions: Array, rotations: Array) -> Array:
-        """Position error of the platform at commanded poses, 95 %.
+    def position_errors(self, positions: Array, rotations: Array) -> tuple[Array, Array]:
+        """Position errors of the platform at commanded poses, 95 %.
 
         Args:
             positions: World frame, shape (k, 3), [m].
             rotations: ``world_from_platform``, shape (k, 3, 3).
 
         Returns:
-            Along the worst direction, shape (k,), [m].
+            As by `RigUncertainty.worst`, and the part that errors common to all measured poses
+            cause, shape (k,) both, [m].
         """
         there = _sent_to(self.rig, positions, rotations)
         line = RigModel(self.parameters, there).linearised(self.fit.values, positions, rotations)
         moved = -np.linalg.pinv(line.by_pose) @ line.by_values
-        return self.uncertainty.worst(moved[:, :3])
+        by_values, uncertainty = moved[:, :3], self.uncertainty
+        return uncertainty.worst(by_values), uncertainty.worst_by_common(by_values)
 
     def reached(self, positions: Array, rotations: Array) -> Array:
         """Positions that the platform reaches when the rig file's parameters command poses.

@@ -6,17 +6,24 @@ samples. Unknowns are in standard deviations of the rig file, which acts as a pr
 
 from __future__ import annotations
 
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf, radians
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.model import RigModel
 from calibration.geometry.parameters import Parameters
 from calibration.statistics import huber, huber_weight
 from model.errors import Fault
-from model.kinematics import ForwardSolution, NoCable, forward_kinematics
+from model.kinematics import (
+    LEAST_DAMPING,
+    NoCable,
+    cables_exist,
+    cables_to,
+    structure_matrix_of,
+)
 from model.pose import Array, matrix_from_rotation_vector, read_only, rotation_vector_from_matrix
 from model.rig import Rig
 
@@ -80,6 +87,9 @@ MOST_DAMPING = 1e9
 """No smaller step is tried: its gain would be below round-off."""
 START_TOLERANCE = 1e-5
 """Tolerance of initial poses, [m] and [rad]."""
+START_DEVIATION, START_TURN = 5e-3, radians(10.0)
+"""Assumed for initial poses: standard deviation of lengths and positions, [m], and of rotations
+from home, [rad]; the fit itself assumes nothing about rotations that were not measured."""
 RESIDUAL_BEND, POSE_BEND = 3.0, 4.0
 """Huber thresholds of cable and sensor residuals, and of poses, in standard deviations."""
 
@@ -103,6 +113,8 @@ class RigFit:
         informations: Information of each sample on the unknowns, its pose projected out, shape
             (n, p, p), per variance of the rig file.
         scores: Half the gradient of each sample's squares by the unknowns, same units, (n, p).
+        common_scores: Change of the sum of these by one deviation of each error common to all
+            poses, shape (p, q).
     """
 
     values: Array
@@ -115,6 +127,7 @@ class RigFit:
     pose_misfits: Array
     informations: Array
     scores: Array
+    common_scores: Array
 
     @property
     def cables(self) -> Array:
@@ -192,20 +205,17 @@ class RigFitter:
         )
 
     def _initial_poses(self) -> tuple[Array, Array]:
-        """Measured poses; missing ones and missing rotations from forward kinematics.
-
-        Forward kinematics uses the rig file and starts at the previous pose.
-        """
-        rig, counted = self._parameters.rig, self._model.counted
+        """Measured poses; missing ones and missing rotations from the lengths by the rig file."""
+        rig, counted, measured = self._parameters.rig, self._model.counted, self._measured
         lengths = counted.lengths(self._parameters.geometry(np.zeros(len(self._parameters))))
-        positions, rotations = self._measured.positions.copy(), self._measured.rotations.copy()
-        unknown = np.flatnonzero(~(self._posed & self._rotated))
-        for k, found in zip(unknown, poses_from_lengths(rig, lengths[unknown]), strict=True):
-            rotations[k] = found.pose.rotation
-            positions[k] = found.pose.position
-            if self._posed[k]:
-                positions[k] = self._measured.positions[k]
-                positions[k] -= rotations[k] @ self._measured.reflector
+        positions, rotations = measured.positions.copy(), measured.rotations.copy()
+        unknown = ~(self._posed & self._rotated)
+        if unknown.any():
+            found = poses_from_lengths(rig, lengths[unknown], measured.part(unknown))
+            positions[unknown], rotations[unknown] = found
+        points = self._posed & unknown
+        arms = rotations[points] @ measured.reflector
+        positions[points] = measured.positions[points] - arms
         return positions, rotations
 
     def _pose_errors(self, positions: Array, rotations: Array) -> Array:
@@ -241,9 +251,7 @@ class RigFitter:
         line = self._model.linearised(values, positions, rotations)
         weights = self._weights(line.residuals) / self._deviations**2
         errors = self._pose_errors(positions, rotations)
-        informations = self._measured.pose_information(rotations)
-        share = huber_weight(self._distances(errors, informations), POSE_BEND)
-        pose_weights = share[:, None, None] * informations
+        pose_weights = self._pose_weights(positions, rotations)
         by_z = line.by_values @ spread
         weighted = weights[..., None] * line.by_pose
         return NormalEquations(
@@ -255,6 +263,12 @@ class RigFitter:
             pose_pull=np.einsum("nmi,nm->ni", weighted, line.residuals)
             + np.einsum("nij,nj->ni", pose_weights, errors),
         )
+
+    def _pose_weights(self, positions: Array, rotations: Array) -> Array:
+        """Information of the measured poses with Huber weights, shape (n, 6, 6)."""
+        informations = self._measured.pose_information(rotations)
+        distances = self._distances(self._pose_errors(positions, rotations), informations)
+        return np.asarray(huber_weight(distances, POSE_BEND)[:, None, None] * informations)
 
     def _weights(self, residuals: Array) -> Array:
         """Huber weight of each residual, shape (n, k)."""
@@ -277,29 +291,112 @@ class RigFitter:
                 self._pose_errors(positions, rotations), self._measured.pose_information(rotations)
             ),
             *system.reduced_by_sample(),
+            self._common_scores(system, positions, rotations),
         )
 
+    def _common_scores(self, system: NormalEquations, positions: Array, rotations: Array) -> Array:
+        """As in `RigFit`; an error of a measured pose pulls the estimated one along."""
+        pulls = self._pose_weights(positions, rotations) @ self._measured.common_errors
+        return np.asarray(np.sum(system.mixed @ np.linalg.solve(system.poses, pulls), axis=0))
 
-def poses_from_lengths(rig: Rig, lengths: Array) -> list[ForwardSolution]:
-    """Forward kinematics of samples, each started at the last pose, at home, or anywhere.
+
+# Poses whose rotation was not measured, from cable lengths.
+
+
+def poses_from_lengths(
+    rig: Rig, lengths: Array, measured: RigMeasurements, *, alone: bool = False
+) -> tuple[Array, Array]:
+    """Poses near home's rotation and the measured positions, with cable lengths near given ones.
+
+    Where the rig differs from its file, lengths alone may rotate the platform far.
 
     Args:
         rig: With its assumed parameters.
         lengths: From outlet to anchor, shape (n, m), [m].
+        measured: The samples, without rotations.
+        alone: Whether lengths alone count in the end.
+
+    Returns:
+        Positions, world frame, shape (n, 3), [m], and rotations, shape (n, 3, 3).
 
     Raises:
-        Fault: No start leads to a pose.
+        NoCable: A measured position is out of the rig's reach.
     """
-    found: list[ForwardSolution] = []
-    for wanted in lengths:
-        tries = []
-        for start in (found[-1].pose if found else rig.home, rig.home):
-            with suppress(Fault):
-                tries.append(forward_kinematics(rig, wanted, start, tolerance=START_TOLERANCE))
-        if not tries:
-            tries = [forward_kinematics(rig, wanted, tolerance=START_TOLERANCE)]
-        found.append(min(tries, key=lambda solution: solution.worst))
-    return found
+    vague = np.tile(START_DEVIATION**2 * np.eye(6), (len(lengths), 1, 1))
+    data = replace(measured, covariances=vague)
+    rotations = np.tile(rig.home.rotation, (len(lengths), 1, 1))
+    points = data.positions - rotations @ data.reflector
+    positions = np.where(data.has_position[:, None], points, rig.home.position)
+    found = _nearest_poses(rig, lengths, data, START_TURN, (positions, rotations))
+    return _nearest_poses(rig, lengths, data.without_poses(), inf, found) if alone else found
+
+
+def _nearest_poses(
+    rig: Rig, lengths: Array, data: RigMeasurements, turn: float, poses: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Damped least squares from given poses, each damped by itself; see `_pose_systems`."""
+    damping = np.full(len(lengths), 1e-3)
+    for _ in range(MOST_STEPS):
+        squares, normal, slopes = _pose_systems(rig, lengths, data, turn, poses)
+        damped = normal + damping[:, None, None] * normal * np.eye(6)
+        twists = np.asarray(-np.linalg.solve(damped, slopes[..., None]))[..., 0]
+        trial = (poses[0] + twists[:, :3], _rotated(poses[1], twists[:, 3:]))
+        exists = cables_exist(rig, _anchors(rig, trial))
+        trial = _chosen(exists, trial, poses)
+        better = exists & (_pose_systems(rig, lengths, data, turn, trial)[0] <= squares)
+        poses = _chosen(better, trial, poses)
+        damping = np.clip(damping * np.where(better, 0.1, 10.0), LEAST_DAMPING, MOST_DAMPING)
+        if np.abs(twists).max() < START_TOLERANCE:
+            break
+    return poses
+
+
+def _pose_systems(
+    rig: Rig, lengths: Array, data: RigMeasurements, turn: float, poses: tuple[Array, Array]
+) -> tuple[Array, Array, Array]:
+    """Least squares by lengths, measured positions, and rotations from home.
+
+    Args:
+        rig: With its assumed parameters.
+        lengths: From outlet to anchor, shape (n, m), [m].
+        data: The samples, without rotations.
+        turn: Standard deviation of rotations from home, [rad].
+        poses: Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3).
+
+    Returns:
+        Sums of squares, shape (n,), and their normal equations, shapes (n, 6, 6) and (n, 6).
+    """
+    positions, rotations = poses
+    cables = cables_to(rig, _anchors(rig, poses))
+    off = (cables.lengths - lengths) / START_DEVIATION
+    by_twist = -structure_matrix_of(cables, positions) / START_DEVIATION
+    apart, rotated = np.zeros((2, len(lengths), 6))
+    apart[:, :3] = np.nan_to_num(data.measured_points(positions, rotations) - data.positions)
+    from_home = rotations @ rig.home.rotation.T
+    rotated[:, 3:] = [rotation_vector_from_matrix(rotation) / turn for rotation in from_home]
+    information = data.pose_information(rotations)
+    pulls = (information @ apart[..., None])[..., 0]
+    squares = np.sum(off**2, axis=1) + np.sum(rotated**2, axis=1) + np.sum(apart * pulls, axis=1)
+    normal = by_twist @ np.swapaxes(by_twist, 1, 2) + information
+    normal[:, 3:, 3:] += np.eye(3) / turn**2
+    slopes = (by_twist @ off[..., None])[..., 0] + pulls + rotated / turn
+    return squares, normal, slopes
+
+
+def _anchors(rig: Rig, poses: tuple[Array, Array]) -> Array:
+    """Anchors in the world at poses, shape (n, m, 3), [m]."""
+    positions, rotations = poses
+    return np.asarray(positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors))
+
+
+def _chosen(
+    first: NDArray[np.bool_], one: tuple[Array, Array], other: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Poses of one of two sets; ``first`` shape (n,)."""
+    return (
+        np.where(first[:, None], one[0], other[0]),
+        np.where(first[:, None, None], one[1], other[1]),
+    )
 
 
 def _rotated(rotations: Array, turns: Array) -> Array:

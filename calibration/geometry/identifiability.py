@@ -14,7 +14,7 @@ import numpy as np
 from calibration.geometry.fit import RigFit, RigFitter
 from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.parameters import AXES, Parameters
-from calibration.statistics import student_factor
+from calibration.statistics import rms_bound, student_factor
 from model.pose import Array, read_only, skew
 
 LEAST_INFORMATION = 1.0
@@ -176,7 +176,8 @@ def identified(
 #
 # Scatter alone is too optimistic if residuals within a sample are correlated: a pose error, a cable
 # model that differs from the rig file's. The jackknife over samples, to first order, covers that.
-# The rig file acts as a prior that is never left out.
+# The rig file acts as a prior that is never left out. Neither shows errors that all measured poses
+# share, such as of the camera's pose: the fit follows them, and what it does is added to both.
 #
 # Source: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11.
 
@@ -188,12 +189,15 @@ class RigUncertainty:
     Attributes:
         by_scatter: Covariance, shape (p, p); of unidentified directions it is the rig file's.
         by_jackknife: The same, from leaving out each sample.
+        common: Changes of the unknowns by one deviation of each error common to all measured
+            poses, shape (p, q); no scatter shows them.
         scatter: Ratio of the residuals' variance to the stated one, at least 1.
         quantile: Half width of a 95 % interval in standard deviations.
     """
 
     by_scatter: Array
     by_jackknife: Array
+    common: Array
     scatter: float
     quantile: float
 
@@ -205,6 +209,8 @@ class RigUncertainty:
     def worst(self, slopes: Array) -> Array:
         """95 % error of vectors that depend on the parameters, along their worst direction.
 
+        Errors common to all poses count by their magnitude, since they are the same everywhere.
+
         Args:
             slopes: Their derivatives by the parameters, shape (k, d, p).
 
@@ -215,8 +221,14 @@ class RigUncertainty:
             np.linalg.eigvalsh(slopes @ covariance @ np.swapaxes(slopes, 1, 2))[:, -1]
             for covariance in (self.by_scatter, self.by_jackknife)
         ]
-        worst: Array = self.quantile * np.sqrt(np.maximum(*variances))
-        return worst
+        alone = self.quantile * np.sqrt(np.maximum(*variances))
+        return np.asarray(np.hypot(alone, self.worst_by_common(slopes)))
+
+    def worst_by_common(self, slopes: Array) -> Array:
+        """The part of `worst` that errors common to all poses cause, shape (k,)."""
+        unit = np.eye(self.common.shape[1])
+        bounds = [rms_bound(unit, slope @ self.common) for slope in slopes]
+        return np.asarray(np.sqrt(slopes.shape[1]) * np.array(bounds))
 
 
 def uncertainty_of_rig(
@@ -252,5 +264,7 @@ def uncertainty_of_rig(
         for inner in (scatter * np.linalg.inv(whole), jackknifed)
     )
     by_scatter, by_jackknife = (read_only(inner * np.outer(spread, spread)) for inner in of_all)
+    pulled = known @ np.linalg.solve(whole, known.T @ fit.common_scores)
+    common = read_only(-spread[:, None] * pulled)
     quantile = student_factor(count - 1)
-    return RigUncertainty(by_scatter, by_jackknife, scatter, quantile)
+    return RigUncertainty(by_scatter, by_jackknife, common, scatter, quantile)

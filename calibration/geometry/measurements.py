@@ -54,6 +54,8 @@ class RigMeasurements:
             accelerometers at rest, shape (n, 3); NaN where not measured.
         swivel_deviation: Of each swivel angle, [rad].
         imu_deviation: Of a vertical's direction about any axis, [rad].
+        common_deviations: Of errors that all measured poses may share, in position along any axis,
+            [m], and in rotation about any axis, [rad].
     """
 
     names: tuple[str, ...]
@@ -68,6 +70,7 @@ class RigMeasurements:
     verticals: Array = field(default_factory=_nothing)
     swivel_deviation: float = radians(0.1)
     imu_deviation: float = radians(0.1)
+    common_deviations: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Fills sensors that were left out with NaN."""
@@ -138,14 +141,34 @@ class RigMeasurements:
         names = tuple(n for n, yes in zip(self.names, chosen.tolist(), strict=True) if yes)
         return replace(self, names=names, **arrays)
 
-    def with_added_deviation(self, deviations: Array) -> RigMeasurements:
+    def with_added_deviation(self, length: float, turn: float) -> RigMeasurements:
         """The same with larger pose covariances, for errors common to all images of a sample.
 
+        All samples may share these errors as well, which no number of samples averages out.
+
         Args:
-            deviations: Of camera and tags, shape (6,), [m, rad].
+            length: Standard deviation of positions along any axis, [m].
+            turn: Standard deviation of rotations about any axis, [rad].
         """
-        more = self.covariances + np.diag(np.square(deviations))
-        return replace(self, covariances=read_only(more))
+        more = self.covariances + np.diag(np.square([length] * 3 + [turn] * 3))
+        return replace(self, covariances=read_only(more), common_deviations=(length, turn))
+
+    @property
+    def common_errors(self) -> Array:
+        """Twists of the measured poses by one deviation of each common error, shape (n, 6, 9).
+
+        Displacements of the world, rotations of the world about the middle of the poses, and
+        rotations of the platform's axes alone, as by tags mounted askew. Where no rotation was
+        measured, only displacements; where no pose was, 0.
+        """
+        length, turn = self.common_deviations
+        errors, whole = np.zeros((len(self), 6, 9)), self.has_position & self.has_rotation
+        errors[self.has_position, :3, :3] = length * np.eye(3)
+        errors[whole, 3:, 3:] = turn * np.hstack([np.eye(3), np.eye(3)])
+        middle = self.positions[whole].mean(axis=0) if whole.any() else np.zeros(3)
+        for k in np.flatnonzero(whole):
+            errors[k, :3, 3:6] = -turn * skew(self.positions[k] - middle)
+        return errors
 
     def without_poses(self) -> RigMeasurements:
         """The same without measured poses."""

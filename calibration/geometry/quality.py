@@ -181,6 +181,11 @@ SCATTERED = 2.0
 """Largest acceptable RMS residual of a sensor, in stated standard deviations."""
 _INSET = 0.15
 """The workspace is assessed at its centre and this share inside its corners."""
+_COMMON = (
+    "calibrate the camera's lens, its pose and the tags more accurately, and pass their error as"
+    " --pose-mm and --pose-deg: all measured poses share it, so more of them do not help"
+)
+"""Next step where errors common to all measured poses are the larger part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,8 +234,8 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
         wanted: Required error, 95 %, [m].
         tilt: Largest rotation of the platform from its orientation at home, [rad].
     """
-    level, rotated = (
-        float(result.position_error(*workspace_poses(result.rig, angle)).max())
+    (level, level_common), (rotated, rotated_common) = (
+        [float(e.max()) for e in result.position_errors(*workspace_poses(result.rig, angle))]
         for angle in (0.0, tilt)
     )
     out = result.held_out
@@ -258,7 +263,9 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
         issues.append(
             Issue(
                 f"the platform may be {level * 1e3:.2g} mm off between the measured poses",
-                "measure at more poses all over the workspace"
+                _COMMON
+                if level_common**2 > 0.5 * level**2
+                else "measure at more poses all over the workspace"
                 + ("" if out.poses else ", and with a camera"),
             )
         )
@@ -266,7 +273,9 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
         issues.append(
             Issue(
                 f"rotated by {math.degrees(tilt):.3g}° it may be {rotated * 1e3:.2g} mm off",
-                f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
+                _COMMON
+                if rotated_common**2 > 0.5 * rotated**2
+                else f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
                 " (`cdpr calibrate poses` plans it), or pass --tilt-deg 0 if it never rotates",
             )
         )

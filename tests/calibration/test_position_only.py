@@ -16,8 +16,14 @@ from calibration.geometry.quality import judge_rig
 from calibration.geometry.result import rig_result
 from model.errors import BadInput
 from model.pose import read_only
-from model.rig import Rig, load_rig
-from tests.calibration.rig_places import Truth, samples
+from model.rig import Rig, load_rig, rig_from_document
+from tests.calibration.rig_places import (
+    Truth,
+    rig_with_errors,
+    samples,
+    share_inside,
+    true_numbers,
+)
 from tests.calibration.test_rig_calibration import LENGTH_DEVIATION, TODAY, errors_of, rms
 from tests.cli.program import call
 
@@ -112,3 +118,38 @@ def test_a_file_of_positions_needs_no_rotation_and_half_of_one_is_refused(
         )
         with pytest.raises(BadInput, match=f"'{column}' is missing"):
             read_rig_data(half, 8)
+
+
+def parallel_cables(rig: Rig) -> Rig:
+    """A rig of 3.1 x 2.3 x 2.2 m with uncrossed cables, which hardly resist rotation about z."""
+    document, corners = rig.document, [(x, y) for y in (1, -1) for x in (-1, 1)]
+    upper, lower = (
+        [[1550 * x, 1150 * y, 2200] for x, y in corners],
+        [[1570 * x, 1110 * y, 60] for x, y in corners],
+    )
+    home = document.platform.home.model_copy(update={"position_mm": [0, 0, 1000]})
+    workspace = {"lower_mm": [-700, -500, 600], "upper_mm": [700, 500, 1500]}
+    changes = {
+        "outlets_mm": upper + lower,
+        "anchors_mm": [[150 * x, 120 * y, z] for z in (-100, 100) for x, y in corners],
+        "platform": document.platform.model_copy(update={"home": home}),
+        "workspace": document.workspace.model_copy(update=workspace),
+    }
+    return rig_from_document(document.model_copy(update=changes))
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("positions", [True, False])
+def test_a_weakly_determined_yaw_needs_no_measured_rotation(
+    rig: Rig, seed: int, positions: bool
+) -> None:
+    """Lengths by the rig file alone rotate the platform far: a start, not a reason to refuse."""
+    built = rig_with_errors(parallel_cables(rig), seed)
+    truth = samples(built, 60, tilt=np.radians(10.0), seed=seed)
+    data = followed(truth, REFLECTOR) if positions else truth.measured.without_poses()
+    result = fit_rig(built, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    assert len(result.measured) == 60
+    assert share_inside(result.intervals, true_numbers(built)) >= 0.9
+    quality = judge_rig(result, 2e-3, np.radians(5.0))
+    assert quality.held_out < 0.2 * quality.before
+    assert quality.verdict.good == positions
