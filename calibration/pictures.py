@@ -319,7 +319,7 @@ def same_images(sets: Sequence[ImageSet]) -> list[ImageSet]:
     """The sets, but of videos samples with the same numbers, as far as the shortest one.
 
     Raises:
-        BadInput: The videos' rates differ so much that the same number is another time.
+        BadInput: The videos differ in rate: images of the same number are not simultaneous.
     """
     videos = [one.video for one in sets if one.video is not None]
     if len(videos) < len(sets):
