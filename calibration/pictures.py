@@ -316,11 +316,23 @@ def _named_by_time(frames: Iterable[Frame]) -> Iterator[tuple[str, Image]]:
 
 
 def same_images(sets: Sequence[ImageSet]) -> list[ImageSet]:
-    """The sets, but of videos samples with the same numbers, as far as the shortest one."""
+    """The sets, but of videos samples with the same numbers, as far as the shortest one.
+
+    Raises:
+        BadInput: The videos differ in rate: images of the same number are not simultaneous.
+    """
     videos = [one.video for one in sets if one.video is not None]
     if len(videos) < len(sets):
         return list(sets)
     total, most = min(map(_length, videos)), min(one.count for one in sets)
+    rates = [video.rate for video in videos]
+    if total * (max(rates) - min(rates)) > 0.5 * min(rates):
+        raise BadInput(
+            "the videos have different rates, so images of the same number are not simultaneous",
+            where=", ".join(f"{rate:.6g} images/s" for rate in rates),
+            next_step="convert them to one rate, or save simultaneous images with the same name in"
+            " two folders",
+        )
     return [_sampled(video, most, total) for video in videos]
 
 

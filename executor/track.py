@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import islice, takewhile
@@ -13,7 +13,13 @@ import numpy as np
 
 from drivers.cameras.files import ImageFolder, PictureOutput
 from drivers.cameras.live import Frame, LiveCamera, VideoFile
-from executor.cameras.sources import SYNTHETIC, require_camera_source
+from executor.cameras.sources import (
+    SYNTHETIC,
+    report_different_videos,
+    require_camera_source,
+    require_one_kind,
+    times_by_name,
+)
 from executor.kernels import ready_to_measure
 from executor.recording.mcap import write_track_mcap
 from executor.trajectory.setpoints import prepare
@@ -189,6 +195,7 @@ def track_sources(
         CameraMoved: Frame tags differ from their positions in the rig file.
     """
     require_plan_used(sources.values(), plan)
+    require_one_kind({camera.name: source for camera, source in sources.items()})
     the_scene = plan.scene if scene is None and plan is not None else scene
     ready_to_measure(listener)
     several = len(sources) > 1
@@ -203,6 +210,7 @@ def track_sources(
         _opened(rig, the_scene, camera, source, plan, result.unused[camera.name], listener)
         for camera, source in sources.items()
     ]
+    opened, within = _simultaneous(list(sources), opened, listener)
     totals = [total for _, total in opened if total is not None]
     total = max(totals) if len(totals) == len(opened) else None
     is_live = any(length is None for _, length in opened)  # then times are of the monotonic clock
@@ -219,8 +227,6 @@ def track_sources(
                 model=model,
                 on_picture=drawing.enter_context(_overlay(target, rig, camera, replace_overlay)),
             )
-        # The fastest camera defines the time window of simultaneous images.
-        within = 0.5 / max(camera.rate for camera in sources)
         try:
             _measure(_together(streams, within, result.together, model), result, advance)
         except (CdprError, KeyboardInterrupt):
@@ -228,6 +234,33 @@ def track_sources(
                 keep(result)
             raise
     return result
+
+
+def _simultaneous(
+    cameras: Sequence[Camera],
+    opened: list[tuple[Iterable[Picture], int | None]],
+    listener: Listener,
+) -> tuple[list[tuple[Iterable[Picture], int | None]], float]:
+    """The opened sources with times common to all cameras.
+
+    Returns:
+        The sources, and the distance from the median time within which images are fused, [s]; 0
+        for folders, whose simultaneous images have the same name.
+    """
+    named = {camera.name: frames for camera, (frames, _) in zip(cameras, opened, strict=True)}
+    folders = {name: one for name, one in named.items() if isinstance(one, ImageFolder)}
+    videos = {name: one for name, one in named.items() if isinstance(one, VideoFile)}
+    if len(folders) > 1:
+        times = times_by_name(folders, listener)
+        return [(_dated(one, times), len(one)) for one in folders.values()], 0.0
+    report_different_videos(videos, listener)
+    # The fastest camera defines the time window of simultaneous images.
+    return opened, 0.5 / max(camera.rate for camera in cameras)
+
+
+def _dated(folder: ImageFolder, times: Mapping[str, float]) -> Iterator[Frame]:
+    """Images of a folder with the times of their names, [s]."""
+    return (replace(frame, time=times[frame.name]) for frame in folder)
 
 
 def _measure(

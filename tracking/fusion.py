@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import brentq
 
 from model.pose import (
     Array,
@@ -30,6 +31,8 @@ UNSTATED_ERROR = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
 #: Squared Mahalanobis distance above which two poses disagree; one correct pair in ten thousand
 #: exceeds it.
 GATE = 27.9
+#: Part of the reason for a missing pose where two cameras contradict each other.
+DISAGREE = "disagree"
 
 
 class MultiCameraFusion:
@@ -83,6 +86,7 @@ class MultiCameraFusion:
 def fuse_poses(seen: Mapping[str, Observation]) -> Observation:
     """The information-weighted mean of all poses.
 
+    Where they disagree by more than their stated errors explain, its covariance is wider.
     Of three or more cameras, one that disagrees with the others is dropped; of two that disagree it
     is unknown which is wrong, and there is no pose.
 
@@ -101,7 +105,7 @@ def fuse_poses(seen: Mapping[str, Observation]) -> Observation:
             a, b = poses.values()
             gap = a.pose.distance_to(b.pose) * 1e3
             names = " and ".join(poses)
-            return NoPose(a.time, f"cameras {names} disagree by {gap:.1f} mm", ())
+            return NoPose(a.time, f"cameras {names} {DISAGREE} by {gap:.1f} mm", ())
         del poses[worst]
     return _mean(list(poses.values()))
 
@@ -128,7 +132,8 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
     first = poses[0]
     if len(poses) == 1:
         return first
-    weights = [np.linalg.inv(one.covariance) for one in poses]
+    unstated = _unstated_covariance(poses)
+    weights = [np.linalg.inv(one.covariance + unstated) for one in poses]
     covariance = np.linalg.inv(np.sum(weights, axis=0))
     steps = [w @ step_between(first.pose, one.pose) for w, one in zip(weights, poses, strict=True)]
     step = covariance @ np.sum(steps, axis=0)
@@ -142,6 +147,32 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
         unstated=any(one.unstated for one in poses),
         cable_error=max(one.cable_error for one in poses),
     )
+
+
+def _unstated_covariance(poses: Sequence[PoseMeasurement]) -> Array:
+    """Covariance of each pose that their disagreement shows beyond the stated errors, shape (6, 6).
+
+    It is the least multiple of `UNSTATED_ERROR`² with which the squared Mahalanobis distances from
+    the mean add up to k − 2, k their degrees of freedom: the mean of 1/χ² is 1/(k − 2), so that
+    the squared error of the fused pose, in units of its covariance, is six on average.
+
+    Source: Paule and Mandel, Journal of Research of the NBS 87 (1982), 377–385.
+    """
+    gaps = np.array([_between(poses[0].pose, one.pose) for one in poses])
+    stated = np.array([one.covariance + one.shared for one in poses])
+    unit, usual = np.diag(UNSTATED_ERROR**2), 6 * (len(poses) - 1) - 2
+
+    def excess(scale: float) -> float:
+        weights = np.linalg.inv(stated + scale * unit)
+        mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, gaps))
+        return float(np.einsum("ni,nij,nj->", gaps - mean, weights, gaps - mean)) - usual
+
+    if excess(0.0) <= 0.0:
+        return np.zeros((6, 6))
+    high = 1.0
+    while excess(high) > 0.0:
+        high *= 2.0
+    return np.asarray(brentq(excess, 0.0, high, rtol=1e-6) * unit)
 
 
 def _shared(poses: Sequence[PoseMeasurement], parts: Sequence[Array]) -> Array:

@@ -9,7 +9,7 @@ errors are propagated through extrinsics and pose together.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,13 @@ from model.errors import BadInput, Fault
 from model.pose import Array, Pose, lever_arm_matrix, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import project_undistorted, ray_slopes, rays_of, undistorted_slopes
-from tracking.detection.tags import tag_corners
+from tracking.detection.tags import (
+    WRONG_ROTATIONS,
+    rotated_tags,
+    rotation_cause,
+    rotation_remedy,
+    tag_corners,
+)
 from tracking.pnp import BundlePose, TagView, expected_cost, moved_by_pixels, solve_pnp
 
 _GRID = 7
@@ -315,7 +321,11 @@ def change_of_inverse(pose: Pose) -> Array:
 
 
 def require_unmoved_camera(
-    camera: Camera, views: Sequence[TagView], limit_px: float, before: CameraCheck | None
+    camera: Camera,
+    views: Sequence[TagView],
+    limit_px: float,
+    before: CameraCheck | None,
+    family: str,
 ) -> CameraCheck | None:
     """Checks the camera's pose if frame tags are visible.
 
@@ -327,6 +337,7 @@ def require_unmoved_camera(
         views: Of frame tags.
         limit_px: Largest median error of the tags.
         before: The check of the last image; None if it passed.
+        family: Of the tags.
 
     Returns:
         The check, or None if no frame tag is completely visible.
@@ -345,6 +356,17 @@ def require_unmoved_camera(
         "error_mm": round(check.distance * 1e3, 2),
         "frame_tags": ", ".join(map(str, check.tags)),
     }
+    for degrees in WRONG_ROTATIONS:
+        tags = rotated_tags((view.tag for view in views), degrees)
+        rotated = [replace(view, tag=tag) for view, tag in zip(views, tags, strict=True)]
+        if len(check.tags) > 1 and check_camera(camera, rotated).error <= limit_px:
+            raise CameraMoved(
+                f"frame tags {values['frame_tags']} are not mounted as the rig file states",
+                where=f"camera {camera.name!r}",
+                why=rotation_cause(family, degrees),
+                next_step=rotation_remedy(degrees),
+                values=values,
+            )
     by = ""
     found = measured_camera(camera, views)
     if found is not None:

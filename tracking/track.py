@@ -21,9 +21,15 @@ from model.rig import Camera, Rig
 from tracking.camera_model import Image, pixels_of
 from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
-from tracking.detection.tags import tag_corners
+from tracking.detection.tags import (
+    WRONG_ROTATIONS,
+    rotated_tags,
+    rotation_cause,
+    rotation_remedy,
+    tag_corners,
+)
 from tracking.estimator import UNCERTAIN, UNSHARP
-from tracking.fusion import MultiCameraFusion, synchronize_frames
+from tracking.fusion import DISAGREE, MultiCameraFusion, synchronize_frames
 from tracking.measurement import Observation, PoseMeasurement, rates
 from tracking.pose_log import LoggedPicture
 from tracking.shared_errors import PERHAPS_MOVED, require_stated_errors
@@ -155,7 +161,7 @@ def _nothing_seen(
         "check that the camera sees the platform, that the light suffices, and that the rig file"
         " has the family and numbers of the printed tags"
     )
-    reason = reasons.most_frequent()
+    reason, why = reasons.most_frequent(), ""
     soft = edge_width(last.image) > SOFT
     if UNCERTAIN in reason and not soft:
         next_step = "focus the camera, bring it nearer, or make more tags of the platform visible"
@@ -165,14 +171,29 @@ def _nothing_seen(
         next_step = "focus the camera on the platform, and add light to shorten the exposure"
     elif len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
+        degrees = _rotation_of_tags(tracker, last)
+        if degrees:
+            why = rotation_cause(tracker.rig.tag_family, degrees)
+            next_step = rotation_remedy(degrees)
     return NoPlatformSeen(
         f"none of {pictures} image{'s' if pictures != 1 else ''} gives a pose of the platform:"
         f" {reason}",
         where=where,
-        why=f"expected {tracker.rig.tag_family} tags {wanted}; {last.name} shows {instead}",
+        why=why or f"expected {tracker.rig.tag_family} tags {wanted}; {last.name} shows {instead}",
         next_step=next_step,
         values={"pictures": pictures, "family": tracker.rig.tag_family, "expected": wanted},
     )
+
+
+def _rotation_of_tags(tracker: Tracker, picture: Picture) -> int:
+    """Rotation about their normals with which two or more platform tags fit, [deg]; 0 if none."""
+    for degrees in WRONG_ROTATIONS:
+        tags = rotated_tags(tracker.rig.platform_tags, degrees)
+        rig = replace(tracker.rig, platform_tags=tags, frame_tags=())
+        found = Tracker(rig, tracker.camera, tracker.settings).observe(picture.image, picture.time)
+        if isinstance(found, PoseMeasurement) and len(found.tags) > 1:
+            return degrees
+    return 0
 
 
 # Several cameras at once.
@@ -232,11 +253,19 @@ def track_cameras(
             reason = found.reason
         yield LoggedPicture(next(iter(alone.values())).name, found, clearance, frame), alone
     if not poses:
+        next_step = (
+            "check that the cameras see the platform; `cdpr track` with a single source gives"
+            " details"
+        )
+        if DISAGREE in reason:
+            next_step = (
+                "check that simultaneous images have the same name (in videos the same time), then"
+                " calibrate the cameras' poses again"
+            )
         raise NoPlatformSeen(
             f"no camera gives a platform pose: {reason}",
             where=f"cameras {', '.join(streams)}",
-            next_step="check that the cameras see the platform; `cdpr track` with a single source"
-            " gives details",
+            next_step=next_step,
         )
 
 

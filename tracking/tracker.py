@@ -250,7 +250,9 @@ class Tracker:
         )
         number, before = self._failed or (0, None)
         in_other_image = before if number != self._pictures else None
-        check = require_unmoved_camera(self.camera, views, self._moved_px, in_other_image)
+        check = require_unmoved_camera(
+            self.camera, views, self._moved_px, in_other_image, self.rig.tag_family
+        )
         if check is not None:
             self.camera_check = check
             self._failed = (self._pictures, check) if check.error > self._moved_px else None

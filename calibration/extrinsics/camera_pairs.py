@@ -193,9 +193,9 @@ def locate_by_pairs(
             f"too few pairs of images show the same body: {len(pairs)} of {LEAST_PAIRS} required",
             where=f"cameras {camera.name} and {reference.name}",
             why="; ".join(f"{name} {why}" for name, why in list(unused.items())[:4])
-            or "images taken at the same time need the same name in both folders",
-            next_step="take images at the same times, of tags that both cameras see, at other poses"
-            " each time",
+            or "no name is in both folders",
+            next_step="take images at the same times, with the same name in both folders, of tags"
+            " that both cameras see, at other poses each time",
         )
     observed = list(pairs.values())
     fit = _fit(observed)

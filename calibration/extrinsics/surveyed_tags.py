@@ -21,7 +21,13 @@ from model.errors import BadInput
 from model.pose import Array, Pose, moved, read_only, skew, step_between
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import project_undistorted, undistorted_slopes
-from tracking.detection.tags import tag_corners
+from tracking.detection.tags import (
+    WRONG_ROTATIONS,
+    rotated_tags,
+    rotation_cause,
+    rotation_remedy,
+    tag_corners,
+)
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, solve_pnp
 from tracking.shared_errors import change_of_inverse
@@ -123,10 +129,20 @@ def locate_by_frame_tags(
     """
     observations = _without_moved_images(observations)
     start = _initial_pose(rig, camera, observations)
+    if start is None:
+        raise BadInput(
+            "no camera pose fits the frame tags",
+            where=f"camera {camera.name}",
+            why="the detected corners contradict their poses and sizes in the rig file",
+            next_step="check the tags' positions, rotations and sizes in the rig file",
+        )
     tags = _seen_tags(rig, camera, observations, start, survey)
     tags, outliers = _reject_outliers(camera, tags, start)
     best = _fit(camera, tags, start)
     unused = {f"tag {tag.number}": _offset_message(camera, tag, best) for tag in outliers}
+    issues = _issues(camera, tags, best)
+    if outliers or issues:
+        issues = _rotation_issues(rig, camera, observations, survey) or issues
     slopes = _slopes(camera, tags, best)
     by_lens = _by_lens(camera, tags, best, slopes)
     covariance = _covariance(camera, tags, best, slopes)
@@ -149,9 +165,24 @@ def locate_by_frame_tags(
         tag_errors={t.number: float(np.sqrt(np.mean(t.errors(camera, best) ** 2))) for t in tags},
         pictures=len(observations.squares),
         unused={**observations.unused, **unused},
-        issues=tuple(_issues(camera, tags, best)),
+        issues=tuple(issues),
         data_hash=observations.data_hash(),
     )
+
+
+def _rotation_issues(
+    rig: Rig, camera: Camera, observations: TagObservations, survey: Survey
+) -> list[Issue]:
+    """That the tags are mounted rotated about their normals, if all of them fit so."""
+    for degrees in WRONG_ROTATIONS:
+        rotated = replace(rig, frame_tags=rotated_tags(rig.frame_tags, degrees))
+        start = _initial_pose(rotated, camera, observations)
+        if start is None:
+            continue
+        tags = _seen_tags(rotated, camera, observations, start, survey)
+        if len(tags) >= LEAST_TAGS and _misfit(camera, tags, _fit(camera, tags, start)) < _OFF:
+            return [Issue(rotation_cause(rig.tag_family, degrees), rotation_remedy(degrees))]
+    return []
 
 
 def _without_moved_images(observations: TagObservations) -> TagObservations:
@@ -172,24 +203,13 @@ def _without_moved_images(observations: TagObservations) -> TagObservations:
     return observations.without(unused)
 
 
-def _initial_pose(rig: Rig, camera: Camera, observations: TagObservations) -> Pose:
-    """``camera_from_world`` from the tags of one image.
-
-    Raises:
-        BadInput: No pose fits them.
-    """
+def _initial_pose(rig: Rig, camera: Camera, observations: TagObservations) -> Pose | None:
+    """``camera_from_world`` from the tags of one image; None if no pose fits them."""
     tags = {tag.id: tag for tag in rig.frame_tags}
     fullest = max(observations.squares.values(), key=len)
     views = [TagView(tags[number], square) for number, square in fullest.items()]
     found = solve_pnp(camera, views, camera.world_from_camera.inverse())
-    if found is None:
-        raise BadInput(
-            "no camera pose fits the frame tags",
-            where=f"camera {camera.name}",
-            why="the detected corners contradict their poses and sizes in the rig file",
-            next_step="check the tags' positions, rotations and sizes in the rig file",
-        )
-    return found.camera_from_body
+    return None if found is None else found.camera_from_body
 
 
 def _seen_tags(

@@ -43,6 +43,7 @@ class ImageFolder:
 
     Attributes:
         files: All files with an image suffix.
+        rate: Images per second, [Hz].
         unused: Reason by name of each file that is not used.
 
     Raises:
@@ -59,7 +60,7 @@ class ImageFolder:
         self.files = picture_files(folder)
         self.unused: dict[str, str] = {}
         self._folder, self._camera = folder, camera
-        self._rate = rate or camera.rate
+        self.rate = rate or camera.rate
         self._on_unused = on_unused
 
     def __len__(self) -> int:
@@ -83,7 +84,7 @@ class ImageFolder:
             none_read &= image is None
             if image is not None and _size(image) == wanted:
                 upright = upright is not False
-                yield Frame(number / self._rate, image, path.name, number)
+                yield Frame(number / self.rate, image, path.name, number)
                 continue
             why = _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
             self.unused[path.name] = why
@@ -174,7 +175,7 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
             where=str(folder),
             next_step=f"name a folder with files ending in {', '.join(PICTURE_ENDINGS)}",
         )
-    return tuple(sorted(found, key=lambda path: _natural(path.name)))
+    return tuple(sorted(found, key=lambda path: natural_order(path.name)))
 
 
 def read_picture(path: Path, upright: bool = True) -> Image | None:
@@ -320,10 +321,10 @@ def _first(unused: Mapping[str, str]) -> str:
     return "; ".join(f"{name} {why}" for name, why in list(unused.items())[:4])
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that puts ``frame_10`` after ``frame_9``."""
+def natural_order(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    """Sort key that puts ``frame_10`` after ``frame_9``; different for different names."""
     parts = re.split(r"(\d+)", name.lower())
-    return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts]
+    return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts], name
 
 
 # Images written to a folder or into a video.

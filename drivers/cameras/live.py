@@ -195,6 +195,9 @@ class VideoFile:
         path: The file.
         camera: The camera that took it.
 
+    Attributes:
+        rate: Images per second that the file states (default: the camera's), [Hz].
+
     Raises:
         BadInput: The file is missing, or is not a video.
     """
@@ -212,6 +215,8 @@ class VideoFile:
             )
         count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self._count = max(0, int(count)) if 0 <= count < 1e9 else 0
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        self.rate = rate if np.isfinite(rate) and rate > 0 else camera.rate
         width, height = (
             capture.get(cv2.CAP_PROP_FRAME_WIDTH),
             capture.get(cv2.CAP_PROP_FRAME_HEIGHT),
@@ -236,9 +241,7 @@ class VideoFile:
             BadInput: They have another size than the camera, or none can be read.
         """
         capture = _opened(str(self._path))
-        rate = capture.get(cv2.CAP_PROP_FPS)
-        rate = rate if np.isfinite(rate) and rate > 0 else self._camera.rate
-        number, seconds = 0, -1.0 / rate
+        number, seconds = 0, -1.0 / self.rate
         try:
             while True:
                 good, picture = capture.read()
@@ -249,7 +252,7 @@ class VideoFile:
                     refuse_wrong_size(image, self._camera, str(self._path))
                 shown = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the rate may vary
                 is_later = np.isfinite(shown) and shown > seconds
-                seconds = shown if is_later else seconds + 1.0 / rate
+                seconds = shown if is_later else seconds + 1.0 / self.rate
                 yield Frame(seconds, image, f"image {number}", number)
                 number += 1
         finally:

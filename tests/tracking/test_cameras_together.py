@@ -15,7 +15,7 @@ from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.fusion import MultiCameraFusion, fuse_poses
+from tracking.fusion import UNSTATED_ERROR, MultiCameraFusion, fuse_poses
 from tracking.measurement import NoPose, PoseMeasurement, extrapolate
 from tracking.tracker import Tracker
 
@@ -73,6 +73,37 @@ def test_two_cameras_give_a_better_pose_than_each_alone(
     assert rms["both"] < 0.8 * min(rms["front"], rms["side"])
     low, high = chdtri(6 * len(values), [0.9995, 0.0005]) / len(values)
     assert 0.5 * low < np.mean(values) < high
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0, 1.5])
+@pytest.mark.parametrize("ratio", [1.0, 8.0])
+@pytest.mark.parametrize("count", [2, 3])
+def test_what_is_accepted_as_agreeing_is_within_the_stated_covariance(
+    count: int, ratio: float, share: float
+) -> None:
+    """Cameras with errors that nothing states, some of them as large as the comparison allows.
+
+    Args:
+        count: Number of cameras.
+        ratio: Scatter of the other cameras relative to that of the first.
+        share: Unstated error of each, in `UNSTATED_ERROR`.
+    """
+    rng, truth, values = np.random.default_rng(5), HERE, []
+    for _ in range(250):
+        seen = {}
+        for name in "abc"[:count]:
+            root = rng.normal(size=(6, 6)) / np.sqrt(6.0) + 0.5 * np.eye(6)
+            root *= 0.02 * UNSTATED_ERROR[:, None] * (ratio if name != "a" else 1.0)
+            error = root @ rng.normal(size=6) + share * UNSTATED_ERROR * rng.normal(size=6)
+            rotation = matrix_from_rotation_vector(error[3:]) @ truth.rotation
+            pose = Pose(truth.position + error[:3], rotation)
+            seen[name] = PoseMeasurement(0.0, pose, root @ root.T, (301,), 0.1, "tracked")
+        found = fuse_poses(seen)
+        if isinstance(found, PoseMeasurement):
+            error = error_of(found, truth)
+            values.append(error @ np.linalg.solve(found.covariance + found.shared, error))
+    assert len(values) > 200
+    assert 2.5 < np.mean(values) < 8.5
 
 
 def test_of_two_that_disagree_there_is_no_pose() -> None:

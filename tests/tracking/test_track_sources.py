@@ -21,7 +21,10 @@ from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import SyntheticCamera
 from tests.tracking.test_cameras_together import other_side
+from tracking.detection.tags import rotated_tags
 from tracking.pose_log import POSE_COLUMNS
+from tracking.shared_errors import CameraMoved
+from tracking.track import NoPlatformSeen
 
 TRUTH = [Pose.level([0.10 - 0.01 * k, 0.1, 0.4]) for k in range(3)]
 
@@ -130,3 +133,56 @@ def test_live_cameras_with_different_latencies_measure_the_platform_where_it_was
     assert len(result.poses) == 5
     for found in result.poses:
         assert found.pose.distance_to(pose_at(found.time)) < 1e-3
+
+
+def two_folders(
+    rig: Rig, scene: Scene, root: Path, names: dict[str, list[str]]
+) -> tuple[Rig, dict[Camera, str]]:
+    """A moving platform; each camera's images, by file name or "" for one that it lost."""
+    front = rig.cameras[0]
+    sources = {}
+    for camera in (front, other_side(front)):
+        eye = SyntheticCamera(rig, replace(scene, obstacles=()), camera, seed=4)
+        (root / camera.name).mkdir()
+        for k, name in enumerate(names[camera.name]):
+            if name:
+                cv2.imwrite(str(root / camera.name / name), eye.render(TRUTH[k], k))
+        sources[camera] = str(root / camera.name)
+    return replace(rig, cameras=tuple(sources)), sources
+
+
+def test_an_image_that_a_camera_lost_shifts_none_of_its_others(
+    rig: Rig, scene: Scene, tmp_path: Path
+) -> None:
+    names = [f"img_{k:04}.png" for k in range(3)]
+    rig, sources = two_folders(rig, scene, tmp_path, {"front": names, "side": ["", *names[1:]]})
+    result = track_sources(rig, sources)
+    assert result.together is not None
+    assert result.together.without_partner == 1
+    assert [found.time for found in result.poses] == pytest.approx([0.0, 0.1, 0.2])
+    for found, pose in zip(result.poses, TRUTH, strict=True):
+        assert found.pose.distance_to(pose) < 1e-3
+
+
+def test_folders_without_common_names_are_refused(rig: Rig, scene: Scene, tmp_path: Path) -> None:
+    names = {"front": ["f0.png", "f1.png", "f2.png"], "side": ["s0.png", "s1.png", "s2.png"]}
+    rig, sources = two_folders(rig, scene, tmp_path, names)
+    with pytest.raises(BadInput, match="0 of the 3 images") as caught:
+        track_sources(rig, sources)
+    assert "the same name in every folder" in caught.value.next_step
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_tags_mounted_with_another_side_up_are_named_as_the_cause(
+    folder: Path, rig: Rig, degrees: int
+) -> None:
+    camera = rig.cameras[0]
+    stated = rotated_tags(rig.platform_tags, -degrees)
+    with pytest.raises(NoPlatformSeen, match="no pose") as caught:
+        track_sources(replace(rig, platform_tags=stated, frame_tags=()), {camera: str(folder)})
+    assert f"rotated by {degrees}°" in caught.value.why
+    assert ("OpenCV" in caught.value.why) is (degrees == 180)
+    wrong = replace(rig, frame_tags=rotated_tags(rig.frame_tags, -degrees))
+    with pytest.raises(CameraMoved, match="not mounted as the rig file states") as moved:
+        track_sources(wrong, {camera: str(folder)})
+    assert f"rotated by {degrees}°" in moved.value.why

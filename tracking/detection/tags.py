@@ -11,7 +11,8 @@ or with low contrast.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput
-from model.pose import Array
+from model.pose import Array, Pose, matrix_from_rotation_vector
 from model.rig import Tag
 from model.tag_families import FAMILIES, drawn_upside_down, opencv_dictionary, tags_in
 from tracking.camera_model import Image
@@ -64,6 +65,40 @@ def tag_corners(tag: Tag) -> Array:
     """Corners of a tag in the frame of its carrier (platform or world), shape (4, 3), [m]."""
     flat = np.column_stack([CORNER_SIGNS * tag.size / 2.0, np.zeros(4)])
     return tag.pose.apply(flat)
+
+
+# Tags mounted with another side up.
+
+
+#: Rotations about its normal in which a tag may be mounted by mistake, [deg].
+WRONG_ROTATIONS = (180, 90, 270)
+
+
+def rotated_tags(tags: Iterable[Tag], degrees: int) -> tuple[Tag, ...]:
+    """The tags, each rotated about its normal, counter-clockwise as seen from its front, [deg]."""
+    turn = matrix_from_rotation_vector(np.array([0.0, 0.0, np.radians(degrees)]))
+    return tuple(
+        replace(tag, pose=Pose(tag.pose.position, tag.pose.rotation @ turn)) for tag in tags
+    )
+
+
+def rotation_cause(family: str, degrees: int) -> str:
+    """Why tags may be mounted rotated about their normals by an angle, [deg]."""
+    if degrees != 180:
+        detail = ", counter-clockwise from its front"
+    else:
+        detail = ", as AprilTags drawn by OpenCV are" if drawn_upside_down(family) else ""
+    return f"all tags fit if each is mounted rotated by {degrees}° about its normal{detail}"
+
+
+def rotation_remedy(degrees: int) -> str:
+    """What to do about tags mounted rotated about their normals by an angle, [deg]."""
+    half = np.radians(degrees) / 2.0
+    factor = f"[{np.cos(half):.7g}, 0, 0, {np.sin(half):.7g}]" if degrees != 180 else "[0, 0, 0, 1]"
+    return (
+        f"multiply the rotation_wxyz of each in the rig file by {factor} from the right, or mount"
+        " them with the other side up"
+    )
 
 
 # Decoding by correlation with all patterns.
