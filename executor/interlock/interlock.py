@@ -131,6 +131,15 @@ class MotionInterlock:
             names = [name for node, name in self._rig.drive_names.items() if node in restarted]
             self._lose(f"{', '.join(names)}: {RESTARTED}")
 
+    def found_released(self, why: str) -> None:
+        """Marks the reference as lost, as a drive released a cable under tension.
+
+        Raises:
+            Refused: It cannot be written.
+        """
+        if self._is_kept:
+            self._note_end(why, holding=False, positions=None)
+
     def confirm_held(self, positions: Sequence[int]) -> None:
         """Stores the positions [counts] of drives that held throughout: the reference stays valid.
 
