@@ -55,7 +55,7 @@ class DriveMonitor:
             names: By node id.
             max_steps: Largest motion of each drive in a cycle, [counts].
             is_warning: Whether an EMCY code is only a warning while the drive stays enabled.
-            heartbeat_cycles: A drive without a heartbeat for so many cycles may be missed by others.
+            heartbeat_cycles: Cycles without a drive's heartbeat after which its peers may stop.
         """
         count, nodes = len(names), tuple(names)
         self.nodes = nodes
