@@ -267,6 +267,23 @@ class DriveRestarted(Refused):
         self.node = node
 
 
+class TorqueLost(Refused):
+    """A drive that held its cable lost its torque while it was configured."""
+
+    def __init__(self, node: int, state: str) -> None:
+        """Takes node and state of the drive; no ``node`` in the values, as for `DriveRestarted`."""
+        super().__init__(
+            f"drive {node} held its cable before the set-up and is now in {state}",
+            where=SETTING_UP,
+            why="it removes its torque when it leaves the NMT state operational, or an error or its"
+            " safe torque off did so: the platform may have dropped",
+            next_step="support the platform and press the emergency stop: each repeated command may"
+            " release one more drive; drives that do this between two commands cannot be used;"
+            " otherwise run `cdpr home`",
+            values={"nodes": str(node)},
+        )
+
+
 def answers_twice(node: int) -> Refused:
     """Two devices have the same node id."""
     return Refused(

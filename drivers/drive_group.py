@@ -93,17 +93,15 @@ class Capabilities:
 
 @dataclass(frozen=True, slots=True)
 class DriveWarning:
-    """An emergency of a drive that stays enabled.
+    """An emergency that only warns.
 
     Attributes:
         node: Of the drive.
         text: Message with cable and drive.
-        stops: Whether it must stop the path; false for a minor warning.
     """
 
     node: int
     text: str
-    stops: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,7 +126,7 @@ class CycleStatus:
         rejected: Number of frames rejected since `configure` for wrong length or implausible
             content.
         error_frames: Number of error frames since `configure`.
-        warnings: Warnings of enabled drives in this cycle; not latched.
+        warnings: Of drives in this cycle; not latched.
     """
 
     positions: Counts

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from can import BusABC
 
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
+from drivers.can_errors import TorqueLost
 from drivers.drive_group import DriveSnapshot
 from drivers.factory import drive_states, make_drive_group, read_drives, stop_alone
 from executor.control.preconditions import counted_here, require_below, set_up_here
@@ -233,7 +234,11 @@ def open_drives(
             counted, max_tension = configure_as(snapshot)
         group = make_drive_group(counted, reached.bus, reached.pump, max_tension=max_tension)
         try:
-            remarks = group.configure(to_reset=to_reset, on_restarted=note_restarted)
+            try:
+                remarks = group.configure(to_reset=to_reset, on_restarted=note_restarted)
+            except TorqueLost as error:
+                interlock.lost_torque(error.what)
+                raise
             for remark in remarks:
                 listener.remark(remark)
             true_pose: Callable[[], Pose] | None = None

@@ -158,7 +158,7 @@ def _unstated_covariance(poses: Sequence[PoseMeasurement]) -> Array:
 
     Source: Paule and Mandel, Journal of Research of the NBS 87 (1982), 377–385.
     """
-    gaps = np.array([_between(poses[0].pose, one.pose) for one in poses])
+    gaps = np.array([step_between(poses[0].pose, one.pose) for one in poses])
     stated = np.array([one.covariance + one.shared for one in poses])
     unit, usual = np.diag(UNSTATED_ERROR**2), 6 * (len(poses) - 1) - 2
 

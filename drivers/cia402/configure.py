@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import can
 
-from drivers.can_errors import DriveRestarted, Refusals, answers_twice
+from drivers.can_errors import DriveRestarted, Refusals, TorqueLost, answers_twice
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
     HOW_SCALED,
@@ -40,6 +40,7 @@ from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.profile import for_unused_pdos, profile_of, used_pdos
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork, means_absent
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
+from drivers.cia402.state_machine import HOLDS
 from drivers.drive_group import OnRestarted, Pump
 from model.errors import Refused
 from model.files.drive_profile_file import ProfileDocument
@@ -117,6 +118,7 @@ def configure_drives(
     Raises:
         HardwareMissing: Drives do not answer; with all their nodes.
         DriveRestarted: A drive restarted meanwhile.
+        TorqueLost: A drive that held its cable released it meanwhile.
         Refused: A drive is not a CiA 402 drive, is already enabled, or refuses or changes an
             object; two devices have one node id; or another master is active on this bus.
         BadInput: A value of the rig does not fit its object.
@@ -146,10 +148,12 @@ def configure_drives(
     _refuse_duplicates(network)
     restarted = _restarted(network, nodes, settings)
     on_restarted(restarted)
+    holding = {node for node in nodes if network.client(node).read_state() in HOLDS}
     try:
-        absent = _write_settings(rig, network, settings, entries)
+        absent = _write_settings(rig, network, settings, entries, holding)
         simulated = are_simulated(network, nodes)
         _start(network, nodes, settings)
+        _require_held(network, holding)
     except DriveRestarted as error:
         on_restarted(tuple(sorted({*restarted, error.node})))
         raise
@@ -169,6 +173,7 @@ def _write_settings(
     network: SetupNetwork,
     settings: Sequence[Sequence[Setting]],
     entries: Sequence[int],
+    holding: Set[int],
 ) -> dict[str, list[int]]:
     """Writes all settings of all drives; returns nodes by remark on a missing object."""
     profile, nodes, refusals = profile_of(rig), [w.node_id for w in rig.winches], Refusals()
@@ -179,6 +184,7 @@ def _write_settings(
         refused: list[str] = []  # switched off before another PDO takes its identifier
         refusals.note(_switch_off_unused, network, node, profile, refused)
         refused += _write_all(network, node, settings[drive], refusals)
+        _require_held(network, holding & {node})  # not sooner: a drive may react late
         for remark in refused:
             absent.setdefault(remark, []).append(node)
     for drive, node in enumerate(nodes):  # last: by now all peers send at their new period
@@ -189,6 +195,14 @@ def _write_settings(
             refusals.note(_await_mode, network, node)
     refusals.raise_any(UNFINISHED)
     return absent
+
+
+def _require_held(network: SetupNetwork, nodes: Iterable[int]) -> None:
+    """Raises `TorqueLost` for the first drive that no longer holds its cable."""
+    for node in nodes:
+        state = network.client(node).read_state()
+        if state not in HOLDS:
+            raise TorqueLost(node, state.value)
 
 
 def _start(

@@ -9,6 +9,8 @@ from canopen import SdoAbortedError
 from drivers.cia402.sdo_jobs import ERROR_REQUESTS
 from model.errors import Refused
 
+HEARTBEAT_LOST = 0x8130
+
 EMCY_TEXTS: dict[int, str] = {
     0x1000: "generic error",
     0x2300: "current on the motor side",
@@ -33,7 +35,7 @@ EMCY_TEXTS: dict[int, str] = {
     0x7305: "incremental encoder signal",
     0x8110: "CAN overrun, a message was lost",
     0x8120: "CAN controller in error-passive mode",
-    0x8130: "heartbeat or life guard missed",
+    HEARTBEAT_LOST: "heartbeat or life guard missed",
     0x8140: "recovered from bus-off",
     0x8150: "CAN identifier used twice",
     0x8210: "PDO ignored, its length is wrong",

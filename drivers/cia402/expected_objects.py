@@ -13,7 +13,7 @@ from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.profile import load_profile, profile_names, profile_of
 from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent, silent
 from drivers.cia402.sdo_jobs import CSP_MODE
-from drivers.cia402.state_machine import FAULTED, DriveState, state_of
+from drivers.cia402.state_machine import FAULTED, DriveState
 from drivers.plausibility import WrongScale, wrong_scales
 from model.errors import HardwareMissing, Refused
 from model.files.drive_profile_file import (
@@ -381,8 +381,7 @@ def require_idle(network: SetupNetwork, node: int, to_reset: bool, errors: dict[
     Raises:
         Refused: It is enabled, or in fault without ``to_reset``.
     """
-    data = network.client(node).read(0x6041, 0, "status word", 2)
-    state = state_of(int.from_bytes(data, "little"))
+    state = network.client(node).read_state()
     if state in FAULTED:
         errors[node] = code = stored_error(network.client(node).read_if_there)
         if not to_reset:

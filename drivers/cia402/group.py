@@ -11,6 +11,7 @@ from drivers.can_bus import SentFrame
 from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.monitor import DriveMonitor
+from drivers.cia402.object_dictionary import peer_timeout_ms
 from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_message, is_command
 from drivers.cia402.profile import profile_of
 from drivers.cia402.sdo_jobs import (
@@ -88,8 +89,9 @@ class Cia402Group(CyclicGroup):
         commanding = commanding_ids(self._nodes)
         self._cyclic = CyclicBus(self._bus, commanding, foreign_master_message, is_command)
         self._frames = CyclicFrames(self._nodes)
-        is_warning = self._profile.is_warning
-        self._watch = DriveMonitor(self._rig.drive_names, self._max_steps, is_warning)
+        names, is_warning = self._rig.drive_names, self._profile.is_warning
+        missed = peer_timeout_ms(self._rig) / 1000.0 / self._cycle_s - 1.0  # a cycle may be late
+        self._watch = DriveMonitor(names, self._max_steps, is_warning, missed)
         self._warnings: tuple[DriveWarning, ...] = ()
         self._goal = Goal.IDLE
         self._words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
@@ -203,10 +205,8 @@ class Cia402Group(CyclicGroup):
             self._latch(self._new_messages())
         following = self._state is GroupState.ENABLED
         words = next_words(self._goal, self._watch.states, self._stop_commanded)
-        steps = self._goal in (Goal.ENABLE, Goal.RELEASE)
-        if steps and (self._is_new_goal or self._watch.is_unjudged):
-            # No further step until every drive has shown the effect of the last words, and whether
-            # it is in fault.
+        if self._is_new_goal and self._goal in (Goal.ENABLE, Goal.RELEASE):
+            # No further step until every drive has shown the effect of the last words.
             words = self._words
         self._enables |= ControlWord.ENABLE_OPERATION in words
         self._demands = self._targets if self._known else list(self._watch.positions)

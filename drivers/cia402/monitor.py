@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
+from math import inf
 
-from drivers.cia402.error_codes import emergency_text
+from drivers.cia402.error_codes import HEARTBEAT_LOST, emergency_text
 from drivers.cia402.pdo import (
     EMCY_BASE,
     HEARTBEAT_BASE,
@@ -46,6 +47,7 @@ class DriveMonitor:
         names: Mapping[int, str],
         max_steps: Sequence[float],
         is_warning: Callable[[int], bool] = _never,
+        heartbeat_cycles: float = inf,
     ) -> None:
         """Starts without any reply.
 
@@ -53,6 +55,7 @@ class DriveMonitor:
             names: By node id.
             max_steps: Largest motion of each drive in a cycle, [counts].
             is_warning: Whether an EMCY code is only a warning while the drive stays enabled.
+            heartbeat_cycles: Cycles without a drive's heartbeat after which its peers may stop.
         """
         count, nodes = len(names), tuple(names)
         self.nodes = nodes
@@ -66,8 +69,8 @@ class DriveMonitor:
         self._wrong_lengths = 0
         self._check = ReplyCheck(names, max_steps)
         self._is_warning = is_warning
-        self._reported: list[DriveWarning] = []  # in this cycle; the drive may be about to stop
-        self._to_judge: list[DriveWarning] = []  # the drive's next reply says whether it stopped
+        self._heartbeat_cycles = heartbeat_cycles
+        self._since_heartbeat = dict.fromkeys(nodes, 0)  # cycles
         self._warnings: list[DriveWarning] = []
         self._new_messages: list[tuple[int, str]] = []
         self._changes: list[tuple[int, DriveState, DriveState]] = []
@@ -83,8 +86,8 @@ class DriveMonitor:
     def begin_cycle(self) -> None:
         """Starts a new cycle of replies."""
         self._check.begin_cycle()
-        self._to_judge += self._reported
-        self._reported = []
+        for node in self.nodes:
+            self._since_heartbeat[node] += 1
         self.answered = [False] * len(self.nodes)
 
     def end_cycle(self) -> None:
@@ -133,26 +136,14 @@ class DriveMonitor:
         self.answered[drive] = True
         state, before = state_of(reply.status_word), self.states[drive]
         self.states[drive] = state
-        self._judge(self.nodes[drive], state)
         if state is not before:
             self._changes.append((self.nodes[drive], before, state))
 
-    def _judge(self, node: int, state: DriveState) -> None:
-        """An emergency before this SYNC is a warning if the drive is still enabled.
-
-        A code that the profile lists as a warning is one in every state except fault.
-        """
-        own = [warning for warning in self._to_judge if warning.node == node]
-        self._to_judge = [warning for warning in self._to_judge if warning.node != node]
-        if state is not DriveState.OPERATION_ENABLED:
-            own = [warning for warning in own if not warning.stops and state not in FAULTED]
-        self._warnings += own
-
     def warnings(self) -> tuple[DriveWarning, ...]:
-        """Emergencies since the last call that did not stop the drive by the next SYNC.
+        """Emergencies since the last call that only warn, of drives that were not in fault.
 
-        An enabled drive keeps following its set-points. One that stops has left the state by then,
-        which is a fault (`changes_on_their_own`, `state_faults`).
+        One of a drive that stops nevertheless is the cause of its fault (`changes_on_their_own`,
+        `state_faults`).
         """
         warnings, self._warnings = tuple(self._warnings), []
         return warnings
@@ -165,7 +156,11 @@ class DriveMonitor:
                 self._note(drive, Reply(word, _signed(position, 32), _signed(torque, 16)))
 
     def news(self) -> list[tuple[int, str]]:
-        """Emergencies of drives not enabled, restarts and NMT states, since the last call."""
+        """Emergencies, lost heartbeats, restarts and NMT states, since the last call.
+
+        An emergency counts at once: no reply could show before the next frames whether the drive
+        has stopped, and "enable operation" in them would enable it again.
+        """
         news, self._new_messages = self._new_messages, []
         return news
 
@@ -183,11 +178,6 @@ class DriveMonitor:
                 text = f"{self._names[node]} {what}"
                 found.append((node, f"{text}; {cause}" if cause else text))
         return found
-
-    @property
-    def is_unjudged(self) -> bool:
-        """Whether an emergency of an enabled drive awaits the reply that shows if it stopped."""
-        return any(warning.stops for warning in (*self._reported, *self._to_judge))
 
     def state_faults(self, known: Container[str], *, powered: bool) -> list[tuple[int, str]]:
         """Present faults of the drives, by node.
@@ -254,7 +244,7 @@ class DriveMonitor:
         self._emergencies.clear()
         self._over.clear()
         self._new_messages.clear()
-        self._reported, self._to_judge, self._warnings = [], [], []
+        self._warnings = []
 
     def _emergency(self, node: int, data: bytes | bytearray) -> None:
         message = parse_emergency(data)
@@ -270,18 +260,26 @@ class DriveMonitor:
         self._emergencies[node] = text
         self._over.discard(node)
         message = f"{self._names[node]}: {text}"
-        state = self.states[self.nodes.index(node)]
-        if self._is_warning(code) and state not in FAULTED:
-            self._reported.append(DriveWarning(node, f"{message}, a warning", stops=False))
-        elif state is not DriveState.OPERATION_ENABLED:
-            self._new_messages.append((node, message))
-        else:
-            self._reported.append(DriveWarning(node, message, stops=True))
+        if self._is_warning(code) and self.states[self.nodes.index(node)] not in FAULTED:
+            self._warnings.append(DriveWarning(node, f"{message}, a warning"))
+            return
+        if code == HEARTBEAT_LOST:
+            self._name_silent_peers()
+        self._new_messages.append((node, message))
+
+    def _name_silent_peers(self) -> None:
+        """Names the drives whose heartbeat ceased, before those that miss it."""
+        for node, cycles in self._since_heartbeat.items():
+            message = node, f"{self._names[node]} sends no heartbeat"
+            lost = cycles >= self._heartbeat_cycles and node not in self.restarted
+            if lost and message not in self._new_messages:
+                self._new_messages.append(message)
 
     def _answer(self, node: int, data: bytes | bytearray) -> None:
         self.on_answer(node, data)
 
     def _heartbeat(self, node: int, data: bytes | bytearray) -> None:
+        self._since_heartbeat[node] = 0
         state = parse_heartbeat(data)
         if state is None:
             self._wrong_lengths += 1

@@ -243,9 +243,7 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
     )
     if not watches:
         return cleared
-    cycle = rig.cycle
-    time_ms = math.ceil(1000 * heartbeat_timeout(cycle))
-    peers_ms = max(time_ms, math.ceil(HEARTBEATS_WAITED * _produced_ms(cycle, profile_of(rig))))
+    time_ms, peers_ms = math.ceil(1000 * heartbeat_timeout(rig.cycle)), peer_timeout_ms(rig)
     peers = [w.node_id for i, w in enumerate(rig.winches) if i != drive]
     return cleared + tuple(
         Setting(
@@ -258,6 +256,12 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
         )
         for sub, node in enumerate([MASTER_NODE, *peers][:entries], start=1)
     )
+
+
+def peer_timeout_ms(rig: Rig) -> int:
+    """Time without a heartbeat of a drive after which others that monitor it stop, [ms]."""
+    produced = HEARTBEATS_WAITED * _produced_ms(rig.cycle, profile_of(rig))
+    return math.ceil(max(1000 * heartbeat_timeout(rig.cycle), produced))
 
 
 def _process_data(node: int, profile: ProfileDocument) -> tuple[Setting, ...]:

@@ -40,6 +40,7 @@ from drivers.cia402.pdo import (
     make_nmt,
     parse_heartbeat,
 )
+from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import Pump
 from model.errors import CdprError, Fault, HardwareMissing, Refused
 
@@ -308,6 +309,10 @@ class Client:
         """
         target = f"{index:04X}h:{sub:02X} {name}"
         return self._attempt(lambda: self._read(index, sub, size), target)
+
+    def read_state(self) -> DriveState:
+        """The state in the status word; errors as `read`."""
+        return state_of(int.from_bytes(self.read(0x6041, 0, "status word", 2), "little"))
 
     def read_if_there(self, index: int, sub: int, name: str, size: int = 4) -> bytes | None:
         """Reads an optional object as `read`; None if the drive lacks it (`means_absent`).

@@ -266,7 +266,7 @@ class Cycle:
             missing=missing,
             faults=[(self._numbers.get(node, 0), text) for node, text in status.faults],
             lateness=lateness,
-            warnings=[(self._numbers.get(w.node, 0), w.text, w.stops) for w in status.warnings],
+            warnings=[(self._numbers.get(w.node, 0), w.text) for w in status.warnings],
         )
         self._watch, alarms = self._watch.update(seen)
         self._stuck, stuck = self._stuck.update(

@@ -166,6 +166,15 @@ class MotionInterlock:
             return ""
         return released_since(self._rig, reference, restarted, released)
 
+    def lost_torque(self, why: str) -> None:
+        """Marks the reference as lost, as a drive released a cable under tension.
+
+        Raises:
+            Refused: It cannot be written.
+        """
+        if self._is_kept:
+            self._note_end(why, holding=False, positions=None)
+
     def confirm_held(self, positions: Sequence[int]) -> None:
         """Stores the positions [counts] of drives that held throughout: the reference stays valid.
 

@@ -41,10 +41,9 @@ def drive_fault(drive: int, text: str) -> Alarm:
     return Alarm(StopReaction.QUICK_STOP, "drive_fault", text, drive)
 
 
-def drive_warning(drive: int, text: str, *, stops: bool) -> Alarm:
+def drive_warning(drive: int, text: str) -> Alarm:
     """A drive that stays enabled reports a warning."""
-    reaction = StopReaction.PATH_STOP if stops else StopReaction.NOTE
-    return Alarm(reaction, "drive_warning", text, drive)
+    return Alarm(StopReaction.NOTE, "drive_warning", text, drive)
 
 
 def reply_missing(drive: int, name: str, cycles: int, *, fault: bool) -> Alarm:

@@ -53,8 +53,7 @@ class Observation:
         missing: True where a drive did not answer.
         faults: Reported faults: number of the drive, from 1, or 0 for the bus, and the text.
         lateness: How late the cycle began, in cycles.
-        warnings: Reported by drives that stay enabled: number of the drive, from 1, the text, and
-            whether it requires a path stop.
+        warnings: Reported by drives that stay enabled: number of the drive, from 1, and the text.
     """
 
     following: bool
@@ -63,7 +62,7 @@ class Observation:
     missing: Sequence[bool]
     faults: Sequence[tuple[int, str]]
     lateness: float
-    warnings: Sequence[tuple[int, str, bool]] = ()
+    warnings: Sequence[tuple[int, str]] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,10 +116,7 @@ class Monitor:
 
     def _replies(self, seen: Observation) -> list[Alarm]:
         found = [fault_messages.drive_fault(number, text) for number, text in seen.faults]
-        found += [
-            fault_messages.drive_warning(number, text, stops=stops)
-            for number, text, stops in seen.warnings
-        ]
+        found += [fault_messages.drive_warning(number, text) for number, text in seen.warnings]
         most = self.limits.missing_cycles
         for drive, (name, count) in enumerate(zip(self.names, self.missing, strict=True), start=1):
             if count:

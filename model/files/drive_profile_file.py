@@ -53,6 +53,9 @@ NEEDED = (
 )
 """Without these no run is safe, whatever a profile states."""
 
+STOP_CODES = (0x8130, 0x8250, 0x8611, 0x8612, 0x8700)
+"""EMCY codes of drives that stop as they are set up: by 1016h, 1400h:05, 6065h, 607Dh, 1006h."""
+
 _OBJECT = re.compile(r"[0-9A-F]{4}h:[0-9A-F]{2}")
 _CODE = re.compile(r"[0-9A-Fx]{4}h")
 
@@ -209,7 +212,7 @@ class ProfileDocument(Document):
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Checks across keys."""
-        return (self._monitoring, self._torque, self._needed)
+        return (self._monitoring, self._torque, self._needed, self._warned)
 
     def _monitoring(self) -> list[Finding]:
         if self.monitoring == "heartbeat" and self.heartbeat_loss == "fault":
@@ -236,6 +239,14 @@ class ProfileDocument(Document):
             if name in NEEDED
         ]
 
+    def _warned(self) -> list[Finding]:
+        return [
+            (("warnings", index), f"includes {code:04X}h, with which drives stop: not a warning")
+            for index, pattern in enumerate(self.warnings)
+            for code in STOP_CODES
+            if _matches(pattern, code)
+        ]
+
     @property
     def watches_heartbeats(self) -> bool:
         """Whether drives get heartbeats to monitor."""
@@ -251,11 +262,13 @@ class ProfileDocument(Document):
 
     def is_warning(self, code: int) -> bool:
         """Whether an EMCY code is a warning of a drive that stays enabled."""
-        text = f"{code:04X}h"
-        return any(
-            all(want in ("x", digit) for want, digit in zip(pattern, text, strict=True))
-            for pattern in self.warnings
-        )
+        return any(_matches(pattern, code) for pattern in self.warnings)
+
+
+def _matches(pattern: str, code: int) -> bool:
+    """Whether an EMCY code is one of a pattern such as 33xxh."""
+    digits = zip(pattern, f"{code:04X}h", strict=True)
+    return all(want in ("x", digit) for want, digit in digits)
 
 
 def object_name(index: int, sub: int) -> str:

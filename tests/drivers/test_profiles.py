@@ -709,6 +709,8 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
         ('absent: ["6085h:00"]', "required for a safe run"),
         ('absent: ["1006h:00", "1016h:01"]\nmonitoring: heartbeat', "needs 1016h:01"),
         ('warnings: ["31"]', "3180h"),
+        ('warnings: ["3180h", "81xxh"]', "includes 8130h"),
+        ('warnings: ["8612h"]', "includes 8612h"),
         ('ranges: {"60C3h:02": {low: 0, high: 1}}', "60C2h:02"),
     ],
 )

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 
+from drivers.can_errors import TorqueLost
+from drivers.cia402.group import Cia402Group
 from drivers.drive_group import DriveSnapshot
 from drivers.plausibility import require_within_limits
 from executor.control.preconditions import require_still_referenced
+from executor.drives import open_drives
 from executor.homing import use_rig_file_counts
 from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.interlock.reference import HomingReference, reference_at
@@ -19,6 +22,7 @@ from executor.proposals import ForgetProposal
 from executor.state_machine import State
 from model.errors import BadInput, Refused, StoppedByOperator
 from model.rig import Rig, load_rig, rig_from_document
+from model.scene import empty_scene
 from tests.cli.plans import RIG
 
 
@@ -196,6 +200,28 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     absolute.file.write(left)
     absolute.found_restarted((4,))
     assert absolute.kept_reference() == left.model_copy(update={"released": [4]})
+
+
+@pytest.mark.parametrize("encoder", ["incremental", "absolute"])
+@pytest.mark.parametrize("homed", [True, False])
+def test_a_set_up_that_releases_a_cable_loses_it(
+    monkeypatch: pytest.MonkeyPatch, encoder: str, homed: bool
+) -> None:
+    """The platform dropped during the set-up, and the run passed with its old reference."""
+
+    def releases(*_: object, **__: object) -> NoReturn:
+        raise TorqueLost(3, "switch on disabled")
+
+    rig = rig_with(encoder)
+    interlock = MotionInterlock(rig)
+    if homed:
+        interlock.file.write(reference_of(rig))
+    monkeypatch.setattr(Cia402Group, "configure", releases)
+    with pytest.raises(TorqueLost), open_drives(rig, rig.home, empty_scene(rig).load):
+        pass
+    with pytest.raises(Refused, match="homing reference is lost") as caught:
+        interlock.require_ready()
+    assert "drive 3 held its cable before the set-up" in caught.value.why
 
 
 @pytest.mark.parametrize("ended", [State.STOPPED, State.LATCHED])

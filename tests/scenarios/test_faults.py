@@ -24,6 +24,7 @@ from model.files.rig_file import RigDocument
 from model.rig import rig_from_document
 from tests.cli.plans import RIG
 from tests.cli.program import call
+from tests.drivers.test_drive_warnings import answers_after_its_set_points
 from tests.scenarios.stage import Stage, at, concluded, staged
 
 CRUISING = 150
@@ -98,6 +99,22 @@ def unplug(stage: Stage) -> None:
     stage.group._bus.send = send  # type: ignore[attr-defined]
 
 
+def limit_switch(stage: Stage) -> None:
+    drive = stage.drives[2]
+    answers_after_its_set_points(drive)
+    drive._emergency(0x8612)
+    drive._quick_stop()
+
+
+def fails_silently(stage: Stage) -> None:
+    stage.drives[2].fail(0x3210)
+    stage.drives[2].silent = True
+
+
+def no_heartbeat(stage: Stage) -> None:
+    stage.drives[2]._heartbeat_period = 0.0
+
+
 CASES = {
     "a drive falls silent": Case(
         silence(3), "drive_silent", ("(drive 4) did not answer",), lost=(3,)
@@ -107,9 +124,17 @@ CASES = {
     ),
     "a drive reports an emergency and goes on": Case(
         lambda stage: stage.drives[2]._emergency(0x4310),
-        "drive_warning",
-        ("(drive 3)", "temperature", "stopped along"),
-        within=40,
+        "drive_fault",
+        ("(drive 3)", "temperature", "quick stop of all"),
+    ),
+    "a drive stops itself, and shows the state after its set-points": Case(
+        limit_switch, "drive_fault", ("(drive 3)", "8612h", "quick stop of all")
+    ),
+    "a drive fails and leaves the bus": Case(
+        fails_silently, "drive_fault", ("(drive 3)", "3210h", "quick stop of all"), lost=(2,)
+    ),
+    "the heartbeat of a drive ceases": Case(
+        no_heartbeat, "drive_fault", ("(drive 3) sends no heartbeat",), within=12
     ),
     "a drive restarts": Case(
         lambda stage: stage.drives[0].power_on(), "drive_fault", ("drive 1",), lost=(0,)

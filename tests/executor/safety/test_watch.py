@@ -318,10 +318,7 @@ def test_looking_leaves_the_watch_before_unchanged():
     assert watch == Monitor.fresh(LIMITS, NAMES)
 
 
-def test_a_warning_changes_nothing_and_another_emergency_stops_the_path() -> None:
-    seen = replace(FINE, warnings=[(1, "mild", False), (3, "hot", True)])
+def test_a_warning_stops_nothing() -> None:
+    seen = replace(FINE, warnings=[(3, "mild")])
     _, alarms = Monitor.fresh(LIMITS, ("one", "two", "three")).update(seen)
-    assert alarms == (
-        Alarm(StopReaction.NOTE, "drive_warning", "mild", 1),
-        Alarm(StopReaction.PATH_STOP, "drive_warning", "hot", 3),
-    )
+    assert alarms == (Alarm(StopReaction.NOTE, "drive_warning", "mild", 3),)

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from executor.state_machine import State
 from tests.scenarios.faults.bench import Bench, Script
-from tests.scenarios.faults.cases import PATH_STOP, TABLE, Fault, late, then
+from tests.scenarios.faults.cases import TABLE, Fault, late, then
 
 WARNED = 60.0
 """Cycles from arming until an enabled drive sends its first warning."""
@@ -123,7 +123,7 @@ DRIVES: dict[str, Fault] = {
     "D a warning of the profile": with_drives("warning=4210", profile={"warnings": ["42xxh"]}),
     "D a warning that the profile lacks": Fault(
         lambda: Bench.happens,
-        within=WARNED + PATH_STOP,
+        within=WARNED,
         words=("4210",),
         behaviour=("warning=4210",),
     ),
