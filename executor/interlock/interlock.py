@@ -173,7 +173,7 @@ class MotionInterlock:
             Refused: It cannot be written.
         """
         if self._is_kept:
-            self._lose(why)
+            self._note_end(why, holding=False, positions=None, released=())
 
     def confirm_held(self, positions: Sequence[int]) -> None:
         """Stores the positions [counts] of drives that held throughout: the reference stays valid.
