@@ -93,13 +93,13 @@ class Setting:
 
     def is_kept(self, data: bytes) -> bool:
         """Whether the drive holds the value, or one with the same effect."""
+        if len(data) != self.size:
+            return False
         found = int.from_bytes(data, "little")
+        if self.mask:
+            return not (found ^ self.value) & self.mask
         is_near = self.rounded and LOWEST * self.value <= found <= HIGHEST * self.value
-        if len(data) == self.size and (found in self.equivalent or is_near):
-            return True
-        if len(data) != struct.calcsize(self.form) or not self.mask:
-            return data == self.data()
-        return not (found ^ self.value) & self.mask
+        return found in self.equivalent or is_near or data == self.data()
 
     def of_rated(self, rated: int) -> Setting:
         """The setting with its value in the unit of ``per_mille_of``, whose value is ``rated``."""
@@ -115,8 +115,9 @@ class Setting:
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
-HEARTBEAT_CONSUMERS, CURRENT_LIMIT = 0x1016, "current limit"
+HEARTBEAT_CONSUMERS = 0x1016
 SOFTWARE_LIMITS = 0x607D
+CURRENT_LIMIT = "current limit"
 
 
 def settings_for(
@@ -360,15 +361,13 @@ def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> 
     ramp = quick_stop_ramp(rig, drive, cycle, profile)
     window = rig.motion.following_error * abs(winch.counts_per_metre)
     timeout = math.ceil(1000 * cycle)
+    stop = _capped(QUICK_STOP_RAMP, "quick stop deceleration", ramp, "at rest within one cycle")
     return (
         Setting(0x6007, 0, "<h", 3, "abort connection option code", "stop when the bus is lost"),
         Setting(0x605A, 0, "<h", 6, "quick stop option code", "ramp down, then hold under torque"),
         *_options(),
         *_offsets(),
-        replace(
-            _capped(QUICK_STOP_RAMP, "quick stop deceleration", ramp, "at rest within one cycle"),
-            rounded=True,
-        ),
+        replace(stop, rounded=True),
         _capped(0x6065, "following error window", window, "motion.following_error_mm"),
         Setting(FOLLOWING_TIMEOUT, 0, "<H", timeout, "following error time out", "one cycle"),
     )
