@@ -18,13 +18,7 @@ from model.errors import BadInput, Fault
 from model.pose import Array, Pose, lever_arm_matrix, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import project_undistorted, ray_slopes, rays_of, undistorted_slopes
-from tracking.detection.tags import (
-    WRONG_ROTATIONS,
-    rotated_tags,
-    rotation_cause,
-    rotation_remedy,
-    tag_corners,
-)
+from tracking.detection.tags import mounted_rotated, tag_corners
 from tracking.pnp import BundlePose, TagView, expected_cost, moved_by_pixels, solve_pnp
 
 _GRID = 7
@@ -356,17 +350,21 @@ def require_unmoved_camera(
         "error_mm": round(check.distance * 1e3, 2),
         "frame_tags": ", ".join(map(str, check.tags)),
     }
-    for degrees in WRONG_ROTATIONS:
-        tags = rotated_tags((view.tag for view in views), degrees)
+
+    def fit(tags: tuple[Tag, ...]) -> bool:
         rotated = [replace(view, tag=tag) for view, tag in zip(views, tags, strict=True)]
-        if len(check.tags) > 1 and check_camera(camera, rotated).error <= limit_px:
-            raise CameraMoved(
-                f"frame tags {values['frame_tags']} are not mounted as the rig file states",
-                where=f"camera {camera.name!r}",
-                why=rotation_cause(family, degrees),
-                next_step=rotation_remedy(degrees),
-                values=values,
-            )
+        return check_camera(camera, rotated).error <= limit_px
+
+    stated = [view.tag for view in views]
+    mounted = mounted_rotated(stated, family, fit) if len(check.tags) > 1 else None
+    if mounted is not None:
+        raise CameraMoved(
+            f"frame tags {values['frame_tags']} are not mounted as the rig file states",
+            where=f"camera {camera.name!r}",
+            why=mounted[0],
+            next_step=mounted[1],
+            values=values,
+        )
     by = ""
     found = measured_camera(camera, views)
     if found is not None:

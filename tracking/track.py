@@ -17,17 +17,11 @@ from numpy.typing import NDArray
 from model.clearance import ClearanceModel
 from model.errors import BadInput
 from model.pose import Array, Pose
-from model.rig import Camera, Rig
+from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, pixels_of
 from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
-from tracking.detection.tags import (
-    WRONG_ROTATIONS,
-    rotated_tags,
-    rotation_cause,
-    rotation_remedy,
-    tag_corners,
-)
+from tracking.detection.tags import mounted_rotated, tag_corners
 from tracking.estimator import UNCERTAIN, UNSHARP
 from tracking.fusion import DISAGREE, MultiCameraFusion, synchronize_frames
 from tracking.measurement import Observation, PoseMeasurement, rates
@@ -171,10 +165,9 @@ def _nothing_seen(
         next_step = "focus the camera on the platform, and add light to shorten the exposure"
     elif len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
-        degrees = _rotation_of_tags(tracker, last)
-        if degrees:
-            why = rotation_cause(tracker.rig.tag_family, degrees)
-            next_step = rotation_remedy(degrees)
+        rotated = _rotated_tags(tracker, last)
+        if rotated is not None:
+            why, next_step = rotated
     return NoPlatformSeen(
         f"none of {pictures} image{'s' if pictures != 1 else ''} gives a pose of the platform:"
         f" {reason}",
@@ -185,15 +178,15 @@ def _nothing_seen(
     )
 
 
-def _rotation_of_tags(tracker: Tracker, picture: Picture) -> int:
-    """Rotation about their normals with which two or more platform tags fit, [deg]; 0 if none."""
-    for degrees in WRONG_ROTATIONS:
-        tags = rotated_tags(tracker.rig.platform_tags, degrees)
+def _rotated_tags(tracker: Tracker, picture: Picture) -> tuple[str, str] | None:
+    """Cause and remedy, if two or more platform tags fit rotated about their normals."""
+
+    def fit(tags: tuple[Tag, ...]) -> bool:
         rig = replace(tracker.rig, platform_tags=tags, frame_tags=())
         found = Tracker(rig, tracker.camera, tracker.settings).observe(picture.image, picture.time)
-        if isinstance(found, PoseMeasurement) and len(found.tags) > 1:
-            return degrees
-    return 0
+        return isinstance(found, PoseMeasurement) and len(found.tags) > 1
+
+    return mounted_rotated(tracker.rig.platform_tags, tracker.rig.tag_family, fit)
 
 
 # Several cameras at once.

@@ -21,13 +21,7 @@ from model.errors import BadInput
 from model.pose import Array, Pose, moved, read_only, skew, step_between
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import project_undistorted, undistorted_slopes
-from tracking.detection.tags import (
-    WRONG_ROTATIONS,
-    rotated_tags,
-    rotation_cause,
-    rotation_remedy,
-    tag_corners,
-)
+from tracking.detection.tags import mounted_rotated, tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, solve_pnp
 from tracking.shared_errors import change_of_inverse
@@ -174,15 +168,17 @@ def _rotation_issues(
     rig: Rig, camera: Camera, observations: TagObservations, survey: Survey
 ) -> list[Issue]:
     """That the tags are mounted rotated about their normals, if all of them fit so."""
-    for degrees in WRONG_ROTATIONS:
-        rotated = replace(rig, frame_tags=rotated_tags(rig.frame_tags, degrees))
+
+    def fit(frame_tags: tuple[Tag, ...]) -> bool:
+        rotated = replace(rig, frame_tags=frame_tags)
         start = _initial_pose(rotated, camera, observations)
         if start is None:
-            continue
+            return False
         tags = _seen_tags(rotated, camera, observations, start, survey)
-        if len(tags) >= LEAST_TAGS and _misfit(camera, tags, _fit(camera, tags, start)) < _OFF:
-            return [Issue(rotation_cause(rig.tag_family, degrees), rotation_remedy(degrees))]
-    return []
+        return len(tags) >= LEAST_TAGS and _misfit(camera, tags, _fit(camera, tags, start)) < _OFF
+
+    found = mounted_rotated(rig.frame_tags, rig.tag_family, fit)
+    return [] if found is None else [Issue(*found)]
 
 
 def _without_moved_images(observations: TagObservations) -> TagObservations:

@@ -11,7 +11,7 @@ or with low contrast.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -71,7 +71,7 @@ def tag_corners(tag: Tag) -> Array:
 
 
 #: Rotations about its normal in which a tag may be mounted by mistake, [deg].
-WRONG_ROTATIONS = (180, 90, 270)
+_WRONG_ROTATIONS = (180, 90, 270)
 
 
 def rotated_tags(tags: Iterable[Tag], degrees: int) -> tuple[Tag, ...]:
@@ -82,8 +82,23 @@ def rotated_tags(tags: Iterable[Tag], degrees: int) -> tuple[Tag, ...]:
     )
 
 
-def rotation_cause(family: str, degrees: int) -> str:
-    """Why tags may be mounted rotated about their normals by an angle, [deg]."""
+def mounted_rotated(
+    tags: Sequence[Tag], family: str, fit: Callable[[tuple[Tag, ...]], bool]
+) -> tuple[str, str] | None:
+    """Cause and remedy, if tags fit once each is rotated about its normal; else None.
+
+    Args:
+        tags: As in the rig file.
+        family: Of the tags.
+        fit: Whether tags at other poses agree with the images.
+    """
+    for degrees in _WRONG_ROTATIONS:
+        if fit(rotated_tags(tags, degrees)):
+            return _rotation_cause(family, degrees), _rotation_remedy(degrees)
+    return None
+
+
+def _rotation_cause(family: str, degrees: int) -> str:
     if degrees != 180:
         detail = ", counter-clockwise from its front"
     else:
@@ -91,8 +106,7 @@ def rotation_cause(family: str, degrees: int) -> str:
     return f"all tags fit if each is mounted rotated by {degrees}° about its normal{detail}"
 
 
-def rotation_remedy(degrees: int) -> str:
-    """What to do about tags mounted rotated about their normals by an angle, [deg]."""
+def _rotation_remedy(degrees: int) -> str:
     half = np.radians(degrees) / 2.0
     factor = f"[{np.cos(half):.7g}, 0, 0, {np.sin(half):.7g}]" if degrees != 180 else "[0, 0, 0, 1]"
     return (
