@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
 
 from model.pose import (
     Array,
@@ -161,18 +160,15 @@ def _unstated_covariance(poses: Sequence[PoseMeasurement]) -> Array:
     gaps = np.array([step_between(poses[0].pose, one.pose) for one in poses])
     stated = np.array([one.covariance + one.shared for one in poses])
     unit, usual = np.diag(UNSTATED_ERROR**2), 6 * (len(poses) - 1) - 2
-
-    def excess(scale: float) -> float:
+    scale = 0.0
+    while True:  # Newton's steps only grow, as the sum falls with the scale and is convex
         weights = np.linalg.inv(stated + scale * unit)
         mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, gaps))
-        return float(np.einsum("ni,nij,nj->", gaps - mean, weights, gaps - mean)) - usual
-
-    if excess(0.0) <= 0.0:
-        return np.zeros((6, 6))
-    high = 1.0
-    while excess(high) > 0.0:
-        high *= 2.0
-    return np.asarray(brentq(excess, 0.0, high, rtol=1e-6) * unit)
+        pulls = np.einsum("nij,nj->ni", weights, gaps - mean)
+        excess = float(np.sum((gaps - mean) * pulls)) - usual
+        if not excess > 1e-6 * usual:
+            return np.asarray(scale * unit)
+        scale += excess / float(np.sum(pulls @ unit * pulls))
 
 
 def _shared(poses: Sequence[PoseMeasurement], parts: Sequence[Array]) -> Array:
