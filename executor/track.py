@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -11,14 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.cameras.files import ImageFolder, PictureOutput
+from drivers.cameras.files import ImageFolder, PictureOutput, natural_order
 from drivers.cameras.live import Frame, LiveCamera, VideoFile
 from executor.cameras.sources import (
     SYNTHETIC,
-    report_different_videos,
     require_camera_source,
     require_one_kind,
-    times_by_name,
 )
 from executor.kernels import ready_to_measure
 from executor.recording.mcap import write_track_mcap
@@ -251,11 +250,66 @@ def _simultaneous(
     folders = {name: one for name, one in named.items() if isinstance(one, ImageFolder)}
     videos = {name: one for name, one in named.items() if isinstance(one, VideoFile)}
     if len(folders) > 1:
-        times = times_by_name(folders, listener)
+        times = _times_by_name(folders, listener)
         return [(_dated(one, times), len(one)) for one in folders.values()], 0.0
-    report_different_videos(videos, listener)
+    _report_different_videos(videos, listener)
     # The fastest camera defines the time window of simultaneous images.
     return opened, 0.5 / max(camera.rate for camera in cameras)
+
+
+def _times_by_name(folders: Mapping[str, ImageFolder], listener: Listener) -> dict[str, float]:
+    """Times of the images of several cameras: those with the same name are simultaneous.
+
+    All names are numbered together, so that an image that one camera lost shifts no other. The
+    rate is the highest at which no camera exceeds its own.
+
+    Args:
+        folders: Of each camera, by its name.
+        listener: Receives a remark if the cameras' rates contradict the numbers of their images.
+
+    Returns:
+        By file name, increasing in the order of each folder, [s].
+
+    Raises:
+        BadInput: Of a camera's images, or of the most that another camera has if these are fewer,
+            less than half have a namesake.
+    """
+    names = {camera: [path.name for path in folder.files] for camera, folder in folders.items()}
+    count = Counter(name for own in names.values() for name in own)
+    for camera, own in names.items():
+        possible = min(len(own), max(len(one) for other, one in names.items() if other != camera))
+        common = sum(count[name] > 1 for name in own)
+        if 2 * common < possible:
+            raise BadInput(
+                f"{common} of the {len(own)} images of camera {camera!r} have the name of an image"
+                " of another camera",
+                where=", ".join(f"{other}: {one[0]} … {one[-1]}" for other, one in names.items()),
+                why="images are paired by their names, as a folder does not contain their times",
+                next_step="give images taken at the same time the same name in every folder",
+            )
+    order = {name: k for k, name in enumerate(sorted(count, key=natural_order))}
+    rates = {
+        camera: folders[camera].rate * float(np.median(np.diff([order[name] for name in own])))
+        for camera, own in names.items()
+        if len(own) > 1
+    } or {camera: folder.rate for camera, folder in folders.items()}
+    rate = min(rates.values())
+    if max(rates.values()) > 1.4 * rate:
+        listener.remark(
+            f"images with the same name are taken as simultaneous, {rate:.6g} per second; by their"
+            f" own rate_hz it would be {', '.join(f'{n} {one:.6g}' for n, one in rates.items())}"
+        )
+    return {name: k / rate for name, k in order.items()}
+
+
+def _report_different_videos(videos: Mapping[str, VideoFile], listener: Listener) -> None:
+    """Remarks on videos of different length or rate: they may not have begun together."""
+    if len({(len(video), round(video.rate, 3)) for video in videos.values()}) > 1:
+        facts = ", ".join(f"{n} {len(v)} at {v.rate:.6g}/s" for n, v in videos.items())
+        listener.remark(
+            f"the videos have different numbers of images or rates ({facts}); images are paired by"
+            " their times from the beginning of each, which must be simultaneous"
+        )
 
 
 def _dated(folder: ImageFolder, times: Mapping[str, float]) -> Iterator[Frame]:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from drivers.cameras.files import ImageFolder, natural_order
-from drivers.cameras.live import VideoFile
 from model.errors import BadInput, require_not_empty, sequence_of
-from model.progress import Listener
 from model.rig import Camera, Rig
 
 SYNTHETIC = "synthetic"
@@ -303,58 +299,3 @@ def _kind(source: str) -> str:
     if Path(source).is_file():
         return "a video"
     return "synthetic" if source == SYNTHETIC else "live"
-
-
-def times_by_name(folders: Mapping[str, ImageFolder], listener: Listener) -> dict[str, float]:
-    """Times of the images of several cameras: those with the same name are simultaneous.
-
-    All names are numbered together, so that an image that one camera lost shifts no other. The
-    rate is the highest at which no camera exceeds its own.
-
-    Args:
-        folders: Of each camera, by its name.
-        listener: Receives a remark if the cameras' rates contradict the numbers of their images.
-
-    Returns:
-        By file name, increasing in the order of each folder, [s].
-
-    Raises:
-        BadInput: Of a camera's images, or of the most that another camera has if these are fewer,
-            less than half have a namesake.
-    """
-    names = {camera: [path.name for path in folder.files] for camera, folder in folders.items()}
-    count = Counter(name for own in names.values() for name in own)
-    for camera, own in names.items():
-        possible = min(len(own), max(len(one) for other, one in names.items() if other != camera))
-        common = sum(count[name] > 1 for name in own)
-        if 2 * common < possible:
-            raise BadInput(
-                f"{common} of the {len(own)} images of camera {camera!r} have the name of an image"
-                " of another camera",
-                where=", ".join(f"{other}: {one[0]} … {one[-1]}" for other, one in names.items()),
-                why="images are paired by their names, as a folder does not contain their times",
-                next_step="give images taken at the same time the same name in every folder",
-            )
-    order = {name: k for k, name in enumerate(sorted(count, key=natural_order))}
-    rates = {
-        camera: folders[camera].rate * float(np.median(np.diff([order[name] for name in own])))
-        for camera, own in names.items()
-        if len(own) > 1
-    } or {camera: folder.rate for camera, folder in folders.items()}
-    rate = min(rates.values())
-    if max(rates.values()) > 1.4 * rate:
-        listener.remark(
-            f"images with the same name are taken as simultaneous, {rate:.6g} per second; by their"
-            f" own rate_hz it would be {', '.join(f'{n} {one:.6g}' for n, one in rates.items())}"
-        )
-    return {name: k / rate for name, k in order.items()}
-
-
-def report_different_videos(videos: Mapping[str, VideoFile], listener: Listener) -> None:
-    """Remarks on videos of different length or rate: they may not have begun together."""
-    if len({(len(video), round(video.rate, 3)) for video in videos.values()}) > 1:
-        facts = ", ".join(f"{n} {len(v)} at {v.rate:.6g}/s" for n, v in videos.items())
-        listener.remark(
-            f"the videos have different numbers of images or rates ({facts}); images are paired by"
-            " their times from the beginning of each, which must be simultaneous"
-        )
