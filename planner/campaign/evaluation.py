@@ -161,11 +161,13 @@ def findings_json(results: Results, about: dict[str, Any]) -> str:
 
 def _known(change: Change) -> dict[str, Any]:
     """A change as JSON."""
-    each, mean, low, high = (
-        [None if math.isnan(x) else x for x in row]
-        for row in (change.each, [change.mean], [change.low], [change.high])
-    )
-    return {"each": each, "mean": mean[0], "low": low[0], "high": high[0]}
+    numbers = asdict(change)
+    numbers["each"] = [_number(x) for x in change.each]
+    return numbers | {name: _number(numbers[name]) for name in ("mean", "low", "high")}
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 def _case(study: str, case: Case) -> tuple[str, ...]:
