@@ -70,7 +70,7 @@ class DriveMonitor:
         self._check = ReplyCheck(names, max_steps)
         self._is_warning = is_warning
         self._heartbeat_cycles = heartbeat_cycles
-        self._since_heartbeat = dict.fromkeys(nodes, 0)  # cycles
+        self._cycle, self._heartbeat_at = 0, dict.fromkeys(nodes, 0)  # cycle of the last one
         self._warnings: list[DriveWarning] = []
         self._new_messages: list[tuple[int, str]] = []
         self._changes: list[tuple[int, DriveState, DriveState]] = []
@@ -86,8 +86,7 @@ class DriveMonitor:
     def begin_cycle(self) -> None:
         """Starts a new cycle of replies."""
         self._check.begin_cycle()
-        for node in self.nodes:
-            self._since_heartbeat[node] += 1
+        self._cycle += 1
         self.answered = [False] * len(self.nodes)
 
     def end_cycle(self) -> None:
@@ -269,9 +268,9 @@ class DriveMonitor:
 
     def _name_silent_peers(self) -> None:
         """Names the drives whose heartbeat ceased, before those that miss it."""
-        for node, cycles in self._since_heartbeat.items():
+        for node, last in self._heartbeat_at.items():
             message = node, f"{self._names[node]} sends no heartbeat"
-            lost = cycles >= self._heartbeat_cycles and node not in self.restarted
+            lost = self._cycle - last >= self._heartbeat_cycles and node not in self.restarted
             if lost and message not in self._new_messages:
                 self._new_messages.append(message)
 
@@ -279,7 +278,7 @@ class DriveMonitor:
         self.on_answer(node, data)
 
     def _heartbeat(self, node: int, data: bytes | bytearray) -> None:
-        self._since_heartbeat[node] = 0
+        self._heartbeat_at[node] = self._cycle
         state = parse_heartbeat(data)
         if state is None:
             self._wrong_lengths += 1
