@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from model.pose import (
     Array,
@@ -30,6 +31,8 @@ UNSTATED_ERROR = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
 #: Squared Mahalanobis distance above which two poses disagree; one correct pair in ten thousand
 #: exceeds it.
 GATE = 27.9
+#: Stated errors explain a disagreement that they exceed this often, as a share of images.
+CHANCE = 0.05
 #: Part of the reason for a missing pose where two cameras contradict each other.
 DISAGREE = "disagree"
 
@@ -151,7 +154,7 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
 def _unstated_covariance(poses: Sequence[PoseMeasurement]) -> Array:
     """Covariance of each pose that their disagreement shows beyond the stated errors, shape (6, 6).
 
-    It is the least multiple of `UNSTATED_ERROR`² with which the squared Mahalanobis distances from
+    It is 0 where the stated errors explain the disagreement (`CHANCE`), otherwise the least multiple of `UNSTATED_ERROR`² with which the squared Mahalanobis distances from
     the mean add up to k − 2, k their degrees of freedom: the mean of 1/χ² is 1/(k − 2), so that
     the squared error of the fused pose, in units of its covariance, is six on average.
 
@@ -166,7 +169,8 @@ def _unstated_covariance(poses: Sequence[PoseMeasurement]) -> Array:
         mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, gaps))
         pulls = np.einsum("nij,nj->ni", weights, gaps - mean)
         excess = float(np.sum((gaps - mean) * pulls)) - usual
-        if not excess > 1e-6 * usual:
+        explained = scale == 0.0 and excess + usual <= chdtri(usual + 2, CHANCE)
+        if explained or not excess > 1e-6 * usual:
             return np.asarray(scale * unit)
         scale += excess / float(np.sum(pulls @ unit * pulls))
 

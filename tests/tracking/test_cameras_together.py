@@ -75,13 +75,15 @@ def test_two_cameras_give_a_better_pose_than_each_alone(
     assert 0.5 * low < np.mean(values) < high
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 1.0, 1.5])
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0, 1.5])
 @pytest.mark.parametrize("ratio", [1.0, 8.0])
 @pytest.mark.parametrize("count", [2, 3])
 def test_what_is_accepted_as_agreeing_is_within_the_stated_covariance(
     count: int, ratio: float, share: float
 ) -> None:
     """Cameras with errors that nothing states, some of them as large as the comparison allows.
+
+    Errors that the scatter of the worse of two cameras hides cannot show, and are not tried.
 
     Args:
         count: Number of cameras.
