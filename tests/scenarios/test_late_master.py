@@ -75,6 +75,11 @@ class Late:
         drive._take_control_word = take  # type: ignore[method-assign]
 
     def enable(self) -> None:
+        """Also after drives that stopped on their own have latched a fault."""
+        if self.group.state is GroupState.FAULT:
+            self.group.command(GroupCommand.RESET_FAULT)
+            for _ in range(4):
+                self.cycle()
         self.group.command(GroupCommand.ENABLE)
         for _ in range(20):
             self.cycle()
