@@ -154,25 +154,26 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
 def _unstated_covariance(poses: Sequence[PoseMeasurement]) -> Array:
     """Covariance of each pose that their disagreement shows beyond the stated errors, shape (6, 6).
 
-    It is 0 where the stated errors explain the disagreement (`CHANCE`), otherwise the least multiple of `UNSTATED_ERROR`² with which the squared Mahalanobis distances from
-    the mean add up to k − 2, k their degrees of freedom: the mean of 1/χ² is 1/(k − 2), so that
-    the squared error of the fused pose, in units of its covariance, is six on average.
+    It is 0 where the stated errors explain the disagreement (`CHANCE`), otherwise the least
+    multiple of `UNSTATED_ERROR`² with which the squared Mahalanobis distances from the mean add up
+    to k − 2, k their degrees of freedom: the mean of 1/χ² is 1/(k − 2), so that the squared error
+    of the fused pose, in units of its covariance, is six on average.
 
     Source: Paule and Mandel, Journal of Research of the NBS 87 (1982), 377–385.
     """
     gaps = np.array([step_between(poses[0].pose, one.pose) for one in poses])
     stated = np.array([one.covariance + one.shared for one in poses])
-    unit, usual = np.diag(UNSTATED_ERROR**2), 6 * (len(poses) - 1) - 2
-    scale = 0.0
+    unit, freedom = np.diag(UNSTATED_ERROR**2), 6 * (len(poses) - 1)
+    scale, wanted = 0.0, float(chdtri(freedom, CHANCE))
     while True:  # Newton's steps only grow, as the sum falls with the scale and is convex
         weights = np.linalg.inv(stated + scale * unit)
         mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, gaps))
         pulls = np.einsum("nij,nj->ni", weights, gaps - mean)
-        excess = float(np.sum((gaps - mean) * pulls)) - usual
-        explained = scale == 0.0 and excess + usual <= chdtri(usual + 2, CHANCE)
-        if explained or not excess > 1e-6 * usual:
+        total = float(np.sum((gaps - mean) * pulls))
+        if not total > (1.0 + 1e-6) * wanted:
             return np.asarray(scale * unit)
-        scale += excess / float(np.sum(pulls @ unit * pulls))
+        wanted = freedom - 2
+        scale += (total - wanted) / float(np.sum(pulls @ unit * pulls))
 
 
 def _shared(poses: Sequence[PoseMeasurement], parts: Sequence[Array]) -> Array:
