@@ -32,6 +32,9 @@ REPLIES = frozenset(TPDO1_BASE + node for node in NODES)
 REPLY_4, SET_POINT_4 = {TPDO1_BASE + 4}, {RPDO1_BASE + 4}
 E_STOP_OPEN = 0x5441
 
+#: Runs between processes until one is not spoilt by a computer that holds the drives up.
+ATTEMPTS = 10
+
 
 @dataclass(frozen=True)
 class Fault:

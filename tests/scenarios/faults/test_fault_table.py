@@ -14,7 +14,7 @@ from executor.recording.run_folder import RunEvent
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
 from tests.scenarios.faults.bench import SimulatedBench, live, once, simulated
-from tests.scenarios.faults.cases import complaints, held_up
+from tests.scenarios.faults.cases import ATTEMPTS, complaints, held_up
 from tests.scenarios.faults.drive_cases import ROWS
 from tests.scenarios.faults.masters import Masters
 from tests.scenarios.faults.random_faults import random_run
@@ -32,7 +32,6 @@ BETWEEN_PROCESSES = (
     "F20 the operator stops",
     "D a lost heartbeat is a fault",
 )
-ATTEMPTS = 10
 
 
 @pytest.mark.parametrize("name", ROWS)

@@ -30,7 +30,7 @@ from tests.scenarios.faults.bench import (
     once,
     simulated,
 )
-from tests.scenarios.faults.cases import TABLE
+from tests.scenarios.faults.cases import ATTEMPTS, TABLE
 from tests.scenarios.faults.masters import Masters
 from tests.scenarios.stage import Stage
 
@@ -70,7 +70,7 @@ def test_f2_a_suspended_master_that_continues_enables_nothing(
         if bench.cycle >= bench.fault_cycle and bench.since is None:
             bench.suspend()
 
-    for attempt in range(3):
+    for attempt in range(ATTEMPTS):
         run = tmp_path / f"run {attempt}"
         with live(calm_run, run, script, between_processes, masters) as bench:
             bench.resumes_after = 10.0 * cycle
@@ -84,7 +84,7 @@ def test_f2_a_suspended_master_that_continues_enables_nothing(
             assert bench.violations() == []
             assert {drive.state for drive in bench.drives} == {HOLDING}
             return
-    pytest.fail("this computer held the simulated drives up three times")
+    pytest.fail("this computer held the simulated drives up each time")
 
 
 def test_f3_a_restart_begins_where_the_drives_are_and_moves_nothing(
@@ -263,7 +263,7 @@ def test_f23_a_step_of_the_clock_changes_nothing(
 def test_f25_a_master_that_is_requested_to_end_stops_along_the_path(
     calm_run: PreparedRun, tmp_path: Path, masters: Masters, between_processes: BusSettings
 ) -> None:
-    for attempt in range(3):
+    for attempt in range(ATTEMPTS):
         run = tmp_path / f"run {attempt}"
         with live(calm_run, run, once(lambda b: b.ask_stop()), between_processes, masters) as bench:
             if bench.run() is not State.STOPPED:
@@ -273,7 +273,7 @@ def test_f25_a_master_that_is_requested_to_end_stops_along_the_path(
             outcome = json.loads((run / "outcome.json").read_text())
             assert "stop requested" in outcome["cause"]
             return
-    pytest.fail("this computer held the simulated drives up three times")
+    pytest.fail("this computer held the simulated drives up each time")
 
 
 @pytest.mark.parametrize(
