@@ -282,6 +282,7 @@ def read_poses(path: Path) -> dict[str, Pose]:
         InvalidFile: With every invalid row.
     """
     table = CsvTable(path)
+    table.require(COLUMNS)
     names, *columns = (table.texts(name) for name in COLUMNS)
     states = table.texts("status") if "status" in table.names else None
     poses: dict[str, Pose] = {}

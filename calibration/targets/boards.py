@@ -103,6 +103,7 @@ def read_corners(path: Path) -> dict[str, DetectedBoard]:
             image shows `LEAST_POINTS`.
     """
     table = CsvTable(path)
+    table.require(_COLUMNS)
     pictures, numbers = table.texts(_COLUMNS[0]), table.of(_COLUMNS[1:])
     found: dict[str, list[Array]] = {}
     for picture, values in zip(pictures, numbers, strict=True):

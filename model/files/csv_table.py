@@ -23,8 +23,8 @@ class CsvTable:
         """Reads a file with a header line and at least one line of values.
 
         Raises:
-            BadInput: It cannot be read, names a column twice, or a line has more or fewer values
-                than there are columns.
+            BadInput: It cannot be read, has other separators than commas, names a column twice, or
+                a line has more or fewer values than there are columns.
         """
         self._path = path
         file = CsvFile(path)
@@ -32,6 +32,10 @@ class CsvTable:
         self._rows, self._lines = file.rows[1:], file.lines[1:]
         if not self._rows:
             raise self.bad("the file holds no values", "write a header line, then lines of values")
+        for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+            if len(self.names) == 1 and separator in self.names[0]:
+                what = f"values are separated by {name}"
+                raise self.bad(what, "separate them by commas, and decimals by a point")
         twice = {name for name in self.names if self.names.count(name) > 1}
         if twice:
             raise self.bad(f"the column {min(twice)!r} appears twice", "name each column once")
@@ -40,13 +44,26 @@ class CsvTable:
                 what = f"line {number} has {len(row)} values for {len(self.names)} columns"
                 raise self.bad(what, "give every line one value per column")
 
+    def require(self, names: Sequence[str]) -> None:
+        """Refuses a table that lacks one of these columns.
+
+        Raises:
+            BadInput: With all that are missing.
+        """
+        missing = [repr(name) for name in names if name not in self.names]
+        if missing:
+            several = f"columns {', '.join(missing)} are" if len(missing) > 1 else None
+            what = f"the {several or f'column {missing[0]} is'} missing"
+            raise self.bad(what, f"name it in the first line, which has: {', '.join(self.names)}")
+
     def of(self, names: Sequence[str]) -> Array:
         """Columns of finite numbers side by side, shape (n, len(names)).
 
         Raises:
             BadInput: A column is missing, or a value is not a finite number; with its line.
         """
-        columns = [(self._index(name), name) for name in names]
+        self.require(names)
+        columns = [(self.names.index(name), name) for name in names]
         return np.array(
             [
                 [self._number(row[index], name, line) for index, name in columns]
@@ -60,7 +77,8 @@ class CsvTable:
         Raises:
             BadInput: It is missing.
         """
-        index = self._index(name)
+        self.require([name])
+        index = self.names.index(name)
         return [row[index].strip() for row in self._rows]
 
     def line(self, row: int) -> int:
@@ -70,11 +88,6 @@ class CsvTable:
     def bad(self, what: str, next_step: str) -> BadInput:
         """The error about this file."""
         return BadInput(what, where=str(self._path), next_step=next_step)
-
-    def _index(self, name: str) -> int:
-        if name not in self.names:
-            raise self.bad(f"the column {name!r} is missing", "see docs/data-formats.md")
-        return self.names.index(name)
 
     def _number(self, text: str, name: str, line: int) -> float:
         try:

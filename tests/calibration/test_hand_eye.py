@@ -256,7 +256,10 @@ LOG_HEAD = HEAD.replace("\n", ",status\n")
     ("text", "named"),
     [
         ("", "no values"),
-        ("picture,x_mm\na.png,1\n", "column 'y_mm' is missing"),
+        (HEAD.replace(",y_mm", "") + "a.png,1,2,1,0,0,0\n", "column 'y_mm' is missing"),
+        ("picture,x_mm\na.png,1\n", "columns 'y_mm', 'z_mm', 'qw', 'qx', 'qy', 'qz' are missing"),
+        (HEAD.replace(",", ";") + "a.png;1,5;2\n", "separated by semicolons"),
+        (HEAD.replace(",", "\t") + "a.png\t1\t2\n", "separated by tabs"),
         (LOG_HEAD + "a.png,1,2,3,1,0,0,0,ok\n\nb.png,4,5,300,1,0,0,0\n", "line 4 has 8 values"),
         (LOG_HEAD + "a.png,1,2,3,1,0,0,0,ok,1\n", "line 2 has 10 values for 9 columns"),
         (HEAD + "a.png,1,2,3\n", "line 2 has 4 values for 8 columns"),

@@ -110,7 +110,7 @@ def test_a_file_of_positions_needs_no_rotation_and_half_of_one_is_refused(
     assert "positions RMS error at held-out samples" in " ".join(answer.out.split())
     half = tmp_path / "half.csv"
     half.write_text("\n".join([lines[0] + ",qw", *(line + ",1" for line in lines[1:])]))
-    with pytest.raises(BadInput, match="'qx' is missing"):
+    with pytest.raises(BadInput, match="'qx', 'qy', 'qz' are missing"):
         read_rig_data(half, 8)
     for column in ("x_mm", "std_x_mm"):
         half.write_text(

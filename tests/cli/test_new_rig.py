@@ -171,9 +171,8 @@ def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:
     table.write_text(table.read_text().replace("\n", ",1\n", 1))
     one_message(call("new", tmp_path / "rig.yaml", "--from", table), 2, "line 2 has 6 values")
     table.write_text("outlet_x_mm\n1\n")
-    one_message(
-        call("new", tmp_path / "rig.yaml", "--from", table), 2, "column 'outlet_y_mm' is missing"
-    )
+    missing = call("new", tmp_path / "rig.yaml", "--from", table)
+    one_message(missing, 2, "columns 'outlet_y_mm', 'outlet_z_mm'", "which has: outlet_x_mm")
     few = call("new", tmp_path / "rig.yaml", "--from", cables_csv(tmp_path, 5))
     one_message(few, 2, "5 cables", "from 6 to 24", "one line per cable, 6 or more")
     assert "begin with the line" not in few.err
