@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from can import BusABC
 
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
@@ -21,9 +22,9 @@ from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
 from executor.kernels import ready_to_simulate
 from executor.realtime.child import ReadyDrives
-from model.errors import BadInput, CdprError, Fault, Refused, require_types
+from model.errors import BadInput, CdprError, Refused, require_types
 from model.files.rig_file import RigDocument
-from model.kinematics import forward_kinematics
+from model.kinematics import cable_lengths
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
@@ -313,13 +314,8 @@ def resting_drives_of(
 # Forward kinematics from drive positions.
 
 
-#: Elastic stretch depends on the pose: iterations until the pose changes by less than this, [m];
-#: soft cables on a large robot need about twenty.
-_SETTLED, _ROUNDS = 1e-8, 200
-
-
 def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
-    """The pose whose planned drive positions are these, ``world_from_platform``.
+    """The pose at which the drives hold the platform, ``world_from_platform``.
 
     On a face of the workspace box, rounded counts give a position up to micrometres outside: within
     the start tolerance, the nearest one of the box is meant.
@@ -330,37 +326,26 @@ def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
         load: Carried by the platform.
 
     Raises:
-        Refused: No pose of the workspace fits them within the rig's start tolerance.
+        Refused: The planned drive positions there differ by more than the rig's start tolerance.
         TensionInfeasible: The cables cannot hold the platform there.
-        Fault: The solver did not converge.
+        Fault: The cables hold the platform in no equilibrium.
     """
     winches = WinchMap(rig)
     unstrained = winches.unstrained_from_counts(counts)
-    tensions = working_tensions(rig, rig.home, load).tensions
-    found = forward_kinematics(rig, winches.strained(unstrained, tensions))
-    for _ in range(_ROUNDS):
-        before = found.pose
-        tensions = working_tensions(rig, before, load).tensions
-        found = forward_kinematics(rig, winches.strained(unstrained, tensions), before)
-        if found.pose.distance_to(before) < _SETTLED:
-            break
-    else:
-        raise Fault(
-            "the platform pose could not be computed from the drive positions",
-            where="drive positions",
-            why="the solver did not converge",
-            next_step="report this with the rig file and the positions; nothing has moved",
-        )
-    pose = rig.clipped(found.pose)
-    off = max(found.worst, pose.distance_to(found.pose))
-    if not off <= rig.motion.start_tolerance:
-        x, y, z = found.pose.position * 1000.0
-        raise Refused(
-            f"the drive positions fit no pose in the workspace: the nearest is {x:.1f}, {y:.1f},"
-            f" {z:.1f} mm, with a cable {found.worst * 1000:.1f} mm off",
-            where="drive positions",
-            why="the homing reference is lost, a cable slipped, or the rig file is wrong",
-            next_step="home the drives at a known pose (home_counts in the rig file);"
-            " nothing was moved",
-        )
-    return pose
+    found = winches.equilibrium(unstrained, load)
+    pose = rig.clipped(found)
+    tensions = working_tensions(rig, found, load).tensions
+    off = np.abs(unstrained - winches.unstrained(cable_lengths(rig, found), tensions))
+    worst, limit = int(off.argmax()), rig.motion.start_tolerance
+    if off[worst] <= limit and pose.distance_to(found) <= limit:
+        return pose
+    x, y, z = found.position * 1000.0
+    raise Refused(
+        f"the drive positions fit no pose in the workspace: the nearest is {x:.1f}, {y:.1f},"
+        f" {z:.1f} mm, with cable {worst + 1} {off[worst] * 1000:.1f} mm off",
+        where="drive positions",
+        why="the homing reference is lost, a cable slipped, the rig file is wrong, or homing left"
+        " tensions far from the planned ones",
+        next_step="home the drives at a known pose, with a pretension (`--tension-n`) near the"
+        f" planned {tensions.min():.0f} to {tensions.max():.0f} N; nothing was moved",
+    )

@@ -34,9 +34,10 @@ from model.errors import (
     require_types,
     sequence_of,
 )
-from model.pose import Pose
+from model.pose import Array, Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
+from model.statics.gravity import working_tensions
 from planner.settings import whole_number
 from tracking.shared_errors import require_stated_errors
 
@@ -44,6 +45,8 @@ from tracking.shared_errors import require_stated_errors
 FURTHEST, FASTEST = 0.200, 0.010
 #: Defaults: reach [m], speed [m/s], number of images, and slack of simulated cables, [m].
 REACH, SPEED, PICTURES, SLACK = 0.050, 0.002, 20, 0.005
+#: Largest pretension, as a share of the limit.
+_SHARE_OF_LIMIT = 0.8
 #: Smallest and largest number of images for the pose.
 FEWEST_IMAGES, MOST_IMAGES = 5, 1000
 
@@ -105,7 +108,8 @@ def home(
         at_home: A jig holds the platform at the rig's home pose.
         pose: A jig holds the platform at this pose, ``world_from_platform``.
         camera: The platform hangs free and this camera measures it: a source or ``NAME=SOURCE``.
-        tension: Pretension, [N]; None for twice the rig's smallest tension.
+        tension: Pretension, [N]; None for the tensions planned at a stated pose, at most 80 % of
+            the limit, or with a camera for twice the rig's smallest tension.
         limit: Largest tension of any cable, [N]; None for 60 % of the rig's range.
         reach: Largest length of cable wound in, [m].
         speed: Largest winch speed, [m/s].
@@ -143,7 +147,7 @@ def home(
         require_synthetic_images(source[1:], not realtime)
     known = None if source is not None else _stated_pose(rig, pose)
     limit = limit_of(rig, limit)
-    target = _target(rig, tension, limit)
+    targets = _targets(rig, tension, known, limit)
     speed = min(speed, rig.motion.speed)
     interlock = MotionInterlock(rig)
     made: list[HomingReference] = []
@@ -163,15 +167,15 @@ def home(
         interlock.require_free()
         if source is not None:  # check that it delivers images before anything moves
             measure_at_rest(rig, source, 1, rig.home, commands.require_no_stop, listener)
-        fastest = float(wind_in_speed(rig, target, limit, speed).max())
-        proposal = HomingProposal(rig, target, limit, reach, speed, fastest, source)
+        fastest = float(wind_in_speed(rig, targets, limit, speed).max())
+        proposal = HomingProposal(rig, targets, limit, reach, speed, fastest, source)
         require_confirmed(confirm, proposal)
         motion = WinchMotion(
             rig=rig,
             pose=known or rig.home,
             limit=limit,
             speed=speed,
-            make_law=partial(PretensionLaw, target=target, limit=limit, reach=reach, speed=speed),
+            make_law=partial(PretensionLaw, targets=targets, limit=limit, reach=reach, speed=speed),
             lost_power=lost_power,
             realtime=realtime,
             need_real_time_rights=need_real_time_rights,
@@ -251,22 +255,33 @@ def _stated_pose(rig: Rig, pose: Pose | None) -> Pose:
     return pose
 
 
-def _target(rig: Rig, tension: float | None, limit: float) -> float:
-    """The pretension, [N].
+def _targets(rig: Rig, tension: float | None, known: Pose | None, limit: float) -> Array:
+    """The pretension of each cable, shape (m,), [N].
+
+    By default the tensions planned at the stated pose: the platform stays there when its jig is
+    removed, and the next motion begins with the tensions it expects. A platform that hangs free
+    moves while cables are wound in, so that their tensions exceed a common, smaller one.
 
     Raises:
         Refused: It leaves no headroom below the limit.
+        TensionInfeasible: The cables cannot hold the platform at the pose.
     """
-    target = 2.0 * rig.min_tension if tension is None else real_number("tension", tension, "N")
-    if not rig.min_tension <= target <= 0.8 * limit:
+    most = _SHARE_OF_LIMIT * limit
+    if tension is None and known is not None:
+        targets = np.minimum(working_tensions(rig, known).tensions, most)
+    else:
+        common = 2.0 * rig.min_tension if tension is None else real_number("tension", tension, "N")
+        targets = np.full(rig.cable_count, common)
+    wrong = targets[~((rig.min_tension <= targets) & (targets <= most))]
+    if wrong.size:
         raise Refused(
-            f"a pretension of {target:g} N must be from {rig.min_tension:g} N to 80 % of the"
-            f" limit of {limit:g} N",
+            f"a pretension of {wrong[0]:g} N must be from {rig.min_tension:g} N to"
+            f" {_SHARE_OF_LIMIT:.0%} of the limit of {limit:g} N",
             where="`tension=`",
             why="cables must be taut afterwards, with headroom below the limit while winding in",
             next_step="set another pretension or limit",
         )
-    return target
+    return targets
 
 
 def _referenced(

@@ -16,7 +16,7 @@ from model.errors import (
     require_functions,
     without_passwords,
 )
-from model.pose import Pose
+from model.pose import Array, Pose
 from model.rig import Camera, Rig
 from model.scene import Scene
 
@@ -151,7 +151,7 @@ class HomingProposal:
 
     Attributes:
         rig: The robot.
-        target: Pretension, [N].
+        targets: Pretension of each cable, shape (m,), [N].
         limit: Largest tension, [N].
         reach: Largest length of cable wound in, [m].
         speed: Fastest winch, [m/s].
@@ -164,7 +164,7 @@ class HomingProposal:
     title: ClassVar[str] = "ready to pretension"
 
     rig: Rig
-    target: float
+    targets: Array
     limit: float
     reach: float
     speed: float
@@ -175,10 +175,12 @@ class HomingProposal:
         """See `Proposal`."""
         source, bus = self.camera, self.rig.document.bus
         fastest, reach = self.fastest * 1000.0, self.reach * 1000.0
+        low, high = self.targets.min(), self.targets.max()
+        pull = f"{low:g}" if low == high else f"{low:.1f} to {high:.1f}"
         measured = f"measured, camera {_shown(*source)}" if source else "stated, held by a jig"
         return [
             ("rig", self.rig.name),
-            ("pretension", f"{self.target:g} N per cable, at most {self.limit:g} N"),
+            ("pretension", f"{pull} N per cable, at most {self.limit:g} N"),
             ("winches", f"all together, at most {fastest:.2f} mm/s and {reach:g} mm each"),
             ("pose", measured),
             ("bus", f"{bus.interface} {bus.channel}".strip()),

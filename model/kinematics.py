@@ -232,7 +232,7 @@ def poses_near(
     Returns:
         Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3).
     """
-    scale = _step_scale(rig)
+    scale = step_scale(rig)
     for _ in range(steps):
         anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
         cables = cables_to(rig, anchors)
@@ -264,7 +264,7 @@ def _levenberg_marquardt(
 ) -> ForwardSolution | None:
     """Damped Gauss–Newton on the pose; None when it does not converge."""
     pose, damping = start, 1e-6
-    scale = _step_scale(rig)
+    scale = step_scale(rig)
     residual = _residual(rig, pose, lengths)
     if residual is None:
         return None
@@ -285,7 +285,7 @@ def _levenberg_marquardt(
     return None
 
 
-def _step_scale(rig: Rig) -> Array:
+def step_scale(rig: Rig) -> Array:
     """Scale with which a unit of rotation moves the anchors as far as a unit of translation."""
     radius = rms_anchor_radius(rig.anchors)
     return np.array([1.0, 1.0, 1.0, 1.0 / radius, 1.0 / radius, 1.0 / radius])

@@ -10,11 +10,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from model.kinematics import cable_lengths
-from model.pose import Array, Pose, read_only
+from model.errors import Fault
+from model.kinematics import (
+    NoCable,
+    cable_lengths,
+    forward_kinematics,
+    step_scale,
+    structure_matrix,
+)
+from model.pose import Array, Pose, moved, read_only
 from model.rig import Rig
 from model.scene import Load
-from model.statics.gravity import working_tensions
+from model.statics.gravity import weight_wrench, working_tensions
+
+#: Steps of the search for an equilibrium, largest last step [m], and step of its differences [m].
+_STEPS, _SETTLED, _DIFFERENCE = 60, 1e-9, 1e-6
 
 
 class WinchMap:
@@ -74,3 +84,71 @@ class WinchMap:
         paid_out = (np.asarray(counts, dtype=np.float64) - self.home_counts) / self.counts_per_metre
         unstrained: Array = self.home_unstrained + paid_out
         return unstrained
+
+    def tensions(self, unstrained: Array, lengths: Array) -> Array:
+        """Tensions of cables stretched to these lengths, shape (m,), [N]; 0 for slack cables.
+
+        Args:
+            unstrained: Of whole cables, shape (m,), [m].
+            lengths: From outlet to anchor, shape (m,), [m].
+        """
+        strain = (lengths + self.behind_outlet) / unstrained - 1.0
+        pull: Array = np.maximum(0.0, self.stiffness * strain)
+        return pull
+
+    def equilibrium(self, unstrained: Array, load: Load | None = None) -> Pose:
+        """The pose at which elastic cables of these lengths hold the platform at rest.
+
+        Newton's method on the wrench balance, from the pose that the working tensions at home give;
+        derivatives by differences.
+
+        Args:
+            unstrained: Of whole cables, shape (m,), [m].
+            load: Payload; none when left out.
+
+        Returns:
+            ``world_from_platform``.
+
+        Raises:
+            Fault: No equilibrium was found.
+        """
+        tensions = working_tensions(self._rig, self._rig.home).tensions
+        pose = forward_kinematics(self._rig, self.strained(unstrained, tensions)).pose
+        scale = step_scale(self._rig)
+        balance = self._balance(pose, unstrained, load)
+        for _ in range(_STEPS):
+            columns = [
+                self._balance(moved(pose, scale * way), unstrained, load) - balance
+                for way in _DIFFERENCE * np.eye(6)
+            ]
+            try:
+                step = np.linalg.solve(np.array(columns).T / _DIFFERENCE, -balance)
+            except np.linalg.LinAlgError:  # with slack cables
+                break
+            if not np.isfinite(step).all():  # an anchor has entered a pulley
+                break
+            while np.linalg.norm(step) >= _SETTLED:
+                trial = moved(pose, scale * step)
+                found = self._balance(trial, unstrained, load)
+                if np.linalg.norm(found) < np.linalg.norm(balance):
+                    pose, balance = trial, found
+                    break
+                step = step / 2.0
+            else:
+                return pose
+        raise Fault(
+            "cables of these lengths hold the platform in no equilibrium",
+            where="drive positions",
+            why="the homing reference is lost, a cable slipped, or the rig file is wrong",
+            next_step="home the drives at a known pose; nothing was moved",
+        )
+
+    def _balance(self, pose: Pose, unstrained: Array, load: Load | None) -> Array:
+        """Wrench on the platform, moments over the anchors' radius, shape (6,), [N]; or NaN."""
+        try:
+            pull = self.tensions(unstrained, cable_lengths(self._rig, pose))
+            wrench = structure_matrix(self._rig, pose) @ pull
+        except NoCable:
+            return np.full(6, np.nan)
+        balance: Array = step_scale(self._rig) * (wrench + weight_wrench(self._rig, pose, load))
+        return balance

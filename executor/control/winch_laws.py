@@ -167,7 +167,7 @@ class PretensionLaw:
     """Winds in all cables slowly and together, each until it is taut."""
 
     def __init__(
-        self, rig: Rig, begin: Sequence[int], *, target: float, limit: float, reach: float,
+        self, rig: Rig, begin: Sequence[int], *, targets: Array, limit: float, reach: float,
         speed: float,
     ) -> None:  # fmt: skip
         """Prepares the law.
@@ -175,16 +175,16 @@ class PretensionLaw:
         Args:
             rig: The robot.
             begin: Positions of the drives, [counts].
-            target: Tension at which a cable is taut, [N].
+            targets: Tension at which each cable is taut, shape (m,), [N].
             limit: Largest tension of any cable, [N].
             reach: Largest length of a cable wound in, [m].
             speed: Largest cable speed, [m/s].
         """
         self._rig, self._begin = rig, np.array(begin, dtype=np.float64)
-        self._target, self._reach = target, reach
-        self._room = TensionHeadroom(target, limit)
+        self._targets, self._reach = targets, reach
+        self._room = TensionHeadroom(float(np.max(targets)), limit)
         self._per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
-        self._step = wind_in_speed(rig, target, limit, speed) * rig.cycle
+        self._step = wind_in_speed(rig, targets, limit, speed) * rig.cycle
         self._wound = np.zeros(rig.cable_count)
         self._taut = np.zeros(rig.cable_count, dtype=bool)
         self._cycles = 0
@@ -192,7 +192,7 @@ class PretensionLaw:
     @property
     def reach(self) -> tuple[Targets, Targets]:
         """See `WinchLaw`."""
-        return self._targets(0.0 * self._wound), self._targets(0.0 * self._wound + self._reach)
+        return self._counts(0.0 * self._wound), self._counts(0.0 * self._wound + self._reach)
 
     @property
     def done(self) -> bool:
@@ -208,7 +208,7 @@ class PretensionLaw:
         """See `WinchLaw`."""
         pull = np.asarray(tensions)
         pace *= self._room.share(tensions)
-        self._taut = pull >= np.where(self._taut, STAYS_TAUT, 1.0) * self._target
+        self._taut = pull >= np.where(self._taut, STAYS_TAUT, 1.0) * self._targets
         self._cycles = self._cycles + 1 if self._taut.all() else 0
         wanting = ~self._taut
         short = wanting & (self._wound >= self._reach)
@@ -216,12 +216,12 @@ class PretensionLaw:
             wanting, np.minimum(self._wound + pace * self._step, self._reach), self._wound
         )
         still_slack = (
-            not_taut(int(cable) + 1, float(pull[cable]), self._reach, self._target)
+            not_taut(int(cable) + 1, float(pull[cable]), self._reach, self._targets[cable])
             for cable in np.flatnonzero(short)
         )
-        return self._targets(self._wound), (*self._room.used_up(tensions), *still_slack)
+        return self._counts(self._wound), (*self._room.used_up(tensions), *still_slack)
 
-    def _targets(self, wound: Array) -> Targets:
+    def _counts(self, wound: Array) -> Targets:
         counts = self._begin - self._per_metre * wound
         return tuple(int(c) for c in np.rint(counts))
 
@@ -335,7 +335,7 @@ class CableFeed(OneCableLaw):
         return self._duration - self._passed
 
 
-def wind_in_speed(rig: Rig, target: float, limit: float, speed: float) -> Array:
+def wind_in_speed(rig: Rig, target: float | Array, limit: float, speed: float) -> Array:
     """Speed at which each cable may be wound in under tension control, shape (m,), [m/s].
 
     Never faster than its winch; cable stiffness is that at home.

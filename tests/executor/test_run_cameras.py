@@ -377,6 +377,12 @@ def test_the_password_of_a_camera_is_neither_sent_nor_recorded_nor_shown() -> No
     client = CameraClient(Scripted("front", [0]), "rtsp://user:s3cret@h/x")  # type: ignore[arg-type]
     assert client.as_dict(0.0)["source"] == client.record().source == "rtsp://user:***@h/x"
     facts = HomingProposal(
-        _RIG, 10.0, 50.0, 0.05, 0.002, 0.002, (_RIG.cameras[0], "rtsp://user:s3cret@h/x")
+        _RIG,
+        np.full(8, 10.0),
+        50.0,
+        0.05,
+        0.002,
+        0.002,
+        (_RIG.cameras[0], "rtsp://user:s3cret@h/x"),
     ).facts()
     assert dict(facts)["pose"] == "measured, camera front (rtsp://user:***@h/x)"

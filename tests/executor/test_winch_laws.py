@@ -23,6 +23,9 @@ from tests.cli.plans import HALL, RIG
 RIGS = [load_rig(RIG), load_rig(HALL)]
 
 
+TAUT = np.full(8, 10.0)
+
+
 def per_metre(rig):
     return np.array([winch.counts_per_metre for winch in rig.winches])
 
@@ -37,7 +40,9 @@ def test_winding_in_never_pays_out_and_stays_in_its_reach(rig, seed, paces):
     random = np.random.default_rng(seed)
     begin = random.integers(-(10**6), 10**6, rig.cable_count).tolist()
     target, limit = 2.0 * rig.min_tension, 0.5 * rig.max_tension
-    law = PretensionLaw(rig, begin, target=target, limit=limit, reach=1e-4, speed=0.002)
+    law = PretensionLaw(
+        rig, begin, targets=np.full(rig.cable_count, target), limit=limit, reach=1e-4, speed=0.002
+    )
     most = wind_in_speed(rig, target, limit, 0.002) * 0.01
     before = np.array(begin, dtype=np.float64)
     for pace in paces:
@@ -54,7 +59,7 @@ def test_winding_in_never_pays_out_and_stays_in_its_reach(rig, seed, paces):
 
 def test_a_taut_cable_is_wound_in_no_further_and_all_must_stay_taut():
     rig = RIGS[0]
-    law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.01, speed=0.002)
+    law = PretensionLaw(rig, [0] * 8, targets=TAUT, limit=60.0, reach=0.01, speed=0.002)
     slack = [12.0] * 8
     slack[3] = 0.0
     first, _ = law.next(1.0, slack)
@@ -67,6 +72,17 @@ def test_a_taut_cable_is_wound_in_no_further_and_all_must_stay_taut():
     assert not law.done, "one went slack again"
     for _ in range(20):
         law.next(1.0, [12.0] * 8)
+    assert law.done
+
+
+def test_each_cable_is_taut_at_its_own_tension():
+    rig = RIGS[0]
+    own = np.linspace(10.0, 45.0, 8)
+    law = PretensionLaw(rig, [0] * 8, targets=own, limit=60.0, reach=0.01, speed=0.002)
+    targets, _ = law.next(1.0, np.where(np.arange(8) % 2, own, 0.95 * own).tolist())
+    assert [target != 0 for target in targets] == [True, False] * 4
+    for _ in range(20):
+        law.next(1.0, own.tolist())
     assert law.done
 
 
@@ -84,7 +100,7 @@ def test_a_step_raises_no_tension_beyond_what_is_left_before_it_is_seen():
 def test_beyond_the_limit_no_winch_continues(wrong):
     rig = RIGS[0]
     for law in (
-        PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002),
+        PretensionLaw(rig, [0] * 8, targets=TAUT, limit=60.0, reach=0.05, speed=0.002),
         CableStep(rig, [0] * 8, cable=1, length=-0.02, limit=60.0, speed=0.005),
     ):
         for _ in range(200):
@@ -104,7 +120,7 @@ def test_beyond_the_limit_no_winch_continues(wrong):
 def test_near_the_limit_all_continue_more_slowly():
     rig, steps = RIGS[0], []
     for tension in (10.0, 35.0, 59.9):
-        law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=0.05, speed=0.002)
+        law = PretensionLaw(rig, [0] * 8, targets=TAUT, limit=60.0, reach=0.05, speed=0.002)
         targets, _ = law.next(1.0, [0.0] * 7 + [tension])
         for _ in range(99):
             targets, _ = law.next(1.0, [0.0] * 7 + [tension])
@@ -115,7 +131,7 @@ def test_near_the_limit_all_continue_more_slowly():
 
 def test_a_cable_that_stays_slack_is_reported():
     rig = RIGS[0]
-    law = PretensionLaw(rig, [0] * 8, target=10.0, limit=60.0, reach=1e-5, speed=0.002)
+    law = PretensionLaw(rig, [0] * 8, targets=TAUT, limit=60.0, reach=1e-5, speed=0.002)
     found = ()
     for _ in range(10):
         _, found = law.next(1.0, [12.0] * 7 + [0.3])

@@ -39,6 +39,7 @@ from model.plan import plan_from_document
 from model.pose import Array, Pose
 from model.rig import Rig, load_rig, rig_from_document
 from model.scene import empty_scene
+from model.statics.gravity import working_tensions
 from planner.check import verify
 from simulation.camera.camera import SyntheticCamera
 from simulation.drives.cia402_rig import SimulatedCia402Rig
@@ -94,7 +95,12 @@ class Bench:
 
     def take_up(self, reach: float = 0.02) -> WinchResult:
         law = PretensionLaw(
-            self.as_set_up, self.counts, target=TARGET, limit=LIMIT, reach=reach, speed=0.002
+            self.as_set_up,
+            self.counts,
+            targets=np.full(self.as_set_up.cable_count, TARGET),
+            limit=LIMIT,
+            reach=reach,
+            speed=0.002,
         )
         return self.move(law)
 
@@ -610,9 +616,9 @@ def test_a_pose_that_is_not_known_well_is_refused() -> None:
         static_pose(rig, looks(rig, far, far))
 
 
-def test_the_hall_robot_is_taken_up_too() -> None:
-    rig = load_rig(HALL)
-    loss = PowerLoss.drawn(rig, 1, 0.005, on_a_stand=False)
+def wound_in(rig: Rig, targets: Array, *, on_a_stand: bool) -> WinchResult:
+    """The end of winding in all cables of a robot that lost its power."""
+    loss = PowerLoss.drawn(rig, 1, 0.005, on_a_stand=on_a_stand)
     settings = BusSettings("virtual", f"home-{next(_CHANNELS)}")
     with open_bus(settings) as near, open_bus(settings) as far:
         rehearsal = SimulatedCia402Rig(rig, far, rig.home)
@@ -624,14 +630,41 @@ def test_the_hall_robot_is_taken_up_too() -> None:
         limited = with_reduced_limits(counted, limit=400.0, speed=0.005)
         group = make_drive_group(counted, near, rehearsal.pump, max_tension=400.0)
         group.configure()
-        law = PretensionLaw(limited, counts, target=60.0, limit=400.0, reach=0.05, speed=0.002)
+        law = PretensionLaw(limited, counts, targets=targets, limit=400.0, reach=0.05, speed=0.002)
         result = move_winches(
             mover(limited, law, group, LocalRequests()), rig, MotionInterlock(rig),
             Records(lambda _record: None, lambda _event: None),
             record=Path("nowhere"), rehome=True, at_rest=lambda _result, _true_pose: None,
         )  # fmt: skip
         assert result.state is State.FINISHED, result.cause
-        assert rehearsal.tensions.min() >= 0.7 * 60.0
+        return result
+
+
+def test_the_hall_robot_is_taken_up_too() -> None:
+    rig = load_rig(HALL)
+    result = wound_in(rig, np.full(rig.cable_count, 60.0), on_a_stand=False)
+    assert min(result.tensions) >= 0.7 * 60.0
+
+
+def test_after_homing_on_a_jig_under_the_planned_tensions_a_motion_may_begin() -> None:
+    """Long, soft cables stretch by far more than the start tolerance between two tensions."""
+    rig = soft(load_rig(HALL))
+    planned = working_tensions(rig, rig.home).tensions
+    result = wound_in(rig, planned, on_a_stand=True)
+    made = reference_at(rig, rig.home, result.counts, result.tensions, "stated pose", 0.0)
+    found = current_pose(referenced(rig, made), result.counts, empty_scene(rig).load)
+    assert found.distance_to(rig.home) <= 1e-3
+    result = wound_in(rig, np.full(rig.cable_count, 60.0), on_a_stand=True)
+    made = reference_at(rig, rig.home, result.counts, result.tensions, "stated pose", 0.0)
+    with pytest.raises(Refused, match="fit no pose") as caught:
+        current_pose(referenced(rig, made), result.counts, empty_scene(rig).load)
+    assert "pretension" in caught.value.next_step
+
+
+def soft(rig: Rig) -> Rig:
+    """A rig whose cables stretch more: 30 kN."""
+    cables = rig.document.cables.model_copy(update={"stiffness_n": 30000.0})
+    return rig_from_document(rig.document.model_copy(update={"cables": cables}))
 
 
 def stops(stage: Stage) -> None:

@@ -30,7 +30,9 @@ from executor.drives import is_simulated, require_own_time
 class WindingOptions:
     """Settings of pretension and pose measurement; every field is an option."""
 
-    tension_n: float | None = option("pretension (default: twice the rig's smallest tension)")
+    tension_n: float | None = option(
+        "pretension of every cable (default: the tensions planned there)"
+    )
     limit_n: float | None = option("tension limit of any cable (default: 60 % of the range)")
     reach_mm: float = option(
         "largest length to wind in per cable",
