@@ -267,6 +267,12 @@ class Pose(ReadOnly):
         """Angle between the z axes of both frames, [rad]."""
         return float(np.arccos(np.clip(self.rotation[2, 2], -1.0, 1.0)))
 
+    @property
+    def turn(self) -> float:
+        """Angle about z that is left without the tilt, as in `RotationLimits`, −π to π, [rad]."""
+        w, _, _, z = self.quaternion
+        return 2.0 * math.atan2(z, w) if w >= 0.0 else 2.0 * math.atan2(-z, -w)
+
     def apply(self, points: ArrayLike) -> Array:
         """Maps points, shape (..., 3), [m], of the inner frame into the outer one."""
         mapped: Array = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.position

@@ -67,11 +67,10 @@ def scene_of(rig: Rig, scene: Scene | None) -> dict[str, Any]:
 
 def pose_data(rig: Rig, pose: Pose, source: str) -> dict[str, Any]:
     """The platform's pose and the cables' exit points, in mm for the page."""
-    turn = float(np.degrees(np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])))
     return {
         "position_mm": (np.round(pose.position * 1e3, 2) + 0.0).tolist(),
         "tilt_deg": round(math.degrees(pose.tilt), 2) + 0.0,
-        "turn_deg": round(turn, 2) + 0.0,
+        "turn_deg": round(math.degrees(pose.turn), 2) + 0.0,
         "rotation": np.round(pose.rotation, 6).reshape(-1).tolist(),
         "exits_mm": np.round(cables_at(rig, pose).exits * 1e3, 2).tolist(),
         "source": source,
