@@ -68,7 +68,7 @@ class TakeCommand(_Command):
     held_by: Text | None = None
 
 
-class RunCommand(_Command):
+class RunPlanCommand(_Command):
     """Run the loaded plan, if it is the one that was shown; by its hash."""
 
     command: Literal["run"]
@@ -200,7 +200,7 @@ class Seen(_Incoming):
 Message = (
     PlainCommand
     | TakeCommand
-    | RunCommand
+    | RunPlanCommand
     | ResetCommand
     | SpeedCommand
     | FileCommand

@@ -27,7 +27,7 @@ from cdpr.console.commands import (
     PlanCommand,
     RenameCommand,
     ResetCommand,
-    RunCommand,
+    RunPlanCommand,
     SpeedCommand,
     TakeCommand,
 )
@@ -269,7 +269,7 @@ class Console:
 
     def _operate(self, message: Message) -> str:
         match message:
-            case RunCommand():
+            case RunPlanCommand():
                 return self._run(message.plan)
             case ResetCommand():
                 return self._reset(message.cause)
