@@ -227,7 +227,7 @@ class PlatformEstimator:
         self._modules = modules_across(rig.tag_family)
         self._platform = {tag.id: tag for tag in rig.platform_tags}
         self._frame = frozenset(tag.id for tag in rig.frame_tags)
-        # The platform hangs between or below the outlets, after a fault and on a stand outside its
+        # The platform hangs between or below the outlets, after a fault and on supports outside its
         # workspace: it is in the box around outlets, workspace and home, plus its own size.
         size = float(np.linalg.norm(rig.half_size))
         reached = np.vstack(
@@ -342,13 +342,13 @@ class PlatformEstimator:
     def _no_fit_reason(self, views: Sequence[TagView], start: Pose) -> str:
         """Why no view gives a pose near ``start``, in the camera frame."""
         limit, angles = self._settings.view_angle, [view_angle(v.tag, start) for v in views]
-        # The mirror pose of a tag seen at 80° can show it from behind, at 100°.
-        nearest = min((min(angle, math.pi - angle) for angle in angles), default=0.0)
-        if nearest < limit:
+        if not views or min(angles) < limit:
             return f"no tag of the platform fits a pose; {CAUSE}"
+        # The mirror pose of a tag seen at 80° can show it from behind, at 100°.
+        seen = max(limit, min(min(angle, math.pi - angle) for angle in angles))
         return (
             f"tags {', '.join(str(view.tag.id) for view in views)} are seen"
-            f" {np.degrees(nearest):.0f}° from their normal, the limit is {np.degrees(limit):.0f}°"
+            f" {np.degrees(seen):.0f}° from their normal, the limit is {np.degrees(limit):.0f}°"
         )
 
     def _no_pose_reason(self, seen: tuple[int, ...], measured: bool) -> str:
