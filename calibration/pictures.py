@@ -346,8 +346,19 @@ def _sampled(video: VideoFile, most: int, total: int | None = None) -> ImageSet:
     total = _length(video) if total is None else total
     count = min(most, total)
     numbers = {k * total // count for k in range(count)}
-    frames = (frame for number, frame in enumerate(video) if number in numbers)
-    return ImageSet(((f.name, f.image) for f in frames), count, video=video)
+    return ImageSet(_Sample(video, numbers), count, video=video)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    """Images of a video with given numbers; it can be read repeatedly."""
+
+    video: VideoFile
+    numbers: set[int]
+
+    def __iter__(self) -> Iterator[tuple[str, Image]]:
+        frames = (f for number, f in enumerate(self.video) if number in self.numbers)
+        return ((f.name, f.image) for f in frames)
 
 
 def _live(source: str, camera: Camera, most: int) -> Iterable[tuple[str, Image]]:

@@ -32,7 +32,7 @@ from calibration.statistics import (
     student_factor,
     widened,
 )
-from calibration.targets.boards import Board, DetectedBoard, is_mirrored
+from calibration.targets.boards import Board, DetectedBoard, generic_camera, is_mirrored
 from model.cameras import Z_95
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
@@ -256,6 +256,43 @@ def fit_camera(
     if size is None or len(views) < LEAST_VIEWS:
         raise _too_few(views, left_out, board, without.chosen())
     return replace(calibrate_from_views(views, size, left_out, lens), previews=previews)
+
+
+def refit_camera(
+    first: CameraCalibration,
+    pictures: Iterable[tuple[str, Image]],
+    board: Board,
+    lens: str = AUTO,
+) -> CameraCalibration:
+    """Fits a camera again, to corners detected with the lens of the first fit.
+
+    Args:
+        first: The first fit.
+        pictures: Its images, read again.
+        board: As in the first fit.
+        lens: As in `fit_camera`.
+
+    Raises:
+        BadInput: An image cannot be read again, or too few images show the board.
+    """
+    camera = replace(
+        generic_camera(first.size),
+        matrix=first.matrix,
+        distortion=first.distortion,
+        lens=first.lens.kind,
+    )
+    again = {name: board.find(image, camera) for name, image in pictures if name in first.views}
+    if missing := [name for name in first.views if name not in again]:
+        raise BadInput(
+            "the image cannot be read again",
+            where=missing[0],
+            why=f"the corners of {board} depend on the lens: they are detected twice",
+            next_step="pass images that can be read twice, such as a folder or a list",
+        )
+    views = {name: seen for name, seen in again.items() if seen is not None}
+    left_out = {name: NOT_FOUND for name in again if name not in views}
+    found = calibrate_from_views(views, first.size, {**first.unused, **left_out}, lens)
+    return replace(found, previews={name: first.previews[name] for name in found.views})
 
 
 def _reduced(image: Image) -> Image:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -43,10 +43,21 @@ class DetectedBoard:
 
 @runtime_checkable
 class Board(Protocol):
-    """Interface of a board for `calibration.intrinsics.calibrate`."""
+    """Interface of a board for `calibration.intrinsics.calibrate`.
 
-    def find(self, image: Image) -> DetectedBoard | None:
-        """Detects the board in a grey image; None where too little of it is visible."""
+    Attributes:
+        needs_lens: Whether its corners are biased by lens distortion unless the lens is known.
+    """
+
+    needs_lens: ClassVar[bool]
+
+    def find(self, image: Image, camera: Camera | None = None) -> DetectedBoard | None:
+        """Detects the board in a grey image; None where too little of it is visible.
+
+        Args:
+            image: The image.
+            camera: That took it; one without distortion is assumed when left out.
+        """
         ...
 
     def describe_other(self, image: Image) -> str:
@@ -162,6 +173,7 @@ class Chessboard:
     columns: int
     rows: int
     square: float
+    needs_lens: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Refuses impossible boards.
@@ -184,7 +196,7 @@ class Chessboard:
         grid = np.array([(x, y, 0.0) for y in range(self.rows) for x in range(self.columns)])
         return np.asarray(grid * self.square)
 
-    def find(self, image: Image) -> DetectedBoard | None:
+    def find(self, image: Image, camera: Camera | None = None) -> DetectedBoard | None:
         """Detects its inner corners; a large image is searched in a smaller copy first."""
         rough = None
         if (times := max(image.shape) / _SEARCHED) > 1.0:
@@ -274,6 +286,7 @@ class Charuco:
     marker: float
     dictionary: str
     legacy: bool = False
+    needs_lens: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Refuses impossible boards.
@@ -301,7 +314,7 @@ class Charuco:
         """Its kind, size and dictionary."""
         return f"a ChArUco board of {self.columns} x {self.rows} squares with {self.dictionary}"
 
-    def find(self, image: Image) -> DetectedBoard | None:
+    def find(self, image: Image, camera: Camera | None = None) -> DetectedBoard | None:
         """Detects its visible inner corners; black and white may be inverted."""
         seen = self._seen_in(image)
         return self._seen_in(np.asarray(255 - image)) if seen is None else seen
