@@ -1,7 +1,7 @@
-"""Circle grids, with centres corrected for perspective, and grids of tags.
+"""Circle grids, with centres corrected for perspective and lens, and grids of tags.
 
-A circle is imaged as an ellipse whose centre is not the image of the circle's centre. The offset
-follows from the grid's homography and the circles' diameter. Centres are darkness-weighted means
+The centroid of a circle's image is not the image of the circle's centre. The offset follows from
+the grid's homography, the lens and the circles' diameter. Centres are darkness-weighted means
 over the pixels of a circle, so they do not depend on the detector's thresholds.
 
 A grid of tags may be visible in part. Kalibr's AprilGrid numbers its tags from the bottom left and
@@ -29,7 +29,7 @@ from calibration.targets.boards import LEAST_POINTS, DetectedBoard, generic_came
 from model.pose import Array
 from model.rig import Camera
 from model.tag_families import FAMILIES, tags_in
-from tracking.camera_model import Image, distort_pixels
+from tracking.camera_model import Image, distort_pixels, undistort_pixels
 from tracking.detection.detector import TagDetector
 from tracking.detection.diagnostics import diagnose_tags, row_numbering, tag_offsets
 from tracking.detection.tags import CORNER_SIGNS, dictionary, modules_across, upright_corners
@@ -41,6 +41,8 @@ _LEAST_AREA, _LEAST_APART = 12.0, 4.0
 """Minimum area of a circle and distance between circles in that copy, [px²] and [px]."""
 _WINDOW, _CORE = 1.3, 0.6
 """Radii of the window around a circle and of its dark core, in radii of the circle."""
+_RIM = 90
+"""Points of a circle's rim whose images give its centroid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +93,7 @@ class CircleGrid:
 
     def find(self, image: Image, camera: Camera | None = None) -> DetectedBoard | None:
         """Detects the centres of its circles, if all are visible."""
+        lens = camera or generic_camera((image.shape[1], image.shape[0]))
         times = max(1.0, max(image.shape) / _SEARCHED)
         small = image
         if times > 1.0:
@@ -102,7 +105,7 @@ class CircleGrid:
             centres = None if found is None else self._upright((found + 0.5) * scale - 0.5)
             if centres is not None:
                 dark = np.asarray(255 - image) if white else image
-                return DetectedBoard(self.points(), self._refined(dark, centres))
+                return DetectedBoard(self.points(), self._refined(dark, centres, lens))
         return None
 
     def describe_other(self, image: Image) -> str:
@@ -155,34 +158,37 @@ class CircleGrid:
             return None
         return np.asarray(turn, dtype=np.float64)
 
-    def _refined(self, dark: Image, centres: Array) -> Array:
+    def _refined(self, dark: Image, centres: Array, camera: Camera) -> Array:
         """Images of the circles' centres, shape (n, 2), [px]."""
-        turn = self._homography(centres)
+        turn = self._homography(undistort_pixels(camera, centres))
         if turn is None:  # not after `_upright`
             return centres
-        middles = np.array(
-            [_centroid(dark, c, e) for c, e in zip(centres, self._ellipses(turn)[1], strict=True)]
-        )
-        return np.asarray(middles - self._ellipses(turn)[0])
+        offsets, shapes = self._ellipses(turn, camera)
+        middles = [_centroid(dark, c, e) for c, e in zip(centres, shapes, strict=True)]
+        return np.asarray(np.array(middles) - offsets)
 
-    def _ellipses(self, turn: Array) -> tuple[Array, Array]:
-        """The ellipses that are the circles' images.
+    def _ellipses(self, turn: Array, camera: Camera) -> tuple[Array, Array]:
+        """The circles' images: ellipses, but for the lens distortion.
+
+        Args:
+            turn: Homography from board plane to undistorted pixels, shape (3, 3).
+            camera: Of the image.
 
         Returns:
-            Their centres minus the images of the circles' centres, shape (n, 2), [px], and the
-            matrices E of xᵀE⁻¹x = 1 about the ellipse centres, shape (n, 2, 2), [px²].
+            Their centroids minus the images of the circles' centres, shape (n, 2), [px], and the
+            matrices E of xᵀE⁻¹x = 1 about the centroids, shape (n, 2, 2), [px²].
         """
-        offsets, shapes = [], []
-        for x, y, _ in self.points().tolist():
-            move = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
-            there = turn @ move
-            # Dual of the circle x² + y² = r² is diag(r², r², −1); it maps by H C* Hᵀ.
-            dual = there @ np.diag([self.diameter**2 / 4.0] * 2 + [-1.0]) @ there.T
-            dual = dual / dual[2, 2]
-            middle = dual[:2, 2]
-            offsets.append(middle - there[:2, 2] / there[2, 2])
-            shapes.append(np.outer(middle, middle) - dual[:2, :2])
-        return np.array(offsets), np.array(shapes)
+        angles = np.arange(_RIM) * 2.0 * np.pi / _RIM
+        unit = np.column_stack([np.cos(angles), np.sin(angles)])
+        circle = np.vstack([np.zeros(2), self.diameter / 2.0 * unit])
+        plane = self.points()[:, None, :2] + circle
+        there = distort_pixels(camera, np.asarray(cv2.perspectiveTransform(plane, turn)))
+        rims = there[:, 1:] - there[:, :1]
+        after = np.roll(rims, -1, axis=1)
+        areas = rims[..., 0] * after[..., 1] - rims[..., 1] * after[..., 0]
+        offsets = np.einsum("nr,nri->ni", areas, rims + after) / (3.0 * areas.sum(axis=1))[:, None]
+        axes = 2.0 / _RIM * np.einsum("nri,rj->nij", rims, unit)
+        return offsets, axes @ axes.transpose(0, 2, 1)
 
 
 def _centroid(dark: Image, centre: Array, shape: Array) -> Array:
