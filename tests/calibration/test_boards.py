@@ -15,6 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.intrinsics.calibrate import fit_camera
+from calibration.pictures import ImageSet
+from calibration.procedures import calibrate_camera
 from calibration.statistics import EvenSample
 from calibration.targets.boards import Charuco, Chessboard, is_mirrored
 from calibration.targets.grids import CircleGrid, TagGrid
@@ -269,6 +271,32 @@ def test_the_camera_comes_back_from_parts_of_a_board(board: Charuco | TagGrid) -
     assert (off < 4.0).all()
     assert found.error < 0.2
     assert found.size == SIZE
+
+
+BARREL = (-0.3, 0.1, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("board", "sheet", "margin"),
+    [
+        (TAGS, tag_print(), 0.012),
+        (CIRCLES, circle_print(CIRCLES), MARGIN),
+        (CHARUCO, charuco_print(), 0.0),
+    ],
+)
+def test_barrel_distortion_does_not_bias_the_camera(board, sheet, margin: float) -> None:
+    """Edges of tags are curved, and centroids of circles are off their centres."""
+    origin, middle = np.full(2, margin), np.array([0.11, 0.08, 0.0])
+    images = []
+    for k, pose in enumerate(poses_before_the_camera(middle, 12, spread=0.09)):
+        near = replace(pose, position=pose.position - [0.0, 0.0, 0.1])
+        image = picture_of(sheet, PIXEL, origin, near, BARREL)
+        images.append((f"{k}.png", with_noise(image, k)))
+    found = calibrate_camera(ImageSet(images, len(images)), board, lens="five").found
+    for name, truth in (("fx_px", MATRIX[0, 0]), ("fy_px", MATRIX[1, 1])):
+        low, high = found.intervals[name].bounds
+        assert low < truth < high
+        assert high - low < 1.2
 
 
 @pytest.mark.parametrize("board", [CHARUCO, TAGS])
