@@ -15,10 +15,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.targets.boards import Board, DetectedBoard, generic_camera
+from calibration.targets.boards import Board, DetectedBoard
 from drivers.cameras.files import ImageFolder, OneCamerasPictures
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from executor.cameras.sources import require_camera_source
+from model.cameras import generic_camera
 from model.errors import BadInput, path_of
 from model.files.documents import write_bytes_atomic
 from model.pose import Array

@@ -118,6 +118,18 @@ def camera_from(document: CameraDocument) -> Camera:
 _SCALES = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
 
 
+def generic_camera(size: tuple[int, int], name: str = "camera") -> Camera:
+    """A camera without distortion and with a horizontal field of view of about 53°.
+
+    Args:
+        size: Width and height of its images, [px].
+        name: For messages.
+    """
+    width, height = size
+    matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(name, width, height, matrix, np.zeros(5), Pose.level([0.0, 0.0, 0.0]), 10.0)
+
+
 def is_camera_matrix(matrix: Array) -> bool:
     """Whether entries of a 3 x 3 matrix below the diagonal are 0, and the last one is 1."""
     return bool(np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0.0, 0.0, 0.0, 1.0], 0.0, 1e-9))

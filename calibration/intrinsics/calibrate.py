@@ -32,8 +32,8 @@ from calibration.statistics import (
     student_factor,
     widened,
 )
-from calibration.targets.boards import Board, DetectedBoard, generic_camera, is_mirrored
-from model.cameras import Z_95
+from calibration.targets.boards import Board, DetectedBoard, is_mirrored
+from model.cameras import Z_95, generic_camera
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
 from tracking.camera_model import Image
@@ -180,6 +180,7 @@ class CameraCalibration:
         unused: Why each of the other images is not used, by name.
         data_hash: Of the corners used.
         previews: Reduced copies of the images used, by name; empty when fitted to corners.
+        board: The board in the images; None when fitted to corners.
     """
 
     size: tuple[int, int]
@@ -193,6 +194,7 @@ class CameraCalibration:
     unused: Mapping[str, str]
     data_hash: str
     previews: Mapping[str, Image] = field(default_factory=dict)
+    board: Board | None = None
 
     @property
     def error(self) -> float:
@@ -255,7 +257,8 @@ def fit_camera(
             left_out |= {f"{name}, {k}": "is detected more than once" for k in seen.twice}
     if size is None or len(views) < LEAST_VIEWS:
         raise _too_few(views, left_out, board, without.chosen())
-    return replace(calibrate_from_views(views, size, left_out, lens), previews=previews)
+    found = calibrate_from_views(views, size, left_out, lens)
+    return replace(found, previews=previews, board=board)
 
 
 def refit_camera(
@@ -292,7 +295,8 @@ def refit_camera(
     views = {name: seen for name, seen in again.items() if seen is not None}
     left_out = {name: NOT_FOUND for name in again if name not in views}
     found = calibrate_from_views(views, first.size, {**first.unused, **left_out}, lens)
-    return replace(found, previews={name: first.previews[name] for name in found.views})
+    previews = {name: first.previews[name] for name in found.views}
+    return replace(found, previews=previews, board=board)
 
 
 def _reduced(image: Image) -> Image:

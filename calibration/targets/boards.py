@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.cameras.live import silent_opencv
 from model.errors import BadInput
 from model.files.csv_table import CsvTable
-from model.pose import Array, Pose, read_only
+from model.pose import Array, read_only
 from model.rig import Camera
 from model.tag_families import FAMILIES
 from tracking.camera_model import Image
@@ -34,11 +36,13 @@ class DetectedBoard:
         corners: Where they are in the image, shape (n, 2), [px].
         twice: Numbers of markers or tags left out because they were detected more than once: it is
             unknown which of them is on the board.
+        marker: Side of a ChArUco board's markers by its corners, [m], to a few percent.
     """
 
     points: Array
     corners: Array
     twice: tuple[int, ...] = ()
+    marker: float = math.nan
 
 
 @runtime_checkable
@@ -84,21 +88,6 @@ def require_board(
     """
     if not holds:
         raise BadInput(what, next_step=next_step)
-
-
-# A camera of which only the image size is known.
-
-
-def generic_camera(size: tuple[int, int], name: str = "camera") -> Camera:
-    """A camera without distortion and with a horizontal field of view of about 53°.
-
-    Args:
-        size: Width and height of its images, [px].
-        name: For messages.
-    """
-    width, height = size
-    matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
-    return Camera(name, width, height, matrix, np.zeros(5), Pose.level([0.0, 0.0, 0.0]), 10.0)
 
 
 # Corners detected by another program, from a CSV file (docs/data-formats.md).
@@ -336,10 +325,19 @@ class Charuco:
         chosen = points[np.ravel(numbers)[found]]
         if len(chosen) < LEAST_POINTS or _in_a_line(chosen):
             return None
-        return DetectedBoard(chosen, better[found], twice)
+        side = _marker_side(np.reshape(squares, (1, -1, 2)), chosen, better[found])
+        return DetectedBoard(chosen, better[found], twice, side)
 
     def describe_other(self, image: Image) -> str:
-        """OpenCV's other pattern, else tags and markers that the image shows."""
+        """The board with rows and columns exchanged, else tags and markers in the image.
+
+        OpenCV's other pattern, too.
+        """
+        exchanged = replace(self, columns=self.rows, rows=self.columns)
+        for other in (exchanged, replace(exchanged, legacy=not self.legacy)):
+            if self.columns != self.rows and other.find(image) is not None:
+                legacy = " --legacy" if other.legacy else ""
+                return f"{other}: try --columns {other.columns} --rows {other.rows}{legacy}"
         if replace(self, legacy=not self.legacy).find(image) is not None:
             use = "without --legacy" if self.legacy else "with --legacy"
             drawn = "4.6 and later draw" if self.legacy else "before 4.6 drew"
@@ -377,12 +375,10 @@ class Charuco:
 
     @cached_property
     def _board(self) -> cv2.aruco.CharucoBoard:
-        board = cv2.aruco.CharucoBoard(
-            (self.columns, self.rows),
-            self.square,
-            self.marker,
-            cv2.aruco.getPredefinedDictionary(_ARUCO[self.dictionary]),
-        )
+        dictionary = cv2.aruco.getPredefinedDictionary(_ARUCO[self.dictionary])
+        size = (self.columns, self.rows)
+        with silent_opencv():  # it warns about markers almost as large as their squares
+            board = cv2.aruco.CharucoBoard(size, self.square, self.marker, dictionary)
         board.setLegacyPattern(self.legacy)
         return board
 
@@ -430,6 +426,19 @@ def _saddles(image: Image, rough: Array, gaps: Array) -> tuple[Array, NDArray[np
         found = np.clip(found + step, rough - gaps[:, None], rough + gaps[:, None])
     is_saddle = (np.abs(step).max(axis=1) < _SETTLED) & (curvature < -_LEAST_CURVATURE)
     return found, is_saddle
+
+
+def _marker_side(squares: Array, points: Array, corners: Array) -> float:
+    """Median side of markers in the board's plane, [m].
+
+    Args:
+        squares: Corners of m markers, shape (1, 4 m, 2), [px].
+        points: Corners of the board in its plane, shape (n, 3), [m].
+        corners: Where they are in the image, shape (n, 2), [px].
+    """
+    back, _ = cv2.findHomography(corners, points[:, :2])
+    flat = cv2.perspectiveTransform(squares, back).reshape(-1, 4, 2)
+    return float(np.median(np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2)))
 
 
 def _in_a_line(points: Array) -> bool:

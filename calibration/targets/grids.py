@@ -25,7 +25,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.targets.boards import LEAST_POINTS, DetectedBoard, generic_camera, require_board
+from calibration.targets.boards import LEAST_POINTS, DetectedBoard, require_board
+from model.cameras import generic_camera
 from model.pose import Array
 from model.rig import Camera
 from model.tag_families import FAMILIES, tags_in

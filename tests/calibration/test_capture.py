@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from calibration.pictures import VIDEO_IMAGES, CaptureGuide, open_images, open_source, same_images
-from calibration.targets.boards import Chessboard, DetectedBoard, generic_camera
+from calibration.targets.boards import Chessboard, DetectedBoard
 from drivers.cameras.live import VideoFile
+from model.cameras import generic_camera
 from model.pose import Array, Pose, matrix_from_rotation_vector
 
 SIZE = (1280, 720)
