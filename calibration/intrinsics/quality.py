@@ -281,20 +281,21 @@ def _bow_issues(bow: float, bent: float) -> list[Issue]:
 
 def _size_issues(result: CameraCalibration) -> list[Issue]:
     """Sizes of the board that the images contradict."""
-    what, step = "", "measure the print, and correct"
+    what = options = ""
     match result.board:
         case TagGrid() as grid:
             gap, share = _gap_of(result, grid)
             if share > _EXPLAINED:
-                step = f"{step} --tag-mm or --gap-mm"
+                options = "--tag-mm or --gap-mm"
                 what = f"gaps of {gap * 1e3:.3g} mm between tags of {grid.tag * 1e3:g} mm"
-                what = f"{what}, not {grid.gap * 1e3:g} mm"
+                what += f", not {grid.gap * 1e3:g} mm"
         case Charuco() as board:
-            marker = float(np.median([seen.marker for seen in result.views.values()]))
-            if abs(marker / board.marker - 1.0) > _OTHER_MARKER:
-                step = f"{step} --square-mm or --marker-mm"
-                what = f"markers of about {marker * 1e3:.2g} mm in squares of {board.square * 1e3:g} mm"
-                what = f"{what}, not {board.marker * 1e3:g} mm"
+            side = float(np.median([seen.marker for seen in result.views.values()]))
+            if abs(side / board.marker - 1.0) > _OTHER_MARKER:
+                options = "--square-mm or --marker-mm"
+                what = f"markers of about {side * 1e3:.2g} mm in squares of {board.square * 1e3:g}"
+                what += f" mm, not {board.marker * 1e3:g} mm"
+    step = f"measure the print, and correct {options}"
     return [Issue(f"the images fit {what}", step)] if what else []
 
 
