@@ -30,7 +30,7 @@ from model.cameras import generic_camera
 from model.pose import Array
 from model.rig import Camera
 from model.tag_families import FAMILIES, tags_in
-from tracking.camera_model import Image, distort_pixels, undistort_pixels
+from tracking.camera_model import Image, distort_pixels, has_rays, undistort_pixels
 from tracking.detection.detector import TagDetector
 from tracking.detection.diagnostics import diagnose_tags, row_numbering, tag_offsets
 from tracking.detection.tags import CORNER_SIGNS, dictionary, modules_across, upright_corners
@@ -94,17 +94,18 @@ class CircleGrid:
 
     def find(self, image: Image, camera: Camera | None = None) -> DetectedBoard | None:
         """Detects the centres of its circles, if all are visible."""
-        lens = camera or generic_camera((image.shape[1], image.shape[0]))
+        lens = camera or _plain_lens(image)
         times = max(1.0, max(image.shape) / _SEARCHED)
         small = image
         if times > 1.0:
             size = (round(image.shape[1] / times), round(image.shape[0] / times))
             small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         scale = np.array(image.shape[::-1]) / small.shape[::-1]
-        for white, picture in ((False, small), (True, 255 - small)):
-            found = self._found(np.asarray(picture))
+        for white, picture in ((False, small), (True, np.asarray(255 - small))):
+            found = self._found(picture)
             centres = None if found is None else self._upright((found + 0.5) * scale - 0.5)
             if centres is not None:
+                lens = lens if has_rays(lens, centres).all() else _plain_lens(image)
                 dark = np.asarray(255 - image) if white else image
                 return DetectedBoard(self.points(), self._refined(dark, centres, lens))
         return None
@@ -165,8 +166,10 @@ class CircleGrid:
         if turn is None:  # not after `_upright`
             return centres
         offsets, shapes = self._ellipses(turn, camera)
-        middles = [_centroid(dark, c, e) for c, e in zip(centres, shapes, strict=True)]
-        return np.asarray(np.array(middles) - offsets)
+        return (
+            np.array([_centroid(dark, *each) for each in zip(centres, shapes, strict=True)])
+            - offsets
+        )
 
     def _ellipses(self, turn: Array, camera: Camera) -> tuple[Array, Array]:
         """The circles' images: ellipses, but for the lens distortion.
@@ -187,9 +190,14 @@ class CircleGrid:
         rims = there[:, 1:] - there[:, :1]
         after = np.roll(rims, -1, axis=1)
         areas = rims[..., 0] * after[..., 1] - rims[..., 1] * after[..., 0]
-        offsets = np.einsum("nr,nri->ni", areas, rims + after) / (3.0 * areas.sum(axis=1))[:, None]
+        offsets = np.einsum("nr,nri->ni", areas, rims + after) / (3.0 * areas.sum(axis=1)[:, None])
         axes = 2.0 / _RIM * np.einsum("nri,rj->nij", rims, unit)
         return offsets, axes @ axes.transpose(0, 2, 1)
+
+
+def _plain_lens(image: Image) -> Camera:
+    """A camera of an image, without distortion."""
+    return generic_camera((image.shape[1], image.shape[0]))
 
 
 def _centroid(dark: Image, centre: Array, shape: Array) -> Array:
@@ -301,7 +309,7 @@ class TagGrid:
         Black and white may be inverted. None, too, where the tags contradict the board: where a
         tag's nearest neighbour is in another direction than by its number.
         """
-        lens = camera or generic_camera((image.shape[1], image.shape[0]))
+        lens = camera or _plain_lens(image)
         seen = self._seen_in(image, lens)
         return self._seen_in(np.asarray(255 - image), lens) if seen is None else seen
 
@@ -333,12 +341,13 @@ class TagGrid:
         counts = Counter(d.id for d in detected)
         detected = [d for d in detected if counts[d.id] == 1]
         rough = np.array([d.corners for d in detected]).reshape(-1, 4, 2)
-        squares = refine(image, camera, rough, modules_across(self.family))
-        whole = {
-            d.id: distort_pixels(camera, s.corners)
-            for d, s in zip(detected, squares, strict=True)
-            if s and s.whole
-        }
+        near, plain = has_rays(camera, rough).all(axis=1), _plain_lens(image)
+        whole = {}
+        for lens, which in ((camera, near), (plain, ~near)):
+            squares = refine(image, lens, rough[which], modules_across(self.family))
+            for k, square in zip(np.flatnonzero(which).tolist(), squares, strict=True):
+                if square and square.whole:
+                    whole[detected[k].id] = distort_pixels(lens, square.corners)
         return whole, tuple(number for number, count in counts.items() if count > 1)
 
     def _saddles(self, image: Image) -> tuple[dict[int, Array], tuple[int, ...]]:
@@ -395,7 +404,7 @@ class TagGrid:
         """The grid by its tags' neighbours, where some of its own numbers are among them."""
         most = tags_in(self.family)
         every = replace(self, columns=most, rows=1, first=0)
-        squares, _ = every._squares(image, generic_camera((image.shape[1], image.shape[0])))
+        squares, _ = every._squares(image, _plain_lens(image))
         own = range(self.first, self.first + self.columns * self.rows)
         rows = row_numbering(squares)
         if rows is None or not any(number in own for number in squares):
