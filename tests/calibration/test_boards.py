@@ -20,6 +20,7 @@ from calibration.procedures import calibrate_camera
 from calibration.statistics import EvenSample
 from calibration.targets.boards import Charuco, Chessboard, is_mirrored
 from calibration.targets.grids import CircleGrid, TagGrid
+from model.cameras import generic_camera
 from model.errors import BadInput
 from model.pose import Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import (
@@ -30,6 +31,7 @@ from tests.calibration.board_pictures import (
     poses_before_the_camera,
     with_noise,
 )
+from tracking.camera_model import has_rays
 from tracking.detection.diagnostics import RowNumbering, row_numbering, tag_offsets
 
 CHARUCO = Charuco(7, 5, 0.040, 0.030, "4X4_50")
@@ -443,6 +445,27 @@ def test_rows_and_columns_of_a_charuco_board_exchanged_are_named() -> None:
     exchanged = replace(CHARUCO, columns=5, rows=7)
     assert exchanged.find(image) is None
     assert "7 x 5 squares with 4X4_50: try --columns 7 --rows 5" in exchanged.describe_other(image)
+
+
+def test_images_that_can_be_read_only_once_are_refused() -> None:
+    """Corners of tags are detected twice; without the second time they would be biased."""
+    images = whole_pictures(TAGS, 40)
+    with pytest.raises(BadInput, match="cannot be read again"):
+        calibrate_camera(ImageSet(iter(images), len(images)), TAGS, lens="five")
+
+
+@pytest.mark.parametrize("board", [TAGS, CIRCLES])
+def test_boards_where_a_lens_has_no_rays_are_found_as_without_it(board) -> None:
+    """As by a fisheye more than 90° off its axis, which straight lines do not describe."""
+    own = pictures(board) if board is TAGS else grid_pictures(board)
+    image = next(image for image, _ in own if board.find(image) is not None)
+    matrix = np.array([[60.0, 0.0, -40.0], [0.0, 60.0, -40.0], [0.0, 0.0, 1.0]])
+    wide = replace(generic_camera(SIZE), matrix=matrix, distortion=np.zeros(4), lens="fisheye")
+    plain, seen = board.find(image), board.find(image, wide)
+    far = ~has_rays(wide, plain.corners)
+    assert far.sum() > 16
+    np.testing.assert_array_equal(seen.points, plain.points)
+    np.testing.assert_allclose(seen.corners[far], plain.corners[far], atol=0.5)
 
 
 @given(count=st.integers(0, 200), wanted=st.integers(1, 7))

@@ -173,3 +173,11 @@ def test_of_two_videos_images_with_the_same_numbers_are_used(
     first, second = ([name for name, _ in one.images] for one in samples)
     assert first == second
     assert len(first) == samples[0].count == samples[1].count == min(20, *lengths)
+
+
+def test_the_images_of_a_video_can_be_read_repeatedly(tmp_path: Path) -> None:
+    """For boards that are detected again with the lens."""
+    images = open_images(video_of(tmp_path / "board.avi", 100))
+    first, second = ([(name, image.tobytes()) for name, image in images.images] for _ in range(2))
+    assert len(first) == images.count
+    assert first == second
