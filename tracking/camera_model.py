@@ -183,6 +183,18 @@ def pixels_of(camera: Camera, points_in_camera: Array) -> Array:
     return project(camera.lens, camera.matrix, camera.distortion, points_in_camera)
 
 
+_ROUND_TRIP = 0.01
+"""Pixels undistorted and distorted again return within this, [px], where the lens has rays."""
+
+
+def has_rays(camera: Camera, pixels: Array) -> NDArray[np.bool_]:
+    """Whether points, shape (..., 2), [px], can be undistorted: not 90° off the axis; (...)."""
+    if not pixels.size:
+        return np.ones(pixels.shape[:-1], dtype=np.bool_)
+    back = distort_pixels(camera, undistort_pixels(camera, pixels))
+    return np.asarray(np.abs(back - pixels).max(axis=-1) < _ROUND_TRIP)
+
+
 def project_undistorted(camera: Camera, points_in_camera: Array) -> Array:
     """Undistorted pixels of points, shape (..., 3), [m]; shape (..., 2)."""
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
