@@ -327,12 +327,19 @@ class _Check:
         self, name: str, closest: Closest, proof: Smallest, required: float
     ) -> None:
         pair = f"{closest.nearest.first} – {closest.nearest.second}"
-        if not proof.value >= required:
-            what = f"{name} too small, {pair}"
-            self._violation(what, proof.value, required, "mm", closest.pose.position)
-        elif not proof.proved >= required:
-            what = f"{name} not proved between samples, {pair}"
-            self._violation(what, proof.proved, required, "mm", closest.pose.position)
+        what = (f"{name} too small, {pair}", f"{name} not proved between samples, {pair}")
+        self._smallest_violation(what, proof, required, "mm")
+
+    def _smallest_violation(
+        self, what: tuple[str, str], proof: Smallest, limit: float, unit: str
+    ) -> None:
+        """``what`` is said of a sample below the limit, and of a bound below it between samples."""
+        below, unproved = what
+        position = self._pose(proof.at).position
+        if not proof.value >= limit:
+            self._violation(below, proof.value, limit, unit, position)
+        elif not proof.proved >= limit:
+            self._violation(unproved, proof.value, limit, unit, position, proof.proved)
 
     def _margin(self) -> Smallest:
         load = self.scene.load
@@ -350,10 +357,11 @@ class _Check:
 
         tolerance = MARGIN_TOLERANCE * self.rig.max_tension
         found = smallest_along(self.samples, evaluate, self._margin_slope(), 0.0, tolerance)
-        if not found.proved >= 0.0:
-            what = "the cables cannot hold every required load: capacity margin"
-            position = self._pose(found.at).position
-            self._violation(what, min(found.value, found.proved), 0.0, "N", position)
+        what = (
+            "the cables cannot hold every required load: capacity margin",
+            "capacity margin not proved between samples",
+        )
+        self._smallest_violation(what, found, 0.0, "N")
         return found
 
     def _margin_slope(self) -> float:
@@ -414,9 +422,16 @@ class _Check:
         return largest
 
     def _violation(
-        self, what: str, measured: float, limit: float, unit: str, position: Array
+        self,
+        what: str,
+        measured: float,
+        limit: float,
+        unit: str,
+        position: Array,
+        proved: float | None = None,
     ) -> None:
-        self.violations.append(Violation(what, float(measured), float(limit), unit, position))
+        figures = float(measured), float(limit)
+        self.violations.append(Violation(what, *figures, unit, position, proved))
 
 
 def axis_distances(rig: Rig, pose: Pose) -> Array:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from model.clearance import ClearanceModel
@@ -148,6 +149,33 @@ def test_a_load_that_cannot_be_held_is_a_violation_not_a_crash(gachon, scene_wit
     assert "no tensions within the limits" in kinds(report)
     assert math.isnan(report.min_tension)
     assert report.as_dict()["min_tension_n"] is None
+
+
+@pytest.mark.parametrize(
+    ("smallest", "what", "is_proved"),
+    [(-0.5, "cannot hold every required load", False), (1e-5, "not proved between samples", True)],
+)
+def test_a_margin_violation_states_the_margin_at_its_position(
+    gachon, scene_with, smallest, what, is_proved
+) -> None:
+    def scene(force: float):
+        return scene_with(load={"force_n": [force] * 3}, goal={"position_mm": [60.0, 40.0, 480.0]})
+
+    def margin(force: float, positions) -> float:
+        return capacity_margins(gachon, scene(force), np.array(positions), np.eye(3)).min()
+
+    ends = scene(0.0)
+    line = np.linspace(ends.start.position, ends.goal.position, 201)
+    force = brentq(lambda force: margin(force, line) - smallest, 0.0, 100.0, xtol=1e-13)
+    report = check_path(gachon, scene(force), [ends.start, ends.goal])
+    (violation,) = (v for v in report.violations if "margin" in v.what)
+    assert what in violation.what
+    assert violation.measured == pytest.approx(smallest, abs=1e-6)
+    assert violation.measured == pytest.approx(margin(force, [violation.position]), abs=1e-9)
+    assert violation.measured == report.capacity_margin
+    assert (violation.proved == report.proved_capacity_margin) == is_proved
+    assert f"{violation.measured:.4g} N" in violation.sentence()
+    assert ("proved -" in violation.sentence()) == is_proved
 
 
 def test_disturbances_count_although_the_weight_alone_is_held(gachon, scene_with) -> None:
