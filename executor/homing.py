@@ -21,6 +21,7 @@ from executor.drives import is_simulated, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
 from executor.proposals import Facts, ForgetProposal, HomingProposal, require_confirmed
+from executor.realtime.scheduling import require_imported_script
 from executor.remote.command_server import commands_from_start
 from executor.supervision import RequestBoard, Supervisor
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
@@ -198,6 +199,7 @@ def use_rig_file_counts(
         Refused: The bus is latched, or not all encoders are absolute.
         StoppedByOperator: Cancelled.
     """
+    require_imported_script()
     interlock = MotionInterlock(rig)
     interlock.require_rig_file_counts()
     require_confirmed(confirm, ForgetProposal(interlock))

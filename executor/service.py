@@ -36,6 +36,7 @@ from executor.interlock.locks import SetUpLock
 from executor.interlock.reference import RESTARTED
 from executor.proposals import Facts, ReleaseProposal, ResetProposal, require_confirmed
 from executor.realtime.process import real_time_process
+from executor.realtime.scheduling import require_imported_script
 from executor.realtime.shared_memory import SharedRequests
 from executor.remote.client import preparations
 from executor.remote.command_server import Commands, commands_from_start
@@ -316,6 +317,7 @@ def reset(
         CdprError: A run is active; or a drive does not answer, may not be reset now, or stays in
             fault.
     """
+    require_imported_script()
     require_other_process(rig)
     settings = BusSettings.of(rig)
     latch = FaultLatch(settings)
