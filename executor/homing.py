@@ -34,6 +34,7 @@ from model.errors import (
     require_functions,
     require_types,
     sequence_of,
+    truth_value,
 )
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
@@ -132,6 +133,8 @@ def home(
     """
     require_types((rig, Rig), (listener, Listener), optional=[(pose, Pose)])
     require_functions(confirm=confirm)
+    at_home, realtime = truth_value("at_home", at_home), truth_value("realtime", realtime)
+    need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     in_process = is_simulated(rig)
     require_own_time(rig, realtime)
     if isinstance(camera, str | int | np.integer):

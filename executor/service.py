@@ -43,7 +43,7 @@ from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import WinchStatus, bus_name
 from executor.state_machine import State
 from executor.supervision import Supervisor
-from model.errors import CdprError
+from model.errors import CdprError, truth_value
 from model.files.documents import PoseDocument
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -386,6 +386,7 @@ def release(
         CdprError: The bus is latched, or the drives could not be configured; or they were not
             released, and a fault is latched.
     """
+    need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     require_other_process(rig)
     interlock = MotionInterlock(rig)
     with commands_from_start("release", rig, supervisor, realtime=True) as commands:
