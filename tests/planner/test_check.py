@@ -14,8 +14,8 @@ from model.errors import Refused
 from model.kinematics import structure_matrix
 from model.plan import plan_from_document, sealed
 from model.pose import Pose, interpolate
-from model.rig import rig_from_document
-from planner.check import _Check, check_path, verify
+from model.rig import Rig, rig_from_document
+from planner.check import _Check, axis_distances, check_path, verify
 from planner.check_report import VerifiedPlan
 from planner.costs import capacity_margins
 from planner.path import PosePath
@@ -209,6 +209,47 @@ def test_a_path_that_turns_the_platform_is_checked_too(gachon, scene_with) -> No
     assert "self clearance" in kinds(
         check_path(gachon, scene_with(), [gachon.home, far], ends=False)
     )
+
+
+def test_a_rotation_violation_states_where_the_rotation_is_largest(gachon, scene_with) -> None:
+    scene = scene_with(rotation_limits={"tilt_deg": 3.0, "turn_deg": 180.0})
+    position = np.add(gachon.home.position, [0.05, 0.0, 0.0])
+    goal = Pose(position, Rotation.from_euler("x", 0.1).as_matrix())
+    report = check_path(gachon, scene, [gachon.home, goal, gachon.home], ends=False)
+    (violation,) = (v for v in report.violations if "tilted" in v.what)
+    assert violation.measured == pytest.approx(0.1)
+    assert violation.position == pytest.approx(goal.position)
+
+
+def test_a_speed_violation_and_the_report_state_the_fastest_sample(gachon, scene_with) -> None:
+    """Slow at first, as the cable is nearly at right angles to the path, then faster."""
+    document = gachon.document
+    slow = [w.model_copy(update={"max_speed_mm_s": 5.0}) for w in document.winches]
+    rig = rig_from_document(document.model_copy(update={"winches": slow}))
+    path = [Pose.level(p) for p in ([0.1, 0.1, 0.6], [0.1, 0.1, 0.4], [0, 0, 0.4])]
+    report = check_path(rig, scene_with(), path, ends=False)
+    assert (
+        report.max_cable_speed == check_path(gachon, scene_with(), path, ends=False).max_cable_speed
+    )
+    (violation,) = (v for v in report.violations if "faster" in v.what)
+    assert violation.measured == report.max_cable_speed
+    cable = int(violation.what.split()[1]) - 1
+    row = structure_matrix(rig, Pose.level(violation.position))[:3, cable]
+    direction = np.array([-1.0, -1.0, 0.0]) / math.sqrt(2.0)
+    assert abs(row @ direction) * rig.motion.speed == pytest.approx(violation.measured)
+
+
+def test_a_cable_near_its_pulleys_axis_is_reported_with_its_distance(gachon, scene_with) -> None:
+    pulleys = {"radius_mm": 13.0, "feed_directions": [[0.0, 0.0, 1.0]] * 8}
+    rig = Rig.from_dict({**gachon.as_dict(), "pulleys": pulleys})
+    x, y, _ = rig.outlets[0] - rig.anchors[0]
+    below = Pose.level([x - np.sign(x) * 0.04, y, 0.3])
+    report = check_path(rig, scene_with(), [below, gachon.home], ends=False)
+    (violation,) = (v for v in report.violations if "pulley's axis" in v.what)
+    reach = axis_distances(rig, Pose.level(violation.position))
+    cable = int(violation.what.split()[1]) - 1
+    assert violation.measured == reach[cable] == reach.min()
+    assert violation.limit == pytest.approx(4 * 0.013 + 0.005)
 
 
 @pytest.mark.parametrize("name", ["gachon", "hall"])
