@@ -381,6 +381,7 @@ def calibrate_rig(
     if len(of_poses) != 2:
         raise BadInput(f"pose_deviations must be two numbers [m, rad], not {len(of_poses)}")
     measured_point = read_only(point_of("reflector", reflector))
+    without_poses = truth_value("without_poses", without_poses)
     require_file_name(name, "`name=`")
     given = [data] if isinstance(data, str | PathLike) else sequence_of("data", data)
     paths = [path_of(one) for one in given]
@@ -391,7 +392,7 @@ def calibrate_rig(
         swivel_deviation=swivel_deviation,
         imu_deviation=imu_deviation,
     )
-    if truth_value("without_poses", without_poses):
+    if without_poses:
         measured = measured.without_poses()
     to = Destination.of(output)
     to.require_free("rig", name)

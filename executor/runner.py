@@ -47,6 +47,7 @@ from model.errors import (
     path_of,
     require_functions,
     require_types,
+    truth_value,
 )
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
@@ -125,11 +126,12 @@ def run(
     """
     require_types((plan, Plan), (rig, Rig), (listener, Listener), optional=[(start, Pose)])
     require_functions(confirm=confirm, on_event=on_event)
+    realtime = truth_value("realtime", realtime)
     options = RunOptions(
         realtime=realtime,
         start=start,
-        clearance_stop=clearance_stop,
-        need_real_time_rights=need_real_time_rights,
+        clearance_stop=truth_value("clearance_stop", clearance_stop),
+        need_real_time_rights=truth_value("need_real_time_rights", need_real_time_rights),
         listener=listener,
         confirm=confirm,
         on_event=on_event,

@@ -36,13 +36,14 @@ from executor.interlock.locks import SetUpLock
 from executor.interlock.reference import RESTARTED
 from executor.proposals import Facts, ReleaseProposal, ResetProposal, require_confirmed
 from executor.realtime.process import real_time_process
+from executor.realtime.scheduling import require_imported_script
 from executor.realtime.shared_memory import SharedRequests
 from executor.remote.client import preparations
 from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import WinchStatus, bus_name
 from executor.state_machine import State
 from executor.supervision import Supervisor
-from model.errors import CdprError
+from model.errors import CdprError, truth_value
 from model.files.documents import PoseDocument
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -316,6 +317,7 @@ def reset(
         CdprError: A run is active; or a drive does not answer, may not be reset now, or stays in
             fault.
     """
+    require_imported_script()
     require_other_process(rig)
     settings = BusSettings.of(rig)
     latch = FaultLatch(settings)
@@ -384,6 +386,7 @@ def release(
         CdprError: The bus is latched, or the drives could not be configured; or they were not
             released, and a fault is latched.
     """
+    need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     require_other_process(rig)
     interlock = MotionInterlock(rig)
     with commands_from_start("release", rig, supervisor, realtime=True) as commands:

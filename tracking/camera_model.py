@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from model.errors import BadInput
 from model.files.camera_file import FISHEYE, Gamma
-from model.pose import Array
+from model.pose import Array, require_unmasked
 from model.rig import Camera
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
@@ -227,8 +227,9 @@ def require_image_format(image: Image, camera: Camera, rig: str) -> None:
         rig: Name of the rig.
 
     Raises:
-        BadInput: It is not grey with 8 bits, or not of the camera's size.
+        BadInput: It is not grey with 8 bits, not of the camera's size, or has masked pixels.
     """
+    require_unmasked(image)
     wanted = (camera.height, camera.width)
     if image.shape != wanted or image.dtype != np.uint8:
         size = " x ".join(map(str, image.shape[1::-1] if image.ndim > 1 else image.shape))

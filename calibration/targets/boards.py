@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.live import silent_opencv
-from model.errors import BadInput
+from model.errors import BadInput, truth_value
 from model.files.csv_table import CsvTable
 from model.pose import Array, read_only
 from model.rig import Camera
@@ -281,9 +281,10 @@ class Charuco:
         """Refuses impossible boards.
 
         Raises:
-            BadInput: Too few squares, a marker that does not fit its square, or a dictionary that
-                is unknown or has too few markers.
+            BadInput: Too few squares, a marker that does not fit its square, a dictionary that is
+                unknown or has too few markers, or another value for ``legacy``.
         """
+        truth_value("legacy", self.legacy)
         require_board(min(self.columns, self.rows) >= 3, "a ChArUco board needs 3 squares per side")
         require_board(0.0 < self.marker < self.square, "a marker must be smaller than its square")
         require_board(

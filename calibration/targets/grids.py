@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from calibration.targets.boards import LEAST_POINTS, DetectedBoard, require_board
 from model.cameras import generic_camera
+from model.errors import truth_value
 from model.pose import Array
 from model.rig import Camera
 from model.tag_families import FAMILIES, tags_in
@@ -71,8 +72,10 @@ class CircleGrid:
         """Refuses impossible boards.
 
         Raises:
-            BadInput: Too few circles, a size not above 0, or circles that touch.
+            BadInput: Too few circles, a size not above 0, circles that touch, or another value for
+                ``asymmetric``.
         """
+        truth_value("asymmetric", self.asymmetric)
         require_board(min(self.columns, self.rows) >= 3, "a circle grid needs 3 circles per side")
         apart = self.spacing * (np.sqrt(2.0) if self.asymmetric else 1.0)
         require_board(0.0 < self.diameter < apart, "circles must be larger than 0 mm and not touch")

@@ -164,6 +164,13 @@ class WinchDocument(Document):
         default=None, description="E·A of its cable; left out, cables.stiffness_n"
     )
 
+    @field_validator("direction", mode="before")
+    @classmethod
+    def _no_truth_value(cls, direction: object) -> object:
+        if isinstance(direction, bool):  # which equals 1 in Python
+            raise ValueError(f"must be -1 or 1; it is {str(direction).lower()}")
+        return direction
+
 
 class MotionDocument(Document):
     """Limits of motion along a plan."""
