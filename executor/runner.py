@@ -57,6 +57,8 @@ from tracking.shared_errors import require_stated_errors
 
 __all__ = ["RunOptions", "RunResult", "run", "run_prepared"]
 
+_PASS_THE_RIG = "; then plan again, or pass --rig FILE, in Python `rig=`: a plan contains its rig"
+
 #: Rate of progress reports without a camera, [Hz].
 PROGRESS_RATE = 10.0
 
@@ -142,7 +144,8 @@ def run(
         require_synthetic_images(chosen.values(), not realtime)
         require_own_time(rig, realtime)
         if plan.scene.obstacles:
-            require_stated_errors(rig, list(chosen))
+            is_sealed = rig.document.cameras == plan.rig.document.cameras
+            require_stated_errors(rig, list(chosen), then=_PASS_THE_RIG if is_sealed else "")
         require_simulated_start(rig, start)
         output = dated_folder() if folder is None else path_of(folder)
         RunFolder.require_free(output)

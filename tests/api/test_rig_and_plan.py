@@ -309,7 +309,11 @@ def test_arguments_that_contradict_each_other_are_refused(rig: cdpr.Rig, scene: 
         (lambda *_: cdpr.track("r.yaml", 0), "a Rig, not text", "cdpr.load_rig('r.yaml')"),
         (lambda *_: cdpr.workspace_map("r.yaml"), "a Rig", "cdpr.load_rig('r.yaml')"),
         (lambda rig, scene: rig.at(rig.home, scene), "a Load, not Scene", "scene.load"),
-        (lambda rig, _: rig.plot([0, 0, 1]), "a Pose, not list", "cdpr.Pose.level([0, 0, 1])"),
+        (
+            lambda rig, _: rig.plot([0, 0, 1]),
+            "a Pose, not list",
+            "pass cdpr.Pose.level([0, 0, 1]), with the position in metres",
+        ),
         (lambda rig, scene: rig.plot(scene), "a Pose, not Scene", "cdpr.Pose.level"),
         (lambda rig, _: rig.clipped([0, 0, 1]), "a Pose, not list", "Pose.level([0, 0, 1])"),
         (lambda _, scene: scene.changed(start=[0, 0, 1]), "a Pose, not list", "Pose.level("),

@@ -437,7 +437,7 @@ def test_the_report_sets_every_number_beside_the_rig_files(rig: Rig, found: RigC
         if not name.endswith("_n"):  # of any size: with its hundredths
             assert all("." in text for text in (before, new, change)), name
     page = rig_page(found, quality, "<b>rig</b>", "2026-03-14")
-    assert f"{quality.before * 1e3:.2f} → {quality.held_out * 1e3:.2f} <small>mm" in page
+    assert f"{quality.before * 1e3:.2f} → {quality.held_out * 1e3:.2f}\u00a0<small>mm" in page
     assert "good enough" in page
     assert "<b>rig</b>" not in page
     for head in ("rig file", "new", "change", "± 95 %"):
