@@ -310,6 +310,53 @@ def resting_drives_of(
     return open_drives(rig, rig.home, load, to_reset=to_reset, configure_as=configure_as)
 
 
+# Status of drives at rest.
+
+
+@dataclass(frozen=True, slots=True)
+class DriveStatus:
+    """Status of one drive.
+
+    Attributes:
+        node: Its node ID.
+        state: Of its state machine, as text.
+        position: Of its encoder, [counts].
+        tension: Of its cable, from the drive's torque, [N].
+        set_up: It has the configuration for this rig: no power cycle or other cycle time since.
+        error: The error that a drive in fault stores; empty if it has none.
+    """
+
+    node: int
+    state: str
+    position: int
+    tension: float
+    set_up: bool
+    error: str = ""
+
+
+def drive_statuses(rig: Rig, seen: DriveSnapshot) -> tuple[DriveStatus, ...]:
+    """The status of each drive that answered."""
+    columns = zip(
+        [winch for winch in rig.winches if winch.node_id not in seen.silent],
+        drive_states(rig, seen.status_words.tolist()),
+        seen.positions.tolist(),
+        seen.torques.tolist(),
+        seen.errors,
+        strict=True,
+    )
+    return tuple(
+        DriveStatus(
+            node=winch.node_id,
+            state=state,
+            position=position,
+            tension=torque / 1000.0 * winch.torque_constant,
+            set_up=winch.node_id not in seen.restarted,
+            error=error,
+        )
+        for winch, state, position, torque, error in columns
+    )
+
+
 # Forward kinematics from drive positions.
 
 
