@@ -76,7 +76,11 @@ class CameraNews:
 
 
 class MultiCameraMonitor:
-    """Fuses the samples of all cameras, frame by frame."""
+    """Fuses the samples of all cameras, frame by frame, and monitors their clearance.
+
+    The fused clearance and that of each camera are monitored, so no camera delays or prevents a
+    stop for which another one suffices.
+    """
 
     def __init__(
         self, names: Sequence[str], model: ClearanceModel, limit: float, rate: float
@@ -94,8 +98,9 @@ class MultiCameraMonitor:
         self.news: list[CameraNews] = []
         """New conditions since the reader cleared the list."""
         self._model, self._several = model, len(names) > 1
-        # One per camera: if cameras disagree, the correct one is unknown.
-        self._watches = {name: ClearanceMonitor(limit) for name in names}
+        # Of the fused pose ("") and of each camera: fusion with a poor one must not hide what a
+        # good one measures, and if they disagree, the correct one is unknown.
+        self._watches = {name: ClearanceMonitor(limit) for name in ("", *names)}
         self._within = 0.5 / rate
         self._common = MultiCameraFusion(self._within)
         self._moments = self._disagree = 0
@@ -111,17 +116,18 @@ class MultiCameraMonitor:
         picture = next((sample.picture for sample in samples.values() if sample.picture), "")
         each = {name: sample.found for name, sample in samples.items()}
         found = self._common.of(each) if self._several else next(iter(each.values()))
+        poses = {name: one for name, one in each.items() if isinstance(one, PoseMeasurement)}
+        clearance = None
         if isinstance(found, PoseMeasurement):
             self._count_disagreement("")
             clearance = clearance_of(self._model, found)
-            for name in self._watches:
-                self._watch(name, clearance, "")
-            return CameraSample(frame, found, picture, clearance=clearance)
-        poses = {name: one for name, one in each.items() if isinstance(one, PoseMeasurement)}
-        self._count_disagreement(found.reason if poses else "")
-        for name, one in poses.items():
-            self._watch(name, clearance_of(self._model, one), f", measured by camera {name} alone")
-        return CameraSample(frame, found, picture)
+            self._watch("", clearance)
+        else:
+            self._count_disagreement(found.reason if poses else "")
+        if self._several:
+            for name, one in poses.items():
+                self._watch(name, clearance_of(self._model, one))
+        return CameraSample(frame, found, picture, clearance=clearance)
 
     def finish(self) -> None:
         """Reports how often images were left out because they were too far apart in time."""
@@ -133,10 +139,10 @@ class MultiCameraMonitor:
             )
             self.news.append(CameraNews("pictures_dropped", text))
 
-    def _watch(self, name: str, clearance: MeasuredClearance | None, suffix: str) -> None:
+    def _watch(self, name: str, clearance: MeasuredClearance | None) -> None:
         near = self._watches[name].take(clearance)
         if near and not self.near:
-            self.near = near + suffix
+            self.near = near + (f", measured by camera {name} alone" if name else "")
 
     def _count_disagreement(self, reason: str) -> None:
         self._disagree = self._disagree + 1 if reason else 0
