@@ -135,8 +135,7 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
     own = [one.covariance + unstated for one in poses]
     weights = np.linalg.inv([c + one.shared for c, one in zip(own, poses, strict=True)])
     parts = np.linalg.solve(weights.sum(axis=0), weights)
-    gaps = [step_between(first.pose, one.pose) for one in poses]
-    step = np.einsum("nij,nj->i", parts, gaps)
+    step = np.einsum("nij,nj->i", parts, [step_between(first.pose, one.pose) for one in poses])
     covariance = np.einsum("nij,njk,nlk->il", parts, own, parts)
     return replace(
         first,
@@ -188,9 +187,9 @@ def _chi_squared_95(freedom: int) -> float:
 def _shared(poses: Sequence[PoseMeasurement], parts: Array) -> Array:
     """Covariance of the mean from errors of lenses, extrinsics and tags, shape (6, 6).
 
-    Extrinsics found from the same tags have correlated errors of unknown correlation. Whatever it
-    is, the covariance of a sum is at most the sum of covariances, each divided by a share; here
-    the shares, which add up to 1, are in proportion to the errors (Cauchy and Schwarz).
+    Extrinsics found from the same tags have correlated errors of unknown correlation. At worst the
+    covariance of their sum is the sum of covariances, each divided by a share: here the shares,
+    which add up to 1, are in proportion to the errors (Cauchy and Schwarz).
     """
     each = np.array([part @ one.shared @ part.T for one, part in zip(poses, parts, strict=True)])
     sizes = np.sqrt(np.einsum("nii,i->n", each, UNSTATED_ERROR**-2.0))

@@ -116,18 +116,23 @@ class MultiCameraMonitor:
         picture = next((sample.picture for sample in samples.values() if sample.picture), "")
         each = {name: sample.found for name, sample in samples.items()}
         found = self._common.of(each) if self._several else next(iter(each.values()))
-        poses = {name: one for name, one in each.items() if isinstance(one, PoseMeasurement)}
         clearance = None
         if isinstance(found, PoseMeasurement):
             self._count_disagreement("")
             clearance = clearance_of(self._model, found)
             self._watch("", clearance)
         else:
-            self._count_disagreement(found.reason if poses else "")
+            seen = any(isinstance(one, PoseMeasurement) for one in each.values())
+            self._count_disagreement(found.reason if seen else "")
         if self._several:
-            for name, one in poses.items():
-                self._watch(name, clearance_of(self._model, one))
+            for name, sample in samples.items():
+                self.watch_alone(name, sample)
         return CameraSample(frame, found, picture, clearance=clearance)
+
+    def watch_alone(self, name: str, sample: CameraSample) -> None:
+        """Monitors what one of several cameras measured, also too late to be fused."""
+        if isinstance(sample.found, PoseMeasurement):
+            self._watch(name, clearance_of(self._model, sample.found))
 
     def finish(self) -> None:
         """Reports how often images were left out because they were too far apart in time."""
@@ -294,9 +299,13 @@ class RunCameras:
             rounds += 1
 
     def _put(self, client: CameraClient, sample: CameraSample | None) -> None:
+        if sample is None:
+            return
         for frame_set in self._open:
-            if sample is not None and frame_set.trigger.frame == sample.frame:
+            if frame_set.trigger.frame == sample.frame:
                 frame_set.samples[client.name] = sample
+                return
+        self._common.watch_alone(client.name, sample)
 
     def _process_complete(self, last: bool = False) -> None:
         """Fuses complete frames; in order, except that none waits for a late one without a pose."""

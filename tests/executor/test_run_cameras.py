@@ -271,6 +271,20 @@ def test_another_camera_never_delays_a_stop(
             assert both or not alone
 
 
+@pytest.mark.parametrize("late", [0, 1, 2, 5])
+@pytest.mark.parametrize("shift", [-0.02, 0.02])
+def test_a_slow_camera_stops_a_run_too(late: int, shift: float) -> None:
+    """Also where a fast one is fused without waiting for it."""
+    limit = (nearest_at(0.0).at_most + nearest_at(shift).at_most) / 2.0
+    near = nearest_at(shift).at_most < limit
+    cameras: list[Any] = [Scripted("fast", [0], 0.0 if near else shift)]
+    cameras.append(Scripted("slow", [late], shift if near else 0.0))
+    run = RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE)
+    for k in range(2 * late + 6):
+        run.trigger(k / RATE, k / RATE, None, None)
+    assert run.near.endswith("measured by camera slow alone")
+
+
 def test_the_camera_that_alone_measures_too_little_clearance_is_named() -> None:
     """Its pose agrees with that of the other camera, and their mean is far enough away."""
     fine, shifts = (0.1, 0.2, 0.0), {"front": 0.0, "side": 1.0}
