@@ -88,7 +88,7 @@ class MultiCameraFusion:
 
 
 def fuse_poses(seen: Mapping[str, Observation]) -> Observation:
-    """The information-weighted mean of all poses.
+    """The mean of all poses, weighted by the inverse of their covariances with shared errors.
 
     Where they disagree by more than their stated errors explain, its covariance is wider.
     Of three or more cameras, one that disagrees with the others is dropped; of two that disagree it
@@ -137,19 +137,21 @@ def _mean(poses: list[PoseMeasurement]) -> PoseMeasurement:
     if len(poses) == 1:
         return first
     unstated = _unstated_covariance(poses)
-    weights = [np.linalg.inv(one.covariance + unstated) for one in poses]
-    covariance = np.linalg.inv(np.sum(weights, axis=0))
-    steps = [w @ step_between(first.pose, one.pose) for w, one in zip(weights, poses, strict=True)]
-    step = covariance @ np.sum(steps, axis=0)
+    own = [one.covariance + unstated for one in poses]
+    weights = np.linalg.inv([c + one.shared for c, one in zip(own, poses, strict=True)])
+    parts = np.linalg.solve(weights.sum(axis=0), weights)
+    step = np.einsum("nij,nj->i", parts, [step_between(first.pose, one.pose) for one in poses])
+    covariance = np.einsum("nij,njk,nlk->il", parts, own, parts)
     return replace(
         first,
         pose=moved(first.pose, step),
         covariance=read_only((covariance + covariance.T) / 2.0),
         tags=tuple(sorted({number for one in poses for number in one.tags})),
         reprojection=float(np.sqrt(np.mean([one.reprojection**2 for one in poses]))),
-        shared=_shared(poses, [covariance @ weight for weight in weights]),
+        shared=_shared(poses, parts),
         unstated=any(one.unstated for one in poses),
-        cable_error=max(one.cable_error for one in poses),
+        # 0 where calibrations state it: an operator's value replaces only what is not stated.
+        cable_error=min(one.cable_error for one in poses),
     )
 
 
@@ -187,16 +189,17 @@ def _chi_squared_95(freedom: int) -> float:
     return float(freedom * (1.0 - share + 1.645 * np.sqrt(share)) ** 3)
 
 
-def _shared(poses: Sequence[PoseMeasurement], parts: Sequence[Array]) -> Array:
-    """Covariance of the mean from errors of extrinsics and tags, shape (6, 6).
+def _shared(poses: Sequence[PoseMeasurement], parts: Array) -> Array:
+    """Covariance of the mean from errors of lenses, extrinsics and tags, shape (6, 6).
 
-    Extrinsics found from the same tags have correlated errors of unknown correlation: the square of
-    a sum of n errors is at most n times the sum of their squares.
+    Extrinsics found from the same tags have correlated errors of unknown correlation. At worst the
+    covariance of their sum is the sum of covariances, each divided by a share: here the shares,
+    which add up to 1, are in proportion to the errors (Cauchy and Schwarz).
     """
-    total = np.zeros((6, 6))
-    for one, part in zip(poses, parts, strict=True):
-        total += part @ one.shared @ part.T
-    return read_only(len(poses) * total)
+    each = np.array([part @ one.shared @ part.T for one, part in zip(poses, parts, strict=True)])
+    sizes = np.sqrt(np.einsum("nii,i->n", each, UNSTATED_ERROR**-2.0))
+    some = sizes > 0.0
+    return read_only(sizes.sum() * np.einsum("nij,n->ij", each[some], 1.0 / sizes[some]))
 
 
 class ClockComparison:

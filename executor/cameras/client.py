@@ -12,8 +12,8 @@ import numpy as np
 from executor.cameras.process import CameraProcess, CameraSample, FrameRequest, sample_without_pose
 from executor.recording.record_files import CameraRecord
 from model.errors import CdprError, Fault, Refused, without_passwords
-from model.kinematics import structure_matrix
-from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.kinematics import cable_lengths, structure_matrix
+from model.pose import Pose, moved, step_between
 from model.rig import Rig
 from tracking.measurement import Observation, PoseMeasurement, largest_deviations
 from tracking.track import FrameRate
@@ -226,8 +226,10 @@ def wait_until_ready(processes: Sequence[CameraProcess], check_stop: Callable[[]
 
 #: At least this share of the images must give a pose.
 SEEN_SHARE = 0.8
-#: Largest scatter of poses; more means a moving platform or flickering light, [m].
-MOST_SCATTER = 0.5e-3
+#: Largest standard deviation of a cable's length over the images, and half of its largest drift
+#: over all of them, as a share of the start tolerance and in [m]; the smaller one counts. More
+#: means a moving platform or flickering light.
+SCATTER_SHARE, MOST_SCATTER = 0.25, 0.5e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,7 +238,8 @@ class RestPose:
 
     Attributes:
         pose: ``world_from_platform``.
-        uncertainty: Of the position along its worst direction, standard deviation, [m].
+        uncertainty: Of the position along its worst direction, or of a cable's length if that is
+            more, as by the rotation; standard deviation, [m].
         pictures: Number of images with a pose.
     """
 
@@ -248,7 +251,8 @@ class RestPose:
 def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
     """The pose of a platform at rest, as the mean over its images.
 
-    Systematic errors are the same in all images, so the mean is not more certain than each.
+    Systematic errors are the same in all images, so the mean is not more certain than each. What
+    the poses scatter is added, as it may be a motion.
 
     Raises:
         Refused: Too few images give a pose, the platform was not at rest, or the uncertainty of a
@@ -261,21 +265,12 @@ def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
             f"{len(found)} of {len(samples)} images give a platform pose",
             "; ".join(sorted(reasons)),
         )
+    _require_rest(rig, found)
     first = found[0].pose
-    positions = np.array([sample.pose.position for sample in found])
-    turns = np.array(
-        [rotation_vector_from_matrix(sample.pose.rotation @ first.rotation.T) for sample in found]
-    )
-    scatter = float(np.max(np.std(positions, axis=0)))
-    if not scatter <= MOST_SCATTER:
-        raise _refusal(
-            f"the platform is not at rest: its poses scatter by {scatter * 1000:.2f} mm,"
-            f" limit {MOST_SCATTER * 1000:g} mm",
-            "it swings, or the light flickers",
-        )
-    rotation = matrix_from_rotation_vector(turns.mean(axis=0))
-    pose = Pose(positions.mean(axis=0), rotation @ first.rotation)
-    covariance = np.mean([sample.covariance + sample.shared for sample in found], axis=0)
+    steps = np.array([step_between(first, sample.pose) for sample in found])
+    pose = moved(first, steps.mean(axis=0))
+    stated = [sample.covariance + sample.shared for sample in found]
+    covariance = np.mean(stated, axis=0) + np.cov(steps.T, bias=True)
     columns = structure_matrix(rig, pose)
     lengths = float(np.sqrt(np.max(np.einsum("im,ij,jm->m", columns, covariance, columns))))
     allowed = rig.motion.start_tolerance / 2.0
@@ -287,7 +282,32 @@ def static_pose(rig: Rig, samples: Sequence[Observation]) -> RestPose:
             " or `error_mm`, state an error that large",
         )
     worst, _ = largest_deviations(covariance)
-    return RestPose(pose, worst, len(found))
+    return RestPose(pose, max(worst, lengths), len(found))
+
+
+def _require_rest(rig: Rig, found: Sequence[PoseMeasurement]) -> None:
+    """Refuses poses between which a cable's length changes.
+
+    A rotation changes lengths, but no position; a slow motion changes them more from the first to
+    the last image than they scatter.
+    """
+    limit = min(SCATTER_SHARE * rig.motion.start_tolerance, MOST_SCATTER)
+    lengths = np.array([cable_lengths(rig, one.pose) for one in found])
+    changes = lengths - lengths.mean(axis=0)
+    along = np.linspace(-0.5, 0.5, len(found))
+    drifts = np.abs(along @ changes) / (along @ along)
+    for how, values, most in (
+        ("has a standard deviation of", changes.std(axis=0), limit),
+        ("drifts by", drifts, 2.0 * limit),
+    ):
+        worst = int(np.argmax(values))
+        if not values[worst] <= most:
+            raise _refusal(
+                f"the platform is not at rest: the length of cable {worst + 1} {how}"
+                f" {values[worst] * 1000:.2f} mm in {len(found)} images, limit"
+                f" {most * 1000:.2f} mm",
+                "it swings or still sinks, the light flickers, or the image is poor",
+            )
 
 
 def _refusal(what: str, why: str) -> Refused:

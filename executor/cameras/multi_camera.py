@@ -76,7 +76,11 @@ class CameraNews:
 
 
 class MultiCameraMonitor:
-    """Fuses the samples of all cameras, frame by frame."""
+    """Fuses the samples of all cameras, frame by frame, and monitors their clearance.
+
+    The fused clearance and that of each camera are monitored, so no camera delays or prevents a
+    stop for which another one suffices.
+    """
 
     def __init__(
         self, names: Sequence[str], model: ClearanceModel, limit: float, rate: float
@@ -94,8 +98,9 @@ class MultiCameraMonitor:
         self.news: list[CameraNews] = []
         """New conditions since the reader cleared the list."""
         self._model, self._several = model, len(names) > 1
-        # One per camera: if cameras disagree, the correct one is unknown.
-        self._watches = {name: ClearanceMonitor(limit) for name in names}
+        # Of the fused pose ("") and of each camera: fusion with a poor one must not hide what a
+        # good one measures, and if they disagree, the correct one is unknown.
+        self._watches = {name: ClearanceMonitor(limit) for name in ("", *names)}
         self._within = 0.5 / rate
         self._common = MultiCameraFusion(self._within)
         self._moments = self._disagree = 0
@@ -111,17 +116,23 @@ class MultiCameraMonitor:
         picture = next((sample.picture for sample in samples.values() if sample.picture), "")
         each = {name: sample.found for name, sample in samples.items()}
         found = self._common.of(each) if self._several else next(iter(each.values()))
+        clearance = None
         if isinstance(found, PoseMeasurement):
             self._count_disagreement("")
             clearance = clearance_of(self._model, found)
-            for name in self._watches:
-                self._watch(name, clearance, "")
-            return CameraSample(frame, found, picture, clearance=clearance)
-        poses = {name: one for name, one in each.items() if isinstance(one, PoseMeasurement)}
-        self._count_disagreement(found.reason if poses else "")
-        for name, one in poses.items():
-            self._watch(name, clearance_of(self._model, one), f", measured by camera {name} alone")
-        return CameraSample(frame, found, picture)
+            self._watch("", clearance)
+        else:
+            seen = any(isinstance(one, PoseMeasurement) for one in each.values())
+            self._count_disagreement(found.reason if seen else "")
+        if self._several:
+            for name, sample in samples.items():
+                self.watch_alone(name, sample)
+        return CameraSample(frame, found, picture, clearance=clearance)
+
+    def watch_alone(self, name: str, sample: CameraSample) -> None:
+        """Monitors what one of several cameras measured, also too late to be fused."""
+        if isinstance(sample.found, PoseMeasurement):
+            self._watch(name, clearance_of(self._model, sample.found))
 
     def finish(self) -> None:
         """Reports images left out because they were too far apart in time, and unequal clocks."""
@@ -134,10 +145,10 @@ class MultiCameraMonitor:
             )
             self.news.append(CameraNews("pictures_dropped", text))
 
-    def _watch(self, name: str, clearance: MeasuredClearance | None, suffix: str) -> None:
+    def _watch(self, name: str, clearance: MeasuredClearance | None) -> None:
         near = self._watches[name].take(clearance)
         if near and not self.near:
-            self.near = near + suffix
+            self.near = near + (f", measured by camera {name} alone" if name else "")
 
     def _count_disagreement(self, reason: str) -> None:
         self._disagree = self._disagree + 1 if reason else 0
@@ -289,9 +300,13 @@ class RunCameras:
             rounds += 1
 
     def _put(self, client: CameraClient, sample: CameraSample | None) -> None:
+        if sample is None:
+            return
         for frame_set in self._open:
-            if sample is not None and frame_set.trigger.frame == sample.frame:
+            if frame_set.trigger.frame == sample.frame:
                 frame_set.samples[client.name] = sample
+                return
+        self._common.watch_alone(client.name, sample)
 
     def _process_complete(self, last: bool = False) -> None:
         """Fuses complete frames; in order, except that none waits for a late one without a pose."""

@@ -69,7 +69,7 @@ def reference_at(
         counts: Positions of the drives there, shape (m,), [counts].
         tensions: Of the cables there, shape (m,), [N].
         how: How the pose is known.
-        uncertainty: Of the pose, standard deviation of the position, [m].
+        uncertainty: Of the pose, standard deviation of the position or of a cable's length, [m].
     """
     winches = WinchMap(rig)
     unstrained = winches.unstrained(cable_lengths(rig, pose), tensions)

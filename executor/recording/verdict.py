@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import executor
-from executor.recording.clearance import ClearanceTable
+from executor.recording.clearance import ClearanceTable, camera_of, source_of
 from executor.recording.record_files import CameraRecord
 from executor.recording.tables import CycleTable, PoseTable
 from executor.safety.limits import tension_limits
@@ -269,11 +269,15 @@ def distances(
 ) -> list[Check]:
     """Checks of the clearance against the scene's and, for cameras, the planned one.
 
-    A distance fails only if it is too small by more than its uncertainty. Distances before the time
+    A distance fails only if it is too small by more than its uncertainty. Each of several cameras
+    counts alone as well, so that none hides what another one measures. Distances before the time
     ``path_began`` [s] have no planned ones: the platform is beside the start, by the tolerance.
     """
     checks = []
-    for source, source_name in (("tag", _camera_phrase(cameras)), ("encoder", "the encoders")):
+    alone = sorted(filter(None, map(camera_of, {*clearance.source})))
+    names = {"tag": _camera_phrase(cameras), "encoder": "the encoders"}
+    names |= {source_of(camera): f"camera {camera} alone" for camera in alone}
+    for source, source_name in names.items():
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():
             checks.append(_against_required(rows, required, source_name))

@@ -89,9 +89,10 @@ def test_two_cameras_are_logged_together_and_alone(
     both = rows_of(log)
     front, side = (rows_of(tmp_path / f"poses-{name}.csv") for name in ("front", "side"))
     for fused, *alone in zip(both, front, side, strict=True):
-        for axis in "xyz":
-            smallest = min(float(one[f"std_{axis}_mm"]) for one in alone)
-            assert float(fused[f"std_{axis}_mm"]) < smallest
+        scatter, *each = (
+            sum(float(one[f"std_{axis}_mm"]) ** 2 for axis in "xyz") for one in (fused, *alone)
+        )
+        assert scatter < min(each)
         numbers = {n for one in alone for n in one["tags"].split()}
         assert set(fused["tags"].split()) == numbers
     assert len(list((tmp_path / "drawn" / "side").iterdir())) == 3

@@ -49,6 +49,16 @@ def rows(
     )
 
 
+def joined(*tables: ClearanceTable) -> ClearanceTable:
+    """The rows of tables of the same obstacles."""
+    columns = {f.name: [getattr(one, f.name) for one in tables] for f in fields(ClearanceTable)}
+    made = {
+        name: sum(each, ()) if isinstance(each[0], tuple) else np.concatenate(each)
+        for name, each in columns.items()
+    }
+    return ClearanceTable(**made | {"obstacles": tables[0].obstacles})
+
+
 def test_a_good_run_passes_and_says_by_how_much(run: fake_run.FakeRun) -> None:
     made = run.summary
     assert (made["verdict"], made["passed"]) == ("PASSED", True)
@@ -271,6 +281,21 @@ def test_a_clearance_fails_only_when_too_small_beyond_its_uncertainty(
     assert "required 10 mm" in check.text
 
 
+@pytest.mark.parametrize("side", [9.9, 10.1])
+@pytest.mark.parametrize("together", [True, False])
+def test_a_clearance_that_one_of_several_cameras_measures_counts_too(
+    side: float, together: bool
+) -> None:
+    """As for the stop: whether or not the others agree."""
+    each = [rows("tag:side", side, 0.0, 9.0), rows("tag:front", 30.0, 0.0, 9.0)]
+    checks = distances(joined(*each, *[rows("tag", 20.0, 0.0, 9.0)] * together), 0.010)
+    found = {check.name: check for check in checks}
+    assert found["clearance_tag:side"].passed is (side > 10.0)
+    assert f"measured by camera side alone: {side} mm" in found["clearance_tag:side"].text
+    assert found["clearance_tag:front"].passed
+    assert ("clearance_tag" in found) is together
+
+
 @pytest.mark.parametrize(("distance", "passed"), [(39.01, True), (38.99, False), (60.0, True)])
 def test_the_camera_is_also_held_against_the_plan(distance: float, passed: bool) -> None:
     required, planned = distances(rows("tag", distance, 1.0, 40.0), 0.010)
@@ -327,16 +352,7 @@ def test_a_platform_that_never_left_for_its_path_is_not_compared_with_it(
 def test_one_bad_row_among_good_ones_is_found(run: fake_run.FakeRun) -> None:
     """The worst row is the one furthest beyond its own uncertainty, not the smallest distance."""
     good, bad = rows("tag", 9.5, 1.0, 9.5), rows("tag", 9.9, 0.05, 9.9)
-    both = ClearanceTable(
-        *(
-            good.obstacles
-            if f.name == "obstacles"
-            else getattr(good, f.name) + getattr(bad, f.name)
-            if isinstance(getattr(good, f.name), tuple)
-            else np.concatenate([getattr(good, f.name), getattr(bad, f.name)])
-            for f in fields(ClearanceTable)
-        )
-    )
+    both = joined(good, bad)
     check = distances(both, 0.010)[0]
     assert not check.passed
     assert "9.9 mm, 95 % interval 9.8 to 10.0 mm" in check.text

@@ -6,18 +6,25 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from executor.cameras import multi_camera as run_cameras
 from executor.cameras import process as camera_process
 from executor.cameras.client import BLIND_IMAGES, CameraClient, wait_until_ready
-from executor.cameras.multi_camera import HURRY, PATIENCE, ROUND, RunCameras
+from executor.cameras.multi_camera import (
+    HURRY,
+    PATIENCE,
+    ROUND,
+    MultiCameraMonitor,
+    RunCameras,
+)
 from executor.cameras.process import (
     CameraProcess,
     CameraSample,
@@ -216,6 +223,80 @@ def test_of_cameras_that_disagree_one_that_sees_too_little_clearance_is_enough(w
     assert not any(reported[:2])
     assert f"measured by camera {sees} alone" in run.near
     assert all(look.clearance is None for look in run.finish(never).together)
+
+
+#: Each frame of a camera: what it measures beside the truth along x, [mm]; None without a pose.
+FRAMES = st.lists(st.sampled_from([None, -3.0, 0.0, 1.0, 3.0, 20.0]), min_size=6, max_size=6)
+#: Standard deviations of scatter and shared errors, and the operator's value of errors, [mm].
+CAMERA = st.tuples(
+    st.sampled_from([0.02, 0.2, 1.0]), st.sampled_from([0.0, 0.2, 2.0]), st.sampled_from([0.0, 5.0])
+)
+
+
+def stops(seen: dict[str, tuple[Sequence[float | None], Any]], limit: float) -> list[str]:
+    """Why cameras stop the run, after each frame; empty while they do not."""
+    monitor, reasons = MultiCameraMonitor(list(seen), MODEL, limit, RATE), []
+    for k in range(len(next(iter(seen.values()))[0])):
+        samples = {}
+        for name, (shifts, (own, common, operator)) in seen.items():
+            shift, time = shifts[k], k / RATE
+            if shift is None:
+                samples[name] = sample_without_pose(k, time, "no tag")
+                continue
+            one = seen_at(FrameRequest(k, time, time, None), shift / 1e3, own / 1e3)
+            shared = np.diag([max(common, operator / 1.96) ** 2 * 1e-6] * 3 + [0.0] * 3)
+            found = replace(one.found, shared=shared, cable_error=operator / 1e3)
+            samples[name] = replace(one, found=found)
+        monitor.of(samples)
+        reasons.append(monitor.near)
+    return reasons
+
+
+@given(
+    frames=st.lists(FRAMES, min_size=2, max_size=3),
+    cameras=st.lists(CAMERA, min_size=3, max_size=3),
+    room=st.floats(-3.0, 6.0),
+)
+@example(frames=[[0.0] * 6] * 2, cameras=[(0.02, 2.0, 0.0), (0.2, 0.2, 0.0)], room=2.0)
+@example(frames=[[0.0] * 6] * 2, cameras=[(0.02, 0.0, 5.0), (0.2, 0.2, 0.0)], room=2.0)
+def test_another_camera_never_delays_a_stop(
+    frames: list[list[float | None]], cameras: list[Any], room: float
+) -> None:
+    """Whatever it measures, and with whatever uncertainty."""
+    limit = nearest_at(0.0).distance + room / 1e3
+    seen = dict(zip("abc", zip(frames, cameras, strict=False), strict=False))
+    together = stops(seen, limit)
+    for name, one in seen.items():
+        for alone, both in zip(stops({name: one}, limit), together, strict=True):
+            assert both or not alone
+
+
+@pytest.mark.parametrize("late", [0, 1, 2, 5])
+@pytest.mark.parametrize("shift", [-0.02, 0.02])
+def test_a_slow_camera_stops_a_run_too(late: int, shift: float) -> None:
+    """Also where a fast one is fused without waiting for it."""
+    limit = (nearest_at(0.0).at_most + nearest_at(shift).at_most) / 2.0
+    near = nearest_at(shift).at_most < limit
+    cameras: list[Any] = [Scripted("fast", [0], 0.0 if near else shift)]
+    cameras.append(Scripted("slow", [late], shift if near else 0.0))
+    run = RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE)
+    for k in range(2 * late + 6):
+        run.trigger(k / RATE, k / RATE, None, None)
+    assert run.near.endswith("measured by camera slow alone")
+
+
+def test_the_camera_that_alone_measures_too_little_clearance_is_named() -> None:
+    """Its pose agrees with that of the other camera, and their mean is far enough away."""
+    fine, shifts = (0.1, 0.2, 0.0), {"front": 0.0, "side": 1.0}
+    fine_at = {name: nearest_at(shift / 1e3).distance for name, shift in shifts.items()}
+    near = min(fine_at, key=lambda name: fine_at[name])
+    seen = {name: ([shift] * 3, fine) for name, shift in shifts.items()}
+    for step in np.arange(0.0, 1e-3, 2e-5):
+        reasons = stops(seen, min(fine_at.values()) + step)
+        if any(reasons):
+            break
+    assert reasons[0] == ""
+    assert reasons[1].endswith(f"measured by camera {near} alone")
 
 
 def test_one_that_dies_is_reported_and_after_the_last_one_none_is_left() -> None:

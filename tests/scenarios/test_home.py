@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from drivers.can_bus import BusSettings, open_bus
 from drivers.can_errors import BusDown
@@ -35,8 +37,9 @@ from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests
 from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import CdprError, Fault, Refused, StoppedByOperator
+from model.kinematics import cable_lengths
 from model.plan import plan_from_document
-from model.pose import Array, Pose
+from model.pose import Array, Pose, moved
 from model.rig import Rig, load_rig, rig_from_document
 from model.scene import empty_scene
 from model.statics.gravity import working_tensions
@@ -46,6 +49,7 @@ from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.ground_truth import PowerLoss
 from tests.cli.plans import HALL, RIG, straight_plan
 from tests.scenarios.stage import Stage, at, staged
+from tracking.measurement import PoseMeasurement
 from tracking.tracker import Tracker
 
 _CHANNELS = itertools.count()
@@ -614,6 +618,78 @@ def test_a_pose_that_is_not_known_well_is_refused() -> None:
     far = Pose.level(home.position + np.array([5.0, 5.0, 0.0]))
     with pytest.raises(Refused, match="0 of 2 images"):
         static_pose(rig, looks(rig, far, far))
+
+
+THE_RIG = load_rig(RIG)
+
+
+def seen_at(steps: Array, deviation: float = 1e-5) -> list[PoseMeasurement]:
+    """Measurements beside the home pose, [m] and [rad], shape (n, 6), without shared errors."""
+    covariance = np.diag([deviation**2] * 6)
+    return [
+        PoseMeasurement(k / 10.0, moved(THE_RIG.home, step), covariance, (1, 2), 0.1, "found")
+        for k, step in enumerate(steps)
+    ]
+
+
+def lengths_of(seen: Sequence[PoseMeasurement]) -> Array:
+    return np.array([cable_lengths(THE_RIG, one.pose) for one in seen])
+
+
+DIRECTIONS = st.tuples(*[st.floats(-1.0, 1.0)] * 6).filter(lambda d: max(map(abs, d)) > 0.3)
+#: Of a step of 1 in these directions: 1 mm, and 1° about each axis.
+UNITS = np.array([1e-3] * 3 + [np.radians(1.0)] * 3)
+
+
+@given(direction=DIRECTIONS, size=st.floats(0.01, 3.0), pace=st.floats(0.02, 3.1))
+@example(direction=(0.0, 0.0, 0.0, 1.0, 0.0, 0.0), size=3.0, pace=1.1)
+@example(direction=(0.0, 0.0, 0.0, 0.0, 0.0, 1.0), size=1.0, pace=1.1)
+@example(direction=(0.0, 0.0, 0.0, 1.0, 0.0, 0.0), size=0.5, pace=1.1)
+def test_a_platform_that_swings_is_not_at_rest(
+    direction: tuple[float, ...], size: float, pace: float
+) -> None:
+    """Also about its own centre, where no position changes."""
+    swing = np.outer(np.sin(pace * np.arange(20)), size * UNITS * direction)
+    seen = seen_at(swing)
+    lengths = lengths_of(seen)
+    half = THE_RIG.motion.start_tolerance / 2.0
+    drift = np.abs(np.polyfit(np.linspace(0.0, 1.0, 20), lengths, 1)[0]).max()
+    if max(2.0 * lengths.std(axis=0).max(), drift) > half:
+        with pytest.raises(Refused, match="not at rest"):
+            static_pose(THE_RIG, seen)
+        return
+    found = static_pose(THE_RIG, seen)
+    assert np.abs(lengths - cable_lengths(THE_RIG, found.pose)).max() < 1.1 * half
+    assert found.uncertainty >= swing[:, :3].std(axis=0).max()
+    assert found.uncertainty > 0.98 * lengths.std(axis=0).max()
+
+
+@given(direction=DIRECTIONS, change=st.floats(0.1, 3.0))
+def test_a_platform_that_still_moves_is_not_at_rest(
+    direction: tuple[float, ...], change: float
+) -> None:
+    """A steady motion that changes a cable's length by more than half the start tolerance."""
+    toward = UNITS * direction
+    effect = np.ptp(lengths_of(seen_at(np.outer([-0.5, 0.5], toward))), axis=0).max()
+    drift = change * THE_RIG.motion.start_tolerance / 2.0
+    seen = seen_at(np.outer(np.linspace(-0.5, 0.5, 20) * drift / effect, toward))
+    if change > 1.01:
+        with pytest.raises(Refused, match=r"not at rest: the length of cable \d"):
+            static_pose(THE_RIG, seen)
+    elif change < 0.99:
+        static_pose(THE_RIG, seen)
+
+
+@pytest.mark.parametrize("count", [5, 20])
+def test_images_that_scatter_as_they_state_are_of_a_platform_at_rest(count: int) -> None:
+    """Scatter of 0.08 mm per axis, with rotations to match; the error is as stated."""
+    rng, worst = np.random.default_rng(3), []
+    deviation = 0.08e-3
+    for _ in range(50):
+        steps = rng.normal(size=(count, 6)) * deviation
+        found = static_pose(THE_RIG, seen_at(steps, deviation))
+        worst.append(found.pose.distance_to(THE_RIG.home) / found.uncertainty)
+    assert max(worst) < 3.0
 
 
 def wound_in(rig: Rig, targets: Array, *, on_a_stand: bool) -> WinchResult:

@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import chdtri
 
-from model.pose import Array, Pose, matrix_from_rotation_vector
+from model.pose import Array, Pose, matrix_from_rotation_vector, moved, step_between
 from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
 from tracking.fusion import UNSTATED_ERROR, MultiCameraFusion, fuse_poses
-from tracking.measurement import NoPose, PoseMeasurement, extrapolate
+from tracking.measurement import NoPose, Observation, PoseMeasurement, extrapolate
 from tracking.tracker import Tracker
 
 HERE = Pose.level([0.05, 0.05, 0.4])
@@ -35,6 +35,12 @@ def other_side(camera: Camera) -> Camera:
 def measured(position: list[float], sigma: list[float]) -> PoseMeasurement:
     covariance = np.diag(np.square([*sigma, 1e-3, 1e-3, 1e-3]))
     return PoseMeasurement(0.0, Pose.level(position), covariance, (301,), 0.1, "tracked")
+
+
+def without_shared(found: Observation) -> Observation:
+    """A measurement by a camera whose lens, pose and tags are exactly those of the rig file."""
+    assert isinstance(found, PoseMeasurement), found
+    return replace(found, shared=np.zeros((6, 6)))
 
 
 def test_each_camera_counts_where_it_measures_well() -> None:
@@ -62,7 +68,9 @@ def test_two_cameras_give_a_better_pose_than_each_alone(
             matrix_from_rotation_vector(rng.normal(size=3) * 0.1),
         )
         seen = {
-            name: Tracker(rig, eyes[name]).observe(pictures[name].render(truth, frame), 0.0)
+            name: without_shared(
+                Tracker(rig, eyes[name]).observe(pictures[name].render(truth, frame), 0.0)
+            )
             for name in eyes
         }
         for name, one in {**seen, "both": fuse_poses(seen)}.items():
@@ -75,6 +83,88 @@ def test_two_cameras_give_a_better_pose_than_each_alone(
     assert rms["both"] < 0.8 * min(rms["front"], rms["side"])
     low, high = chdtri(6 * len(values), [0.9995, 0.0005]) / len(values)
     assert 0.5 * low < np.mean(values) < high
+
+
+#: Standard deviations of scatter and shared errors of a camera, in `UNSTATED_ERROR`.
+CAMERA = st.tuples(st.floats(0.02, 0.5), st.floats(0.0, 5.0))
+
+
+def covariances(seed: int, size: float) -> np.ndarray:
+    """The root of a random covariance, shape (6, 6), of about ``size`` in `UNSTATED_ERROR`."""
+    root = np.random.default_rng(seed).normal(size=(6, 6)) / np.sqrt(6.0) + 0.3 * np.eye(6)
+    return size * UNSTATED_ERROR[:, None] * root
+
+
+@given(cameras=st.lists(CAMERA, min_size=2, max_size=4), seed=st.integers(0, 2**16))
+def test_errors_common_to_all_images_count_in_the_weights(
+    cameras: list[tuple[float, float]], seed: int
+) -> None:
+    """Against generalized least squares, for independent and for equal shared errors.
+
+    The fused pose is that of independent errors, and what it states covers both.
+    """
+    roots = [
+        (covariances(seed + 2 * k, own), covariances(seed + 2 * k + 1, common))
+        for k, (own, common) in enumerate(cameras)
+    ]
+    steps = [
+        0.1 * size * UNSTATED_ERROR * np.random.default_rng(seed + 100 + k).uniform(-1, 1, 6)
+        for k, (size, _) in enumerate(cameras)
+    ]
+    seen = {}
+    for k, ((own, common), step) in enumerate(zip(roots, steps, strict=True)):
+        one = PoseMeasurement(0.0, moved(HERE, step), own @ own.T, (301,), 0.1, "tracked")
+        seen[str(k)] = replace(one, shared=common @ common.T)
+    found = fuse_poses(seen)
+    assert isinstance(found, PoseMeasurement)
+    weights = [np.linalg.inv(own @ own.T + common @ common.T) for own, common in roots]
+    best = np.linalg.inv(np.sum(weights, axis=0))
+    wanted = best @ np.sum([w @ s for w, s in zip(weights, steps, strict=True)], axis=0)
+    error = (step_between(HERE, found.pose) - wanted) / UNSTATED_ERROR
+    assert np.abs(error).max() < 1e-3
+    scatter = np.zeros((6, 6))
+    for weight, (own, _) in zip(weights, roots, strict=True):
+        scatter += best @ weight @ own @ own.T @ weight @ best
+    units = np.outer(UNSTATED_ERROR, UNSTATED_ERROR)
+    assert found.covariance / units == pytest.approx(scatter / units, rel=1e-6, abs=1e-9)
+    sums = [best @ w @ common for w, (_, common) in zip(weights, roots, strict=True)]
+    for true in (sum(s @ s.T for s in sums), sum(sums) @ sum(sums).T):
+        assert np.linalg.eigvalsh((found.shared - true) / units).min() > -1e-9
+
+
+@given(poor=st.floats(1.0, 100.0), count=st.integers(1, 3), sharp=st.booleans())
+def test_poorer_cameras_hardly_change_what_a_good_one_measures(
+    poor: float, count: int, sharp: bool
+) -> None:
+    """Also where a poorer one, such as a camera that was located badly, scatters less."""
+    good = replace(measured([0.0, 0.0, 0.4], [2e-5] * 3), shared=np.diag([2e-4**2] * 3 + [0.0] * 3))
+    own, common = (5e-6 if sharp else 2e-5 * poor), 2e-4 * poor
+    bad = replace(
+        measured([common, 0.0, 0.4], [own] * 3), shared=np.diag([common**2] * 3 + [0.0] * 3)
+    )
+    found = fuse_poses({"good": good} | {str(k): bad for k in range(count)})
+    assert isinstance(found, PoseMeasurement)
+
+    def deviation(one: PoseMeasurement) -> float:
+        return float(np.sqrt((one.covariance + one.shared)[0, 0]))
+
+    assert deviation(found) < (1.0 + 1.1 * count / (poor + 1.0)) * deviation(good)
+    assert found.pose.position[0] < 1.1 * count * 2e-4 / poor
+
+
+@pytest.mark.parametrize(
+    ("stated", "fused"), [([0.005, 0.0], 0.0), ([0.005, 0.001], 0.001), ([0.002] * 2, 0.002)]
+)
+def test_the_cables_are_as_certain_as_the_best_statement_says(
+    stated: list[float], fused: float
+) -> None:
+    """One camera with a rough value of the operator makes no cable less certain."""
+    one = measured([0.0, 0.0, 0.4], [1e-4] * 3)
+    seen = {str(k): replace(one, cable_error=error) for k, error in enumerate(stated)}
+    for order in (seen, dict(reversed(seen.items()))):
+        found = fuse_poses(order)
+        assert isinstance(found, PoseMeasurement)
+        assert found.cable_error == fused
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0, 1.5])

@@ -348,7 +348,7 @@ def test_a_mean_over_pictures_makes_no_shared_error_smaller(rig: Rig) -> None:
     one = replace(measurement(pose, np.eye(6) * 1e-8), shared=shared, unstated=False)
     both = fuse_poses({"a": one, "b": one})
     assert isinstance(both, PoseMeasurement)
-    np.testing.assert_allclose(both.shared, shared, rtol=1e-9)
+    np.testing.assert_allclose(both.shared, shared, rtol=1e-9, atol=1e-15)
     assert not both.unstated
     half = fuse_poses({"a": one, "b": replace(one, unstated=True)})
     assert isinstance(half, PoseMeasurement)
