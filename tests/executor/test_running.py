@@ -443,8 +443,9 @@ VERBS: dict[str, Callable[..., Any]] = {
 def test_a_stop_before_the_answer_to_its_question_ends_every_verb(
     folders, tmp_path, monkeypatch, verb
 ):
-    """Whatever the answer is: nothing is opened, and no folder is left."""
+    """Whatever the answer is: nothing is enabled, and no folder is left."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(service, "faults_to_release_under", lambda _rig: (None, ()))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     asked: list[tuple[int, ...]] = []
 
