@@ -386,12 +386,9 @@ def test_after_a_fault_no_target_moves_a_drive(prepared: PreparedRun, tmp_path: 
         assert np.abs(np.diff(positions[-3:], axis=0)).max() == 0, "at rest at the end"
 
 
-def die(kind: str) -> Callable[[], None]:
-    def kill() -> None:
-        (child,) = multiprocessing.active_children()
-        child.kill() if kind == "killed" else child.terminate()
-
-    return kill
+def kill_camera() -> None:
+    (child,) = multiprocessing.active_children()
+    child.kill()
 
 
 @pytest.mark.parametrize(
@@ -415,12 +412,12 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
         nonlocal cycles
         cycles += 1
         if cycles == cycle:
-            die("killed")()
+            kill_camera()
         return real(clock)
 
     def die_or_answer(process: CameraProcess, patience: float) -> Any:
         if cycles < cycle and patience == ROUND:
-            die("killed")()
+            kill_camera()
         return answer_within(process, patience)
 
     monkeypatch.setattr(SimulatedClock, "next_cycle", next_cycle)
