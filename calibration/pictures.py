@@ -15,10 +15,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.targets.boards import Board, DetectedBoard, generic_camera
+from calibration.targets.boards import Board, DetectedBoard
 from drivers.cameras.files import ImageFolder, OneCamerasPictures
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from executor.cameras.sources import require_camera_source
+from model.cameras import generic_camera
 from model.errors import BadInput, path_of
 from model.files.documents import write_bytes_atomic
 from model.pose import Array
@@ -346,8 +347,19 @@ def _sampled(video: VideoFile, most: int, total: int | None = None) -> ImageSet:
     total = _length(video) if total is None else total
     count = min(most, total)
     numbers = {k * total // count for k in range(count)}
-    frames = (frame for number, frame in enumerate(video) if number in numbers)
-    return ImageSet(((f.name, f.image) for f in frames), count, video=video)
+    return ImageSet(_Sample(video, numbers), count, video=video)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    """Images of a video with given numbers; it can be read repeatedly."""
+
+    video: VideoFile
+    numbers: set[int]
+
+    def __iter__(self) -> Iterator[tuple[str, Image]]:
+        frames = (f for number, f in enumerate(self.video) if number in self.numbers)
+        return ((f.name, f.image) for f in frames)
 
 
 def _live(source: str, camera: Camera, most: int) -> Iterable[tuple[str, Image]]:

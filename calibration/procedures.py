@@ -23,7 +23,12 @@ from calibration.geometry.parameters import DEFAULT_DEVIATIONS, checked_deviatio
 from calibration.geometry.quality import RigQuality, judge_rig
 from calibration.geometry.report import rig_page
 from calibration.geometry.result import RigResult, rig_result
-from calibration.intrinsics.calibrate import CameraCalibration, fit_camera, fit_corners
+from calibration.intrinsics.calibrate import (
+    CameraCalibration,
+    fit_camera,
+    fit_corners,
+    refit_camera,
+)
 from calibration.intrinsics.lens import AUTO
 from calibration.intrinsics.quality import CameraQuality, judge_camera
 from calibration.intrinsics.readout import (
@@ -119,6 +124,9 @@ def calibrate_camera(
     to.require_free("camera", name)
     with source.reported("detecting the board", listener) as images:
         found = fit_camera(images, board, source.unused, lens)
+    if board.needs_lens:
+        with source.reported("detecting the board again, with the lens", listener) as images:
+            found = refit_camera(found, images, board, lens)
     return _judged_camera(found, name, wanted, distance, to)
 
 
@@ -373,6 +381,7 @@ def calibrate_rig(
     if len(of_poses) != 2:
         raise BadInput(f"pose_deviations must be two numbers [m, rad], not {len(of_poses)}")
     measured_point = read_only(point_of("reflector", reflector))
+    without_poses = truth_value("without_poses", without_poses)
     require_file_name(name, "`name=`")
     given = [data] if isinstance(data, str | PathLike) else sequence_of("data", data)
     paths = [path_of(one) for one in given]
@@ -383,7 +392,7 @@ def calibrate_rig(
         swivel_deviation=swivel_deviation,
         imu_deviation=imu_deviation,
     )
-    if truth_value("without_poses", without_poses):
+    if without_poses:
         measured = measured.without_poses()
     to = Destination.of(output)
     to.require_free("rig", name)

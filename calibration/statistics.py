@@ -35,20 +35,29 @@ class Interval:
     Attributes:
         value: The estimate.
         half_width: Half width of the interval, in the same unit.
+        skew: Middle of the interval beyond the estimate, in the same unit.
     """
 
     value: float
     half_width: float
+    skew: float = 0.0
 
     @classmethod
     def between(cls, low: float, high: float) -> Interval:
         """The interval with these bounds."""
         return cls((low + high) / 2.0, (high - low) / 2.0)
 
+    @classmethod
+    def by_factor(cls, value: float, factor: float) -> Interval:
+        """The interval from the estimate divided by a factor to the estimate times it."""
+        around = cls.between(value / factor, value * factor)
+        return cls(value, around.half_width, around.value - value)
+
     @property
     def bounds(self) -> list[float]:
         """Lower and upper bound."""
-        return [self.value - self.half_width, self.value + self.half_width]
+        middle = self.value + self.skew
+        return [middle - self.half_width, middle + self.half_width]
 
     def __str__(self) -> str:
         """Value and half width, to two digits of the half width."""

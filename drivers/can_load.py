@@ -63,6 +63,8 @@ def heartbeat_timeout(cycle: float) -> float:
 def bus_load(drives: int, cycle: float, bitrate: int) -> float:
     """Bus load of CiA 402 drives with heartbeats, as a fraction, with worst-case stuffing.
 
+    Without the SDO request and answer of each cycle, to which all these frames have priority.
+
     Args:
         drives: Number of drives m.
         cycle: [s].

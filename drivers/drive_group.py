@@ -153,8 +153,8 @@ class DriveSnapshot:
         status_words: Shape (m,); see `drive_states`.
         restarted: Nodes without this program's configuration: power-cycled, or never configured.
             For drives with non-volatile settings, all without an absolute encoder.
-        errors: The error that each drive in fault stores, as text; empty without one, and for
-            drives that show it in their state.
+        errors: The error that each drive in fault stores, or why one at rest cannot be enabled, as
+            text; empty without one, and for drives that show it in their state.
     """
 
     positions: Counts

@@ -57,6 +57,26 @@ def without_torque(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
     return tuple(winch.node_id for winch, word in rows if state_of(word) not in HOLDS)
 
 
+def unready_remarks(rig: Rig, status_words: Sequence[int]) -> list[str]:
+    """Which drives at rest cannot be enabled, and why; one text per reason.
+
+    None for ODrives, whose states name it.
+
+    Args:
+        rig: The robot.
+        status_words: Reported status word of each drive.
+    """
+    if rig.document.drives.type == "odrive":
+        return []
+    from drivers.cia402.state_machine import without_power
+
+    names: dict[str, list[str]] = {}
+    for name, word in zip(rig.drive_names.values(), status_words, strict=True):
+        for reason in without_power(word):
+            names.setdefault(reason, []).append(name)
+    return [f"{', '.join(found)}: {reason}" for reason, found in names.items()]
+
+
 def cycles_until_reported(rig: Rig) -> int:
     """Cycles from the one that sends a set-point to the one that reports the position it commands.
 

@@ -319,12 +319,13 @@ def _written(files: Sequence[_File], given_up: Callable[[], bool]) -> dict[str, 
 
 
 def _reasons(folder: RunFolder, missing: Mapping[str, CdprError]) -> dict[str, str]:
-    """Why each file is missing; names the file that is the cause, if that is another one."""
-    own = {"", *(str(folder.path / name) for name in missing)}
+    """Why each file is missing: the cause of those it is made from, and names any other file."""
+    causes = {str(folder.path / name): error for name, error in missing.items()}
     reasons = {}
     for name, error in missing.items():
-        cause = "" if error.where in own else f"{error.where}: "
-        reasons[name] = cause + (error.why or error.what)
+        first = causes.get(error.where, error)
+        elsewhere = f"{error.where}: " if error.where and error.where not in causes else ""
+        reasons[name] = elsewhere + (first.why or first.what)
     return reasons
 
 

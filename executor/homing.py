@@ -21,6 +21,7 @@ from executor.drives import is_simulated, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
 from executor.proposals import Facts, ForgetProposal, HomingProposal, require_confirmed
+from executor.realtime.scheduling import require_imported_script
 from executor.remote.command_server import commands_from_start
 from executor.supervision import RequestBoard, Supervisor
 from executor.winch_runs import WinchMotion, limit_of, move_by_law
@@ -33,6 +34,7 @@ from model.errors import (
     require_functions,
     require_types,
     sequence_of,
+    truth_value,
 )
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
@@ -131,6 +133,8 @@ def home(
     """
     require_types((rig, Rig), (listener, Listener), optional=[(pose, Pose)])
     require_functions(confirm=confirm)
+    at_home, realtime = truth_value("at_home", at_home), truth_value("realtime", realtime)
+    need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     in_process = is_simulated(rig)
     require_own_time(rig, realtime)
     if isinstance(camera, str | int | np.integer):
@@ -198,6 +202,7 @@ def use_rig_file_counts(
         Refused: The bus is latched, or not all encoders are absolute.
         StoppedByOperator: Cancelled.
     """
+    require_imported_script()
     interlock = MotionInterlock(rig)
     interlock.require_rig_file_counts()
     require_confirmed(confirm, ForgetProposal(interlock))

@@ -30,6 +30,7 @@ from model.errors import (
     real_number,
     require_functions,
     require_types,
+    truth_value,
 )
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument
@@ -90,6 +91,9 @@ def jog(
     """
     require_types((rig, Rig), (listener, Listener), optional=[(scene, Scene)])
     require_functions(confirm=confirm, on_event=on_event)
+    to_home = truth_value("to_home", to_home)
+    realtime = truth_value("realtime", realtime)
+    need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     with commands_from_start("jog", rig, supervisor, realtime=realtime) as commands:
         slow = with_speed(rig, speed)
         by = None if by is None else point_of("by", by)
@@ -305,6 +309,8 @@ def jog_cable(
         Fault: A tension left its limits; all drives stopped together.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
+    realtime = truth_value("realtime", realtime)
+    need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     _require_cable(slow, cable, length)

@@ -47,6 +47,7 @@ from model.errors import (
     path_of,
     require_functions,
     require_types,
+    truth_value,
 )
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
@@ -55,6 +56,8 @@ from model.rig import Camera, Rig
 from tracking.shared_errors import require_stated_errors
 
 __all__ = ["RunOptions", "RunResult", "run", "run_prepared"]
+
+_PASS_THE_RIG = "; then plan again, or pass --rig FILE, in Python `rig=`: a plan contains its rig"
 
 #: Rate of progress reports without a camera, [Hz].
 PROGRESS_RATE = 10.0
@@ -125,11 +128,12 @@ def run(
     """
     require_types((plan, Plan), (rig, Rig), (listener, Listener), optional=[(start, Pose)])
     require_functions(confirm=confirm, on_event=on_event)
+    realtime = truth_value("realtime", realtime)
     options = RunOptions(
         realtime=realtime,
         start=start,
-        clearance_stop=clearance_stop,
-        need_real_time_rights=need_real_time_rights,
+        clearance_stop=truth_value("clearance_stop", clearance_stop),
+        need_real_time_rights=truth_value("need_real_time_rights", need_real_time_rights),
         listener=listener,
         confirm=confirm,
         on_event=on_event,
@@ -140,7 +144,8 @@ def run(
         require_synthetic_images(chosen.values(), not realtime)
         require_own_time(rig, realtime)
         if plan.scene.obstacles:
-            require_stated_errors(rig, list(chosen))
+            is_sealed = rig.document.cameras == plan.rig.document.cameras
+            require_stated_errors(rig, list(chosen), then=_PASS_THE_RIG if is_sealed else "")
         require_simulated_start(rig, start)
         output = dated_folder() if folder is None else path_of(folder)
         RunFolder.require_free(output)

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.can_bus import BusSettings, open_bus
 from drivers.drive_group import CycleStatus
-from drivers.factory import drive_states, read_drives, without_torque
+from drivers.factory import drive_states, read_drives, unready_remarks, without_torque
 from drivers.plausibility import HOMING_OPTIONS
 from executor.control.standstill import (
     FaultReset,
@@ -36,13 +36,14 @@ from executor.interlock.locks import SetUpLock
 from executor.interlock.reference import RESTARTED
 from executor.proposals import Facts, ReleaseProposal, ResetProposal, require_confirmed
 from executor.realtime.process import real_time_process
+from executor.realtime.scheduling import require_imported_script
 from executor.realtime.shared_memory import SharedRequests
 from executor.remote.client import preparations
 from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import WinchStatus, bus_name
 from executor.state_machine import State
 from executor.supervision import Supervisor
-from model.errors import CdprError
+from model.errors import CdprError, truth_value
 from model.files.documents import PoseDocument
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -60,7 +61,8 @@ class DriveStatus:
         position: Of its encoder, [counts].
         tension: Of its cable, from the drive's torque, [N].
         set_up: It has the configuration for this rig: no power cycle or other cycle time since.
-        error: The error that a drive in fault stores; empty if it has none.
+        error: The error that a drive in fault stores, or why one at rest cannot be enabled; empty
+            without one.
     """
 
     node: int
@@ -138,6 +140,8 @@ class StatusResult:
         file, steps = quote(str(rig_file)), []
         if self.latched is not None:
             steps.append(f"find the cause and check the platform, then run cdpr reset {file}")
+        if failed := [str(drive.node) for drive in self.drives or () if drive.error]:
+            steps.insert(0, f"remove the cause shown for drive {', '.join(failed)}")
         if not self.reference.counts:
             steps.append(f"cdpr home {file} with {HOMING_OPTIONS}")
         return "; then ".join(steps)
@@ -309,13 +313,15 @@ def reset(
     Args:
         rig: The robot and its bus.
         confirm: Called once, before anything is reset; False cancels it.
-        listener: Receives remarks on missing capabilities of the drives.
+        listener: Receives remarks on missing capabilities of the drives, and on those that cannot
+            be enabled.
 
     Raises:
         StoppedByOperator: Cancelled.
         CdprError: A run is active; or a drive does not answer, may not be reset now, or stays in
             fault.
     """
+    require_imported_script()
     require_other_process(rig)
     settings = BusSettings.of(rig)
     latch = FaultLatch(settings)
@@ -337,6 +343,8 @@ def reset(
             ) as process,
         ):
             done = reset_drives(interlock, process)
+        for remark in unready_remarks(rig, done.left.status_words.tolist()):
+            listener.remark(f"{remark}; correct this before a motion")
         return ResetResult(
             was_latched=latched is not None,
             cause=latched.cause if latched else None,
@@ -384,6 +392,7 @@ def release(
         CdprError: The bus is latched, or the drives could not be configured; or they were not
             released, and a fault is latched.
     """
+    need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     require_other_process(rig)
     interlock = MotionInterlock(rig)
     with commands_from_start("release", rig, supervisor, realtime=True) as commands:

@@ -232,6 +232,8 @@ def track_sources(
             if result.count.poses:
                 keep(result)
             raise
+    for text in result.together.clocks if result.together is not None else ():
+        listener.remark(text)
     return result
 
 

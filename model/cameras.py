@@ -118,5 +118,38 @@ def camera_from(document: CameraDocument) -> Camera:
 _SCALES = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
 
 
+def generic_camera(size: tuple[int, int], name: str = "camera") -> Camera:
+    """A camera without distortion and with a horizontal field of view of about 53°.
+
+    Args:
+        size: Width and height of its images, [px].
+        name: For messages.
+    """
+    width, height = size
+    matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(name, width, height, matrix, np.zeros(5), Pose.level([0.0, 0.0, 0.0]), 10.0)
+
+
+def is_camera_matrix(matrix: Array) -> bool:
+    """Whether entries of a 3 x 3 matrix below the diagonal are 0, and the last one is 1."""
+    return bool(np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0.0, 0.0, 0.0, 1.0], 0.0, 1e-9))
+
+
+_OUTER = 0.1
+"""Share of an image's width or height within which, from an edge, a principal point is doubtful."""
+
+
+def principal_point_doubt(camera: CameraDocument) -> str:
+    """Why a camera's principal point is doubtful; empty if it is near the image's middle."""
+    x, y = camera.cx_px / camera.width_px, camera.cy_px / camera.height_px
+    if min(x, y, 1.0 - x, 1.0 - y) >= _OUTER:
+        return ""
+    where = "outside" if min(x, y, 1.0 - x, 1.0 - y) < 0.0 else "at the edge of"
+    return (
+        f"the principal point ({camera.cx_px:g}, {camera.cy_px:g}) px is {where} the image of"
+        f" {camera.width_px} x {camera.height_px} px; check the file, unless the image is cropped"
+    )
+
+
 def _scaled(rows: list[list[float]] | None, scales: Array) -> Array | None:
     return None if rows is None else read_only(np.array(rows) * scales)

@@ -132,6 +132,7 @@ _MAKERS = {
     "Pose": "cdpr.Pose.level",
     "CalibrationResult": "cdpr.load_calibration",
 }
+_UNITS = {"Pose": ", with the position in metres"}
 _OTHERS = {
     "Load": "scene.load, or leave it out",
     "Listener": "an object of a subclass of model.progress.Listener, or leave it out",
@@ -163,7 +164,8 @@ def require_types(
             pass_it = _OTHERS.get(name) or (
                 f"{_MAKERS[name]}({shown if made_from and len(shown) < 80 else '...'})"
             )
-            raise BadInput(f"expected a {name}, not {found}", next_step=f"pass {pass_it}")
+            next_step = f"pass {pass_it}{_UNITS.get(name, '')}"
+            raise BadInput(f"expected a {name}, not {found}", next_step=next_step)
 
 
 def require_text(**given: object) -> None:

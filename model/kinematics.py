@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput, Fault
-from model.pose import Array, Pose, matrix_from_rotation_vector, moved, read_only
+from model.pose import Array, Pose, floats_of, matrix_from_rotation_vector, moved, read_only
 from model.statics.wrench_sets import rms_anchor_radius
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ def forward_kinematics(
         BadInput: There is not a finite length for each cable.
         Fault: No start converged to a stationary pose.
     """
-    wanted = np.asarray(lengths, dtype=np.float64)
+    wanted = floats_of(lengths)
     if wanted.shape != (rig.cable_count,) or not np.all(np.isfinite(wanted)):
         raise BadInput(
             f"needs a finite length for each of {rig.cable_count} cables",

@@ -277,9 +277,11 @@ def _rotation(document: PlanDocument) -> list[tuple[str, str]]:
 
 def _search_sentence(document: PlanDocument) -> str:
     statistics, planner = document.statistics, document.planner
-    rest = f"{statistics.edge_checks} edge checks, {statistics.planning_time_s:.2f} s"
+    checks = f"{statistics.edge_checks} edge check{'s' * (statistics.edge_checks != 1)}"
+    rest = f"{checks}, {statistics.planning_time_s:.2f} s"
     if isinstance(planner, OptimalPlannerDocument):
         search = f", {(statistics.search_time_s or 0.0) * 1e3:.0f} ms of search"
-        again = " ".join(f"--rounds {rounds}" for rounds in planner.rounds)
-        return f"{sum(planner.rounds)} rounds (to repeat: {again}), {rest}{search}"
+        again = " ".join(f"--rounds {of_leg}" for of_leg in planner.rounds)
+        rounds = sum(planner.rounds)
+        return f"{rounds} round{'s' * (rounds != 1)} (to repeat: {again}), {rest}{search}"
     return f"{statistics.nodes} nodes, {statistics.iterations} samples, {rest}"

@@ -22,9 +22,35 @@ from model.errors import BadInput
 Array = NDArray[np.float64]
 
 
+def floats_of(values: ArrayLike) -> Array:
+    """What a script passes as an array of numbers; a copy only where it is none yet.
+
+    Raises:
+        BadInput: It has masked values; NumPy would use the numbers behind the mask.
+    """
+    require_unmasked(values)
+    return np.asarray(values, dtype=np.float64)
+
+
+def require_unmasked(values: object) -> None:
+    """Requires an array, or a list of arrays, without masked values.
+
+    Raises:
+        BadInput: It has some.
+    """
+    if isinstance(values, list | tuple):
+        for one in values:
+            require_unmasked(one)
+    elif isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        raise BadInput(
+            "an array has masked values, which are not to be used as numbers",
+            next_step="leave them out, or fill them with `numpy.ma.filled`",
+        )
+
+
 def read_only(values: ArrayLike) -> Array:
-    """A float copy of ``values`` that cannot be written to."""
-    array = np.array(values, dtype=np.float64)
+    """A float copy of ``values`` that cannot be written to; errors as for `floats_of`."""
+    array = np.array(floats_of(values))
     array.setflags(write=False)
     return array
 
@@ -40,7 +66,7 @@ def point_of(name: str, given: ArrayLike) -> Array:
         BadInput: It is something else, or a coordinate is not finite.
     """
     try:
-        point = np.asarray(given, dtype=np.float64)
+        point = floats_of(given)
     except (TypeError, ValueError, OverflowError):
         point = np.empty(0)
     if point.shape != (3,) or not np.isfinite(point).all():
@@ -267,9 +293,15 @@ class Pose(ReadOnly):
         """Angle between the z axes of both frames, [rad]."""
         return float(np.arccos(np.clip(self.rotation[2, 2], -1.0, 1.0)))
 
+    @property
+    def turn(self) -> float:
+        """Angle about z that is left without the tilt, as in `RotationLimits`, −π to π, [rad]."""
+        w, _, _, z = self.quaternion
+        return 2.0 * math.atan2(z, w) if w >= 0.0 else 2.0 * math.atan2(-z, -w)
+
     def apply(self, points: ArrayLike) -> Array:
         """Maps points, shape (..., 3), [m], of the inner frame into the outer one."""
-        mapped: Array = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.position
+        mapped: Array = floats_of(points) @ self.rotation.T + self.position
         return mapped
 
     def compose(self, other: Pose) -> Pose:

@@ -16,7 +16,7 @@ from model.errors import BadInput, path_of, require_types
 from model.files.documents import document_hash, document_of, key_path, load_yaml, millimetres
 from model.files.rig_file import MotionDocument, RigDocument, WinchDocument
 from model.pages.page import html_table
-from model.pose import Array, Pose, ReadOnly, read_only
+from model.pose import Array, Pose, ReadOnly, floats_of, read_only
 from model.posed_rig import PosedRig, posed_rig
 from model.scene import Load, Scene
 
@@ -202,12 +202,12 @@ class Rig(ReadOnly):
 
     def tensions_by(self, torques: ArrayLike) -> Array:
         """Cable tensions at rest, shape (..., m), [N], from torques [per mille of rated torque]."""
-        tensions: Array = np.asarray(torques, dtype=np.float64) / 1000.0 * self._rated_tensions
+        tensions: Array = floats_of(torques) / 1000.0 * self._rated_tensions
         return tensions
 
     def torques_by(self, tensions: ArrayLike) -> Array:
         """The inverse of `tensions_by`: torques, shape (..., m), [per mille of rated torque]."""
-        torques: Array = np.asarray(tensions, dtype=np.float64) * 1000.0 / self._rated_tensions
+        torques: Array = floats_of(tensions) * 1000.0 / self._rated_tensions
         return torques
 
     @cached_property

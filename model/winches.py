@@ -118,8 +118,8 @@ class WinchMap:
         balance = self._balance(pose, unstrained, load)
         for _ in range(_STEPS):
             columns = [
-                self._balance(moved(pose, scale * way), unstrained, load) - balance
-                for way in _DIFFERENCE * np.eye(6)
+                self._balance(moved(pose, scale * unit), unstrained, load) - balance
+                for unit in _DIFFERENCE * np.eye(6)
             ]
             try:
                 step = np.linalg.solve(np.array(columns).T / _DIFFERENCE, -balance)

@@ -25,7 +25,7 @@ from model.clearance import ClearanceModel, Nearest
 from model.errors import BadInput
 from model.kinematics import cables_at, structure_matrix
 from model.plan import Plan
-from model.pose import Array, Pose
+from model.pose import Array, Pose, interpolate, largest_rotations
 from model.rig import Rig
 from model.scene import Scene, legs_of
 from model.statics.feasibility import WrenchBox, capacity_margin
@@ -233,7 +233,11 @@ class _Check:
             excess = limits.excess(start, end)
             if excess is not None:
                 what = f"the platform is {excess.how} too far"
-                self._violation(what, excess.measured, excess.limit, "°", start.position)
+                kind = 0 if excess.how == "tilted" else 1
+                poses = [interpolate(start, end, share) for share in np.linspace(0.0, 1.0, 101)]
+                angles = [largest_rotations(p.quaternion, p.quaternion)[kind] for p in poses]
+                position = poses[int(np.argmax(angles))].position
+                self._violation(what, excess.measured, excess.limit, "°", position)
                 return
 
     def _check_pulleys(self) -> None:
@@ -249,10 +253,10 @@ class _Check:
             pose = self._pose(sample)
             reach = axis_distances(self.rig, pose)
             k = int(np.argmin(reach))
-            nearest = float(reach[k]) - SPACING  # it may come nearer between samples
-            if not nearest >= AXIS_RADII * radius:
+            least = AXIS_RADII * radius + SPACING  # it may come nearer between samples
+            if not reach[k] >= least:
                 what = f"cable {k + 1} is too close to its pulley's axis to bound its motion"
-                self._violation(what, nearest, AXIS_RADII * radius, "mm", pose.position)
+                self._violation(what, reach[k], least, "mm", pose.position)
                 return
 
     def _obstacle_clearance(self) -> tuple[Closest | None, Smallest | None]:
@@ -327,12 +331,19 @@ class _Check:
         self, name: str, closest: Closest, proof: Smallest, required: float
     ) -> None:
         pair = f"{closest.nearest.first} – {closest.nearest.second}"
-        if not proof.value >= required:
-            what = f"{name} too small, {pair}"
-            self._violation(what, proof.value, required, "mm", closest.pose.position)
-        elif not proof.proved >= required:
-            what = f"{name} not proved between samples, {pair}"
-            self._violation(what, proof.proved, required, "mm", closest.pose.position)
+        what = (f"{name} too small, {pair}", f"{name} not proved between samples, {pair}")
+        self._smallest_violation(what, proof, required, "mm")
+
+    def _smallest_violation(
+        self, what: tuple[str, str], proof: Smallest, limit: float, unit: str
+    ) -> None:
+        """``what`` is said of a sample below the limit, and of a bound below it between samples."""
+        below, unproved = what
+        position = self._pose(proof.at).position
+        if not proof.value >= limit:
+            self._violation(below, proof.value, limit, unit, position)
+        elif not proof.proved >= limit:
+            self._violation(unproved, proof.value, limit, unit, position, proof.proved)
 
     def _margin(self) -> Smallest:
         load = self.scene.load
@@ -350,10 +361,11 @@ class _Check:
 
         tolerance = MARGIN_TOLERANCE * self.rig.max_tension
         found = smallest_along(self.samples, evaluate, self._margin_slope(), 0.0, tolerance)
-        if not found.proved >= 0.0:
-            what = "the cables cannot hold every required load: capacity margin"
-            position = self._pose(found.at).position
-            self._violation(what, min(found.value, found.proved), 0.0, "N", position)
+        what = (
+            "the cables cannot hold every required load: capacity margin",
+            "capacity margin not proved between samples",
+        )
+        self._smallest_violation(what, found, 0.0, "N")
         return found
 
     def _margin_slope(self) -> float:
@@ -401,22 +413,27 @@ class _Check:
         """The largest speed of a cable at the rig's path speed, [m/s]."""
         twists = self.rig.motion.speed * self.path.twists(self.samples, self.length_unit)
         limits = np.array([winch.max_speed for winch in self.rig.winches])
-        largest = 0.0
-        for sample, twist in zip(self.samples.tolist(), twists, strict=True):
-            pose = self._pose(sample)
-            speeds = np.abs(structure_matrix(self.rig, pose).T @ twist)
-            largest = max(largest, float(speeds.max()))
-            over = int(np.argmax(speeds - limits))
-            if not speeds[over] <= limits[over]:
-                what = f"cable {over + 1} would have to move faster than its winch can"
-                self._violation(what, speeds[over], limits[over], "mm/s", pose.position)
-                break
-        return largest
+        poses = [self._pose(sample) for sample in self.samples.tolist()]
+        matrices = np.array([structure_matrix(self.rig, pose) for pose in poses])
+        speeds = np.abs(np.einsum("kim,ki->km", matrices, twists))
+        at, cable = np.unravel_index(np.argmax(speeds - limits), speeds.shape)
+        if not speeds[at, cable] <= limits[cable]:
+            what = f"cable {cable + 1} would have to move faster than its winch can"
+            figures = speeds[at, cable], limits[cable]
+            self._violation(what, *figures, "mm/s", poses[at].position)
+        return float(speeds.max())
 
     def _violation(
-        self, what: str, measured: float, limit: float, unit: str, position: Array
+        self,
+        what: str,
+        measured: float,
+        limit: float,
+        unit: str,
+        position: Array,
+        proved: float | None = None,
     ) -> None:
-        self.violations.append(Violation(what, float(measured), float(limit), unit, position))
+        figures = float(measured), float(limit)
+        self.violations.append(Violation(what, *figures, unit, position, proved))
 
 
 def axis_distances(rig: Rig, pose: Pose) -> Array:

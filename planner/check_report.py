@@ -59,10 +59,11 @@ class Violation:
 
     Attributes:
         what: The violation, without figures.
-        measured: SI.
+        measured: The value at ``position``, SI.
         limit: SI.
         unit: Unit of display: "mm", "mm/s", "°" or "N".
         position: Of the platform there, shape (3,), [m].
+        proved: Lower bound of the value along the path, SI, where only that violates the limit.
     """
 
     what: str
@@ -70,13 +71,15 @@ class Violation:
     limit: float
     unit: str
     position: Array
+    proved: float | None = None
 
     def sentence(self) -> str:
         """The violation in words, with figures and platform position."""
         scale = _SCALE[self.unit]
         x, y, z = (float(c) * 1000.0 for c in self.position)
+        bound = "" if self.proved is None else f", proved {self.proved * scale:.4g} {self.unit}"
         return (
-            f"{self.what}: {self.measured * scale:.4g} {self.unit}"
+            f"{self.what}: {self.measured * scale:.4g} {self.unit}{bound}"
             f" (limit {self.limit * scale:.4g} {self.unit})"
             f" with the platform at [{x:.1f}, {y:.1f}, {z:.1f}] mm"
         )

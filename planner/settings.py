@@ -47,7 +47,7 @@ def whole_number(name: str, value: int, least: int = 0, most: int = WHOLE_LARGES
         BadInput: It is not a whole number, or outside the limits.
     """
     try:
-        number = operator.index(value)
+        number = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = None
     if number is None or not least <= number <= most:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from model.errors import BadInput
 from model.files.camera_file import FISHEYE, Gamma
-from model.pose import Array
+from model.pose import Array, require_unmasked
 from model.rig import Camera
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
@@ -183,6 +183,18 @@ def pixels_of(camera: Camera, points_in_camera: Array) -> Array:
     return project(camera.lens, camera.matrix, camera.distortion, points_in_camera)
 
 
+_ROUND_TRIP = 0.01
+"""Pixels undistorted and distorted again return within this, [px], where the lens has rays."""
+
+
+def has_rays(camera: Camera, pixels: Array) -> NDArray[np.bool_]:
+    """Whether points, shape (..., 2), [px], can be undistorted: not 90° off the axis; (...)."""
+    if not pixels.size:
+        return np.ones(pixels.shape[:-1], dtype=np.bool_)
+    back = distort_pixels(camera, undistort_pixels(camera, pixels))
+    return np.asarray(np.abs(back - pixels).max(axis=-1) < _ROUND_TRIP)
+
+
 def project_undistorted(camera: Camera, points_in_camera: Array) -> Array:
     """Undistorted pixels of points, shape (..., 3), [m]; shape (..., 2)."""
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
@@ -215,8 +227,9 @@ def require_image_format(image: Image, camera: Camera, rig: str) -> None:
         rig: Name of the rig.
 
     Raises:
-        BadInput: It is not grey with 8 bits, or not of the camera's size.
+        BadInput: It is not grey with 8 bits, not of the camera's size, or has masked pixels.
     """
+    require_unmasked(image)
     wanted = (camera.height, camera.width)
     if image.shape != wanted or image.dtype != np.uint8:
         size = " x ".join(map(str, image.shape[1::-1] if image.ndim > 1 else image.shape))

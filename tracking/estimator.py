@@ -19,7 +19,7 @@ from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, distort_pixels, pixels_of, project_undistorted
 from tracking.detection.detector import Detection
 from tracking.detection.diagnostics import edge_faults
-from tracking.detection.tags import carries_tag, modules_across, tag_corners
+from tracking.detection.tags import carries_tag, modules_across, tag_corners, view_angle
 from tracking.edges.refine import refine
 from tracking.measurement import NoPose, Observation, PoseMeasurement, largest_deviations
 from tracking.pnp import BundlePose, TagView, displaced_tag, fit_inliers, solve_pnp, square_poses
@@ -227,8 +227,8 @@ class PlatformEstimator:
         self._modules = modules_across(rig.tag_family)
         self._platform = {tag.id: tag for tag in rig.platform_tags}
         self._frame = frozenset(tag.id for tag in rig.frame_tags)
-        # The platform hangs between or below the outlets: it is in the box around them, its
-        # workspace and its home pose, plus its own size.
+        # The platform hangs between or below the outlets, after a fault and on supports outside its
+        # workspace: it is in the box around outlets, workspace and home, plus its own size.
         size = float(np.linalg.norm(rig.half_size))
         reached = np.vstack(
             [rig.outlets, rig.workspace_lower, rig.workspace_upper, rig.home.position]
@@ -285,7 +285,8 @@ class PlatformEstimator:
         status: str,
     ) -> Observation:
         detected = views
-        agreed, measured = self._agreed(views), len(views) > 0
+        agreed = find_consensus(self._camera, views, lambda pose: not self._impossible(views, pose))
+        measured = len(views) > 0
         if agreed.ambiguous:
             twice = ", ".join(map(str, agreed.ambiguous))
             return NoPose(time, f"tags {twice} are detected at inconsistent positions", seen)
@@ -303,7 +304,7 @@ class PlatformEstimator:
             by_rows = self._by_rows.fitted(time, views, start, self._fitted)
             fitted = None if by_rows is None else (by_rows.views, by_rows.bundle)
         if fitted is None:
-            return NoPose(time, f"no tag of the platform fits a pose; {CAUSE}", seen)
+            return NoPose(time, self._no_fit_reason(views, start), seen)
         faced = [v for v in views if self._faces(v.tag, fitted[1].camera_from_body)]
         edges = sum(int(view.seen.edges.sum()) for view in faced)
         views, bundle = fitted
@@ -313,6 +314,7 @@ class PlatformEstimator:
         elsewhere = self._elsewhere(detected, views, bundle)
         likely = self._expected_error(bundle)
         reason = rejection_reason(limits, views, bundle, prior, edges, likely, elsewhere)
+        reason = reason or self._impossible(views, bundle.camera_from_body)
         faults = edge_faults(image, self._camera, [view.seen for view in views], self._modules)
         if reason or faults.unusable:
             return NoPose(time, "; ".join(filter(None, (reason, str(faults)))), seen)
@@ -322,16 +324,32 @@ class PlatformEstimator:
         covariance = read_only(found.covariance + by_rows.covariance)
         return replace(found, covariance=covariance, at_rest=by_rows.at_rest)
 
-    def _agreed(self, views: Sequence[TagView]) -> Consensus:
-        """The views that agree on a possible pose of the platform."""
-        world_from_camera = self._camera.world_from_camera
+    def _impossible(self, views: Sequence[TagView], camera_from_platform: Pose) -> str:
+        """Why the platform cannot have the pose that fits tags; empty if it can.
 
-        def possible(camera_from_platform: Pose) -> bool:
-            pose = world_from_camera.compose(camera_from_platform)
-            inside = np.all((pose.position >= self._lower) & (pose.position <= self._upper))
-            return bool(inside) and pose.angle_to(self._rig.home) < self._settings.turn
+        A fit can end at the mirror pose of the one it began at, so its result is tested as well.
+        """
+        pose = self._camera.world_from_camera.compose(camera_from_platform)
+        fits = f"the pose that fits tags {', '.join(str(view.tag.id) for view in views)} is"
+        turn, limit = np.degrees([pose.angle_to(self._rig.home), self._settings.turn])
+        if not turn < limit:
+            return f"{fits} {turn:.0f}° from the home pose, the limit is {limit:g}°"
+        if np.all((pose.position >= self._lower) & (pose.position <= self._upper)):
+            return ""
+        x, y, z = pose.position * 1e3
+        return f"{fits} at ({x:.0f}, {y:.0f}, {z:.0f}) mm, where the platform cannot be"
 
-        return find_consensus(self._camera, views, possible)
+    def _no_fit_reason(self, views: Sequence[TagView], start: Pose) -> str:
+        """Why no view gives a pose near ``start``, in the camera frame."""
+        limit, angles = self._settings.view_angle, [view_angle(v.tag, start) for v in views]
+        if not views or min(angles) < limit:
+            return f"no tag of the platform fits a pose; {CAUSE}"
+        # The mirror pose of a tag seen at 80° can show it from behind, at 100°.
+        seen = max(limit, min(min(angle, math.pi - angle) for angle in angles))
+        return (
+            f"tags {', '.join(str(view.tag.id) for view in views)} are seen"
+            f" {np.degrees(seen):.0f}° from their normal, the limit is {np.degrees(limit):.0f}°"
+        )
 
     def _no_pose_reason(self, seen: tuple[int, ...], measured: bool) -> str:
         if mine := [str(number) for number in seen if number in self._platform]:
@@ -395,9 +413,7 @@ class PlatformEstimator:
 
     def _faces(self, tag: Tag, camera_from_platform: Pose) -> bool:
         """Whether the camera sees a tag's front within the view angle."""
-        camera_from_tag = camera_from_platform.compose(tag.pose)
-        away = camera_from_tag.position / np.linalg.norm(camera_from_tag.position)
-        return bool(-camera_from_tag.rotation[:, 2] @ away > np.cos(self._settings.view_angle))
+        return view_angle(tag, camera_from_platform) < self._settings.view_angle
 
     def _fitted(self, views: list[TagView], start: Pose) -> tuple[list[TagView], BundlePose] | None:
         """The pose from all views, without oblique and displaced tags and outlier edges."""

@@ -10,18 +10,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
-from model.pose import (
-    Array,
-    Pose,
-    interpolate,
-    moved,
-    read_only,
-    step_between,
-)
-from tracking.measurement import NoPose, Observation, PoseMeasurement, extrapolate
+from model.cameras import Z_95
+from model.pose import Array, Pose, interpolate, moved, read_only, step_between
+from tracking.measurement import MEMORY, NoPose, Observation, PoseMeasurement, extrapolate
 from tracking.pose_log import LoggedPicture
 
 #: Standard deviation of a camera's pose from lens, extrinsics and tags where not stated; always
@@ -32,6 +27,8 @@ UNSTATED_ERROR = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
 GATE = 27.9
 #: Part of the reason for a missing pose where two cameras contradict each other.
 DISAGREE = "disagree"
+#: Clocks are compared from this number of frame sets on.
+LEAST_FRAME_SETS = 10
 
 
 class MultiCameraFusion:
@@ -55,6 +52,11 @@ class MultiCameraFusion:
         """Number of frame sets in which a pose was dropped because its velocity was unknown."""
         self._within = within
         self._before: dict[str, PoseMeasurement] = {}
+        self._clocks: dict[tuple[str, str], ClockComparison] = {}
+
+    def clock_remarks(self) -> list[str]:
+        """One sentence for each pair of cameras whose clocks differ."""
+        return [text for clocks in self._clocks.values() if (text := clocks.remark())]
 
     def of(self, seen: Mapping[str, Observation]) -> Observation:
         """The fused pose of a frame set, see `fuse_poses`.
@@ -70,6 +72,9 @@ class MultiCameraFusion:
         carried = {n: extrapolate(one, self._before.get(n), newest) for n, one in near.items()}
         at_newest = {name: one for name, one in carried.items() if one is not None}
         self._before |= poses
+        for pair in combinations(poses, 2):
+            clocks = self._clocks.setdefault(pair, ClockComparison(*pair))
+            clocks.add(poses[pair[0]], poses[pair[1]])
         self.apart += len(near) < len(poses)
         self.without_speed += len(at_newest) < len(near)
         return fuse_poses(at_newest)
@@ -192,6 +197,78 @@ def _shared(poses: Sequence[PoseMeasurement], parts: Sequence[Array]) -> Array:
     for one, part in zip(poses, parts, strict=True):
         total += part @ one.shared @ part.T
     return read_only(len(poses) * total)
+
+
+class ClockComparison:
+    """Finds the offset between the clocks of two cameras from the platform's motion.
+
+    Their disagreement is fitted by an offset and a matrix times the position, for errors of lens,
+    extrinsics and tags (0 within what the poses and `UNSTATED_ERROR` state), plus a time times the
+    velocity, and a share of the change of velocity, to which an offset also leads.
+    """
+
+    def __init__(self, first: str, second: str) -> None:
+        """Starts without poses of two cameras, given by name."""
+        self._names = (first, second)
+        self._newest: deque[tuple[PoseMeasurement, PoseMeasurement]] = deque(maxlen=3)
+        self._start, self._prior = np.zeros(3), np.zeros((14, 14))
+        self._normal, self._sum, self._cost = np.zeros((14, 14)), np.zeros(14), 0.0
+        self._count, self._speed_2, self._speed_4 = 0, 0.0, 0.0
+
+    def add(self, first: PoseMeasurement, second: PoseMeasurement) -> None:
+        """Adds the poses of a frame set; the velocity is that between its neighbours."""
+        self._newest.append((first, second))
+        if len(self._newest) < 3:
+            return
+        before, (a, b), after = self._newest
+        spans = np.array([new.time - old.time for old, new in zip(before, after, strict=True)])
+        if not np.all((spans > 0.0) & (spans <= 2.0 * MEMORY)):
+            return
+        old, here, new = (np.array([one.pose.position for one in pair]) for pair in self._newest)
+        velocity = np.mean((new - old) / spans[:, None], axis=0)
+        second_difference = np.mean(new - 2.0 * here + old, axis=0)
+        if self._count == 0:
+            self._start = here[0]
+            stated = (a.shared + b.shared)[:3, :3] + 2.0 * np.diag(UNSTATED_ERROR[:3] ** 2)
+            self._prior[:3, :3] = np.linalg.inv(stated)
+            self._prior[3:12, 3:12] = np.eye(9) / (2.0 * UNSTATED_ERROR[3] ** 2)
+            self._prior[13, 13] = 1.0
+        gap = here[1] - here[0] - velocity * (b.time - a.time)
+        by_position = np.kron(np.eye(3), here[0] - self._start)
+        row = np.column_stack([np.eye(3), by_position, velocity, second_difference])
+        weighted = row.T @ np.linalg.inv((a.covariance + b.covariance)[:3, :3])
+        self._normal += weighted @ row
+        self._sum += weighted @ gap
+        self._cost += float(gap @ weighted[:3] @ gap)
+        self._count += 1
+        self._speed_2 += float(velocity @ velocity)
+        self._speed_4 += float(velocity @ velocity) ** 2
+
+    def remark(self) -> str:
+        """The offset and its effect; empty if it is not significant (3σ), or below 0.5 mm."""
+        if self._count < LEAST_FRAME_SETS or self._speed_2 == 0.0:
+            return ""
+        scale, unknown = 1.0, np.ones((14, 14))
+        unknown[:3, :3] = 1e-4  # as if nothing were known about the cameras' poses
+        for _ in range(2):  # then with the scatter that the first fit leaves
+            covariance = np.linalg.inv(self._normal / scale + self._prior)
+            fit = covariance @ self._sum / scale
+            left = float(self._cost - 2.0 * fit @ self._sum + fit @ self._normal @ fit)
+            scale = max(1.0, left / (3.0 * self._count))
+        alone = np.linalg.inv(self._normal / scale + unknown * self._prior)
+        late, (sigma, sigma_alone) = fit[12], np.sqrt([covariance[12, 12], alone[12, 12]])
+        speed = np.sqrt(self._speed_4 / self._speed_2)
+        if abs(late) < 3.0 * sigma or abs(late) * speed < UNSTATED_ERROR[0]:
+            return ""
+        earlier, later = self._names if late > 0.0 else self._names[::-1]
+        perhaps = "perhaps " if abs(late) < 3.0 * sigma_alone else ""
+        otherwise = ", and their poses at rest, as the velocity hardly changes" if perhaps else ""
+        return (
+            f"cameras {' and '.join(self._names)} {DISAGREE} by {abs(late) * speed * 1e3:.1f} mm"
+            f" along the motion at {speed * 1e3:.0f} mm/s: {perhaps}images of {later} are taken"
+            f" {abs(late) * 1e3:.0f} ± {np.ceil(Z_95 * sigma * 1e3):.0f} ms (95 %) later than those"
+            f" of {earlier} with the same time; compare their clocks and latency_ms{otherwise}"
+        )
 
 
 # Synchronization of images from several cameras.

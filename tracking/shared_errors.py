@@ -42,7 +42,7 @@ def missing_errors(rig: Rig, camera: Camera) -> tuple[str, ...]:
 
 
 def require_stated_errors(
-    rig: Rig, cameras: Sequence[Camera], use: str = "measure clearance"
+    rig: Rig, cameras: Sequence[Camera], use: str = "measure clearance", then: str = ""
 ) -> None:
     """Refuses to measure with unknown errors.
 
@@ -50,6 +50,7 @@ def require_stated_errors(
         rig: Its tags.
         cameras: That measure.
         use: What they are to do.
+        then: The step after a change of the rig file.
 
     Raises:
         BadInput: For a camera with unknown errors; it asks for one number.
@@ -62,7 +63,7 @@ def require_stated_errors(
                 where=f"rig {rig.name}",
                 why=f"calibrations have not stated {', '.join(missing)}",
                 next_step=f"add `error_mm` to camera {camera.name!r} in the rig file: the error of"
-                " the measured platform and cables, 95 %; or run these calibrations",
+                f" the measured platform and cables, 95 %; or run these calibrations{then}",
                 values={"camera": camera.name},
             )
 

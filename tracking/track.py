@@ -200,11 +200,13 @@ class MultiCameraCount:
         without_partner: Images without an image of another camera at about the same time.
         apart: Frame sets with a pose dropped because its image is too far from the others in time.
         without_speed: Frame sets with a pose dropped because its velocity is unknown.
+        clocks: Pairs of cameras whose clocks differ, one sentence each; known at the end.
     """
 
     without_partner: int = 0
     apart: int = 0
     without_speed: int = 0
+    clocks: list[str] = field(default_factory=list)
 
 
 def track_cameras(
@@ -245,6 +247,7 @@ def track_cameras(
         else:
             reason = found.reason
         yield LoggedPicture(next(iter(alone.values())).name, found, clearance, frame), alone
+    count.clocks = common.clock_remarks()
     if not poses:
         next_step = (
             "check that the cameras see the platform; `cdpr track` with a single source gives"
@@ -258,6 +261,7 @@ def track_cameras(
         raise NoPlatformSeen(
             f"no camera gives a platform pose: {reason}",
             where=f"cameras {', '.join(streams)}",
+            why="; ".join(count.clocks),
             next_step=next_step,
         )
 

@@ -136,7 +136,7 @@ def require_oriented(board: Board) -> None:
 
 def observe_board(board: Board, camera: Camera, image: Image) -> BodyObservation | None:
     """Detects a board in an image; None where it is not found."""
-    seen = board.find(image)
+    seen = board.find(image, camera)
     return None if seen is None else _board_pose(seen, camera)
 
 

@@ -230,7 +230,7 @@ class RigCalibration:
                 one = [geometry.stiffness.mean()] if group == "stiffness" else geometry.stiffness
                 rows = zip(names, one, np.exp(half_widths[columns]), strict=True)
                 # The interval is symmetric in the logarithm of the stiffness.
-                found |= {f"{n}_n": Interval.between(s / w, s * w) for n, s, w in rows}
+                found |= {f"{n}_n": Interval.by_factor(float(s), float(w)) for n, s, w in rows}
                 continue
             values, unit, scale = tables[group]
             rows = zip(names, values, half_widths[columns] * scale, strict=True)

@@ -146,7 +146,7 @@ def number_rows(result: RigCalibration) -> list[tuple[str, str, str, str, str, s
 
 def _row(name: str, before: float, found: Interval) -> tuple[str, str, str, str, str, str]:
     change = found.value - before
-    digits = 0 if abs(found.value) > 2000.0 else 2
+    digits = 0 if name.endswith("_n") else 2
     return (
         name,
         f"{before:.{digits}f}",

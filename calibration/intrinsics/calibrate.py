@@ -33,7 +33,7 @@ from calibration.statistics import (
     widened,
 )
 from calibration.targets.boards import Board, DetectedBoard, is_mirrored
-from model.cameras import Z_95
+from model.cameras import Z_95, generic_camera
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
 from tracking.camera_model import Image
@@ -180,6 +180,7 @@ class CameraCalibration:
         unused: Why each of the other images is not used, by name.
         data_hash: Of the corners used.
         previews: Reduced copies of the images used, by name; empty when fitted to corners.
+        board: The board in the images; None when fitted to corners.
     """
 
     size: tuple[int, int]
@@ -193,6 +194,7 @@ class CameraCalibration:
     unused: Mapping[str, str]
     data_hash: str
     previews: Mapping[str, Image] = field(default_factory=dict)
+    board: Board | None = None
 
     @property
     def error(self) -> float:
@@ -255,7 +257,46 @@ def fit_camera(
             left_out |= {f"{name}, {k}": "is detected more than once" for k in seen.twice}
     if size is None or len(views) < LEAST_VIEWS:
         raise _too_few(views, left_out, board, without.chosen())
-    return replace(calibrate_from_views(views, size, left_out, lens), previews=previews)
+    found = calibrate_from_views(views, size, left_out, lens)
+    return replace(found, previews=previews, board=board)
+
+
+def refit_camera(
+    first: CameraCalibration,
+    pictures: Iterable[tuple[str, Image]],
+    board: Board,
+    lens: str = AUTO,
+) -> CameraCalibration:
+    """Fits a camera again, to corners detected with the lens of the first fit.
+
+    Args:
+        first: The first fit.
+        pictures: Its images, read again.
+        board: As in the first fit.
+        lens: As in `fit_camera`.
+
+    Raises:
+        BadInput: An image cannot be read again, or too few images show the board.
+    """
+    camera = replace(
+        generic_camera(first.size),
+        matrix=first.matrix,
+        distortion=first.distortion,
+        lens=first.lens.kind,
+    )
+    again = {name: board.find(image, camera) for name, image in pictures if name in first.views}
+    if missing := [name for name in first.views if name not in again]:
+        raise BadInput(
+            "the image cannot be read again",
+            where=missing[0],
+            why=f"the corners of {board} depend on the lens: they are detected twice",
+            next_step="pass images that can be read twice, such as a folder or a list",
+        )
+    views = {name: seen for name, seen in again.items() if seen is not None}
+    left_out = {name: NOT_FOUND for name in again if name not in views}
+    found = calibrate_from_views(views, first.size, {**first.unused, **left_out}, lens)
+    previews = {name: first.previews[name] for name in found.views}
+    return replace(found, previews=previews, board=board)
 
 
 def _reduced(image: Image) -> Image:

@@ -22,7 +22,7 @@ import yaml
 from pydantic import ValidationError
 
 from calibration.intrinsics.result import camera_named, with_camera
-from model.cameras import camera_from
+from model.cameras import camera_from, is_camera_matrix, principal_point_doubt
 from model.errors import BadInput
 from model.files.camera_file import FISHEYE, CameraDocument
 from model.files.documents import read_text, read_yaml, write_atomic
@@ -174,9 +174,6 @@ FORMATS: dict[FormatName, Callable[[CameraDocument], str]] = {
 def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None) -> CameraDocument:
     """A camera with the parameters of a file in one of `FORMATS`, detected by content.
 
-    Such files state no uncertainties: that of the lens, of a pose found with another lens, and of
-    what is measured with both, is unknown.
-
     Args:
         path: The file.
         camera: Gives name, pose and rate.
@@ -195,18 +192,19 @@ def _with_lens(camera: CameraDocument, found: Mapping[str, Any], path: Path) -> 
         return CameraDocument.model_validate(kept | {key: found[key] for key in _KEYS})
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise _unusable(path, f"{key}: {first['msg']}") from None
+        raise _unusable(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
-def _remarks(camera: CameraDocument, found: Mapping[str, Any], path: Path) -> list[str]:
-    """What is assumed about a file, and what remains to be done after its import."""
-    what = f"the pose of camera {camera.name!r} was found with another lens"
+def _remarks(own: CameraDocument, new: CameraDocument, path: Path, assumed: bool) -> list[str]:
+    """What is assumed or doubtful about a file, and what remains to be done after its import."""
+    what = f"the pose of camera {own.name!r} was found with another lens"
     remarks = [f"{what}; calibrate it with `cdpr calibrate extrinsics`"]
-    if found["assumed"]:
+    if doubt := principal_point_doubt(new):
+        remarks.insert(0, f"{path.name}: {doubt}")
+    if assumed:
         remarks.insert(0, f"{path.name} has no distortion_model; plumb_bob is assumed, as by ROS")
-    if camera.error_mm is not None:
-        what = f"error_mm, {camera.error_mm:g}, was stated for another lens and is left out"
+    if own.error_mm is not None:
+        what = f"error_mm, {own.error_mm:g}, was stated for another lens and is left out"
         remarks.append(f"{what}; state it again before clearance is measured")
     return remarks
 
@@ -279,22 +277,22 @@ def write_rig_with_camera(
             next_step="choose a name that does not exist yet",
         )
     own, found = camera_named(rig.document, name), _found(path, entry)
-    document = with_camera(rig.document, _with_lens(own, found, path))
+    new = _with_lens(own, found, path)
+    document = with_camera(rig.document, new)
     rig_from_document(document)
     plain = document.model_dump(mode="json", exclude_unset=True)
     body = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None)
     head = [f"{rig.name} with camera {name} of {path.name}; written by `cdpr calibrate import`"]
-    remarks = _remarks(own, found, path)
+    remarks = _remarks(own, new, path, found["assumed"])
     comments = "".join(f"# {line}\n" for line in head + remarks)
     write_atomic(output, f"{comments}{body}")
     for remark in remarks:
         listener.remark(remark)
-    return camera_named(document, name)
+    return new
 
 
 def _ros_matrix(values: np.ndarray[Any, Any]) -> dict[str, Any]:
-    rows, columns = values.shape
-    return {"rows": rows, "cols": columns, "data": [float(x) for x in values.ravel()]}
+    return {"rows": len(values), "cols": values.shape[1], "data": values.ravel().tolist()}
 
 
 def _opencv_yaml(text: str) -> Any:
@@ -431,6 +429,9 @@ def _numbers(path: Path, size: Array, matrix: Array, lens: Array, kind: str) -> 
         shape = f"{len(size)} numbers for the image's size and {len(matrix)} for the matrix"
         raise _unusable(path, f"it has {shape}, not 2 and 9 (3 x 3), or fx, fy, cx, cy")
     if len(matrix) == 9:
+        if not is_camera_matrix(square := matrix.reshape(3, 3)):
+            hint = "; it is transposed, as in MATLAB" if is_camera_matrix(square.T) else ""
+            raise _unusable(path, f"its camera matrix is not fx 0 cx, 0 fy cy, 0 0 1{hint}")
         if abs(matrix[1]) > 1e-9:
             raise _unusable(path, "camera_matrix has a skew, which rig files do not support")
         matrix = matrix[[0, 4, 2, 5]]

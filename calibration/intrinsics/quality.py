@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from calibration.intrinsics.calibrate import CameraCalibration
 from calibration.intrinsics.lens import LENSES, RADIAL, radial_share
 from calibration.results import CalibrationVerdict, Issue
+from calibration.targets.boards import Charuco
+from calibration.targets.grids import TagGrid
 from model.pose import Array, rotation_vector_from_matrix
 from tracking.camera_model import rays_of
 
@@ -26,8 +29,10 @@ ENOUGH_VIEWS = 40
 MORE = f"take more images: {ENOUGH_VIEWS} are recommended"
 NEARER = "take them again with the board filling more of the image, sharp and held still"
 """Used when there are enough images, as more like them gain little."""
-_BENT = 0.2
-"""Share of the squared errors from which a bow of the board is reported."""
+_EXPLAINED = 0.2
+"""Share of the squared errors from which another shape of the board is reported."""
+_OTHER_MARKER = 0.1
+"""Relative difference from which another size of the markers is reported."""
 _SEEN = 0.3
 """RMS corner error below which the lens model is not questioned, [px]."""
 _SIDES = (("left", 0, 0), ("right", 0, -1), ("top", 1, 0), ("bottom", 1, -1))
@@ -109,8 +114,9 @@ def judge_camera(
     bow, bent = bow_of(result)
     radial = radial_share(*corner_errors(result), result.matrix)
     issues = [
+        *_size_issues(result),
         *_image_issues(result, coverage, tilts),
-        *_board_issues(bow, bent),
+        *_bow_issues(bow, bent),
         *_lens_issues(result, radial),
         *_error_issues(result, coverage, error, halves, wanted, distance),
     ]
@@ -207,38 +213,58 @@ def _without_rotation(slopes: Array, turns: Array) -> Array:
 def bow_of(result: CameraCalibration) -> tuple[float, float]:
     """Bow of the board, and the share of the corners' errors that it explains.
 
-    The board's height is a quadratic form of its coordinates, the same in all images, fitted to
-    first order together with the camera and the board's poses.
+    The board's height is a quadratic form of its coordinates, the same in all images.
 
     Returns:
         Highest to lowest, [m], and a share of the squared errors.
     """
     points = np.concatenate([seen.points[:, :2] for seen in result.views.values()])
     middle, half = points.mean(axis=0), np.ptp(points, axis=0) / 2.0
-    numbers = len(result.lens.names)
-    information, score, squares = np.zeros((numbers + 3, numbers + 3)), np.zeros(numbers + 3), 0.0
+
+    def bows(own: Array) -> Array:
+        heights = _bow_shapes((own[:, :2] - middle) / half)
+        return np.asarray(heights[:, None, :] * np.array([0.0, 0.0, 1.0])[:, None])
+
+    change, share = _board_change(result, bows)
+    heights = _bow_shapes((points - middle) / half) @ change
+    plane = np.column_stack([np.ones(len(points)), points - middle])
+    heights = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
+    return float(np.ptp(heights)), share
+
+
+def _board_change(
+    result: CameraCalibration, shapes: Callable[[Array], Array]
+) -> tuple[Array, float]:
+    """Change of the board that fits the images best, to first order.
+
+    It is the same in all images, and fitted together with the camera and the board's poses.
+
+    Args:
+        result: The calibration.
+        shapes: Derivatives of points on the board, shape (n, 3), by the change, shape (n, 3, k).
+
+    Returns:
+        The change, shape (k,), and the share of the corners' squared errors that the fit explains.
+    """
+    information, score, squares = np.zeros(()), np.zeros(()), 0.0
     for name, seen in result.views.items():
         pose = result.boards[name]
         turn = rotation_vector_from_matrix(pose.rotation)
         there, of_pose, of_camera = result.lens.slopes(
             seen.points, turn, pose.position, result.matrix, result.distortion
         )
-        up = np.einsum("pij,j->pi", of_pose[:, 3:].reshape(-1, 2, 3), pose.rotation[:, 2])
-        shape = _bow_shapes((seen.points[:, :2] - middle) / half)
-        by_bow = (up[:, :, None] * shape[:, None, :]).reshape(-1, 3)
+        of_points = of_pose[:, 3:].reshape(-1, 2, 3) @ pose.rotation
+        of_change = of_points @ shapes(seen.points)
         errors = (seen.corners - there).ravel()
         base = np.linalg.qr(of_pose)[0]
-        own = np.column_stack([of_camera, by_bow])
+        own = np.column_stack([of_camera, of_change.reshape(len(errors), -1)])
         own = own - base @ (base.T @ own)
         information, score = information + own.T @ own, score + own.T @ errors
         squares += float(errors @ errors)
     scale = np.sqrt(np.diag(information))
     found = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)
     change = found @ (score / scale) / scale
-    heights = _bow_shapes((points - middle) / half) @ change[numbers:]
-    plane = np.column_stack([np.ones(len(points)), points - middle])
-    heights = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
-    return float(np.ptp(heights)), float(score @ change) / max(squares, 1e-300)
+    return change[len(result.lens.names) :], float(score @ change) / max(squares, 1e-300)
 
 
 def _bow_shapes(positions: Array) -> Array:
@@ -246,11 +272,46 @@ def _bow_shapes(positions: Array) -> Array:
     return np.column_stack([x * x, x * y, y * y])
 
 
-def _board_issues(bow: float, bent: float) -> list[Issue]:
-    if bent < _BENT:
+def _bow_issues(bow: float, bent: float) -> list[Issue]:
+    if bent < _EXPLAINED:
         return []
     what = f"the board is not flat: it bows by {bow * 1e3:.2g} mm"
     return [Issue(what, "glue the print on glass or another flat, stiff plate")]
+
+
+def _size_issues(result: CameraCalibration) -> list[Issue]:
+    """Sizes of the board that the images contradict."""
+    what = options = ""
+    match result.board:
+        case TagGrid() as grid:
+            gap, share = _gap_of(result, grid)
+            if share > _EXPLAINED:
+                options = "--tag-mm or --gap-mm"
+                what = f"gaps of {gap * 1e3:.3g} mm between tags of {grid.tag * 1e3:g} mm"
+                what += f", not {grid.gap * 1e3:g} mm"
+        case Charuco() as board:
+            side = float(np.median([seen.marker for seen in result.views.values()]))
+            if abs(side / board.marker - 1.0) > _OTHER_MARKER:
+                options = "--square-mm or --marker-mm"
+                what = f"markers of about {side * 1e3:.2g} mm in squares of {board.square * 1e3:g}"
+                what += f" mm, not {board.marker * 1e3:g} mm"
+    step = f"measure the print, and correct {options}"
+    return [Issue(f"the images fit {what}", step)] if what else []
+
+
+def _gap_of(result: CameraCalibration, grid: TagGrid) -> tuple[float, float]:
+    """Gap between tags of the stated size by the images, [m], and the share that it explains.
+
+    The size of tags at the stated distance is fitted, which is almost linear.
+    """
+    apart, half = grid.tag + grid.gap, grid.tag / 2.0
+
+    def sides(points: Array) -> Array:
+        middles = np.round((points - half) / apart) * apart + half
+        return np.asarray(((points - middles) / grid.tag * [1.0, 1.0, 0.0])[:, :, None])
+
+    change, share = _board_change(result, sides)
+    return grid.tag * (apart / (grid.tag + float(change[0])) - 1.0), share
 
 
 def corner_errors(result: CameraCalibration) -> tuple[Array, Array]:

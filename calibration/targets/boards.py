@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from model.errors import BadInput
+from drivers.cameras.live import silent_opencv
+from model.errors import BadInput, truth_value
 from model.files.csv_table import CsvTable
-from model.pose import Array, Pose, read_only
+from model.pose import Array, read_only
 from model.rig import Camera
 from model.tag_families import FAMILIES
 from tracking.camera_model import Image
@@ -34,19 +36,32 @@ class DetectedBoard:
         corners: Where they are in the image, shape (n, 2), [px].
         twice: Numbers of markers or tags left out because they were detected more than once: it is
             unknown which of them is on the board.
+        marker: Side of a ChArUco board's markers by its corners, [m], to a few percent.
     """
 
     points: Array
     corners: Array
     twice: tuple[int, ...] = ()
+    marker: float = math.nan
 
 
 @runtime_checkable
 class Board(Protocol):
-    """Interface of a board for `calibration.intrinsics.calibrate`."""
+    """Interface of a board for `calibration.intrinsics.calibrate`.
 
-    def find(self, image: Image) -> DetectedBoard | None:
-        """Detects the board in a grey image; None where too little of it is visible."""
+    Attributes:
+        needs_lens: Whether its corners are biased by lens distortion unless the lens is known.
+    """
+
+    needs_lens: ClassVar[bool]
+
+    def find(self, image: Image, camera: Camera | None = None) -> DetectedBoard | None:
+        """Detects the board in a grey image; None where too little of it is visible.
+
+        Args:
+            image: The image.
+            camera: That took it; one without distortion is assumed when left out.
+        """
         ...
 
     def describe_other(self, image: Image) -> str:
@@ -73,21 +88,6 @@ def require_board(
     """
     if not holds:
         raise BadInput(what, next_step=next_step)
-
-
-# A camera of which only the image size is known.
-
-
-def generic_camera(size: tuple[int, int], name: str = "camera") -> Camera:
-    """A camera without distortion and with a horizontal field of view of about 53°.
-
-    Args:
-        size: Width and height of its images, [px].
-        name: For messages.
-    """
-    width, height = size
-    matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
-    return Camera(name, width, height, matrix, np.zeros(5), Pose.level([0.0, 0.0, 0.0]), 10.0)
 
 
 # Corners detected by another program, from a CSV file (docs/data-formats.md).
@@ -162,6 +162,7 @@ class Chessboard:
     columns: int
     rows: int
     square: float
+    needs_lens: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Refuses impossible boards.
@@ -184,7 +185,7 @@ class Chessboard:
         grid = np.array([(x, y, 0.0) for y in range(self.rows) for x in range(self.columns)])
         return np.asarray(grid * self.square)
 
-    def find(self, image: Image) -> DetectedBoard | None:
+    def find(self, image: Image, camera: Camera | None = None) -> DetectedBoard | None:
         """Detects its inner corners; a large image is searched in a smaller copy first."""
         rough = None
         if (times := max(image.shape) / _SEARCHED) > 1.0:
@@ -274,14 +275,16 @@ class Charuco:
     marker: float
     dictionary: str
     legacy: bool = False
+    needs_lens: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Refuses impossible boards.
 
         Raises:
-            BadInput: Too few squares, a marker that does not fit its square, or a dictionary that
-                is unknown or has too few markers.
+            BadInput: Too few squares, a marker that does not fit its square, a dictionary that is
+                unknown or has too few markers, or another value for ``legacy``.
         """
+        truth_value("legacy", self.legacy)
         require_board(min(self.columns, self.rows) >= 3, "a ChArUco board needs 3 squares per side")
         require_board(0.0 < self.marker < self.square, "a marker must be smaller than its square")
         require_board(
@@ -301,7 +304,7 @@ class Charuco:
         """Its kind, size and dictionary."""
         return f"a ChArUco board of {self.columns} x {self.rows} squares with {self.dictionary}"
 
-    def find(self, image: Image) -> DetectedBoard | None:
+    def find(self, image: Image, camera: Camera | None = None) -> DetectedBoard | None:
         """Detects its visible inner corners; black and white may be inverted."""
         seen = self._seen_in(image)
         return self._seen_in(np.asarray(255 - image)) if seen is None else seen
@@ -323,10 +326,19 @@ class Charuco:
         chosen = points[np.ravel(numbers)[found]]
         if len(chosen) < LEAST_POINTS or _in_a_line(chosen):
             return None
-        return DetectedBoard(chosen, better[found], twice)
+        side = _marker_side(np.reshape(squares, (1, -1, 2)), chosen, better[found])
+        return DetectedBoard(chosen, better[found], twice, side)
 
     def describe_other(self, image: Image) -> str:
-        """OpenCV's other pattern, else tags and markers that the image shows."""
+        """The board with rows and columns exchanged, else tags and markers in the image.
+
+        OpenCV's other pattern, too.
+        """
+        exchanged = replace(self, columns=self.rows, rows=self.columns)
+        for other in (exchanged, replace(exchanged, legacy=not self.legacy)):
+            if self.columns != self.rows and other.find(image) is not None:
+                legacy = " --legacy" if other.legacy else ""
+                return f"{other}: try --columns {other.columns} --rows {other.rows}{legacy}"
         if replace(self, legacy=not self.legacy).find(image) is not None:
             use = "without --legacy" if self.legacy else "with --legacy"
             drawn = "4.6 and later draw" if self.legacy else "before 4.6 drew"
@@ -364,12 +376,10 @@ class Charuco:
 
     @cached_property
     def _board(self) -> cv2.aruco.CharucoBoard:
-        board = cv2.aruco.CharucoBoard(
-            (self.columns, self.rows),
-            self.square,
-            self.marker,
-            cv2.aruco.getPredefinedDictionary(_ARUCO[self.dictionary]),
-        )
+        dictionary = cv2.aruco.getPredefinedDictionary(_ARUCO[self.dictionary])
+        size = (self.columns, self.rows)
+        with silent_opencv():  # it warns about markers almost as large as their squares
+            board = cv2.aruco.CharucoBoard(size, self.square, self.marker, dictionary)
         board.setLegacyPattern(self.legacy)
         return board
 
@@ -417,6 +427,19 @@ def _saddles(image: Image, rough: Array, gaps: Array) -> tuple[Array, NDArray[np
         found = np.clip(found + step, rough - gaps[:, None], rough + gaps[:, None])
     is_saddle = (np.abs(step).max(axis=1) < _SETTLED) & (curvature < -_LEAST_CURVATURE)
     return found, is_saddle
+
+
+def _marker_side(squares: Array, points: Array, corners: Array) -> float:
+    """Median side of markers in the board's plane, [m].
+
+    Args:
+        squares: Corners of m markers, shape (1, 4 m, 2), [px].
+        points: Corners of the board in its plane, shape (n, 3), [m].
+        corners: Where they are in the image, shape (n, 2), [px].
+    """
+    back, _ = cv2.findHomography(corners, points[:, :2])
+    flat = cv2.perspectiveTransform(squares, back).reshape(-1, 4, 2)
+    return float(np.median(np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2)))
 
 
 def _in_a_line(points: Array) -> bool:

@@ -1,7 +1,7 @@
-"""Circle grids, with centres corrected for perspective, and grids of tags.
+"""Circle grids, with centres corrected for perspective and lens, and grids of tags.
 
-A circle is imaged as an ellipse whose centre is not the image of the circle's centre. The offset
-follows from the grid's homography and the circles' diameter. Centres are darkness-weighted means
+The centroid of a circle's image is not the image of the circle's centre. The offset follows from
+the grid's homography, the lens and the circles' diameter. Centres are darkness-weighted means
 over the pixels of a circle, so they do not depend on the detector's thresholds.
 
 A grid of tags may be visible in part. Kalibr's AprilGrid numbers its tags from the bottom left and
@@ -19,18 +19,21 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.targets.boards import LEAST_POINTS, DetectedBoard, generic_camera, require_board
+from calibration.targets.boards import LEAST_POINTS, DetectedBoard, require_board
+from model.cameras import generic_camera
+from model.errors import truth_value
 from model.pose import Array
+from model.rig import Camera
 from model.tag_families import FAMILIES, tags_in
-from tracking.camera_model import Image
+from tracking.camera_model import Image, distort_pixels, has_rays, undistort_pixels
 from tracking.detection.detector import TagDetector
-from tracking.detection.diagnostics import diagnose_tags
+from tracking.detection.diagnostics import diagnose_tags, row_numbering, tag_offsets
 from tracking.detection.tags import CORNER_SIGNS, dictionary, modules_across, upright_corners
 from tracking.edges.refine import refine
 
@@ -40,6 +43,8 @@ _LEAST_AREA, _LEAST_APART = 12.0, 4.0
 """Minimum area of a circle and distance between circles in that copy, [px²] and [px]."""
 _WINDOW, _CORE = 1.3, 0.6
 """Radii of the window around a circle and of its dark core, in radii of the circle."""
+_RIM = 90
+"""Points of a circle's rim whose images give its centroid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +66,16 @@ class CircleGrid:
     spacing: float
     diameter: float
     asymmetric: bool = False
+    needs_lens: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Refuses impossible boards.
 
         Raises:
-            BadInput: Too few circles, a size not above 0, or circles that touch.
+            BadInput: Too few circles, a size not above 0, circles that touch, or another value for
+                ``asymmetric``.
         """
+        truth_value("asymmetric", self.asymmetric)
         require_board(min(self.columns, self.rows) >= 3, "a circle grid needs 3 circles per side")
         apart = self.spacing * (np.sqrt(2.0) if self.asymmetric else 1.0)
         require_board(0.0 < self.diameter < apart, "circles must be larger than 0 mm and not touch")
@@ -87,20 +95,22 @@ class CircleGrid:
         ]
         return np.asarray(np.array(grid) * self.spacing)
 
-    def find(self, image: Image) -> DetectedBoard | None:
+    def find(self, image: Image, camera: Camera | None = None) -> DetectedBoard | None:
         """Detects the centres of its circles, if all are visible."""
+        lens = camera or _plain_lens(image)
         times = max(1.0, max(image.shape) / _SEARCHED)
         small = image
         if times > 1.0:
             size = (round(image.shape[1] / times), round(image.shape[0] / times))
             small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         scale = np.array(image.shape[::-1]) / small.shape[::-1]
-        for white, picture in ((False, small), (True, 255 - small)):
-            found = self._found(np.asarray(picture))
+        for white, picture in ((False, small), (True, np.asarray(255 - small))):
+            found = self._found(picture)
             centres = None if found is None else self._upright((found + 0.5) * scale - 0.5)
             if centres is not None:
+                lens = lens if has_rays(lens, centres).all() else _plain_lens(image)
                 dark = np.asarray(255 - image) if white else image
-                return DetectedBoard(self.points(), self._refined(dark, centres))
+                return DetectedBoard(self.points(), self._refined(dark, centres, lens))
         return None
 
     def describe_other(self, image: Image) -> str:
@@ -153,34 +163,44 @@ class CircleGrid:
             return None
         return np.asarray(turn, dtype=np.float64)
 
-    def _refined(self, dark: Image, centres: Array) -> Array:
+    def _refined(self, dark: Image, centres: Array, camera: Camera) -> Array:
         """Images of the circles' centres, shape (n, 2), [px]."""
-        turn = self._homography(centres)
+        turn = self._homography(undistort_pixels(camera, centres))
         if turn is None:  # not after `_upright`
             return centres
-        middles = np.array(
-            [_centroid(dark, c, e) for c, e in zip(centres, self._ellipses(turn)[1], strict=True)]
+        offsets, shapes = self._ellipses(turn, camera)
+        return (
+            np.array([_centroid(dark, *each) for each in zip(centres, shapes, strict=True)])
+            - offsets
         )
-        return np.asarray(middles - self._ellipses(turn)[0])
 
-    def _ellipses(self, turn: Array) -> tuple[Array, Array]:
-        """The ellipses that are the circles' images.
+    def _ellipses(self, turn: Array, camera: Camera) -> tuple[Array, Array]:
+        """The circles' images: ellipses, but for the lens distortion.
+
+        Args:
+            turn: Homography from board plane to undistorted pixels, shape (3, 3).
+            camera: Of the image.
 
         Returns:
-            Their centres minus the images of the circles' centres, shape (n, 2), [px], and the
-            matrices E of xᵀE⁻¹x = 1 about the ellipse centres, shape (n, 2, 2), [px²].
+            Their centroids minus the images of the circles' centres, shape (n, 2), [px], and the
+            matrices E of xᵀE⁻¹x = 1 about the centroids, shape (n, 2, 2), [px²].
         """
-        offsets, shapes = [], []
-        for x, y, _ in self.points().tolist():
-            move = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
-            there = turn @ move
-            # Dual of the circle x² + y² = r² is diag(r², r², −1); it maps by H C* Hᵀ.
-            dual = there @ np.diag([self.diameter**2 / 4.0] * 2 + [-1.0]) @ there.T
-            dual = dual / dual[2, 2]
-            middle = dual[:2, 2]
-            offsets.append(middle - there[:2, 2] / there[2, 2])
-            shapes.append(np.outer(middle, middle) - dual[:2, :2])
-        return np.array(offsets), np.array(shapes)
+        angles = np.arange(_RIM) * 2.0 * np.pi / _RIM
+        unit = np.column_stack([np.cos(angles), np.sin(angles)])
+        circle = np.vstack([np.zeros(2), self.diameter / 2.0 * unit])
+        plane = self.points()[:, None, :2] + circle
+        there = distort_pixels(camera, np.asarray(cv2.perspectiveTransform(plane, turn)))
+        rims = there[:, 1:] - there[:, :1]
+        after = np.roll(rims, -1, axis=1)
+        areas = rims[..., 0] * after[..., 1] - rims[..., 1] * after[..., 0]
+        offsets = np.einsum("nr,nri->ni", areas, rims + after) / (3.0 * areas.sum(axis=1)[:, None])
+        axes = 2.0 / _RIM * np.einsum("nri,rj->nij", rims, unit)
+        return offsets, axes @ axes.transpose(0, 2, 1)
+
+
+def _plain_lens(image: Image) -> Camera:
+    """A camera of an image, without distortion."""
+    return generic_camera((image.shape[1], image.shape[0]))
 
 
 def _centroid(dark: Image, centre: Array, shape: Array) -> Array:
@@ -225,9 +245,8 @@ _SADDLE = 0.12
 """Half width of the refinement window for corners that black squares touch, in tag sides."""
 _SADDLE_NEAR = 0.25
 """The same of the first window, which is not wider than the squares."""
-_BETTER, _OFF = 3.0, 0.05
-"""The other order is right if it fits better by this factor and this order misfits by that share
-of a tag's side."""
+_OFF = 0.5
+"""Tags that are off from their neighbours by this share of the distance contradict the board."""
 
 
 @dataclass(frozen=True)
@@ -251,6 +270,7 @@ class TagGrid:
     family: str
     first: int = 0
     order: str = "rows"
+    needs_lens: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Refuses impossible boards.
@@ -286,43 +306,51 @@ class TagGrid:
         last = self.first + self.columns * self.rows - 1
         return f"a grid of {self.columns} x {self.rows} tags, {self.family} {self.first} to {last}"
 
-    def find(self, image: Image) -> DetectedBoard | None:
+    def find(self, image: Image, camera: Camera | None = None) -> DetectedBoard | None:
         """Detects the corners of its completely visible tags.
 
-        Black and white may be inverted. None, too, where the numbers contradict the order and the
-        other order fits.
+        Black and white may be inverted. None, too, where the tags contradict the board: where a
+        tag's nearest neighbour is in another direction than by its number.
         """
-        seen = self._seen_in(image)
-        return self._seen_in(np.asarray(255 - image)) if seen is None else seen
+        lens = camera or _plain_lens(image)
+        seen = self._seen_in(image, lens)
+        return self._seen_in(np.asarray(255 - image), lens) if seen is None else seen
 
-    def _seen_in(self, image: Image) -> DetectedBoard | None:
-        squares, twice = self._edges(image)
-        if self.order == "kalibr":  # printed by Kalibr, or with narrow borders by others
-            squares, twice = max((squares, twice), self._saddles(image), key=lambda f: len(f[0]))
+    def _seen_in(self, image: Image, camera: Camera) -> DetectedBoard | None:
+        squares, twice = self._squares(image, camera)
         if 4 * len(squares) < LEAST_POINTS:
             return None
+        offsets = tag_offsets(squares)
         # OpenCV draws some families upside down compared to AprilTag's images.
-        turned = {number: np.roll(square, 2, axis=0) for number, square in squares.items()}
-        ours, as_turned = self._misfit(squares), self._misfit(turned)
-        if as_turned < min(ours / _BETTER, _OFF):
-            squares, ours = turned, as_turned
-        corners = np.concatenate(list(squares.values()))
-        others = replace(self, order=self._other_order())._misfit(squares)
-        if ours > max(_BETTER * others, _OFF):
+        misfits = self._misfit(squares, offsets), self._misfit(squares, -offsets)
+        if min(misfits) > _OFF:
             return None
+        if misfits[1] < misfits[0]:
+            squares = {number: np.roll(square, 2, axis=0) for number, square in squares.items()}
+        corners = np.concatenate(list(squares.values()))
         return DetectedBoard(self.points_of(squares), corners, twice)
 
-    def _edges(self, image: Image) -> tuple[dict[int, Array], tuple[int, ...]]:
+    def _squares(self, image: Image, camera: Camera) -> tuple[dict[int, Array], tuple[int, ...]]:
+        """Corners of its tags by number, and numbers seen more than once."""
+        found = self._edges(image, camera)
+        if self.order == "kalibr":  # printed by Kalibr, or with narrow borders by others
+            found = max(found, self._saddles(image), key=lambda f: len(f[0]))
+        return found
+
+    def _edges(self, image: Image, camera: Camera) -> tuple[dict[int, Array], tuple[int, ...]]:
         """Corners of tags by intersecting edges, by number, and numbers seen more than once."""
         numbers = range(self.first, self.first + self.columns * self.rows)
         detected = [d for d in self._detector.detect_all(image) if d.id in numbers]
         counts = Counter(d.id for d in detected)
         detected = [d for d in detected if counts[d.id] == 1]
         rough = np.array([d.corners for d in detected]).reshape(-1, 4, 2)
-        # An edge is short: its curvature from lens distortion is negligible.
-        lens = generic_camera((image.shape[1], image.shape[0]))
-        squares = refine(image, lens, rough, modules_across(self.family))
-        whole = {d.id: s.corners for d, s in zip(detected, squares, strict=True) if s and s.whole}
+        near, plain = has_rays(camera, rough).all(axis=1), _plain_lens(image)
+        whole = {}
+        for lens, which in ((camera, near), (plain, ~near)):
+            squares = refine(image, lens, rough[which], modules_across(self.family))
+            for k, square in zip(np.flatnonzero(which).tolist(), squares, strict=True):
+                if square and square.whole:
+                    whole[detected[k].id] = distort_pixels(lens, square.corners)
         return whole, tuple(number for number, count in counts.items() if count > 1)
 
     def _saddles(self, image: Image) -> tuple[dict[int, Array], tuple[int, ...]]:
@@ -348,25 +376,51 @@ class TagGrid:
                 squares[number] = np.asarray(better, dtype=np.float64).reshape(4, 2)
         return squares, tuple(number for number, count in counts.items() if count > 1)
 
-    def _misfit(self, squares: dict[int, Array]) -> float:
-        """RMS misfit of corners to a homography of the board, in sides of a tag."""
-        corners = np.concatenate(list(squares.values()))
-        plane = self.points_of(squares)[:, :2] / self.tag
-        back, _ = cv2.findHomography(corners, plane)
-        if np.shape(back) != (3, 3):
-            return float("inf")
-        there = cv2.perspectiveTransform(corners.reshape(-1, 1, 2), back).reshape(-1, 2)
-        return float(np.sqrt(np.mean(np.sum((there - plane) ** 2, axis=1))))
+    def _misfit(self, numbers: Iterable[int], offsets: Array) -> float:
+        """Largest error of a tag's nearest neighbours, as a share of their distance.
 
-    def _other_order(self) -> str:
-        return next(order for order in ORDERS if order != self.order)
+        Args:
+            numbers: Of n tags.
+            offsets: From `tag_offsets`, shape (n, n, 2).
+        """
+        middles = self.points_of(numbers).reshape(-1, 4, 3).mean(axis=1)[:, :2] / self.tag
+        wanted = middles - middles[:, None]
+        apart = np.linalg.norm(wanted, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        nearest = apart < 1.01 * apart.min(axis=1, keepdims=True)
+        errors = np.linalg.norm(offsets - wanted, axis=2) / apart
+        return float(np.minimum(errors, errors.T)[nearest].max())
 
     def describe_other(self, image: Image) -> str:
-        """The tags in another order, else tags that the image shows."""
-        other = self._other_order()
+        """The tags in another order or grid, else tags that the image shows."""
+        other = next(order for order in ORDERS if order != self.order)
         if replace(self, order=other).find(image) is not None:
             return f"these tags {ORDERS[other]}: try --order {other}"
+        if (grid := self._as_seen(image)) is not None and grid.find(image) is not None:
+            names = ("columns", "rows", "first", "order")
+            options = {name: getattr(grid, name) for name in names}
+            wrong = [f"--{n} {value}" for n, value in options.items() if getattr(self, n) != value]
+            return f"tags that fit {grid}: try {' '.join(wrong)}"
         return diagnose_tags(image, self.family, [])
+
+    def _as_seen(self, image: Image) -> TagGrid | None:
+        """The grid by its tags' neighbours, where some of its own numbers are among them."""
+        most = tags_in(self.family)
+        every = replace(self, columns=most, rows=1, first=0)
+        squares, _ = every._squares(image, _plain_lens(image))
+        own = range(self.first, self.first + self.columns * self.rows)
+        rows = row_numbering(squares)
+        if rows is None or not any(number in own for number in squares):
+            return None
+        lowest, columns = min(squares), rows.columns
+        firsts = range(lowest + 1) if rows.start is None else range(rows.start, lowest + 1, columns)
+        first = min(firsts, key=lambda number: abs(number - self.first), default=lowest)
+        needed = (max(squares) - first) // columns + 1
+        count = max(needed, min(self.rows, (most - first) // columns))
+        if first + columns * count > most:
+            return None
+        order = "kalibr" if rows.upward else "rows"
+        return replace(self, columns=columns, rows=count, first=first, order=order)
 
     def points_of(self, numbers: Iterable[int]) -> Array:
         """Corners of tags in the board's plane, y down the rows, shape (4 n, 3), [m]."""

@@ -32,7 +32,9 @@ def check(
     the_plan = load_plan(plan)
     the_rig = the_plan.rig if rig is None else load_rig(rig)
     require_same_rig(the_plan, the_rig, plan)
-    with Terminal(quiet=as_json).waiting("checking"):
+    terminal = Terminal(quiet=as_json)
+    terminal.remarks(the_rig.document.remarks(), the_plan.scene.document.remarks())
+    with terminal.waiting("checking"):
         report = check_path(the_rig, the_plan.scene, the_plan.waypoints, the_plan.stops)
     if as_json:
         show_json({"plan": str(plan), "hash": the_plan.document.hash, **report.as_dict()})

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import JSON
-from cdpr.cli.output import out, show_json, show_line
+from cdpr.cli.output import Terminal, out, show_json, show_line
 from executor.doctor import MachineCheck, check_machine, check_rig, examine, stopping_text
 from model.errors import BadInput
 from model.rig import Rig, load_rig
@@ -56,6 +56,8 @@ def doctor(
         checks += check_rig(the_rig, camera)
     if not as_json:
         _show_checks(checks)
+    if the_rig is not None:
+        Terminal().remarks(the_rig.document.remarks())
     objects = examine(the_rig) if the_rig is not None and drives else None
     if as_json:
         plain = [asdict(check) for check in checks]

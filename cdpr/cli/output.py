@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from itertools import chain
 from typing import IO, Any, cast
 
 import typer
@@ -134,6 +135,11 @@ class Terminal(Listener):
     def remark(self, text: str) -> None:
         """See `Listener`."""
         err.print(f"[yellow]remark[/] {escape(text)}", soft_wrap=True)
+
+    def remarks(self, *texts: Iterable[str]) -> None:
+        """Shows remarks on several files."""
+        for text in chain(*texts):
+            self.remark(text)
 
     def warning(self, text: str) -> None:
         """See `Listener`."""

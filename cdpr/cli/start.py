@@ -9,9 +9,9 @@ from pathlib import Path
 
 from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import Triple
-from cdpr.cli.output import out, show_json, show_line
+from cdpr.cli.output import Terminal, out, show_json, show_line
 from model.errors import AlreadyExists, BadInput
-from model.files.documents import write_atomic
+from model.files.documents import load_yaml, write_atomic
 from model.files.examples import (
     copy_examples,
     find_examples,
@@ -20,6 +20,7 @@ from model.files.examples import (
     select_examples,
 )
 from model.files.new_rig import RigQuestion, collect_answers, read_coordinates
+from model.files.rig_file import RigDocument
 
 
 def examples(
@@ -117,6 +118,7 @@ def new(
     write_atomic(rig, rig_text(answers))
     name = shlex.quote(str(rig))
     show_line(f"wrote {rig}: {answers['cables']} cables")
+    Terminal().remarks(load_yaml(rig, RigDocument).remarks())
     show_line(f"next: review it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE")
 
 

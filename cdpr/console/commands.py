@@ -50,10 +50,8 @@ class PlainCommand(_Command):
         "resume",
         "give_control",
         "home",
-        "reset",
         "release",
         "read_drives",
-        "run",
         "jog_begin",
         "cable_begin",
         "jog_end",
@@ -63,10 +61,25 @@ class PlainCommand(_Command):
 
 
 class TakeCommand(_Command):
-    """Take control; with force, from a page that has it."""
+    """Take control; with force, from the page that was seen to have it."""
 
     command: Literal["take_control"]
     force: bool = False
+    held_by: Text | None = None
+
+
+class RunPlanCommand(_Command):
+    """Run the loaded plan, if it is the one that was shown; by its hash."""
+
+    command: Literal["run"]
+    plan: Text
+
+
+class ResetCommand(_Command):
+    """Reset the latched fault, if its cause is the one that was shown; None if none was latched."""
+
+    command: Literal["reset"]
+    cause: Annotated[str, Field(max_length=3000)] | None
 
 
 class SpeedCommand(_Command):
@@ -187,6 +200,8 @@ class Seen(_Incoming):
 Message = (
     PlainCommand
     | TakeCommand
+    | RunPlanCommand
+    | ResetCommand
     | SpeedCommand
     | FileCommand
     | CompareCommand

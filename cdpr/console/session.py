@@ -26,6 +26,8 @@ from cdpr.console.commands import (
     PickCommand,
     PlanCommand,
     RenameCommand,
+    ResetCommand,
+    RunPlanCommand,
     SpeedCommand,
     TakeCommand,
 )
@@ -46,6 +48,7 @@ from cdpr.console.view import (
     LoadedPlan,
     RobotView,
     nearest_data,
+    plan_id,
     pose_data,
 )
 from cdpr.console.watch import CameraPictures, RobotWatch, RunWatch
@@ -194,9 +197,9 @@ class Console:
             "clearance_mm": near and nearest_data(near, self.view.required_clearance),
             "measured": measured_state(status, age),
             "next_stop": None if status is None else status["next_stop"],
-            "preview": loaded and loaded["name"],
+            "preview": loaded and plan_id(loaded),
             "plan_start_off_mm": self.plan.off_mm(None if robot is None else robot.pose),
-            "compared": compared and compared["name"],
+            "compared": compared and plan_id(compared),
             "jog": jog_state(status),
             "cable": cable_state(status),
             "poses": self.poses.as_dicts(),
@@ -247,6 +250,8 @@ class Console:
 
     def _command(self, page: int, message: Message) -> str:
         if isinstance(message, TakeCommand):
+            if message.force and message.held_by != self.control.holder_name():
+                return "control has changed hands meanwhile: look who has it"
             moving = self.watch.last.status is not None
             why_not = self._bus_control.take(page, moving=moving, force=message.force)
             if not why_not:
@@ -264,6 +269,10 @@ class Console:
 
     def _operate(self, message: Message) -> str:
         match message:
+            case RunPlanCommand():
+                return self._run(message.plan)
+            case ResetCommand():
+                return self._reset(message.cause)
             case SpeedCommand():
                 return self.watch.send("speed", percent=message.percent)
             case FileCommand():
@@ -298,9 +307,7 @@ class Console:
             return self.watch.send(requests[command])
         verbs: dict[str, Callable[[], str]] = {
             "home": self._home,
-            "reset": self._reset,
             "release": self._release,
-            "run": self._run,
             "jog_begin": self._jog_begin,
             "cable_begin": self._cable_begin,
         }
@@ -310,22 +317,27 @@ class Console:
         how = ["--camera", self.files.cameras[0]] if self.files.cameras else ["--at-home"]
         return self._start_verb("home", [str(self.files.rig_file), *how])
 
-    def _reset(self) -> str:
+    def _reset(self, shown: str | None) -> str:
+        stored = read_stored(self.rig, is_moving=self.watch.last.status is not None)
+        if stored.latched != shown:
+            return "another fault is latched now: read its cause first"
         return self._start_verb("reset", [str(self.files.rig_file)], real_time=False)
 
     def _release(self) -> str:
         return self._start_verb("release", [str(self.files.rig_file)])
 
-    def _run(self) -> str:
+    def _run(self, shown: str) -> str:
         if self.plan.preview is None or not self.plan.preview["passed"]:
             return "load a plan that passes its check first"
+        if self.plan.preview["hash"] != shown:
+            return "another plan is loaded now: look at it first"
         if (here := self.robot.pose_at_rest()) is not None and self.plan.begins_elsewhere(here):
             off = self.plan.off_mm(here)
             return f"the platform is {off} mm from the plan's start: plan from its current pose"
         cameras = [text for source in self.files.cameras for text in ("--camera", source)]
         if not (cameras or is_simulated(self.rig)):
             cameras = ["--no-camera"]
-        rig = ["--rig", str(self.files.rig_file), "--plan-hash", self.plan.hash]
+        rig = ["--rig", str(self.files.rig_file), "--plan-hash", shown]
         return self._start_verb("run", [self.plan.preview["name"], *rig, *cameras])
 
     def _jog_begin(self) -> str:

@@ -208,9 +208,11 @@ def _session_state(
     if status is None or jog is None:
         return {"ready": False, "why_not": why_not, "moving": False, "speed_mm_s": 1e3 * FASTEST}
     ready = status["state"] == "moving"
+    is_latched = status["state"] == "latched"
+    why_not = "a fault is latched" if is_latched else f"the drives are {status['state']}"
     return {
         "ready": ready,
-        "why_not": None if ready else f"the drives are {status['state']}",
+        "why_not": None if ready else why_not,
         "moving": bool(status["feed_percent"]),
         "speed_mm_s": jog["speed_mm_s"],
     }

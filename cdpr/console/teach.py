@@ -43,7 +43,10 @@ class TaughtDocument(Document):
 
 
 class TaughtPoses:
-    """An ordered list of poses, saved after every change."""
+    """An ordered list of poses, saved after every change.
+
+    Another console may use the same file: each change begins with the poses that it holds then.
+    """
 
     def __init__(self, path: Path) -> None:
         """Loads the file, if it exists.
@@ -53,16 +56,7 @@ class TaughtPoses:
             InvalidFile: With its errors.
         """
         self._path = path
-        self._poses: list[TaughtPose] = []
-        if path.exists():
-            try:
-                document = TaughtDocument.model_validate(parse_json(read_text(path)))
-            except ValidationError as error:
-                problems = problems_of(error, TaughtDocument, {})
-                raise InvalidFile(str(path), problems, AGAIN) from None
-            except ValueError as error:
-                raise BadInput(str(error), where=str(path), next_step=AGAIN) from None
-            self._poses = list(document.poses)
+        self._poses = self._read()
 
     def __len__(self) -> int:
         """Number of poses."""
@@ -81,6 +75,7 @@ class TaughtPoses:
         Raises:
             BadInput: There are too many, or the name is taken or invalid.
         """
+        self._poses = self._read()
         if len(self._poses) >= MOST:
             raise _refusal(f"there are {MOST} poses already", "remove one that is not needed")
         self._require_free(name)
@@ -93,6 +88,7 @@ class TaughtPoses:
         Raises:
             BadInput: There is no such pose, or the name is taken or invalid.
         """
+        self._poses = self._read()
         index = self._index(pose)
         if name != pose:
             self._require_free(name)
@@ -106,6 +102,7 @@ class TaughtPoses:
         Raises:
             BadInput: There is no such pose or position.
         """
+        self._poses = self._read()
         index = self._index(pose)
         if not 0 <= to < len(self._poses):
             raise _refusal(f"the list has no position {to + 1}", "check the list")
@@ -119,6 +116,7 @@ class TaughtPoses:
         Raises:
             BadInput: There is no such pose.
         """
+        self._poses = self._read()
         index = self._index(pose)
         self._keep([*self._poses[:index], *self._poses[index + 1 :]])
 
@@ -163,6 +161,24 @@ class TaughtPoses:
                 "rotation_limits": limits,
             }
         )
+
+    def _read(self) -> list[TaughtPose]:
+        """The poses in the file; none if there is no file.
+
+        Raises:
+            BadInput: It cannot be read.
+            InvalidFile: With its errors.
+        """
+        if not self._path.exists():
+            return []
+        try:
+            document = TaughtDocument.model_validate(parse_json(read_text(self._path)))
+        except ValidationError as error:
+            problems = problems_of(error, TaughtDocument, {})
+            raise InvalidFile(str(self._path), problems, AGAIN) from None
+        except ValueError as error:
+            raise BadInput(str(error), where=str(self._path), next_step=AGAIN) from None
+        return list(document.poses)
 
     def _keep(self, poses: list[TaughtPose]) -> None:
         """Saves the poses, then adopts them."""

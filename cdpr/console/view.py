@@ -67,11 +67,10 @@ def scene_of(rig: Rig, scene: Scene | None) -> dict[str, Any]:
 
 def pose_data(rig: Rig, pose: Pose, source: str) -> dict[str, Any]:
     """The platform's pose and the cables' exit points, in mm for the page."""
-    turn = float(np.degrees(np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])))
     return {
         "position_mm": (np.round(pose.position * 1e3, 2) + 0.0).tolist(),
         "tilt_deg": round(math.degrees(pose.tilt), 2) + 0.0,
-        "turn_deg": round(turn, 2) + 0.0,
+        "turn_deg": round(math.degrees(pose.turn), 2) + 0.0,
         "rotation": np.round(pose.rotation, 6).reshape(-1).tolist(),
         "exits_mm": np.round(cables_at(rig, pose).exits * 1e3, 2).tolist(),
         "source": source,
@@ -261,8 +260,6 @@ class LoadedPlan:
         self.preview: dict[str, Any] | None = None
         self.compared: dict[str, Any] | None = None
         self.start: Pose | None = None
-        self.hash = ""
-        """Of the plan: its file may be replaced before a run."""
 
     def load(self, path: Path) -> None:
         """Loads a plan for preview.
@@ -273,7 +270,6 @@ class LoadedPlan:
         self.forget()
         plan = self._read(path)
         self.preview, self.start = preview(path, plan, self._rig), plan.waypoints[0]
-        self.hash = plan.document.hash
 
     def forget(self) -> None:
         """No plan is loaded; another takes its place."""
@@ -305,13 +301,19 @@ class LoadedPlan:
         return bool(np.max(np.abs(off)) > self._rig.motion.start_tolerance)
 
 
+def plan_id(preview: dict[str, Any]) -> str:
+    """Identifies what a page shows: another plan in a file of the same name is another one."""
+    return f"{preview['name']} {preview['hash']}"
+
+
 def preview(path: Path, plan: Plan, rig: Rig) -> dict[str, Any]:
     """Preview data of a plan and its file; the verdict says why a plan does not pass."""
+    named = {"name": str(path), "hash": plan.document.hash}  # the file may be replaced before a run
     try:
         prepared = prepare_plan(plan, rig)
     except CdprError as error:
         return {
-            "name": str(path),
+            **named,
             "passed": False,
             "verdict": error.what,
             "checks": [],
@@ -328,7 +330,7 @@ def preview(path: Path, plan: Plan, rig: Rig) -> dict[str, Any]:
     poses = [Pose(table.positions[row], table.rotations[row]) for row in rows]
     times = [round(row * table.cycle, 3) for row in rows]
     return {
-        "name": str(path),
+        **named,
         "passed": True,
         "verdict": "passed every check",
         "checks": _checks(prepared),

@@ -8,6 +8,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -383,10 +384,17 @@ def video_size(path: Path) -> tuple[int, int]:
 def _opened(source: int | str) -> cv2.VideoCapture:
     """Opens a source without the log output of OpenCV and FFmpeg."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    with silent_opencv():
+        return cv2.VideoCapture(source)
+
+
+@contextmanager
+def silent_opencv() -> Iterator[None]:
+    """Keeps OpenCV's warnings, which mean nothing to an operator, from the terminal."""
     before = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        return cv2.VideoCapture(source)
+        yield
     finally:
         cv2.utils.logging.setLogLevel(before)
 

@@ -23,6 +23,7 @@ from drivers.cia402.sdo_jobs import (
     AnswerListener,
     ModeCheck,
     SdoJobs,
+    StatePoll,
     mode_text,
     monitoring_off,
     time_to_end,
@@ -36,6 +37,7 @@ from drivers.cia402.state_machine import (
     ignoring_drives,
     late_drives,
     next_words,
+    stopped_between_replies,
 )
 from drivers.cyclic_group import CyclicBus, CyclicGroup
 from drivers.drive_group import (
@@ -96,17 +98,15 @@ class Cia402Group(CyclicGroup):
         self._goal = Goal.IDLE
         self._words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
         self._stop_commanded = [False] * count
-        self._targets = [0] * count
-        self._demands = [0] * count
+        self._targets, self._demands = [0] * count, [0] * count
         self._faults = []
-        self._cycle = 0
-        self._cycles_to_goal = 0
+        self._cycle = self._cycles_to_goal = 0
         # "Enable operation" was sent for this goal; replies to the former one's words are awaited.
-        self._enables, self._is_new_goal = False, False
+        self._enables = self._is_new_goal = self._known = False
         self._former = self._goal, self._enables
-        self._known = False
         self._monitoring_off: SdoJobs | None = None
         self._modes: ModeCheck | None = None
+        self._poll = StatePoll((), 1)
         self._errors = SdoJobs({}, 1)
 
     @property
@@ -226,16 +226,13 @@ class Cia402Group(CyclicGroup):
     def command(self, command: GroupCommand) -> None:
         """Sets the goal of the group; see `DriveGroup.command`."""
         self._online()
-        if command is GroupCommand.QUICK_STOP:
-            self._stop()
-        elif command is GroupCommand.ENABLE:
-            self._begin_enabling()
-        elif command is GroupCommand.RELEASE:
-            self._begin_release()
-        elif command is GroupCommand.END_MONITORING:
-            self._begin_monitoring_off()
-        else:
-            self._reset_fault()
+        {
+            GroupCommand.QUICK_STOP: self._stop,
+            GroupCommand.ENABLE: self._begin_enabling,
+            GroupCommand.RELEASE: self._begin_release,
+            GroupCommand.END_MONITORING: self._begin_monitoring_off,
+            GroupCommand.RESET_FAULT: self._reset_fault,
+        }[command]()
 
     def quick_stop_now(self) -> None:
         """Sends the stop to all drives in one batch; see `DriveGroup.quick_stop_now`."""
@@ -278,7 +275,7 @@ class Cia402Group(CyclicGroup):
         self._look_for_faults()
         return self._status()
 
-    def _ask(self, jobs: SdoJobs | ModeCheck, most: int) -> None:
+    def _ask(self, jobs: SdoJobs | ModeCheck | StatePoll, most: int) -> None:
         self._cyclic.send(SentFrame(can_id, data) for can_id, data in jobs.next_requests(most))
 
     def _begin_monitoring_off(self) -> None:
@@ -316,6 +313,8 @@ class Cia402Group(CyclicGroup):
         # Replies show the effect of earlier words, at first those of the former goal.
         goal, enables = self._former if self._is_new_goal else (self._goal, self._enables)
         own = self._watch.changes_on_their_own(goal, enables=enables)
+        if self._state is GroupState.ENABLED and self._profile.follows_bit is not False:
+            own += self._watch.ignoring_targets()
         found = [*self._new_messages(), *own]
         known = {text for _, text in (*self._faults, *found)}
         found += self._watch.state_faults(known, powered=powered)
@@ -325,6 +324,8 @@ class Cia402Group(CyclicGroup):
     def _new_messages(self) -> list[tuple[int, str]]:
         """Messages since the last call that are faults regardless of the replies."""
         found = self._watch.news()
+        if self._state is GroupState.ENABLED:
+            found += stopped_between_replies(self._rig.drive_names, self._poll.new_words())
         if self._goal in (Goal.ENABLE, Goal.RELEASE):
             return found
         # An emergency of a drive at rest only explains its state.
@@ -346,8 +347,12 @@ class Cia402Group(CyclicGroup):
             self._watch.take_errors(self._errors.values)
             if self._cycles_to_goal > self._reset_cycles or DriveState.FAULT not in states:
                 self._goal = Goal.IDLE
+        elif self._state is GroupState.ENABLED:
+            self._ask(self._poll, REQUESTS_A_CYCLE)  # late in the cycle: drives stop after SYNC
         elif self._state is GroupState.ENABLING:
-            idle = self._ignoring_targets() if self._profile.follows_bit else []
+            names, words = self._rig.drive_names, self._watch.status_words
+            seconds, needs_bit = self._patience * self._cycle_s, self._profile.follows_bit
+            idle = ignoring_drives(names, words, seconds) if needs_bit else []
             follow = set(self._words) == {ControlWord.ENABLE_OPERATION}
             if follow and set(states) == {DriveState.OPERATION_ENABLED} and not idle:
                 self._check_modes()
@@ -361,23 +366,18 @@ class Cia402Group(CyclicGroup):
 
     def _check_modes(self) -> None:
         """Enters ENABLED once every drive shows CSP; most profiles check it when configuring."""
-        if not self._profile.mode_display_when_enabled:
-            self._state = GroupState.ENABLED
-            return
-        if self._modes is None:
+        if self._profile.mode_display_when_enabled and self._modes is None:
             cycles = len(self._nodes) + round((MODE_WAIT + self._answer_time) / self._cycle_s)
             self._modes = ModeCheck(self._nodes, cycles, self._again_after)
             self._watch.on_answer = self._modes.take
-        wrong = self._modes.wrong()
+        wrong = self._modes.wrong() if self._modes is not None else {}
         if not wrong:
             self._modes, self._state = None, GroupState.ENABLED
-        elif self._modes.is_overdue:
+            self._poll = StatePoll(self._nodes, self._again_after)
+            self._watch.on_answer = self._poll.take
+        elif self._modes is not None and self._modes.is_overdue:
             self._modes = None
             self._latch([(n, mode_text(self._rig.drive_names[n], m)) for n, m in wrong.items()])
-
-    def _ignoring_targets(self) -> list[tuple[int, str]]:
-        seconds = self._patience * self._cycle_s
-        return ignoring_drives(self._rig.drive_names, self._watch.status_words, seconds)
 
     def _late(self, cycles: int) -> list[tuple[int, str]]:
         names, words = self._rig.drive_names, self._watch.status_words

@@ -421,5 +421,8 @@ def read_states(
         torques=np.array(torques, dtype=np.int64) * winding_signs(rig),
         status_words=np.array(words, dtype=np.int64) & 0xFFFF,
         restarted=restarted,
-        errors=tuple(emergency_text(code) if code else "" for code in codes),
+        errors=tuple(
+            emergency_text(code) if code else " and ".join(without_power(word))
+            for code, word in zip(codes, words, strict=True)
+        ),
     )

@@ -20,11 +20,14 @@ from drivers.cia402.pdo import (
 from drivers.cia402.sdo_jobs import ERROR_REQUESTS, STATE_REQUESTS, SdoRequest
 from drivers.cia402.state_machine import (
     FAULTED,
+    FOLLOWS,
+    INTERNAL_LIMIT,
     TORQUE_ON,
     DriveState,
     Goal,
     change_on_its_own,
     state_of,
+    without_power,
 )
 from drivers.drive_group import DriveWarning
 from drivers.plausibility import ReplyCheck
@@ -73,7 +76,8 @@ class DriveMonitor:
         self._cycle, self._heartbeat_at = 0, dict.fromkeys(nodes, 0)  # cycle of the last one
         self._warnings: list[DriveWarning] = []
         self._new_messages: list[tuple[int, str]] = []
-        self._changes: list[tuple[int, DriveState, DriveState]] = []
+        self._changes: list[tuple[int, DriveState, int]] = []  # former state, status word
+        self._followed: set[int] = set()
         self._emergencies: dict[int, str] = {}
         self._stored: dict[int, str] = {}  # errors from before a reset, or read from the drives
         self._over: set[int] = set()
@@ -131,18 +135,35 @@ class DriveMonitor:
             self._note(drive, reply)
 
     def _note(self, drive: int, reply: Reply) -> None:
+        word, node = reply.status_word, self.nodes[drive]
+        raised = word & ~self.status_words[drive]
         self.status_words[drive], self.positions[drive], self.torques[drive] = reply
         self.answered[drive] = True
-        state, before = state_of(reply.status_word), self.states[drive]
+        state, before = state_of(word), self.states[drive]
         self.states[drive] = state
         if state is not before:
-            self._changes.append((self.nodes[drive], before, state))
+            self._changes.append((node, before, word))
+            self._followed.discard(node)
+        elif raised & INTERNAL_LIMIT and state is DriveState.OPERATION_ENABLED:
+            text = f"{self._names[node]} reports that an internal limit is active (bit 11 of 6041h)"
+            self._warnings.append(DriveWarning(node, text))
+        if word & FOLLOWS and state is DriveState.OPERATION_ENABLED:
+            self._followed.add(node)
+
+    def ignoring_targets(self) -> list[tuple[int, str]]:
+        """Enabled drives whose bit 12 showed that they follow their targets, and no longer does."""
+        rows = zip(self.nodes, self.status_words, strict=True)
+        return [
+            (node, f"{self._names[node]} ceased to follow its target (bit 12 of 6041h is 0 again)")
+            for node, word in rows
+            if node in self._followed and not word & FOLLOWS
+        ]
 
     def warnings(self) -> tuple[DriveWarning, ...]:
-        """Emergencies since the last call that only warn, of drives that were not in fault.
+        """Warnings since the last call: some emergencies, and limits reached while enabled.
 
-        One of a drive that stops nevertheless is the cause of its fault (`changes_on_their_own`,
-        `state_faults`).
+        An emergency of a drive that stops nevertheless is the cause of its fault
+        (`changes_on_their_own`, `state_faults`).
         """
         warnings, self._warnings = tuple(self._warnings), []
         return warnings
@@ -170,12 +191,12 @@ class DriveMonitor:
         """
         changes, self._changes = self._changes, []
         found: list[tuple[int, str]] = []
-        for node, before, state in changes:
-            what = change_on_its_own(goal, enables, before, state)
+        for node, before, word in changes:
+            what = change_on_its_own(goal, enables, before, state_of(word))
             if what is not None:
                 cause = None if node in self._over else self._emergencies.get(node)
-                text = f"{self._names[node]} {what}"
-                found.append((node, f"{text}; {cause}" if cause else text))
+                reasons = [*([cause] if cause else []), *without_power(word)]
+                found.append((node, "; ".join([f"{self._names[node]} {what}", *reasons])))
         return found
 
     def state_faults(self, known: Container[str], *, powered: bool) -> list[tuple[int, str]]:

@@ -112,15 +112,22 @@ class SdoJobs:
         failed: Abort codes, by node and job.
     """
 
-    def __init__(self, jobs: Mapping[int, Iterable[SdoRequest]], again_after: int) -> None:
+    def __init__(
+        self,
+        jobs: Mapping[int, Iterable[SdoRequest]],
+        again_after: int,
+        *,
+        endless: bool = False,
+    ) -> None:
         """Sends nothing yet.
 
         Args:
             jobs: Requests of each node, in the order of sending.
             again_after: Turns without an answer after which a request is repeated, as frames may
                 be lost.
+            endless: An answered request is queued again.
         """
-        self._again_after = again_after
+        self._again_after, self._endless = again_after, endless
         self._turns: dict[int, int] = {}
         self._waiting = {node: deque(of_node) for node, of_node in jobs.items()}
         self._order = deque(self._waiting)
@@ -177,7 +184,7 @@ class SdoJobs:
         if self._frames[node] == _ASK_FOR_SEGMENT and not data[0] & 0xF0:
             # A segment holds up to seven bytes, so the first one is the last.
             self.values[node, job] = int.from_bytes(data[1 : 8 - (data[0] >> 1 & 7)], "little")
-            del self._asked[node]
+            self._finish(node)
         elif int.from_bytes(data[1:3], "little") == job.index and data[3] == job.sub:
             self._take_answer(node, job, data)
 
@@ -195,7 +202,12 @@ class SdoJobs:
             return
         else:
             return
-        del self._asked[node]
+        self._finish(node)
+
+    def _finish(self, node: int) -> None:
+        job = self._asked.pop(node)
+        if self._endless:
+            self._waiting[node].append(job)
 
 
 class AnswerListener:
@@ -263,3 +275,36 @@ class ModeCheck:
     def is_overdue(self) -> bool:
         """Whether time is up."""
         return self._left <= 0
+
+
+class StatePoll:
+    """Reads the status words of enabled drives in turn, as they are between two replies.
+
+    Replies alone do not show a drive that stops after each of them, as at a limit switch: the next
+    set-point enables it again (transition 16), and it may fill in its reply after that.
+    """
+
+    def __init__(self, nodes: Iterable[int], again_after: int) -> None:
+        """Sends nothing yet; arguments as for `ModeCheck`."""
+        jobs = {node: STATE_REQUESTS[:1] for node in nodes}
+        self._jobs = SdoJobs(jobs, again_after, endless=True)
+        self._heard: set[int] = set()
+        self._words: dict[int, int] = {}
+
+    def next_requests(self, most: int) -> list[tuple[int, bytes]]:
+        """Requests of one cycle; see `SdoJobs.next_requests`."""
+        return self._jobs.next_requests(most)
+
+    def take(self, node: int, data: bytes | bytearray) -> None:
+        """Processes an answer; the first one of a drive may be late, from an earlier motion."""
+        self._jobs.take(node, data)
+        word = self._jobs.values.pop((node, STATE_REQUESTS[0]), None)
+        if word is not None and node in self._heard:
+            self._words[node] = word
+        elif word is not None:
+            self._heard.add(node)
+
+    def new_words(self) -> dict[int, int]:
+        """Status words since the last call, by node."""
+        words, self._words = self._words, {}
+        return words

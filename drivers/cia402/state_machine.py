@@ -89,7 +89,7 @@ def state_of(status_word: int) -> DriveState:
     return _STATES[status_word & 0x7F]
 
 
-VOLTAGE_ENABLED, REMOTE = 1 << 4, 1 << 9
+VOLTAGE_ENABLED, REMOTE, INTERNAL_LIMIT = 1 << 4, 1 << 9, 1 << 11
 """Bits of the status word. Source: CiA 402-2, object 6041h."""
 
 FOLLOWS = 1 << 12
@@ -154,6 +154,23 @@ def ignoring_drives(
     ]
 
 
+def stopped_between_replies(
+    names: Mapping[int, str], status_words: Mapping[int, int]
+) -> list[tuple[int, str]]:
+    """Enabled drives that were not so between two replies, by node; faults have their own message.
+
+    Args:
+        names: By node id.
+        status_words: Read between replies, by node; not of all.
+    """
+    states = ((node, state_of(word)) for node, word in status_words.items())
+    return [
+        (node, f"{names[node]} stopped on its own: {state.value} between two replies")
+        for node, state in states
+        if state is not DriveState.OPERATION_ENABLED and state not in FAULTED
+    ]
+
+
 def _reason_for(state: DriveState, status_word: int, control_word: ControlWord) -> str:
     """Why a drive stays in its state, as far as its status word shows."""
     if state is DriveState.QUICK_STOP_ACTIVE and control_word is ControlWord.ENABLE_OPERATION:
@@ -164,7 +181,9 @@ def _reason_for(state: DriveState, status_word: int, control_word: ControlWord) 
 
 
 def without_power(status_word: int) -> list[str]:
-    """Reasons in its status word why a drive at rest cannot be enabled."""
+    """Reasons in its status word why a drive at rest cannot be enabled; none for others."""
+    if state_of(status_word) not in WITHOUT_TORQUE:
+        return []
     shown = [_LOCAL] if not status_word & REMOTE else []
     return shown + ([_NO_VOLTAGE] if not status_word & VOLTAGE_ENABLED else [])
 

@@ -124,7 +124,8 @@ class MultiCameraMonitor:
         return CameraSample(frame, found, picture)
 
     def finish(self) -> None:
-        """Reports how often images were left out because they were too far apart in time."""
+        """Reports images left out because they were too far apart in time, and unequal clocks."""
+        self.news += [CameraNews("remark", text) for text in self._common.clock_remarks()]
         if self._common.apart:
             text = (
                 f"at {self._common.apart} of {self._moments} times not all cameras were used"

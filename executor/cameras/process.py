@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from executor.cameras.live_image import ImageBoard
-from executor.realtime.scheduling import interrupts_blocked
+from executor.realtime.scheduling import ended_at_start, interrupts_blocked
 from executor.recording.run_folder import RunFolder
 from model.errors import CdprError, Fault
 from model.pose import Pose
@@ -187,7 +187,7 @@ class CameraProcess:
         self.name = name
         self._may_wait = self._waits = may_wait
         self._asked: FrameRequest | None = None
-        self._closed = False
+        self._is_open = self._closed = False
         context = multiprocessing.get_context("spawn")
         self._link, far_end = context.Pipe()
         self._process = context.Process(
@@ -209,6 +209,7 @@ class CameraProcess:
         if not self._link.poll(within):
             return False
         self._receive()
+        self._is_open = True
         return True
 
     @property
@@ -272,7 +273,11 @@ class CameraProcess:
         try:
             answer = self._link.recv()
         except (EOFError, ConnectionResetError):
-            raise Fault(f"the process of camera {self.name} ended without an answer") from None
+            name = f"the process of camera {self.name}"
+            if self._is_open:
+                raise Fault(f"{name} ended without an answer") from None
+            self._process.join(END_TIMEOUT)
+            raise ended_at_start(name, self._process) from None
         if isinstance(answer, _Failure):
             raise answer.error if isinstance(answer.error, CdprError) else Fault(answer.error)
         return answer  # type: ignore[no-any-return]  # sent by our own process

@@ -36,6 +36,7 @@ from executor.remote.status import CableStatus, JogStatus, SessionStatus
 from executor.state_machine import REMARK, CycleRecord
 from executor.supervision import RequestBoard, Supervisor
 from executor.winch_runs import limit_of, move_supervised, supervised, winch_mover
+from model.errors import truth_value
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig
@@ -84,6 +85,8 @@ def jog_session(
         CdprError: As for `executor.jogging.jog`; a fault is latched.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
+    realtime = truth_value("realtime", realtime)
+    need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     require_simulated_start(slow, start)
@@ -140,6 +143,8 @@ def cable_session(
         CdprError: As for `executor.jogging.jog_cable`; a fault is latched.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
+    realtime = truth_value("realtime", realtime)
+    need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     limit = limit_of(slow, limit)

@@ -25,7 +25,7 @@ from executor.realtime.child import (
     Records,
     serve,
 )
-from executor.realtime.scheduling import interrupts_blocked, one_thread
+from executor.realtime.scheduling import ended_at_start, exit_text, interrupts_blocked, one_thread
 from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedRequests, unpack_event
 from executor.state_machine import REMARK, CycleRecord, LoopEvent, State
 from executor.supervision import record_failure
@@ -123,7 +123,7 @@ class RealTimeProcess:
                         self._listener.remark(remark)
                         records.take_event(LoopEvent(0, 0.0, REMARK, remark))
                     return message
-                raise message.error if isinstance(message, Failed) else self._died()
+                raise message.error if isinstance(message, Failed) else self._not_started()
 
     def run(self) -> Ended:
         """Starts the motion, and takes its records until it is over.
@@ -202,10 +202,13 @@ class RealTimeProcess:
         except (EOFError, OSError):
             return None
 
+    def _not_started(self) -> Fault:
+        self._process.join(END_TIMEOUT)
+        return ended_at_start("the real-time process", self._process, "; nothing moved")
+
     def _died(self) -> Fault:
         self._process.join(END_TIMEOUT)
-        code = self._process.exitcode
-        how = f"killed by signal {-code}" if code is not None and code < 0 else f"exit code {code}"
+        how = exit_text(self._process)
         return Fault(
             f"the real-time process died ({how}); the drives stop and hold on their own"
             " without set-points",

@@ -13,11 +13,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing import resource_tracker
+from multiprocessing import current_process, resource_tracker
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Protocol
 
-from model.errors import Refused
+from model.errors import Fault, Refused
 
 
 class Clock(Protocol):
@@ -255,7 +256,42 @@ def require_real_time(denied: str, *, needed: bool) -> None:
         )
 
 
-# Child processes of a run: not ended by Ctrl-C, and single-threaded.
+# Child processes of a run: not ended by Ctrl-C, and single-threaded. Each first imports the script.
+
+
+def require_imported_script() -> None:
+    """Requires that this process does not yet import the script of the process that started it.
+
+    A script without the guard makes all its calls again there.
+
+    Raises:
+        SystemExit: It does. Not a `CdprError`, which the script may handle and continue.
+    """
+    if getattr(current_process(), "_inheriting", False):  # where Python refuses processes too
+        raise SystemExit(
+            "this process imports the script, and does not run it again: put the script's calls"
+            ' below `if __name__ == "__main__":`'
+        )
+
+
+def ended_at_start(name: str, process: BaseProcess, consequence: str = "") -> Fault:
+    """The error for a process that ended before its first message; it was joined."""
+    if (process.exitcode or 0) < 0:
+        why, next_step = "it was killed, or the system ran out of memory", "start again"
+    else:
+        why = "it imports the script that started it, which failed there as stated above"
+        next_step = 'save the script in a file, with its calls below `if __name__ == "__main__":`'
+    return Fault(
+        f"{name} ended before it was ready ({exit_text(process)}){consequence}",
+        why=why,
+        next_step=next_step,
+    )
+
+
+def exit_text(process: BaseProcess) -> str:
+    """How a process ended."""
+    code = process.exitcode
+    return f"killed by signal {-code}" if code is not None and code < 0 else f"exit code {code}"
 
 
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")

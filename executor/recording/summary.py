@@ -114,6 +114,7 @@ def summarize(
         clearance_stop=any(event.code == "clearance_low" for event in context.events),
         silent=any(event.code == "drive_silent" for event in context.events),
         troubles=context.troubles,
+        warnings=[event.text for event in context.events if event.code == "drive_warning"],
     )
     return {
         "schema_version": 1,

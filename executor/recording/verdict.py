@@ -89,6 +89,7 @@ def judge(
     clearance_stop: bool = False,
     silent: bool = False,
     troubles: Sequence[str] = (),
+    warnings: Sequence[str] = (),
 ) -> Verdict:
     """The verdict on a run.
 
@@ -105,6 +106,7 @@ def judge(
         clearance_stop: It was stopped for the measured clearance, not by the operator.
         silent: It was stopped for drives that did not answer.
         troubles: Missing data, a sentence each.
+        warnings: Of the drives.
     """
     measured = [
         following(cycles, rig.motion.following_error),
@@ -112,6 +114,7 @@ def judge(
         *tensions(cycles, rig),
         *distances(clearance, scene.obstacle_clearance, cameras, cycles.path_began),
         *camera(poses, cameras, cycles.path_began),
+        *(Check("drive_warning", True, f"Warning: {warning}.") for warning in warnings),
         *(Check("record", False, f"{trouble}.") for trouble in troubles),
     ]
     failures = [check for check in measured if not check.passed]

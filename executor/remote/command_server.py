@@ -21,7 +21,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from executor.hold_to_run.presses import PressBoard
-from executor.realtime.scheduling import prompt_threads, take_short_turns
+from executor.realtime.scheduling import (
+    prompt_threads,
+    require_imported_script,
+    take_short_turns,
+)
 from executor.realtime.shared_memory import SharedRequests
 from executor.remote.command_socket import advertised_ahead, is_stopped_since
 from executor.remote.protocol import StatusSource, answer_to, status_answer
@@ -278,7 +282,9 @@ def commands_from_start(
     Raises:
         Refused: No stop would reach the verb.
         StoppedByOperator: A stop was requested before the motion.
+        SystemExit: This process still imports the script of another, which lacks the guard.
     """
+    require_imported_script()
     began, operator = time.clock_gettime(time.CLOCK_BOOTTIME), supervisor or Supervisor()
     board: LocalRequests | SharedRequests = SharedRequests() if realtime else LocalRequests()
     with ExitStack() as outer:

@@ -41,7 +41,11 @@ class CsvTable:
             raise self.bad(f"the column {min(twice)!r} appears twice", "name each column once")
         for number, row in zip(self._lines, self._rows, strict=True):
             if len(row) != len(self.names):
-                what = f"line {number} has {len(row)} values for {len(self.names)} columns"
+                values, columns = (
+                    f"{len(many)} {noun}{'s' * (len(many) != 1)}"
+                    for many, noun in ((row, "value"), (self.names, "column"))
+                )
+                what = f"line {number} has {values} for {columns}"
                 raise self.bad(what, "give every line one value per column")
 
     def require(self, names: Sequence[str]) -> None:

@@ -38,7 +38,7 @@ from model.files.validation import (
     position_of,
     problems_of,
 )
-from model.pose import Pose
+from model.pose import Array, Pose
 
 # Parts shared by rig, scene and plan files: strict models, vectors, poses.
 
@@ -189,9 +189,7 @@ class PoseDocument(Document):
         )
 
 
-def millimetres(
-    values: list[float],
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def millimetres(values: list[float]) -> Array:
     """A list in mm as an array in m."""
     return np.asarray(values, dtype=np.float64) / 1000.0
 
@@ -257,7 +255,10 @@ def document_of(data: Mapping[str, Any], model: type[Model], where: str) -> Mode
     Raises:
         InvalidFile: With every key that does not fit.
     """
-    plain = plain_data(data)
+    try:
+        plain = plain_data(data)
+    except RecursionError:
+        raise BadInput("the dictionary contains itself", where=where) from None
     if not isinstance(plain, dict):
         what = f"expected keys and values in a dictionary, not {type(data).__name__}"
         raise BadInput(what, where=where)
@@ -306,10 +307,10 @@ def check_version(
     """
     field, key = model.model_fields.get("schema_version"), "schema_version"
     version = data.get(key)
-    if field is None or type(version) is not int:
+    if field is None or not isinstance(version, int):
         return
     (known,) = field.annotation.__args__  # type: ignore[union-attr]
-    if version != known:
+    if version != known or isinstance(version, bool):
         what = f"the file has schema version {version}; this program reads version {known}"
         hint = next_step or f"bring the file to version {known}, or use the program it was made for"
         raise InvalidFile(str(path), [Problem(key, what, *position_of((key,), positions))], hint)

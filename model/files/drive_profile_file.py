@@ -198,10 +198,11 @@ class ProfileDocument(Document):
     mode_display_when_enabled: bool = Field(
         default=False, description="6061h shows the mode only once the drive is enabled"
     )
-    follows_bit: bool = Field(
-        default=False,
-        description="in CSP bit 12 of 6041h shows that an enabled drive follows its target; no"
-        " set-point changes before all drives show it",
+    follows_bit: bool | None = Field(
+        default=None,
+        description="in CSP bit 12 of 6041h shows that an enabled drive follows its target; true:"
+        " no set-point changes before all drives show it; false: it means something else; left"
+        " out: it need not be shown, but a drive that no longer shows it stops all",
     )
     enable_timeout_ms: Annotated[int, Field(ge=100, le=30_000)] = Field(
         default=1000, description="longest time to enable or release, brake included"

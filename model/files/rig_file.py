@@ -164,6 +164,13 @@ class WinchDocument(Document):
         default=None, description="E·A of its cable; left out, cables.stiffness_n"
     )
 
+    @field_validator("direction", mode="before")
+    @classmethod
+    def _no_truth_value(cls, direction: object) -> object:
+        if isinstance(direction, bool):  # which equals 1 in Python
+            raise ValueError(f"must be -1 or 1; it is {str(direction).lower()}")
+        return direction
+
 
 class MotionDocument(Document):
     """Limits of motion along a plan."""
@@ -227,11 +234,14 @@ class RigDocument(Document):
     simulation: SimulationDocument | None = None
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
-        """Mismatched counts, ends on a line, duplicate numbers, a home outside the workspace."""
+        """Counts, ends on a line, duplicates, sizes in metres, a home outside the workspace."""
         return (
             self._enough_cables,
             self._an_anchor_each,
             self._ends_off_a_line,
+            self._cables_once,
+            self._frame_size,
+            self._platform_size,
             self._a_winch_each,
             self._a_pulley_each,
             self._nodes_once,
@@ -268,6 +278,55 @@ class RigDocument(Document):
             )
             found.append(((key,), what))
         return found
+
+    def _cables_once(self) -> list[Finding]:
+        ends = list(zip(self.outlets_mm, self.anchors_mm, strict=False))
+        return [
+            (("anchors_mm", k), f"cable {k + 1} has the outlet and anchor of cable {first + 1}")
+            for k, both in enumerate(ends)
+            if (first := ends.index(both)) < k
+        ]
+
+    def _frame_size(self) -> list[Finding]:
+        """A frame in metres, or anchors in the world frame."""
+        if _point_or_line(self.outlets_mm):
+            return []
+        span, across = _span(self.outlets_mm), np.linalg.norm(np.ptp(self.outlets_mm, axis=0))
+        if span < _SMALLEST_FRAME_MM:
+            return [(("outlets_mm",), f"the outlets span only {span:g} mm{_IN_MM}")]
+        away = np.linalg.norm(self.anchors_mm, axis=1)
+        what = (
+            f"cable {away.argmax() + 1}'s anchor is {away.max():.5g} mm from the platform's origin,"
+            f" farther than the outlets from each other ({across:.5g} mm): give anchors in the"
+            " platform frame, not the world frame, and in mm"
+        )
+        return [(("anchors_mm",), what)] if away.max() > across else []
+
+    def _platform_size(self) -> list[Finding]:
+        """A platform box in metres, which obstacles could enter, or its anchors."""
+        edges, span = self.platform.size_mm, _span(self.anchors_mm)
+        key = ("platform", "size_mm") if span > max(edges) else ("anchors_mm",)
+        what = f"the anchors span {span:g} mm, the longest edge of platform.size_mm {max(edges):g}"
+        if min(edges) < _THINNEST_PLATFORM_MM:
+            key, what = ("platform", "size_mm"), f"an edge of {min(edges):g} mm is too thin"
+        elif 1 / _MOST <= span / max(edges) <= _MOST or _point_or_line(self.anchors_mm):
+            return []
+        return [(key, what + _IN_MM)]
+
+    def remarks(self) -> list[str]:
+        """Values that are valid but unlikely, each with its key."""
+        longest, span = max(self.platform.size_mm), _span(self.anchors_mm)
+        middle = float(np.linalg.norm(np.mean(self.anchors_mm, axis=0)))
+        box = (
+            f"platform.size_mm: the longest edge is {longest:g} mm, but the anchors span {span:g}"
+            " mm; only this box and the cables are kept away from obstacles"
+        )
+        frame = (
+            f"anchors_mm: their centre is {middle:.5g} mm from the platform's origin, about which"
+            " the box is; check that they are in the platform frame, not the world frame"
+        )
+        unlikely = {box: span > 20 * longest, frame: middle > 2 * max(span, longest)}
+        return [text for text, applies in unlikely.items() if applies]
 
     def _a_winch_each(self) -> list[Finding]:
         return self._one_each(("winches",), len(self.winches))
@@ -359,6 +418,14 @@ class RigDocument(Document):
 
 _ON_A_LINE_MM = 1e-3
 """Distance from a line that counts as on it."""
+_SMALLEST_FRAME_MM, _THINNEST_PLATFORM_MM, _MOST = 50.0, 1.0, 200.0
+"""Limits of any rig; the last one is the ratio of anchors' span and platform's longest edge."""
+_IN_MM = ": write lengths in mm, not in m"
+
+
+def _span(points: Sequence[Sequence[float]]) -> float:
+    """The largest extent of points along an axis, [mm]."""
+    return float(np.ptp(points, axis=0).max())
 
 
 def _point_or_line(points: Sequence[Sequence[float]]) -> str:

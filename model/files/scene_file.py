@@ -165,6 +165,9 @@ FARTHEST_MM = 1e6
 """Largest number of an obstacle: distances are proved to 0.1 µm, for which floating-point numbers
 suffice up to about ten kilometres."""
 
+SMALL_OBSTACLE_MM, SMALL_CLEARANCE_MM = 10.0, 0.5
+"""Obstacles and clearances below these are unlikely: 10 m and 0.5 m in metres."""
+
 SHAPES = ("box", "sphere", "cylinder", "capsule", "convex", "mesh")
 
 
@@ -200,6 +203,9 @@ class MeshDocument(Document):
     triangles: Annotated[list[Triple], Field(min_length=1)]
 
 
+ShapeDocument = BoxDocument | SphereDocument | RoundDocument | HullDocument | MeshDocument
+
+
 class ObstacleDocument(Document):
     """One obstacle: a name, exactly one shape, and its pose."""
 
@@ -213,7 +219,7 @@ class ObstacleDocument(Document):
     convex: HullDocument | None = None
     mesh: MeshDocument | None = None
 
-    def shapes(self) -> dict[str, Document]:
+    def shapes(self) -> dict[str, ShapeDocument]:
         """The shapes that were given, by key."""
         given = {key: getattr(self, key) for key in SHAPES}
         return {key: shape for key, shape in given.items() if shape is not None}
@@ -291,6 +297,21 @@ class SceneDocument(Document):
             lambda: overdrawn(self.load.payload(), self.stops),
         )
 
+    def remarks(self) -> list[str]:
+        """Values that are valid but unlikely, such as metres for millimetres, each with its key."""
+        clearance = self.clearance.model_dump()
+        small = [
+            f"obstacles[{i}]: {obstacle.name!r} is {size:g} mm large"
+            for i, obstacle in enumerate(self.obstacles)
+            if (size := _extent(obstacle)) < SMALL_OBSTACLE_MM
+        ]
+        small += [
+            f"clearance.{key}: {value:g} mm is very small"
+            for key, value in clearance.items()
+            if 0.0 < value < SMALL_CLEARANCE_MM
+        ]
+        return [f"{what}; check that it is in mm, not in m" for what in small]
+
     def _one_shape_each(self) -> list[Finding]:
         found: list[Finding] = []
         for i, obstacle in enumerate(self.obstacles):
@@ -365,6 +386,19 @@ def _numbers(obstacle: ObstacleDocument) -> list[float]:
         if cloud is not None:
             numbers += [value for point in cloud.points_mm for value in point]
     return numbers
+
+
+def _extent(obstacle: ObstacleDocument) -> float:
+    """The largest dimension of an obstacle along its own axes, [mm]."""
+    match next(iter(obstacle.shapes().values())):
+        case BoxDocument(size_mm=size):
+            return max(size)
+        case SphereDocument(radius_mm=radius):
+            return 2.0 * radius
+        case RoundDocument(radius_mm=radius, length_mm=length):
+            return max(2.0 * radius, length)
+        case HullDocument(points_mm=points) | MeshDocument(points_mm=points):
+            return float(np.ptp(points, axis=0).max())
 
 
 def _is_flat(points_mm: list[list[float]]) -> bool:

@@ -98,7 +98,7 @@ def tile(name: str, value: str, note: str, kind: str = "") -> str:
     number, _, unit = value.rpartition(" ") if " " in value else (value, "", "")
     opening = f'<div class="{kind}">' if kind else "<div>"
     return (
-        f"{opening}<dt>{escape(name)}</dt><dd>{escape(number)} <small>{escape(unit)}</small>"
+        f"{opening}<dt>{escape(name)}</dt><dd>{escape(number)}\u00a0<small>{escape(unit)}</small>"
         f'<span class="note">{prose(note)}</span></dd></div>'
     )
 

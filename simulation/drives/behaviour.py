@@ -40,12 +40,15 @@ class DriveBehaviour:
         enable_delay: Time from the command to enable to "operation enabled", [s]: the motor is
             magnetised and its brake opens.
         warning: EMCY code of a warning that comes and goes while enabled; 0: none.
-        flicker: Bits 4, 7 and 8 to 15 of the status word change at every SYNC.
+        flicker: Bits 4, 7 to 11 and 13 to 15 of the status word change at every SYNC.
         boot_delay: Time from power-on or reset to the boot-up message, [s].
         position_noise: Standard deviation of 6064h, [counts].
         torque_noise: Standard deviation of 6077h, [per mille].
         friction: Friction torque of the drive train, [per mille].
         stick: Following error at which a resting motor jumps, [counts].
+        limit_switch: Travel from the position at power-on to a limit switch, [counts]; 0: none.
+            Beyond it the drive stops soon after each SYNC that enables it, without an EMCY; its
+            replies, filled in after the set-points, always show operation enabled.
     """
 
     sync_periods: float = 3.0
@@ -67,6 +70,7 @@ class DriveBehaviour:
     torque_noise: float = 0.0
     friction: float = 0.0
     stick: float = 0.0
+    limit_switch: float = 0.0
 
     @property
     def answers_late(self) -> bool:
@@ -240,7 +244,7 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "status-flicker",
         "",
         "",
-        "bits 4, 7 and 8 to 15 of the status word change at every SYNC",
+        "bits 4, 7 to 11 and 13 to 15 of the status word change at every SYNC",
         _switch(flicker=True),
     ),
     NamedBehaviour(
@@ -277,6 +281,14 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "40",
         "stick-slip: the motor rests until its lag reaches this value, then jumps",
         _number("stick"),
+    ),
+    NamedBehaviour(
+        "limit-switch",
+        "COUNTS",
+        "2000",
+        "beyond this travel a limit switch stops the drive without an EMCY after each SYNC that"
+        " enables it; all replies show operation enabled",
+        _number("limit_switch"),
     ),
 )
 

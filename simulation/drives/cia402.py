@@ -23,14 +23,18 @@ from drivers.cia402.pdo import (
     make_emergency,
     make_heartbeat,
 )
-from drivers.cia402.state_machine import FAULTED, DriveState
+from drivers.cia402.state_machine import DriveState
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.eds_file import Eds, Key, profile_path, read_eds
 from simulation.drives.object_dictionary import (
+    ACCELERATION_UNIT,
     NO_DUPLICATE_CONSUMER,
     OUT_OF_RANGE,
+    POSITION_UNIT,
+    VELOCITY_UNIT,
     DriveObjects,
     SdoServer,
+    counts_in,
 )
 from simulation.drives.pdo import (
     ACTING,
@@ -46,17 +50,7 @@ from simulation.drives.pdo import (
     ProcessData,
     ReceivePdo,
 )
-from simulation.drives.power import (
-    ACCELERATION_UNIT,
-    MODE_FOLLOWS,
-    NO_WINDOW,
-    POSITION_UNIT,
-    TIMED,
-    VELOCITY_UNIT,
-    Motor,
-    PowerStage,
-    counts_in,
-)
+from simulation.drives.power import MODE_FOLLOWS, NO_WINDOW, TIMED, Motor, PowerStage
 
 Frame = bytes | bytearray
 Send = Callable[[int, Frame], None]
@@ -74,7 +68,7 @@ ERROR_REGISTER, ERROR_CODE = (0x1001, 0), (0x603F, 0)
 
 _SYNC, _BOOT = "sync", "boot"
 
-_FLICKERING = 0xFF90
+_FLICKERING = 0xEF90
 
 _REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x8: 0x10, 0xF: 0x80}
 """Bits of 1001h by the first digit of an error code: current, voltage, temperature, communication,
@@ -197,7 +191,10 @@ class SimulatedDrive(PowerStage):
             self._server.deliver(now)
 
     def on_sync(self) -> None:
-        """SYNC: sends replies with the present state, then applies the waiting set-points."""
+        """SYNC: sends replies with the present state, then applies the waiting set-points.
+
+        At a limit switch set-points are applied first and enable the drive, which then stops again.
+        """
         if self.silent or self.nmt is not OPERATIONAL:
             return
         self._window_ends = self._now + self._sync_window if self._sync_window else inf
@@ -207,13 +204,15 @@ class SimulatedDrive(PowerStage):
                 self._clear_error(_SYNC)
         if self.behaviour.flicker:
             self._flicker = self._random.getrandbits(16) & _FLICKERING
+        is_at_switch = self._is_at_switch
+        if is_at_switch:
+            self._take_waiting()
         for pdo in self._pdos.sent:
             if pdo.is_due():
                 self._send(pdo.can_id, pdo.form.pack(*[read() for read in pdo.readers]))
-        if self._waiting:
-            waiting, self._waiting = self._waiting, {}
-            for received, values in waiting.values():
-                self._take(received, values)
+        self._take_waiting()
+        if is_at_switch:
+            self._stop_at_switch()
 
     def on_set_point(self, data: Frame) -> None:
         """RPDO1 with its default identifier."""
@@ -386,19 +385,6 @@ class SimulatedDrive(PowerStage):
             if what == _SYNC or isinstance(what, int):
                 self._deadlines.forget(what)
 
-    def _connection_lost(self, code: int) -> None:
-        """Abort connection option code 6007h: 1 a fault, 2 disable voltage, 3 quick stop."""
-        option = self.objects.get((0x6007, 0), 1)
-        if option == 1:
-            self._fault_code = code
-            self._react_to_fault()
-        elif self.state in FAULTED:
-            return
-        elif option == 2:
-            self._power_off(DriveState.SWITCH_ON_DISABLED)
-        elif option == 3:
-            self._command_quick_stop()
-
     def _raise_error(self, what: object, code: int) -> None:
         """A communication error: reported once until it is cleared."""
         if what not in self._errors:
@@ -409,6 +395,12 @@ class SimulatedDrive(PowerStage):
         """The error is over: EMCY 0000h, with the remaining error register."""
         if self._errors.pop(what, None) is not None:
             self._emergency(0)
+
+    def _take_waiting(self) -> None:
+        """Applies the synchronous RPDOs received since the last SYNC."""
+        waiting, self._waiting = self._waiting, {}
+        for received, values in waiting.values():
+            self._take(received, values)
 
     def _take(self, pdo: ReceivePdo, values: tuple[int, ...]) -> None:
         """Applies the data of an RPDO, the control word last, after the target."""

@@ -335,3 +335,34 @@ class SdoServer:
     def _check_toggle(self, command: int) -> None:
         if command & 0x10 != self._toggle:
             raise Abort(TOGGLE_NOT_ALTERNATED)
+
+
+# Units of a drive's speed and acceleration in counts, by 60A8h to 60AAh. Pure.
+#
+# Source: CiA 402-2, objects 60A8h to 60AAh: bits 31 to 24 prefix, 23 to 16 numerator, 15 to 8
+# denominator; Maxon EPOS4 firmware specification for C0h, revolutions a minute.
+
+
+POSITION_UNIT, VELOCITY_UNIT, ACCELERATION_UNIT = 0x60A8, 0x60A9, 0x60AA
+
+_COUNTS, _REVOLUTIONS, _RPM = 0xB5, 0xB4, 0xC0
+_SECONDS = {0x00: 1.0, 0x03: 1.0, 0x47: 60.0, 0x56: 1.0, 0x57: 1.0}
+"""Seconds in each denominator: none, s, min, s² (CiA 303-2: 57h; 56h in some files)."""
+
+
+def counts_in(unit: int, counts_per_turn: float) -> float | None:
+    """Counts, counts/s or counts/s² in one unit; None for an unknown unit.
+
+    Args:
+        unit: Value of 60A8h, 60A9h or 60AAh; 0 for counts.
+        counts_per_turn: Of the motor shaft.
+    """
+    if unit == 0:
+        return 1.0
+    prefix = unit >> 24 & 0xFF
+    exponent = prefix - 0x100 if prefix & 0x80 else prefix
+    per_turn = {_COUNTS: 1.0, _REVOLUTIONS: counts_per_turn, _RPM: counts_per_turn / 60.0}
+    numerator, seconds = per_turn.get(unit >> 16 & 0xFF), _SECONDS.get(unit >> 8 & 0xFF)
+    if numerator is None or seconds is None:
+        return None
+    return numerator * 10.0**exponent / seconds

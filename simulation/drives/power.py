@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from drivers.cia402.state_machine import FAULTED, TORQUE_ON, DriveState
 from simulation.drives.behaviour import DriveBehaviour
-from simulation.drives.object_dictionary import DriveObjects
+from simulation.drives.object_dictionary import ACCELERATION_UNIT, DriveObjects, counts_in
 from simulation.drives.pdo import Deadlines
 
 # Motion of the motor: following set-points, ramping down, holding. Pure.
@@ -99,37 +99,6 @@ class Motor:
             self.position += moved
 
 
-# Units of a drive's speed and acceleration in counts, by 60A8h to 60AAh. Pure.
-#
-# Source: CiA 402-2, objects 60A8h to 60AAh: bits 31 to 24 prefix, 23 to 16 numerator, 15 to 8
-# denominator; Maxon EPOS4 firmware specification for C0h, revolutions a minute.
-
-
-POSITION_UNIT, VELOCITY_UNIT, ACCELERATION_UNIT = 0x60A8, 0x60A9, 0x60AA
-
-_COUNTS, _REVOLUTIONS, _RPM = 0xB5, 0xB4, 0xC0
-_SECONDS = {0x00: 1.0, 0x03: 1.0, 0x47: 60.0, 0x56: 1.0, 0x57: 1.0}
-"""Seconds in each denominator: none, s, min, s² (CiA 303-2: 57h; 56h in some files)."""
-
-
-def counts_in(unit: int, counts_per_turn: float) -> float | None:
-    """Counts, counts/s or counts/s² in one unit; None for an unknown unit.
-
-    Args:
-        unit: Value of 60A8h, 60A9h or 60AAh; 0 for counts.
-        counts_per_turn: Of the motor shaft.
-    """
-    if unit == 0:
-        return 1.0
-    prefix = unit >> 24 & 0xFF
-    exponent = prefix - 0x100 if prefix & 0x80 else prefix
-    per_turn = {_COUNTS: 1.0, _REVOLUTIONS: counts_per_turn, _RPM: counts_per_turn / 60.0}
-    numerator, seconds = per_turn.get(unit >> 16 & 0xFF), _SECONDS.get(unit >> 8 & 0xFF)
-    if numerator is None or seconds is None:
-        return None
-    return numerator * 10.0**exponent / seconds
-
-
 # The drive function.
 
 SLIP_SHARE = 0.005
@@ -138,6 +107,9 @@ the limit of the return speed."""
 
 WARNING_LASTS = 0.5
 """Time for which a warning is present or absent, [s]."""
+
+SWITCH_DELAY = 0.0005
+"""Time from a SYNC that enables a drive until its limit switch stops it again, [s]."""
 
 CYCLIC_POSITION = 8
 FOLLOWING_ERROR = 0x8611
@@ -190,7 +162,7 @@ class PowerStage(ABC):
         self.motor, self.behaviour = motor, behaviour
         self._counts_per_turn = counts_per_turn
         self._random = random.Random(seed)
-        self._now = 0.0
+        self._now, self._start = 0.0, motor.position
 
     @abstractmethod
     def _emergency(self, code: int) -> None:
@@ -270,6 +242,19 @@ class PowerStage(ABC):
             self.state = DriveState.FAULT_REACTION_ACTIVE
         else:
             self._power_off(DriveState.FAULT)
+
+    def _connection_lost(self, code: int) -> None:
+        """Abort connection option code 6007h: 1 a fault, 2 disable voltage, 3 quick stop."""
+        option = self.objects.get((0x6007, 0), 1)
+        if option == 1:
+            self._fault_code = code
+            self._react_to_fault()
+        elif self.state in FAULTED:
+            return
+        elif option == 2:
+            self._power_off(DriveState.SWITCH_ON_DISABLED)
+        elif option == 3:
+            self._command_quick_stop()
 
     def _position_shown(self) -> int:
         position = self.motor.position
@@ -436,6 +421,18 @@ class PowerStage(ABC):
         self.state = DriveState.QUICK_STOP_ACTIVE
         if self._stop_option == 0:
             self._power_off(DriveState.SWITCH_ON_DISABLED)
+
+    @property
+    def _is_at_switch(self) -> bool:
+        """Whether the motor is beyond its limit switch."""
+        distance = self.behaviour.limit_switch
+        return bool(distance) and abs(self.motor.position - self._start) > distance
+
+    def _stop_at_switch(self) -> None:
+        """The motor moves for `SWITCH_DELAY`, then the limit switch stops it without an EMCY."""
+        if self._enabled:
+            self._move(SWITCH_DELAY)
+            self._quick_stop()
 
     def _power_off(self, state: DriveState) -> None:
         """Brake closed, torque off."""

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+
+import cdpr
+from calibration.targets.boards import Charuco
+from calibration.targets.grids import CircleGrid
+from tests.cli.plans import write_short_plan
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = (
@@ -47,3 +54,48 @@ def test_every_public_name_is_documented() -> None:
         names = importlib.import_module(package).__all__
         shown = [line.split(".")[-1] for line in page.splitlines() if line.startswith("::: ")]
         assert sorted(shown) == sorted(names), package
+
+
+def with_truth_values() -> list[tuple[str, str]]:
+    """Functions of `cdpr` and `executor`, and their arguments that are True or False."""
+    return sorted(
+        {
+            (f"{package}.{name}", argument.name)
+            for package in ("cdpr", "calibration", "executor")
+            for name in importlib.import_module(package).__all__
+            if inspect.isfunction(function := getattr(importlib.import_module(package), name))
+            for argument in inspect.signature(function).parameters.values()
+            if str(argument.annotation) in ("bool", "bool | None")
+        }
+    )
+
+
+@pytest.mark.parametrize(("function", "argument"), with_truth_values())
+def test_what_is_neither_true_nor_false_is_refused_before_anything_is_asked(
+    function: str, argument: str, tmp_path: Path
+) -> None:
+    """A `None` for `clearance_stop` would switch off a protection."""
+    package, name = function.split(".")
+    rig = cdpr.load_rig(ROOT / "configs" / "gachon_8_6.yaml")
+    scene = cdpr.load_scene(ROOT / "configs" / "environment_1.yaml")
+    given: dict[str, tuple[Any, ...]] = {
+        "calibrate_rig": (rig, tmp_path / "missing.csv"),
+        "jog": (rig, None),
+        "jog_cable": (rig, 1, 0.001),
+        "plan": (rig, scene),
+        "run": (cdpr.load_plan(write_short_plan(tmp_path / "plan.json")), rig),
+    }
+    call = getattr(importlib.import_module(package), name)
+    options = (
+        {} if "confirm" not in inspect.signature(call).parameters else {"confirm": pytest.fail}
+    )
+    for value in (0, 1.0, "no", "", [], np.int64(1), *([] if argument == "volume" else [None])):
+        with pytest.raises(cdpr.BadInput, match=f"^{argument} must be True or False, it is"):
+            call(*given.get(name, (rig,)), **options, **{argument: value})
+
+
+def test_boards_take_only_truth_values_for_their_kind() -> None:
+    with pytest.raises(cdpr.BadInput, match="legacy must be True or False"):
+        Charuco(5, 7, 0.03, 0.02, "4X4_50", legacy="no")  # type: ignore[arg-type]
+    with pytest.raises(cdpr.BadInput, match="asymmetric must be True or False"):
+        CircleGrid(4, 5, 0.03, 0.01, asymmetric=1)  # type: ignore[arg-type]

@@ -23,7 +23,7 @@ import cdpr
 from executor.cameras.sources import choose_camera
 from model.files.documents import PoseDocument
 from model.files.scene_file import StopDocument
-from model.kinematics import cable_lengths
+from model.kinematics import cable_lengths, forward_kinematics
 from model.rig import rig_from_document
 from model.statics.gravity import weight_wrench
 
@@ -144,8 +144,47 @@ def test_a_rig_is_varied_in_memory_and_checked_like_a_file(rig: cdpr.Rig) -> Non
             cdpr.Rig.from_dict(wrong)  # type: ignore[arg-type]
     with pytest.raises(cdpr.BadInput, match="this is a rig file, not a scene file"):
         cdpr.Scene.from_dict(rig.as_dict())
-    with pytest.raises(cdpr.BadInput, match="schema version 2"):
-        cdpr.Rig.from_dict({**rig.as_dict(), "schema_version": 2})
+    for version in (2, True):
+        with pytest.raises(cdpr.BadInput, match=f"schema version {version}"):
+            cdpr.Rig.from_dict({**rig.as_dict(), "schema_version": version})
+    data = rig.as_dict()
+    data["winches"][0]["direction"] = True
+    with pytest.raises(cdpr.BadInput, match="direction: must be -1 or 1; it is true"):
+        cdpr.Rig.from_dict(data)
+    data["itself"] = data
+    with pytest.raises(cdpr.BadInput, match="contains itself"):
+        cdpr.Rig.from_dict(data)
+
+
+@pytest.mark.parametrize("as_rows", [False, True])
+def test_masked_values_are_not_used_as_numbers(rig: cdpr.Rig, as_rows: bool) -> None:
+    def masked(values: Any) -> Any:
+        array = np.ma.array(values, mask=np.zeros(np.shape(values), dtype=bool))
+        array[(0,) * array.ndim] = np.ma.masked
+        return list(array) if as_rows else array
+
+    home, camera = rig.home, rig.camera()
+    image = masked(np.zeros((camera.height, camera.width), np.uint8))
+    for call in (
+        lambda: cdpr.Pose.level(masked(home.position)),
+        lambda: cdpr.Pose(home.position, masked(home.rotation)),
+        lambda: cdpr.Pose.from_quaternion(home.position, masked(home.quaternion)),
+        lambda: home.apply(masked(rig.anchors)),
+        lambda: rig.tensions_by(masked(np.full(8, 10.0))),
+        lambda: rig.torques_by(masked(np.full(8, 10.0))),
+        lambda: forward_kinematics(rig, masked(cable_lengths(rig, home))),
+        lambda: cdpr.jog(rig, None, by=masked([0.001, 0.0, 0.0]), realtime=False),
+        lambda: cdpr.workspace_map(rig, lower=masked(rig.workspace_lower)),
+        lambda: cdpr.workspace_map(rig, rotation=masked(home.rotation)),
+        *(() if as_rows else (lambda: cdpr.Tracker(rig, camera).observe(image, 0.0),)),
+    ):
+        with pytest.raises(cdpr.BadInput, match="masked values"):
+            call()
+    data = {**rig.as_dict(), "outlets_mm": masked(rig.outlets * 1e3)}
+    with pytest.raises(cdpr.BadInput, match="outlets_mm"):
+        cdpr.Rig.from_dict(data)
+    bare = np.ma.array(home.position, mask=[False, False, False])
+    assert cdpr.Pose.level(bare).position.tolist() == home.position.tolist()
 
 
 def test_a_pose_that_cannot_be_held_says_so_and_has_no_tensions(rig: cdpr.Rig) -> None:
@@ -270,7 +309,11 @@ def test_arguments_that_contradict_each_other_are_refused(rig: cdpr.Rig, scene: 
         (lambda *_: cdpr.track("r.yaml", 0), "a Rig, not text", "cdpr.load_rig('r.yaml')"),
         (lambda *_: cdpr.workspace_map("r.yaml"), "a Rig", "cdpr.load_rig('r.yaml')"),
         (lambda rig, scene: rig.at(rig.home, scene), "a Load, not Scene", "scene.load"),
-        (lambda rig, _: rig.plot([0, 0, 1]), "a Pose, not list", "cdpr.Pose.level([0, 0, 1])"),
+        (
+            lambda rig, _: rig.plot([0, 0, 1]),
+            "a Pose, not list",
+            "pass cdpr.Pose.level([0, 0, 1]), with the position in metres",
+        ),
         (lambda rig, scene: rig.plot(scene), "a Pose, not Scene", "cdpr.Pose.level"),
         (lambda rig, _: rig.clipped([0, 0, 1]), "a Pose, not list", "Pose.level([0, 0, 1])"),
         (lambda _, scene: scene.changed(start=[0, 0, 1]), "a Pose, not list", "Pose.level("),
@@ -444,6 +487,8 @@ def test_a_wrong_argument_is_named_with_its_value(
         (lambda: cdpr.plan(rig, scene, weights="length=1"), "the weights must be a mapping"),
         (lambda: cdpr.workspace_map(rig, volume="no"), "volume must be True or False"),
         (lambda: cdpr.workspace_map(rig, workers=0), "workers must be a whole number from 1"),
+        (lambda: cdpr.plan(rig, scene, rounds=True), "rounds must be a whole number from 1"),
+        (lambda: cdpr.plan(rig, scene, seed=False), "the seed must be a whole number from 0"),
         (lambda: cdpr.workspace_map(rig, slices=("z", 0.4)), "'z' is not a slice"),
         (lambda: cdpr.workspace_map(rig, slices=[("xy", 0.1)]), "('xy', 0.1) is not a slice"),
         (lambda: cdpr.workspace_map(rig, rotation=np.ones((3, 3))), "no rotation"),

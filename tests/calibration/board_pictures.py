@@ -29,16 +29,24 @@ def poses_before_the_camera(
 
 
 @cache
-def sample_rays() -> Array:
+def sample_rays(distortion: tuple[float, ...] = tuple(DISTORTION)) -> Array:
     """Rays of 2 x 2 samples per pixel, camera frame, shape (n, 3); cached for all images."""
     columns = (np.arange(SIZE[0] * _SUB) + 0.5) / _SUB - 0.5
     rows = (np.arange(SIZE[1] * _SUB) + 0.5) / _SUB - 0.5
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
-    flat = cv2.undistortPoints(pixels, MATRIX, DISTORTION).reshape(-1, 2)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+    lens = np.array(distortion)
+    flat = cv2.undistortPoints(pixels, MATRIX, lens, criteria=stop).reshape(-1, 2)
     return np.column_stack([flat, np.ones(len(flat))])
 
 
-def picture_of(print_: np.ndarray, pixel: float, origin: Array, pose: Pose) -> np.ndarray:
+def picture_of(
+    print_: np.ndarray,
+    pixel: float,
+    origin: Array,
+    pose: Pose,
+    distortion: tuple[float, ...] = tuple(DISTORTION),
+) -> np.ndarray:
     """Image of a print on a board in front of a grey wall.
 
     Args:
@@ -46,8 +54,9 @@ def picture_of(print_: np.ndarray, pixel: float, origin: Array, pose: Pose) -> n
         pixel: Side of its pixels, [m].
         origin: Where the board's origin is on it, shape (2,), [m] from its top left corner.
         pose: Of the board's frame, whose x and y run along the print's, in the camera's.
+        distortion: Of the lens.
     """
-    rays = sample_rays() @ pose.rotation
+    rays = sample_rays(distortion) @ pose.rotation
     eye = -pose.rotation.T @ pose.position
     on_board = (eye + (-eye[2] / rays[:, 2])[:, None] * rays)[:, :2]
     found = ((on_board + origin) / pixel - 0.5).astype(np.float32)

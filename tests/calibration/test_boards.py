@@ -15,11 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.intrinsics.calibrate import fit_camera
+from calibration.pictures import ImageSet
+from calibration.procedures import calibrate_camera
 from calibration.statistics import EvenSample
 from calibration.targets.boards import Charuco, Chessboard, is_mirrored
 from calibration.targets.grids import CircleGrid, TagGrid
+from model.cameras import generic_camera
 from model.errors import BadInput
-from model.pose import Pose
+from model.pose import Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import (
     DISTORTION,
     MATRIX,
@@ -28,6 +31,8 @@ from tests.calibration.board_pictures import (
     poses_before_the_camera,
     with_noise,
 )
+from tracking.camera_model import has_rays
+from tracking.detection.diagnostics import RowNumbering, row_numbering, tag_offsets
 
 CHARUCO = Charuco(7, 5, 0.040, 0.030, "4X4_50")
 TAGS = TagGrid(5, 4, 0.040, 0.012, "tag36h11", first=20)
@@ -271,6 +276,32 @@ def test_the_camera_comes_back_from_parts_of_a_board(board: Charuco | TagGrid) -
     assert found.size == SIZE
 
 
+BARREL = (-0.3, 0.1, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("board", "sheet", "margin"),
+    [
+        (TAGS, tag_print(), 0.012),
+        (CIRCLES, circle_print(CIRCLES), MARGIN),
+        (CHARUCO, charuco_print(), 0.0),
+    ],
+)
+def test_barrel_distortion_does_not_bias_the_camera(board, sheet, margin: float) -> None:
+    """Edges of tags are curved, and centroids of circles are off their centres."""
+    origin, middle = np.full(2, margin), np.array([0.11, 0.08, 0.0])
+    images = []
+    for k, pose in enumerate(poses_before_the_camera(middle, 12, spread=0.09)):
+        near = replace(pose, position=pose.position - [0.0, 0.0, 0.1])
+        image = picture_of(sheet, PIXEL, origin, near, BARREL)
+        images.append((f"{k}.png", with_noise(image, k)))
+    found = calibrate_camera(ImageSet(images, len(images)), board, lens="five").found
+    for name, truth in (("fx_px", MATRIX[0, 0]), ("fy_px", MATRIX[1, 1])):
+        low, high = found.intervals[name].bounds
+        assert low < truth < high
+        assert high - low < 1.2
+
+
 @pytest.mark.parametrize("board", [CHARUCO, TAGS])
 def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid) -> None:
     image = pictures(board)[0][0]
@@ -314,6 +345,127 @@ def test_the_message_names_what_most_images_show_instead() -> None:
     assert found is not None, caught.value.why
     assert found[1] != "0"
     assert found[2] == "3"
+
+
+def whole_pictures(board: Charuco | TagGrid, least: int) -> list[tuple[str, np.ndarray]]:
+    """Named images that show at least so many points of a board."""
+    found = ((image, board.find(image)) for image, _ in pictures(board))
+    whole = [image for image, seen in found if seen is not None and len(seen.points) >= least]
+    return [(f"{k}.png", image) for k, image in enumerate(whole)]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "advice"),
+    [
+        ({"first": 21}, "fit a grid of 5 x 4 tags, tag36h11 20 to 39: try --first 20;"),
+        ({"first": 18}, "try --first 20;"),
+        ({"columns": 6}, "fit a grid of 5 x 4 tags, tag36h11 20 to 39: try --columns 5;"),
+        ({"columns": 4}, "try --columns 5;"),
+        ({"columns": 4, "rows": 3, "first": 22}, "try --columns 5 --rows 4 --first 20;"),
+        ({"columns": 6, "order": "kalibr"}, "try --columns 5 --order rows;"),
+    ],
+)
+def test_tags_numbered_otherwise_are_named(wrong: dict[str, int], advice: str) -> None:
+    """They would fit a homography by tens of pixels, which no lens model cures."""
+    images = whole_pictures(TAGS, 76)[:2]
+    assert len(images) == 2
+    with pytest.raises(BadInput) as caught:
+        fit_camera(images, replace(TAGS, **wrong))
+    assert advice in caught.value.why
+
+
+@given(
+    columns=st.integers(2, 8),
+    rows=st.integers(2, 6),
+    first=st.integers(0, 300),
+    order=st.sampled_from(["rows", "kalibr"]),
+    turn=st.tuples(*[st.floats(-0.7, 0.7)] * 2, st.floats(-3.1, 3.1)),
+    upside_down=st.booleans(),
+)
+def test_the_numbering_of_a_grid_follows_from_its_tags(
+    columns: int, rows: int, first: int, order: str, turn: tuple[float, ...], upside_down: bool
+) -> None:
+    """Through a lens with barrel distortion, at any tilt and rotation."""
+    grid = TagGrid(columns, rows, 0.040, 0.012, "tag36h11", first, order)
+    numbers = range(first, first + columns * rows)
+    points = grid.points_of(numbers)
+    middle = points.mean(axis=0)
+    rotation = matrix_from_rotation_vector(np.array(turn))
+    seen = (points - middle) @ rotation.T + [0.0, 0.0, 0.8]
+    corners = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), MATRIX, np.array(BARREL))[0]
+    quads = corners.reshape(-1, 4, 2)
+    if upside_down:
+        quads = np.roll(quads, 2, axis=1)
+    squares = dict(zip(numbers, quads, strict=True))
+    assert row_numbering(squares) == RowNumbering(columns, order == "kalibr", first % columns)
+    offsets = tag_offsets(squares) * (-1.0 if upside_down else 1.0)
+    assert grid._misfit(numbers, offsets) < 0.15
+    for wrong in (
+        replace(grid, columns=columns + 1),
+        replace(grid, first=max(0, first - 1), rows=rows + 1),
+        replace(grid, order="rows" if order == "kalibr" else "kalibr"),
+    ):
+        if wrong != replace(grid, rows=rows + 1):
+            assert wrong._misfit(numbers, offsets) > 0.5
+
+
+@pytest.mark.parametrize("gap_mm", [11.0, 13.0])
+def test_a_wrong_gap_between_tags_is_named_with_the_right_one(gap_mm: float) -> None:
+    images = whole_pictures(TAGS, 40)
+    wrong = replace(TAGS, gap=gap_mm / 1e3)
+    verdict = calibrate_camera(ImageSet(images, len(images)), wrong, lens="five").quality.verdict
+    found = re.search(
+        r"gaps of ([\d.]+) mm between tags of 40 mm, not 1[13] mm", str(verdict.reasons)
+    )
+    assert found is not None, verdict.reasons
+    assert float(found[1]) == pytest.approx(12.0, abs=0.1)
+    assert verdict.next_steps[0] == "measure the print, and correct --tag-mm or --gap-mm"
+
+
+def test_right_sizes_of_a_board_are_not_questioned() -> None:
+    for board in (TAGS, CHARUCO):
+        images = whole_pictures(board, 16)
+        right = calibrate_camera(ImageSet(images, len(images)), board, lens="five").quality
+        assert not any("the images fit" in reason for reason in right.verdict.reasons)
+
+
+@pytest.mark.parametrize("marker_mm", [24.0, 36.0])
+def test_a_wrong_size_of_markers_is_named(marker_mm: float, capfd) -> None:
+    """OpenCV itself only warns, on standard error, of markers almost as large as their squares."""
+    images = whole_pictures(CHARUCO, 16)
+    wrong = replace(CHARUCO, marker=marker_mm / 1e3)
+    verdict = calibrate_camera(ImageSet(images, len(images)), wrong, lens="five").quality.verdict
+    assert re.search(r"markers of about (29|30) mm in squares of 40 mm", str(verdict.reasons))
+    assert verdict.next_steps[0].endswith("--square-mm or --marker-mm")
+    assert capfd.readouterr().err == ""
+
+
+def test_rows_and_columns_of_a_charuco_board_exchanged_are_named() -> None:
+    image = whole_pictures(CHARUCO, 16)[0][1]
+    exchanged = replace(CHARUCO, columns=5, rows=7)
+    assert exchanged.find(image) is None
+    assert "7 x 5 squares with 4X4_50: try --columns 7 --rows 5" in exchanged.describe_other(image)
+
+
+def test_images_that_can_be_read_only_once_are_refused() -> None:
+    """Corners of tags are detected twice; without the second time they would be biased."""
+    images = whole_pictures(TAGS, 40)
+    with pytest.raises(BadInput, match="cannot be read again"):
+        calibrate_camera(ImageSet(iter(images), len(images)), TAGS, lens="five")
+
+
+@pytest.mark.parametrize("board", [TAGS, CIRCLES])
+def test_boards_where_a_lens_has_no_rays_are_found_as_without_it(board) -> None:
+    """As by a fisheye more than 90° off its axis, which straight lines do not describe."""
+    own = pictures(board) if board is TAGS else grid_pictures(board)
+    image = next(image for image, _ in own if board.find(image) is not None)
+    matrix = np.array([[60.0, 0.0, -40.0], [0.0, 60.0, -40.0], [0.0, 0.0, 1.0]])
+    wide = replace(generic_camera(SIZE), matrix=matrix, distortion=np.zeros(4), lens="fisheye")
+    plain, seen = board.find(image), board.find(image, wide)
+    far = ~has_rays(wide, plain.corners)
+    assert far.sum() > 16
+    np.testing.assert_array_equal(seen.points, plain.points)
+    np.testing.assert_allclose(seen.corners[far], plain.corners[far], atol=0.5)
 
 
 @given(count=st.integers(0, 200), wanted=st.integers(1, 7))

@@ -60,6 +60,9 @@ OLD = CAMERA.replace("distortion_model: MODEL\n", "").replace("2e-5", "2e-5, 0.5
 OLD = OLD.replace("image_width", "image_Width").replace("image_height", "image_Height")
 OLD = OLD.replace("camera_matrix", "Camera_Matrix")
 OLD = OLD.replace("distortion_coefficients", "Distortion_Coefficients")
+STATED = "[461.5, 0, 362.5, 0, 460.25, 246.0, 0, 0, 1]"
+MATLAB = "[461.5, 0, 0, 0, 460.25, 0, 362.5, 246.0, 1]"
+STATED_BY_ROS = "[461.5, 0.0, 362.5, 0.0, 460.25, 246.0, 0.0, 0.0, 1.0]"
 PLAIN = """image_width: 752
 image_height: 480
 camera_matrix: {rows: 3, cols: 3, data: [461.5, 0, 362.5, 0, 460.25, 246.0, 0, 0, 1]}
@@ -151,6 +154,13 @@ def test_files_are_read_as_other_programs_write_them(rig, tmp_path, name: str) -
         (PLAIN.replace("[-0.28, 0.07", "[a, b"), "distortion_coefficients is not a list of num"),
         (PLAIN.replace("data", "date"), "camera_matrix is not nine numbers, or rows, cols"),
         (PLAIN.replace("752", "wide"), "image_width is not a number of pixels"),
+        (PLAIN.replace(STATED, MATLAB), "it is transposed, as in MATLAB"),
+        (PLAIN.replace(STATED, "[461.5, 0, 0, 1, 460.25, 0, 362, 246, 1]"), "it is transposed, as"),
+        (PLAIN.replace(STATED, "[461.5, 0, 362, 0, 460.25, 246, 0, 0, 2]"), "not fx 0 cx, 0 fy cy"),
+        (PLAIN.replace(STATED, "[461.5, 0, 362, 1, 460.25, 246, 0, 0, 1]"), "not fx 0 cx, 0 fy cy"),
+        (PLAIN.replace(STATED, "[461.5, 1, 362, 0, 460.25, 246, 0, 0, 1]"), "has a skew"),
+        (PLAIN.replace(STATED, "[0, 0, 0, 0, 0, 0, 0, 0, 0]"), "is not fx 0 cx, 0 fy cy, 0 0 1"),
+        (MESSAGE.replace(STATED_BY_ROS, MATLAB), "it is transposed, as in MATLAB"),
         (EUROC.replace("[752, 480]", "752"), "1 numbers for the image's size"),
         (EUROC.replace("pinhole", "omni"), "its camera_model is 'omni'; pinhole can be read"),
         (EUROC.replace("distortion_model", "model"), "distortion_model is missing: one of plumb_"),
@@ -193,3 +203,26 @@ def test_an_import_leaves_out_the_error_of_measurements_and_states_the_next_step
         strict=True,
     ):
         assert part in text
+
+
+@pytest.mark.parametrize(
+    ("middle", "where"),
+    [
+        ((362.5, 246.0), ""),
+        ((80.0, 60.0), ""),
+        ((74.0, 246.0), "is at the edge of the image of 752 x 480 px"),
+        ((362.5, 440.0), "is at the edge of"),
+        ((0.0, 0.0), "(0, 0) px is at the edge of"),
+        ((-1.0, 246.0), "is outside the image"),
+        ((362.5, 481.0), "is outside the image"),
+    ],
+)
+def test_a_principal_point_far_from_the_middle_is_questioned(
+    rig, tmp_path, middle: tuple[float, float], where: str
+) -> None:
+    file, remarks = tmp_path / "camera.yaml", Remarks([])
+    file.write_text(EUROC.replace("362.5, 246.0", "{}, {}".format(*middle)))
+    write_rig_with_camera(tmp_path / "rig.yaml", rig, rig.cameras[0].name, file, listener=remarks)
+    questioned = [text for text in remarks.texts if "principal point" in text]
+    assert len(questioned) == bool(where)
+    assert where in "".join(questioned)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from calibration.pictures import VIDEO_IMAGES, CaptureGuide, open_images, open_source, same_images
-from calibration.targets.boards import Chessboard, DetectedBoard, generic_camera
+from calibration.targets.boards import Chessboard, DetectedBoard
 from drivers.cameras.live import VideoFile
+from model.cameras import generic_camera
 from model.pose import Array, Pose, matrix_from_rotation_vector
 
 SIZE = (1280, 720)
@@ -172,3 +173,11 @@ def test_of_two_videos_images_with_the_same_numbers_are_used(
     first, second = ([name for name, _ in one.images] for one in samples)
     assert first == second
     assert len(first) == samples[0].count == samples[1].count == min(20, *lengths)
+
+
+def test_the_images_of_a_video_can_be_read_repeatedly(tmp_path: Path) -> None:
+    """For boards that are detected again with the lens."""
+    images = open_images(video_of(tmp_path / "board.avi", 100))
+    first, second = ([(name, image.tobytes()) for name, image in images.images] for _ in range(2))
+    assert len(first) == images.count
+    assert first == second

@@ -225,6 +225,9 @@ def test_without_tensions_the_stiffness_stays_as_drawn_and_is_named(
     ends = result.intervals["stiffness_n"].bounds
     width = 0.2 * 2.0  # Student's factor of 59
     assert ends == pytest.approx([6000.0 * np.exp(-width), 6000.0 * np.exp(width)], rel=0.01)
+    assert result.intervals["stiffness_n"].value == pytest.approx(6000.0)
+    (row,) = (row for row in number_rows(result) if row[0] == "stiffness_n")
+    assert (row[1:4], row[5]) == (("6000", "6000", "+0"), "no")
     assert share_inside(result.intervals, true_numbers(rig)) >= 0.9
     verdict = judge_rig(result, 10e-3, 0.0).verdict
     assert not verdict.good
@@ -430,8 +433,11 @@ def test_the_report_sets_every_number_beside_the_rig_files(rig: Rig, found: RigC
     assert float(change) == pytest.approx(float(new) - float(before), abs=0.011)
     assert (changed == "yes") == (abs(float(change)) > float(width))
     quality = judge_rig(found, 1e-3, 0.0)
+    for name, (before, new, change, *_) in rows.items():
+        if not name.endswith("_n"):  # of any size: with its hundredths
+            assert all("." in text for text in (before, new, change)), name
     page = rig_page(found, quality, "<b>rig</b>", "2026-03-14")
-    assert f"{quality.before * 1e3:.2f} → {quality.held_out * 1e3:.2f} <small>mm" in page
+    assert f"{quality.before * 1e3:.2f} → {quality.held_out * 1e3:.2f}\u00a0<small>mm" in page
     assert "good enough" in page
     assert "<b>rig</b>" not in page
     for head in ("rig file", "new", "change", "± 95 %"):

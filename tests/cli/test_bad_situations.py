@@ -18,8 +18,11 @@ import pytest
 from drivers.cia402 import sdo
 from executor.cameras import process as camera_process
 from executor.cameras.process import CameraProcess
+from model.plan import save_plan
+from model.rig import load_rig
+from model.scene import load_scene
 from simulation.drives.cia402_rig import SimulatedCia402Rig
-from tests.cli.plans import CONFIGS, RIG
+from tests.cli.plans import CONFIGS, GOAL_MM, RIG, START_MM, straight_plan
 from tests.cli.program import Answer, call, nothing_written, one_message
 
 SCENE = CONFIGS / "environment_1.yaml"
@@ -400,3 +403,21 @@ def test_a_wrong_option_is_bad_input(
     assert answer.out == ""
     assert "Traceback" not in answer.said
     assert "defect" not in answer.said
+
+
+def test_an_error_that_the_plans_own_rig_lacks_is_stated_in_the_file_that_is_passed(
+    tmp_path: Path,
+) -> None:
+    """The rig file was changed as the message said, but the run used the rig in the plan."""
+    text = RIG.read_text(encoding="utf-8")
+    line = next(line for line in text.splitlines() if line.strip().startswith("error_mm:"))
+    rig, file = tmp_path / "rig.yaml", tmp_path / "plan.json"
+    rig.write_text(text.replace(f"{line}\n", ""), encoding="utf-8")
+    save_plan(straight_plan(load_rig(rig), load_scene(SCENE), [START_MM, GOAL_MM]), file)
+    rig.write_text(text, encoding="utf-8")
+    with nothing_written(tmp_path):
+        answer = call("run", file, "--fast", "-o", tmp_path / "run")
+    one_message(answer, 2, "camera 'front' is unknown", "then plan again, or pass --rig FILE")
+    with nothing_written(tmp_path):
+        answer = call("run", file, "--fast", "--rig", rig, "-o", tmp_path / "run")
+    assert "is unknown" not in answer.err

@@ -178,6 +178,31 @@ def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:
     assert "begin with the line" not in few.err
 
 
+def test_a_table_in_metres_or_with_a_cable_twice_is_refused(tmp_path: Path) -> None:
+    table = cables_csv(tmp_path)
+    head, *rows = table.read_text().splitlines()
+    metres = [",".join(str(float(cell) / 1e3) for cell in row.split(",")) for row in rows]
+    for lines, part in (
+        (metres, "outlets_mm: the outlets span only 1.07504 mm: write lengths in mm, not in m"),
+        ([*rows[:7], rows[0]], "anchors_mm[7]: cable 8 has the outlet and anchor of cable 1"),
+    ):
+        table.write_text("\n".join([head, *lines]) + "\n")
+        with nothing_written(tmp_path):
+            answer = call("new", tmp_path / "rig.yaml", "--from", table)
+        one_message(answer, 2, part)
+
+
+def test_anchors_in_the_world_frame_get_a_remark_from_new_and_doctor(tmp_path: Path) -> None:
+    table = cables_csv(tmp_path)
+    head, *rows = table.read_text().splitlines()
+    lines = [row.rpartition(",")[0] + "," + str(float(row.split(",")[-1]) + 445.0) for row in rows]
+    table.write_text("\n".join([head, *lines]) + "\n")
+    rig = tmp_path / "rig.yaml"
+    for answer in (call("new", rig, "--from", table), call("doctor", rig)):
+        assert answer.code == 0, answer
+        assert "remark anchors_mm: their centre is 445 mm from the platform's origin" in answer.err
+
+
 def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     rig.write_text("mine")

@@ -100,6 +100,7 @@ def preview(name: str) -> dict[str, Any]:
     passed = "colliding" not in name
     return {
         "name": name,
+        "hash": f"hash of {name}",
         "passed": passed,
         "verdict": "passed its check"
         if passed

@@ -340,7 +340,8 @@ class Sequences:
             self._check.release(self._now)
 
     def _take(self, page: SimulatedPage) -> None:
-        self._command(page, "take_control", force=self._random.random() < 0.5)
+        force, holder = self._random.random() < 0.5, self.console.control.holder_name()
+        self._command(page, "take_control", force=force, held_by=holder)
         if self._cables and self._random.random() < 0.8:
             self._change_mode(page, "service_begin")
 
@@ -375,7 +376,8 @@ class Sequences:
         """Other commands of a page; none may start during the session."""
         verbs = ("home", "reset", "release", "run", "jog_begin", "cable_begin", "resume")
         command = self._random.choice(verbs)
-        self._command(page, command)
+        shown = {"run": {"plan": "none"}, "reset": {"cause": None}}
+        self._command(page, command, **shown.get(command, {}))
         if self._started:
             self.figures.wrong.append(f"{self._started.pop()} was started during a session")
 

@@ -229,6 +229,13 @@ def test_reset_shows_the_cause_and_asks(desk: Visit) -> None:
     desk.page.locator("#reset").click()
     desk.page.locator(".confirm").click()
     expect(desk.page.locator("#lamp-latch")).to_have_text("No fault")
+    (sent,) = desk.fake.received("reset")
+    assert sent["cause"] == cause
+    desk.fake.ask(set={"latched": cause})
+    desk.page.locator("#reset").click()
+    desk.fake.ask(set={"latched": "drive 3: over-current"})
+    expect(desk.page.locator("#dialog")).to_be_hidden()
+    expect(desk.page.locator("#notice")).to_contain_text("withdrawn: What it showed has changed")
     assert len(desk.fake.received("reset")) == 1
 
 

@@ -232,6 +232,12 @@ def test_what_rests_is_not_said_to_move(desk: Visit) -> None:
     desk.page.mouse.up()
 
 
+@pytest.mark.parametrize("panel", ["jog", "cable"])
+def test_the_state_of_a_pad_begins_with_a_capital_letter(desk: Visit, panel: str) -> None:
+    desk.fake.ask(state={panel: {"ready": False, "why_not": "a fault is latched", "moving": False}})
+    expect(desk.page.locator(f"#{panel}-state")).to_have_text("A fault is latched")
+
+
 @pytest.mark.parametrize("panel", ["jog", "service"])
 def test_the_distance_of_a_press_is_called_its_limit(desk: Visit, panel: str) -> None:
     desk.view(panel)

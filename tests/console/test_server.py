@@ -422,7 +422,7 @@ def test_a_plan_that_was_made_here_is_loaded(served: Served) -> None:
         served.console.verbs.outcome = planned
         Path("console/taught.plan.json").write_bytes(Path("short.json").read_bytes())
         assert command(page, "plan")["ok"]
-        while state(page)["preview"] != "console/taught.plan.json":
+        while not (state(page)["preview"] or "").startswith("console/taught.plan.json "):
             pass
         served.console.verbs.outcome = replace(planned, exit_code=3)
         assert command(page, "plan", pose="two")["ok"]
@@ -497,7 +497,8 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
     page = console.control.join("test")
 
     def asked(name: str) -> str:
-        message = parse_message(json.dumps({"kind": "command", "id": 1, "command": name}))
+        shown = {"cause": None} if name == "reset" else {}
+        message = parse_message(json.dumps({"kind": "command", "command": name, **shown}))
         assert not isinstance(message, Held | LetGo)
         return console.command(page, message)
 
@@ -585,7 +586,8 @@ def test_one_page_of_all_consoles_of_a_robot_has_control(monkeypatch: pytest.Mon
     mine, theirs = one.control.join("here"), other.control.join("there")
 
     def asked(console: Console, page: int, name: str) -> str:
-        message = parse_message(json.dumps({"kind": "command", "command": name}))
+        shown = {"cause": None} if name == "reset" else {}
+        message = parse_message(json.dumps({"kind": "command", "command": name, **shown}))
         assert not isinstance(message, Held | LetGo)
         return console.command(page, message)
 
@@ -681,6 +683,29 @@ def test_the_fake_server_sends_what_this_one_sends(served: Served) -> None:
     assert set(real) == set(fake)
 
 
+def test_no_fault_is_reset_but_the_one_that_was_shown(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    served = Served()
+    console, latched = served.console, StoredState("cable 4 is slack", False, None)
+    monkeypatch.setattr("cdpr.console.session.read_stored", lambda *_, **__: latched)
+    page = console.control.join("here")
+
+    def asked(name: str, **values: object) -> str:
+        message = parse_message(json.dumps({"kind": "command", "command": name, **values}))
+        assert not isinstance(message, Held | LetGo)
+        return console.command(page, message)
+
+    assert asked("take_control") == ""
+    for shown in ("drive 3: over-current", None):
+        assert "another fault" in asked("reset", cause=shown)
+    assert served.started == []
+    assert asked("reset", cause="cable 4 is slack") == ""
+    assert [verb for verb, _ in served.started] == ["reset"]
+    console.close()
+
+
 def test_one_page_at_a_time_operates(served: Served) -> None:
     with served.page() as first, served.page() as second:
         assert "take control" in command(first, "home")["what"]
@@ -692,7 +717,10 @@ def test_one_page_at_a_time_operates(served: Served) -> None:
         assert not command(second, "home")["ok"]
         assert command(first, "home")["ok"]
         assert [verb for verb, _ in served.started] == ["home"]
-        assert command(second, "take_control", force=True)["ok"]
+        late = command(second, "take_control", force=True, held_by="page 9 on elsewhere")
+        assert "changed hands" in late["what"]
+        holder = state(second)["control"]["held_by"]
+        assert command(second, "take_control", force=True, held_by=holder)["ok"]
         assert not command(first, "home")["ok"]
         assert command(second, "give_control")["ok"]
 
@@ -887,7 +915,8 @@ def test_service_mode_ends_with_control(served: Served) -> None:
         command(first, "take_control")
         command(first, "service_begin")
         assert not command(second, "service_begin")["ok"]
-        assert command(second, "take_control", force=True)["ok"]
+        holder = state(second)["control"]["held_by"]
+        assert command(second, "take_control", force=True, held_by=holder)["ok"]
         assert "service mode" in command(second, "cable_begin")["what"]
         command(second, "service_begin")
         command(second, "give_control")
@@ -976,15 +1005,17 @@ def test_no_more_pages_than_can_be_served_are_open(
 def test_nothing_runs_that_was_not_seen_to_pass(served: Served) -> None:
     with served.page() as page:
         command(page, "take_control")
-        assert "passes" in command(page, "run")["what"]
+        assert "passes" in command(page, "run", plan="")["what"]
         assert not command(page, "load_plan", file="../elsewhere.json")["ok"]
         assert not command(page, "load_plan", file="secret.txt")["ok"]
         assert command(page, "load_plan", file="short.json")["ok"]
-        assert state(page)["preview"] == "short.json"
         shown = json.loads(served.get("/api/preview")[1])
+        assert state(page)["preview"] == f"short.json {shown['hash']}"
         assert shown["passed"]
         assert len(shown["moments"]) == len(shown["curves"]["time_s"])
-        assert command(page, "run")["ok"]
+        assert "another plan" in command(page, "run", plan="of another tab")["what"]
+        assert not served.started
+        assert command(page, "run", plan=shown["hash"])["ok"]
         verb, arguments = served.started[-1]
         assert (verb, arguments[0]) == ("run", "short.json")
         assert "--yes" in arguments
@@ -998,13 +1029,17 @@ def test_a_plan_that_was_replaced_after_it_was_shown_does_not_run(
     console = Served().console
     plan = write_short_plan(tmp_path / "plan.json")
     console.plan.load(Path("plan.json"))
+    shown = console.plan.preview
+    assert shown is not None
     scene = free_scene(START_MM, [GOAL_MM[0], GOAL_MM[1], GOAL_MM[2] - 10.0])
     save_plan(straight_plan(load_rig(RIG), scene, [START_MM, scene.goal.position * 1e3]), plan)
-    answer = call("run", plan, "--fast", "--no-camera", "--plan-hash", console.plan.hash)
+    answer = call("run", plan, "--fast", "--no-camera", "--plan-hash", shown["hash"])
     assert answer.code == 2
     assert "replaced after it was shown" in answer.err
     console.plan.load(Path("plan.json"))
-    answer = call("run", plan, "--fast", "--no-camera", "--plan-hash", console.plan.hash)
+    shown = console.plan.preview
+    assert shown is not None
+    answer = call("run", plan, "--fast", "--no-camera", "--plan-hash", shown["hash"])
     assert answer.code == 0, answer
     console.close()
 
@@ -1075,8 +1110,10 @@ def test_a_console_that_only_shows_does_nothing_but_stop(
     monkeypatch.chdir(folder)
     with serving(Served(read_only=True)) as served, served.page() as page:
         assert state(page)["read_only"]
-        for name in ("take_control", "home", "run", "jog_begin", "hold", "release", "reset"):
+        for name in ("take_control", "home", "jog_begin", "hold", "release"):
             assert "read-only" in command(page, name)["what"]
+        assert "read-only" in command(page, "run", plan="")["what"]
+        assert "read-only" in command(page, "reset", cause=None)["what"]
         assert command(page, "stop")["what"] == "nothing moves"
         assert not served.started
         assert not served.said

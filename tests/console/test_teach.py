@@ -67,6 +67,17 @@ def test_list_and_file_agree_with_a_plain_list(
         assert TaughtPoses(path).as_dicts() == taught.as_dicts()
 
 
+def test_two_consoles_with_one_file_lose_no_pose_of_each_other(tmp_path: Path) -> None:
+    first, second = (TaughtPoses(tmp_path / "poses.json") for _ in range(2))
+    first.teach("a", pose(1))
+    second.teach("b", pose(2))
+    first.rename("b", "c")
+    with pytest.raises(BadInput, match="no pose 'b'"):
+        second.forget("b")
+    second.move("c", 0)
+    assert [one["name"] for one in TaughtPoses(tmp_path / "poses.json").as_dicts()] == ["c", "a"]
+
+
 def test_they_become_a_scene_that_is_read_again(tmp_path: Path) -> None:
     taught = TaughtPoses(tmp_path / "poses.json")
     for k, name in enumerate(("above", "at the part", "goal")):

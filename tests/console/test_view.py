@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import chdtr
 
+from cdpr.console.state import jog_state
 from cdpr.console.view import (
     ELLIPSOID_SCALE,
     RobotView,
@@ -297,3 +298,10 @@ def test_a_run_states_all_errors_of_a_measured_position() -> None:
     near = said["clearance"]
     assert near["low_mm"] < near["distance_mm"] <= near["high_mm"]
     assert near["distance_mm"] == pytest.approx(1e3 * clearance.distance, abs=1e-3)
+
+
+def test_a_session_of_jogs_that_a_fault_ended_says_that_a_fault_is_latched() -> None:
+    status = {"state": "latched", "feed_percent": 0, "elapsed_s": 9.0, "events": []}
+    status |= {"jog": {"limit": None, "room_mm": None, "speed_mm_s": 20.0}}
+    assert jog_state(status)["why_not"] == "a fault is latched"
+    assert jog_state(status | {"state": "securing"})["why_not"] == "the drives are securing"

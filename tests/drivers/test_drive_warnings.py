@@ -75,6 +75,51 @@ def test_a_listed_warning_is_none_other_while_a_drive_is_being_enabled() -> None
     assert [warning.node for warning in watch.warnings()] == [3]
 
 
+LIMITED = 0x0800
+
+
+def test_a_limit_that_a_drive_reaches_while_it_is_enabled_is_a_warning() -> None:
+    watch = watch_of(ENABLED, ENABLED)
+    cycle(watch, ENABLED | LIMITED, ENABLED)
+    (warning,) = watch.warnings()
+    assert warning.node == 3
+    assert "internal limit is active (bit 11 of 6041h)" in warning.text
+    cycle(watch, ENABLED | LIMITED, ENABLED)
+    assert watch.warnings() == ()
+    assert not own_changes(watch)
+
+
+@pytest.mark.parametrize("before", [0x0233, 0x0217])
+def test_a_bit_that_is_set_from_the_start_warns_of_nothing(before: int) -> None:
+    """Some makers set it always, others as soon as the drive is enabled."""
+    watch = watch_of(before, before)
+    cycle(watch, ENABLED | LIMITED, before | LIMITED)
+    cycle(watch, ENABLED | LIMITED, before)
+    assert watch.warnings() == ()
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        (0x0240, "voltage enabled) is 0: mains power is off, or safe torque off (STO) is active"),
+        (0x0221, "voltage enabled) is 0"),
+        (0x0050, "bit 9 (remote) is 0"),
+        (0x0250, "switch on disabled"),
+        (0x0207, "quick stop active"),
+    ],
+)
+def test_a_drive_that_loses_its_power_says_so(word: int, said: str) -> None:
+    """It "stopped on its own: switch on disabled", whether its mains failed or its STO was open."""
+    watch = watch_of(ENABLED, ENABLED)
+    own_changes(watch)
+    cycle(watch, ENABLED, word)
+    ((node, text),) = own_changes(watch)
+    assert node == 5
+    assert text.startswith("cable 2 (drive 5) stopped on its own: ")
+    assert said in text
+    assert (";" in text) == ("bit" in said or "voltage" in said)
+
+
 def test_a_reason_that_is_over_is_reported_as_such() -> None:
     watch = watch_of(ENABLED, ENABLED)
     watch.take(EMCY_BASE + 5, make_emergency(HOT, 1))

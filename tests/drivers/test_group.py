@@ -697,6 +697,71 @@ def test_a_drive_that_stops_in_the_cycle_that_enables_it_is_named_alone(
     assert set(words[first + 16 :]) == {0x02}
 
 
+def test_a_drive_that_stops_after_every_reply_and_is_enabled_by_every_set_point_is_found(
+    bench: Bench,
+) -> None:
+    """All its replies show operation enabled: the run went on to its end without an event."""
+    bench.enable()
+    drive = bench.drives[2]
+    drive.behaviour = replace(STRICT, limit_switch=10.0)
+    for cycle in range(40):
+        status = bench.cycle(bench.lifted(0.00005 * cycle))
+        if status.state is not GroupState.ENABLED:
+            break
+        assert {state_of(word) for word in status.status_words} == {DriveState.OPERATION_ENABLED}
+    assert bench.status is not None
+    ((node, text),) = bench.status.faults
+    assert node == 3
+    assert text.startswith("cable 3 (drive 3) stopped on its own: quick stop active")
+    bench.control_words()
+    for _ in range(3):
+        bench.cycle()
+    assert set(bench.control_words()) == {0x02}
+    assert {each.state for each in bench.drives} == {HOLDING}
+
+
+@pytest.mark.parametrize("judged", [None, True, False])
+def test_a_drive_that_no_longer_follows_its_target_stops_all(
+    bench: Bench, judged: bool | None
+) -> None:
+    """Where bit 12 means something else, the profile says so."""
+    hidden = [False]
+    without_following(bench.drives[3], hidden)
+    profile = bench.group._profile.model_copy(update={"follows_bit": judged})  # type: ignore[attr-defined]
+    bench.group._profile = profile  # type: ignore[attr-defined]
+    bench.enable()
+    bench.cycle()
+    hidden[0] = True
+    status = bench.cycle()
+    if judged is False:
+        assert status.state is GroupState.ENABLED
+        return
+    assert status.state is GroupState.FAULT
+    ((node, text),) = status.faults
+    assert node == 4
+    assert "ceased to follow its target (bit 12 of 6041h" in text
+    bench.cycle()
+    bench.cycle()
+    assert {drive.state for drive in bench.drives} == {HOLDING}
+
+
+def test_a_drive_that_never_shows_that_it_follows_may_lack_the_bit(bench: Bench) -> None:
+    without_following(bench.drives[3], [True])
+    bench.enable()
+    assert not any(bench.cycle().faults for _ in range(20))
+    assert bench.group.state is GroupState.ENABLED
+
+
+def test_an_answer_from_before_the_motion_is_no_state_of_it(bench: Bench) -> None:
+    """A drive took its time to say that it held: it was asked at the end of the motion before."""
+    bench.enable()
+    watch = bench.group._watch  # type: ignore[attr-defined]
+    bench.cycle()
+    watch.take(0x581, bytes.fromhex("4b 41 60 00 17 02 00 00"))
+    for _ in range(20):
+        assert bench.cycle().faults == ()
+
+
 def test_a_drive_that_falls_back_while_the_others_are_enabled_stops_them_once(
     bench: Bench,
 ) -> None:

@@ -901,7 +901,9 @@ def test_doctor_says_what_keeps_a_drive_from_being_enabled(rig: Rig, word: int, 
 
 
 def errors_of(bus: ScriptedBus, code: int | None, history: int | None) -> None:
-    """Drive 5 is in fault, with 603Fh and 1003h:01, or without either."""
+    """Drive 5 is in fault, with 603Fh and 1003h:01, or without either; the others have power."""
+    for drive in bus.drives.values():
+        drive.values[0x6041, 0] = 0x0250
     drive = bus.drives[5]
     drive.values[0x6041, 0] = 0x0218
     drive.objects[0x1003, 1] = drive.objects[0x1006, 0]
@@ -909,6 +911,17 @@ def errors_of(bus: ScriptedBus, code: int | None, history: int | None) -> None:
         drive.values[key] = value or 0
         if value is None:
             drive.aborts[key] = 0x06020000
+
+
+def test_a_drive_at_rest_says_what_keeps_it_from_being_enabled(rig: Rig) -> None:
+    """With its safe torque off active it was in "switch on disabled", without a reason."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values[0x6041, 0] = 0x0250
+    bus.drives[5].values[0x6041, 0] = 0x0240
+    errors = examine.read_states(rig, bus, None).errors  # type: ignore[arg-type]
+    assert [number for number, error in enumerate(errors, 1) if error] == [5]
+    assert "safe torque off (STO)" in errors[4]
 
 
 STORED = [

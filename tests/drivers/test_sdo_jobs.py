@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cia402.sdo_jobs import ModeCheck, SdoJobs, SdoRequest, monitoring_off
+from drivers.cia402.sdo_jobs import ModeCheck, SdoJobs, SdoRequest, StatePoll, monitoring_off
 
 NODE = 5
 NEVER = 1_000_000
@@ -153,3 +153,28 @@ def test_a_drive_that_never_says_its_mode_is_named_when_time_is_over() -> None:
         check.take(1, mode(8))
     assert check.is_overdue
     assert check.wrong() == {2: None}
+
+
+def test_status_words_are_read_in_turn_for_as_long_as_drives_answer() -> None:
+    """A silent drive does not keep the others from being read; first answers are not judged."""
+    poll = StatePoll((1, 2, 3), 5)
+    asked = []
+    for _ in range(12):
+        for can_id, data in poll.next_requests(1):
+            asked.append(can_id - 0x600)
+            assert data == bytes.fromhex("40 41 60 00 00 00 00 00")
+            if asked[-1] != 2:
+                poll.take(asked[-1], bytes.fromhex("4b 41 60 00 17 02 00 00"))
+        assert set(poll.new_words().values()) <= {0x217}
+    assert asked[:5] == [1, 2, 3, 1, 3]
+    assert (asked.count(1), asked.count(3)) == (5, 4)
+    assert asked.count(2) == 3, "the first request, and its repetitions"
+
+
+def test_a_first_answer_may_be_from_before_and_the_next_one_counts() -> None:
+    poll = StatePoll((1,), NEVER)
+    for words in ({}, {1: 0x217}, {1: 0x217}):
+        poll.next_requests(1)
+        poll.take(1, bytes.fromhex("4b 41 60 00 17 02 00 00"))
+        assert poll.new_words() == words
+        assert poll.new_words() == {}

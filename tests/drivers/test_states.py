@@ -19,6 +19,8 @@ from drivers.cia402.state_machine import (
     next_words,
     state_of,
 )
+from drivers.factory import unready_remarks
+from model.rig import Rig
 
 # Bits 6..0 as the standard prints them; x is any.
 STANDARD = {
@@ -103,6 +105,13 @@ def test_a_drive_that_is_not_enabled_in_time_says_what_keeps_it(word: int, said:
     assert said in found[1]
     assert (";" in found[1]) == bool(said)
     assert ("bit 9" in found[1]) == (said == "remote")
+
+
+def test_drives_at_rest_that_cannot_be_enabled_are_named_together(rig: Rig) -> None:
+    words = (0x0240, 0x0250, 0x0221, 0x0050, 0x0217, 0x0207, 0x0208, 0x0040)
+    voltage, remote = sorted(unready_remarks(rig, words))
+    assert voltage.startswith("cable 1 (drive 1), cable 3 (drive 3), cable 8 (drive 8): its bit 4")
+    assert remote.startswith("cable 4 (drive 4), cable 8 (drive 8): its bit 9 (remote)")
 
 
 QUICK_STOPPED, NO_POWER, READY, ON, ENABLED = 0x0217, 0x0240, 0x0231, 0x0233, 0x0237

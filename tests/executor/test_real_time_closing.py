@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
@@ -55,6 +57,29 @@ def breaks(_job: Any, link: Connection, _supervisor: int) -> None:
 
 def dies(_job: Any, link: Connection, _supervisor: int) -> None:
     link.send(Armed("", None))  # type: ignore[arg-type]
+
+
+def is_killed(_job: Any, _link: Connection, _supervisor: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_killed_before_it_was_ready_moved_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(real_time_process, "serve", is_killed)
+    motion_on_board: Any = (Still(), print, board := SharedRequests())
+    try:
+        with (
+            pytest.raises(Fault, match=r"killed by signal 9\); nothing moved") as caught,
+            real_time_process.real_time_process(
+                *motion_on_board, need_real_time=False, check_drives=str
+            ) as process,
+        ):
+            process.arm(SimpleNamespace())
+    finally:
+        board.close()
+    assert "out of memory" in caught.value.why
+    assert "__main__" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

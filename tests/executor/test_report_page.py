@@ -266,5 +266,5 @@ def test_an_error_too_small_for_its_digits_is_not_shown_as_zero(
 ) -> None:
     exact = replace(run.cycles, following_error=np.full(len(run.cycles), 1e-8))
     page = built(replace(run, cycles=exact), tmp_path / "run")
-    assert "&lt;\u00a00.001 <small>mm" in page.text
+    assert "&lt;\u00a00.001\u00a0<small>mm" in page.text
     assert "No cable was more than 0.001\u00a0mm off" in page.text

@@ -96,6 +96,13 @@ def test_lateness_is_reported_for_a_run_in_real_time(run: fake_run.FakeRun) -> N
     assert made["lateness_ms"]["p50"] == pytest.approx(np.median(late) * 1e3, abs=1e-4)
 
 
+def test_a_warning_of_a_drive_is_stated_with_the_verdict(run: fake_run.FakeRun) -> None:
+    limit = "cable 4 (drive 4) reports that an internal limit is active (bit 11 of 6041h)"
+    made = summary(run, events=(RunEvent(1.0, "drive_warning", limit),))
+    assert made["verdict"] == "PASSED"
+    assert f"Warning: {limit}." in made["reasons"]
+
+
 def test_a_stopped_run_is_not_passed_and_not_a_fault(run: fake_run.FakeRun) -> None:
     events = (RunEvent(1.0, "stop", "The operator stopped the run."),)
     made = summary(run, final_state="stopped", events=events)

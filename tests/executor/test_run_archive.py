@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 import cdpr
-from executor.evaluation import rewrite_report
+from executor.evaluation import evaluate_folder, rewrite_report, write_end
 from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunFolder
@@ -134,6 +134,24 @@ def test_a_full_disk_is_named_with_what_to_do(
         rewrite_report(RunFolder.open_cut_short(folder.path))
     assert caught.value.why == "fused.csv: No space left on device"
     assert caught.value.next_step == "make the folder writable, or free some space"
+
+
+def test_a_report_that_a_full_disk_prevents_has_the_cause_of_its_missing_tables(
+    blind: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own reason would be that they are missing."""
+    folder = without(blind, tmp_path / "run")
+    result, course, events = evaluate_folder(folder), folder.course(), folder.events()
+    for name in ("cycles.csv", "summary.json", "report.html"):
+        (folder.path / name).unlink()
+
+    def full(**_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("model.files.documents.tempfile.mkstemp", full)
+    missing = write_end(folder, course, result, events, lambda: False)
+    assert {"cycles.csv", "summary.json", "report.html"} <= set(missing)
+    assert set(missing.values()) == {"No space left on device"}
 
 
 # Missing tables.

@@ -244,6 +244,30 @@ def test_frames_in_which_cameras_were_not_taken_together_are_counted_and_reporte
     ]
 
 
+class Swinging(Scripted):
+    """It sees the platform go to and fro along x, later than the stated time [s]."""
+
+    def __init__(self, name: str, behind: float) -> None:
+        super().__init__(name, [0])
+        self._behind = behind
+
+    def answer_within(self, patience: float) -> CameraSample | None:
+        if self.unanswered is not None:
+            self._off["shift"] = 0.05 * np.sin(1.5 * (self.unanswered.time + self._behind))
+        return super().answer_within(patience)
+
+
+@pytest.mark.parametrize("behind", [0.0, 0.04])
+def test_clocks_that_differ_are_reported_at_the_end(behind: float) -> None:
+    run, _ = run_of(60, Swinging("front", 0.0), Swinging("side", behind))
+    run.finish(never)
+    news = [(one.code, one.text) for one in run.news()]
+    assert len(news) == (behind > 0.0)
+    for code, text in news:
+        assert code == "remark"
+        assert "images of side are taken 40 ±" in text
+
+
 @pytest.mark.parametrize("stops", [None, 0, 100])
 def test_at_the_end_all_that_hang_are_waited_for_together_and_a_stop_cuts_it_short(
     stops: int | None,

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.errors import BadInput, CdprError, InvalidFile
+from model.files.documents import key_path
 from model.files.rig_file import RigDocument
 from model.rig import load_rig, rig_from_document
 from tests.model.rig_builds import CONFIGS, hall_data, paper_data, rig_of
@@ -381,9 +382,9 @@ def rig_with(**changes: object) -> RigDocument:
 @pytest.mark.parametrize("key", ["anchors_mm", "outlets_mm"])
 @settings(max_examples=30)
 @given(
-    at=st.tuples(*[st.floats(-2000.0, 2000.0)] * 3),
+    at=st.tuples(*[st.floats(-600.0, 600.0)] * 3),
     along=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
-    aside=st.sampled_from([0.0, 10.0]),
+    aside=st.sampled_from([0.0, 100.0]),
 )
 def test_cables_that_meet_one_point_or_line_are_refused(key: str, at, along, aside: float) -> None:
     """About it no cable exerts a moment; files round to a tenth of a micrometre."""
@@ -400,6 +401,111 @@ def test_cables_that_meet_one_point_or_line_are_refused(key: str, at, along, asi
         assert path == (key,)
         assert ("at one point" if np.ptp(points, axis=0).max() < 1e-4 else "on one") in what
         assert "cannot hold six degrees of freedom; use three or more points" in what
+
+
+def scaled(points: list[list[float]], factor: float) -> list[list[float]]:
+    return [[factor * x for x in point] for point in points]
+
+
+def resized(factor: float, *keys: str) -> RigDocument:
+    """The paper's rig with some of its lengths multiplied by a factor."""
+    data = paper_data()
+    for key in keys:
+        if key == "size_mm":
+            data["platform"] = data["platform"] | {key: scaled([[130, 130, 130]], factor)[0]}
+        else:
+            data[key] = scaled(data[key], factor)
+    return RigDocument.model_validate(data)
+
+
+LENGTHS = ("size_mm", "outlets_mm", "anchors_mm")
+
+
+@pytest.mark.parametrize(
+    ("keys", "refused"),
+    [
+        (("size_mm",), {"platform.size_mm"}),
+        (("anchors_mm",), {"anchors_mm"}),
+        (("outlets_mm",), {"outlets_mm"}),
+        (("outlets_mm", "anchors_mm"), {"outlets_mm", "anchors_mm"}),
+        (LENGTHS, {"outlets_mm", "platform.size_mm"}),
+    ],
+)
+def test_metres_in_a_rig_file_are_refused_with_their_key(
+    keys: tuple[str, ...], refused: set[str]
+) -> None:
+    """A platform of 0.13 mm would let obstacles into the real one."""
+    found = resized(1e-3, *keys).findings()
+    assert {key_path(key) for key, _ in found} == refused
+    assert all("write lengths in mm, not in m" in what for _, what in found)
+
+
+def test_a_platform_of_more_than_a_metre_in_metres_is_refused() -> None:
+    """Its edges in metres are above the least thickness."""
+    data = paper_data()
+    data["platform"]["size_mm"] = [1.3, 1.3, 1.3]
+    for key in ("outlets_mm", "anchors_mm"):
+        data[key] = scaled(data[key], 10.0)
+    [(key, what)] = RigDocument.model_validate(data).findings()
+    assert key_path(key) == "platform.size_mm"
+    assert "the anchors span 1300 mm, the longest edge of platform.size_mm 1.3" in what
+
+
+@settings(max_examples=60)
+@given(
+    frame=st.floats(0.2, 40.0),
+    share=st.floats(0.2, 1.5),
+    thin=st.floats(1.0, 130.0),
+    posts=st.floats(1.0, 6.0),
+)
+def test_desktop_rigs_halls_thin_plates_and_posts_are_accepted(
+    frame: float, share: float, thin: float, posts: float
+) -> None:
+    """From a frame of 210 mm to one of 42 m; anchors up to six times as far apart as the box."""
+    data = paper_data()
+    data["outlets_mm"] = scaled(data["outlets_mm"], frame)
+    data["platform"]["size_mm"] = [130 * frame * share, 130 * frame * share, thin]
+    data["anchors_mm"] = scaled(data["anchors_mm"], min(frame * share * posts, 8.0 * frame))
+    document = RigDocument.model_validate(data)
+    assert document.findings() == []
+    assert document.remarks() == []
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*_8_6*.yaml")), ids=lambda path: path.stem)
+def test_the_rigs_of_the_repository_have_no_remarks(path: Path) -> None:
+    assert load_rig(path).document.remarks() == []
+
+
+def test_a_cable_listed_twice_is_refused() -> None:
+    data = paper_data()
+    for key in ("outlets_mm", "anchors_mm"):
+        data[key][7] = data[key][0]
+    [(key, what)] = RigDocument.model_validate(data).findings()
+    assert (key_path(key), what) == (
+        "anchors_mm[7]",
+        "cable 8 has the outlet and anchor of cable 1",
+    )
+
+
+def test_an_anchor_beyond_the_frame_is_refused() -> None:
+    data = paper_data()
+    data["anchors_mm"] = [[x + 5000.0, y, z] for x, y, z in data["anchors_mm"]]
+    [(key, what)] = RigDocument.model_validate(data).findings()
+    assert key_path(key) == "anchors_mm"
+    assert (
+        "from the platform's origin, farther than the outlets from each other (1699.1 mm)" in what
+    )
+    assert "in the platform frame, not the world frame" in what
+
+
+def test_anchors_in_the_world_frame_and_a_tiny_box_get_a_remark() -> None:
+    world, box = paper_data(), paper_data()
+    world["anchors_mm"] = [[x, y, z + 445.0] for x, y, z in world["anchors_mm"]]
+    [of_world] = rig_of(world).document.remarks()
+    assert of_world.startswith("anchors_mm: their centre is 445 mm from the platform's origin")
+    box["platform"]["size_mm"] = [5.0, 5.0, 5.0]
+    [of_box] = rig_of(box).document.remarks()
+    assert of_box.startswith("platform.size_mm: the longest edge is 5 mm, but the anchors span 130")
 
 
 def test_a_point_mass_is_refused_with_its_line(tmp_path: Path) -> None:

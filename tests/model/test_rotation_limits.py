@@ -41,6 +41,7 @@ def test_a_tilt_after_a_turn_is_distinguished(tilt: float, turn: float, about: f
     pose = pose_of(Rotation.from_rotvec(tilt * axis) * Rotation.from_rotvec([0.0, 0.0, turn]))
     found = largest_rotations(pose.quaternion, pose.quaternion)
     assert found == pytest.approx((tilt, abs(turn)), abs=1e-6)
+    assert (pose.tilt, pose.turn) == pytest.approx((tilt, turn), abs=1e-6)
 
 
 def test_a_move_between_allowed_ends_may_tilt_too_far_in_between() -> None:

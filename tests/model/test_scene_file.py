@@ -245,6 +245,50 @@ def test_the_points_of_a_shape_grown_by_its_radius_contain_it(shape: Any) -> Non
         assert np.max(points @ u) + radius >= reach - 1e-12
 
 
+SHAPES_MM: list[dict[str, Any]] = [
+    {"box": {"size_mm": [300, 200, 400]}},
+    {"sphere": {"radius_mm": 150}},
+    {"cylinder": {"radius_mm": 90, "length_mm": 300}},
+    {"capsule": {"radius_mm": 90, "length_mm": 300}},
+    {"convex": {"points_mm": TETRAHEDRON}},
+    {"mesh": {"points_mm": TETRAHEDRON, "triangles": FACES[1:]}},
+]
+
+
+def in_metres(value: Any, key: str = "") -> Any:
+    if isinstance(value, dict):
+        return {name: in_metres(part, name) for name, part in value.items()}
+    if isinstance(value, list):
+        return [in_metres(part, key) for part in value]
+    return value / 1e3 if key.endswith("_mm") else value
+
+
+@pytest.mark.parametrize("shape", SHAPES_MM, ids=lambda shape: next(iter(shape)))
+def test_obstacles_in_metres_get_a_remark(shape: dict[str, Any]) -> None:
+    data = scene_data()
+    data["obstacles"] = [{"name": "shelf", **shape}]
+    assert scene_of(data).document.remarks() == []
+    data["obstacles"] = [{"name": "shelf", **in_metres(shape)}]
+    [remark] = scene_of(data).document.remarks()
+    assert remark.startswith("obstacles[0]: 'shelf' is 0.")
+    assert remark.endswith("check that it is in mm, not in m")
+
+
+@pytest.mark.parametrize("key", ["obstacle_mm", "self_mm"])
+@pytest.mark.parametrize(("value", "count"), [(0, 0), (0.04, 1), (1, 0)])
+def test_a_clearance_in_metres_gets_a_remark(key: str, value: float, count: int) -> None:
+    data = scene_data()
+    data["clearance"] = {key: value}
+    found = scene_of(data).document.remarks()
+    assert [remark.split(":")[0] for remark in found] == [f"clearance.{key}"] * count
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_scenes_of_the_repository_have_no_remarks(path: Path) -> None:
+    if "goal:" in path.read_text(encoding="utf-8"):
+        assert load_scene(path).document.remarks() == []
+
+
 def test_a_changed_scene_keeps_the_rest_and_has_another_hash() -> None:
     scene = scene_of(scene_data())
     other = scene.changed(

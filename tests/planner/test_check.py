@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from model.clearance import ClearanceModel
@@ -13,8 +14,8 @@ from model.errors import Refused
 from model.kinematics import structure_matrix
 from model.plan import plan_from_document, sealed
 from model.pose import Pose, interpolate
-from model.rig import rig_from_document
-from planner.check import _Check, check_path, verify
+from model.rig import Rig, rig_from_document
+from planner.check import _Check, axis_distances, check_path, verify
 from planner.check_report import VerifiedPlan
 from planner.costs import capacity_margins
 from planner.path import PosePath
@@ -150,6 +151,33 @@ def test_a_load_that_cannot_be_held_is_a_violation_not_a_crash(gachon, scene_wit
     assert report.as_dict()["min_tension_n"] is None
 
 
+@pytest.mark.parametrize(
+    ("smallest", "what", "is_proved"),
+    [(-0.5, "cannot hold every required load", False), (1e-5, "not proved between samples", True)],
+)
+def test_a_margin_violation_states_the_margin_at_its_position(
+    gachon, scene_with, smallest, what, is_proved
+) -> None:
+    def scene(force: float):
+        return scene_with(load={"force_n": [force] * 3}, goal={"position_mm": [60.0, 40.0, 480.0]})
+
+    def margin(force: float, positions) -> float:
+        return capacity_margins(gachon, scene(force), np.array(positions), np.eye(3)).min()
+
+    ends = scene(0.0)
+    line = np.linspace(ends.start.position, ends.goal.position, 201)
+    force = brentq(lambda force: margin(force, line) - smallest, 0.0, 100.0, xtol=1e-13)
+    report = check_path(gachon, scene(force), [ends.start, ends.goal])
+    (violation,) = (v for v in report.violations if "margin" in v.what)
+    assert what in violation.what
+    assert violation.measured == pytest.approx(smallest, abs=1e-6)
+    assert violation.measured == pytest.approx(margin(force, [violation.position]), abs=1e-9)
+    assert violation.measured == report.capacity_margin
+    assert (violation.proved == report.proved_capacity_margin) == is_proved
+    assert f"{violation.measured:.4g} N" in violation.sentence()
+    assert ("proved -" in violation.sentence()) == is_proved
+
+
 def test_disturbances_count_although_the_weight_alone_is_held(gachon, scene_with) -> None:
     windy = scene_with(load={"force_n": [80.0, 80.0, 80.0]})
     what = kinds(check_path(gachon, windy, [windy.start, windy.goal]))
@@ -181,6 +209,47 @@ def test_a_path_that_turns_the_platform_is_checked_too(gachon, scene_with) -> No
     assert "self clearance" in kinds(
         check_path(gachon, scene_with(), [gachon.home, far], ends=False)
     )
+
+
+def test_a_rotation_violation_states_where_the_rotation_is_largest(gachon, scene_with) -> None:
+    scene = scene_with(rotation_limits={"tilt_deg": 3.0, "turn_deg": 180.0})
+    position = np.add(gachon.home.position, [0.05, 0.0, 0.0])
+    goal = Pose(position, Rotation.from_euler("x", 0.1).as_matrix())
+    report = check_path(gachon, scene, [gachon.home, goal, gachon.home], ends=False)
+    (violation,) = (v for v in report.violations if "tilted" in v.what)
+    assert violation.measured == pytest.approx(0.1)
+    assert violation.position == pytest.approx(goal.position)
+
+
+def test_a_speed_violation_and_the_report_state_the_fastest_sample(gachon, scene_with) -> None:
+    """Slow at first, as the cable is nearly at right angles to the path, then faster."""
+    document = gachon.document
+    slow = [w.model_copy(update={"max_speed_mm_s": 5.0}) for w in document.winches]
+    rig = rig_from_document(document.model_copy(update={"winches": slow}))
+    path = [Pose.level(p) for p in ([0.1, 0.1, 0.6], [0.1, 0.1, 0.4], [0, 0, 0.4])]
+    report = check_path(rig, scene_with(), path, ends=False)
+    assert (
+        report.max_cable_speed == check_path(gachon, scene_with(), path, ends=False).max_cable_speed
+    )
+    (violation,) = (v for v in report.violations if "faster" in v.what)
+    assert violation.measured == report.max_cable_speed
+    cable = int(violation.what.split()[1]) - 1
+    row = structure_matrix(rig, Pose.level(violation.position))[:3, cable]
+    direction = np.array([-1.0, -1.0, 0.0]) / math.sqrt(2.0)
+    assert abs(row @ direction) * rig.motion.speed == pytest.approx(violation.measured)
+
+
+def test_a_cable_near_its_pulleys_axis_is_reported_with_its_distance(gachon, scene_with) -> None:
+    pulleys = {"radius_mm": 13.0, "feed_directions": [[0.0, 0.0, 1.0]] * 8}
+    rig = Rig.from_dict({**gachon.as_dict(), "pulleys": pulleys})
+    x, y, _ = rig.outlets[0] - rig.anchors[0]
+    below = Pose.level([x - np.sign(x) * 0.04, y, 0.3])
+    report = check_path(rig, scene_with(), [below, gachon.home], ends=False)
+    (violation,) = (v for v in report.violations if "pulley's axis" in v.what)
+    reach = axis_distances(rig, Pose.level(violation.position))
+    cable = int(violation.what.split()[1]) - 1
+    assert violation.measured == reach[cable] == reach.min()
+    assert violation.limit == pytest.approx(4 * 0.013 + 0.005)
 
 
 @pytest.mark.parametrize("name", ["gachon", "hall"])

@@ -277,7 +277,7 @@ def test_more_cables_than_can_be_planned_for_are_refused_at_once(gachon, scene_w
     further = range(17)
     document = document.model_copy(
         update={
-            "outlets_mm": [*outlets, *([x - 10.0 * i for x in outlets[i % 8]] for i in further)],
+            "outlets_mm": [*outlets, *([x - 10.0 - i for x in outlets[i % 8]] for i in further)],
             "anchors_mm": [*anchors, *(anchors[i % 8] for i in further)],
             "winches": [
                 *winches,

@@ -240,6 +240,30 @@ def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
 
 @pytest.mark.slow
 @pytest.mark.real_time
+def test_reset_and_status_name_the_drive_whose_safe_torque_off_is_still_active(
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
+) -> None:
+    """The latch was cleared with "drives: switch on disabled", and nothing said what to do."""
+    channel = f"239.74.163.23:{20000 + (os.getpid() * 19) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    FaultLatch(BusSettings("udp_multicast", channel)).engage("gachon_8_6", tmp_path)
+    with drives_on(channel, slow_run) as rehearsal:
+        drive = rehearsal.drives[3]
+        drive.objects.measured(0x6041, 0, lambda: drive.status_word & ~0x10)
+        status = call("status", slow_rig, *bus)
+        assert status.code == 0, status
+        (line,) = [line for line in status.out.splitlines() if "STO" in line]
+        assert "(drive 4)" in line
+        assert "remove the cause shown for drive 4" in status.out.replace("\n", " ")
+        answer = call("reset", slow_rig, *bus, "--yes")
+        assert answer.code == 0, answer
+    (said,) = [line for line in answer.err.splitlines() if "STO" in line]
+    assert "cable 4 (drive 4): its bit 4 (voltage enabled) is 0" in said
+    assert said.endswith("correct this before a motion")
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
 def test_a_drive_that_falls_silent_while_it_is_reset_leaves_the_latch_engaged(
     slow_run: PreparedRun, slow_rig: Path, tmp_path: Path
 ) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,8 @@ from model.plan import Plan, load_plan
 from model.progress import Advance, Listener
 from model.rig import Rig, load_rig
 from tests.cli.plans import RIG
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -212,3 +216,50 @@ def test_limits_of_the_verbs_are_those_of_the_library(rig: Rig) -> None:
         jogging.jog(rig, None, by=np.array([0.0, 0.0, 0.01]), speed=0.021, realtime=False)
     with pytest.raises(BadInput, match="no cable 0"):
         jogging.jog_cable(rig, 0, 0.001, realtime=False)
+
+
+UNGUARDED = """
+import cdpr
+def confirm(_proposal):
+    print("asked")
+    return True
+plan, rig = cdpr.load_plan({plan!r}), cdpr.load_rig({rig!r})
+try:
+    cdpr.{call}, confirm=confirm)
+except cdpr.CdprError as error:
+    raise SystemExit("PARENT " + str(error))
+"""
+
+
+@pytest.mark.parametrize(
+    ("call", "process", "in_file"),
+    [
+        ("run(plan, rig, cameras=()", "the real-time process", True),
+        ("run(plan, rig, cameras=()", "the real-time process", False),
+        ("run(plan, rig", "the process of camera", True),
+        ("home(rig, at_home=True", "the real-time process", True),
+        ("jog(rig, None, by=[0, 0, 0.005]", "the real-time process", True),
+    ],
+)
+def test_a_script_without_the_guard_asks_once_and_is_named_as_the_cause(
+    short_plan: Path, tmp_path: Path, call: str, process: str, in_file: bool
+) -> None:
+    """Its child imports it again; a script from standard input cannot be imported at all."""
+    text = UNGUARDED.format(plan=str(short_plan), rig=str(RIG), call=call)
+    (tmp_path / "script.py").write_text(text)
+    (tmp_path / "empty").mkdir()
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py" if in_file else "-"],
+        input=text, cwd=tmp_path / "empty", capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    before, _, of_parent = done.stderr.partition("PARENT ")
+    assert process in of_parent
+    assert "ended before it was ready (exit code 1)" in of_parent
+    assert 'if __name__ == "__main__"' in of_parent
+    assert "killed" not in of_parent
+    assert ("nothing moved" in of_parent) == (process == "the real-time process")
+    assert ("does not run it again" in before) == in_file
+    assert done.stdout.split() == ["asked"]
+    assert done.returncode == 1
+    assert not [file for file in (tmp_path / "empty").rglob("*") if file.is_file()]

@@ -7,6 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 
 from drivers.can_bus import BusSettings, open_bus
@@ -16,7 +17,7 @@ from model.rig import Rig
 from simulation.drives.behaviour import BEHAVIOURS, STRICT, behaviour_named, table
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from tests.cli.program import call
-from tests.simulation.drive_line import ENABLED, FAULT, ON, STOPPED, Line, ready
+from tests.simulation.drive_line import ENABLED, FAULT, MASK, ON, STOPPED, Line, ready
 
 STATES = {"switch on disabled": [], "switched on": [6, 7], "stopped": [6, 7, 0x0F, 2]}
 
@@ -250,7 +251,25 @@ def test_status_flicker_leaves_the_state_alone() -> None:
     changed = 0
     for before, after in pairwise(words):
         changed |= before ^ after
-    assert changed == 0xFF90
+    assert changed == 0xEF90, "bit 12 shows that it follows"
+
+
+def test_a_limit_switch_stops_the_drive_after_every_reply_that_shows_it_enabled() -> None:
+    """605Ah = 6 and 0Fh every cycle: transitions 11 and 16 by turns, without an emergency."""
+    line = named("limit-switch=100")
+    line.enable()
+    for target in range(1000, 1250, 50):
+        assert line.sync(0x0F, target) == ENABLED
+        assert line.position is not None
+        assert (line.drive.state is DriveState.OPERATION_ENABLED) == (line.position <= 1100)
+    reached = []
+    for target in range(1250, 2250, 50):
+        assert line.sync(0x0F, target) == ENABLED
+        reached.append(line.position)
+        assert line.read(0x6041, 0) & MASK == STOPPED
+    assert min(np.diff(reached)) > 0, "it moves on"
+    assert line.emergencies() == []
+    assert line.sync(None) == STOPPED, "no set-point, no transition 16"
 
 
 def test_boot_late() -> None:

@@ -11,8 +11,7 @@ import pytest
 
 from model.errors import BadInput
 from simulation.drives.eds_file import EDS_FOLDER, profile_path, read_eds
-from simulation.drives.object_dictionary import READ_ONLY, Abort, DriveObjects
-from simulation.drives.power import counts_in
+from simulation.drives.object_dictionary import READ_ONLY, Abort, DriveObjects, counts_in
 from tests.simulation.drive_line import Line
 
 EDS = EDS_FOLDER / "cia402.eds"

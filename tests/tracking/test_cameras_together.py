@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import chdtri
 
-from model.pose import Pose, matrix_from_rotation_vector
+from model.pose import Array, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
@@ -144,6 +146,91 @@ def test_cameras_slightly_apart_in_time_agree_on_a_moving_platform(
     assert found.time == pytest.approx(now + late)
     assert found.pose.distance_to(seen(now + late, 1e-4).pose) < 1e-9
     assert (found.position_deviation <= 2e-4 + 1e-12).all()
+
+
+CORNERS = np.array([[-0.2, -0.1, 0.3], [0.2, 0.1, 0.3], [0.1, -0.1, 0.5], [-0.2, 0.2, 0.4]])
+
+
+def there_and_at_rest(time: float) -> Array:
+    """A path from corner to corner, 4 s each with a rest of 1 s, mostly at 80 to 110 mm/s."""
+    leg = min(int(time // 5.0), 2)
+    share = min(max((time - 5.0 * leg) / 4.0, 0.0), 1.0)
+    share = share**2 * (3.0 - 2.0 * share)
+    return np.asarray(CORNERS[leg] + share * (CORNERS[leg + 1] - CORNERS[leg]))
+
+
+def always_forward(time: float) -> Array:
+    """A straight line at 80 mm/s."""
+    return np.array([-0.1 + 0.08 * time, 0.02, 0.4])
+
+
+def clock_remarks(
+    path: Callable[[float], Array],
+    duration: float,
+    late: float,
+    rng: np.random.Generator,
+    tilt: float,
+    apart: float = 0.0,
+) -> list[str]:
+    """Remarks on two cameras with 10 images per second.
+
+    Args:
+        path: Position at a time [s], [m].
+        duration: [s].
+        late: By how much the second camera's images are taken later than their time, [s].
+        rng: Generator.
+        tilt: Standard deviation of each camera's rotation about a point 1.5 m away, [rad].
+        apart: Difference of the times of a frame set, [s].
+    """
+    eyes = [np.array([1.1, 0.0, 1.4]), np.array([0.0, -1.1, 1.4])]
+    tilts = [matrix_from_rotation_vector(rng.normal(size=3) * tilt) for _ in eyes]
+    common = MultiCameraFusion(0.05)
+    for time in np.arange(0.0, duration, 0.1).tolist():
+        seen = {}
+        for name, eye, turn, own in zip(("a", "b"), eyes, tilts, (0.0, apart), strict=True):
+            true = path(time + own + (late if name == "b" else 0.0))
+            position = eye + turn @ (true - eye) + rng.normal(size=3) * 1e-4
+            covariance = np.diag([1e-8] * 3 + [1e-8] * 3)
+            pose = Pose.level(position)
+            seen[name] = PoseMeasurement(time + own, pose, covariance, (301,), 0.1, "tracked")
+        common.of(seen)
+    return common.clock_remarks()
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.03])
+@pytest.mark.parametrize("late", [-0.08, -0.02, 0.02, 0.08])
+def test_an_offset_between_clocks_is_measured_beside_errors_of_the_cameras_poses(
+    late: float, apart: float
+) -> None:
+    """The poses disagree by 3 mm at rest already, on average."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        (text,) = clock_remarks(there_and_at_rest, 15.0, late, rng, 1e-3, apart)
+        stated = re.search(r": images of (\w) are taken (\d+) ± (\d+) ms", text)
+        assert stated, text
+        assert stated[1] == ("b" if late > 0.0 else "a")
+        assert int(stated[3]) <= 3
+        assert float(stated[2]) == pytest.approx(abs(late) * 1e3, abs=4.0)
+        assert text.endswith("compare their clocks and latency_ms")
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.03])
+@pytest.mark.parametrize("tilt", [0.0, 1e-3, 3e-3])
+def test_wrong_poses_of_cameras_are_not_blamed_on_their_clocks(tilt: float, apart: float) -> None:
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        assert clock_remarks(there_and_at_rest, 15.0, 0.0, rng, tilt, apart) == []
+
+
+def test_what_a_constant_velocity_does_not_separate_is_left_open() -> None:
+    (text,) = clock_remarks(always_forward, 2.0, 0.04, np.random.default_rng(3), 0.0)
+    stated = re.search(r"disagree by (\S+) mm along the motion at 80 mm/s", text)
+    assert stated
+    assert float(stated[1]) == pytest.approx(3.2, abs=0.5)
+    assert "perhaps images of b are taken" in text
+    assert "their poses at rest" in text
+    assert clock_remarks(always_forward, 2.0, 0.0, np.random.default_rng(3), 0.0) == []
+    assert clock_remarks(lambda _: CORNERS[0], 20.0, 0.04, np.random.default_rng(3), 3e-3) == []
 
 
 def test_the_covariance_includes_the_extrapolation() -> None:

@@ -65,6 +65,46 @@ def test_a_decoy_alone_that_lies_as_no_platform_can_gives_no_pose(
     assert isinstance(found, NoPose)
 
 
+@pytest.mark.parametrize("number", [301, 302, 303, 304, 305, 306])
+def test_a_loose_print_on_the_floor_gives_no_pose(
+    rig: Rig, camera: Camera, empty: Scene, number: int
+) -> None:
+    """The platform is out of view; its pose would be below the floor or rotated by 90° or more."""
+    rng = np.random.default_rng(number)
+    for yaw in np.radians([0.0, 60.0, 120.0, 200.0]):
+        where = Pose(
+            np.append(rng.uniform(-0.25, 0.25, size=2), 0.005),
+            matrix_from_rotation_vector(np.array([0.0, 0.0, yaw])),
+        )
+        real = replace(rig, frame_tags=(*rig.frame_tags, Tag(number, 0.096, where)))
+        image = SyntheticCamera(real, empty, camera, seed=4).render(Pose.level([0.0, 0.0, -3.0]), 0)
+        found = Tracker(rig, camera).observe(image, 0.0)
+        assert isinstance(found, NoPose), found
+        assert str(number) in found.reason
+
+
+@pytest.mark.parametrize("height", [0.30, 0.34, 0.37])
+def test_a_tag_seen_too_obliquely_is_named_with_its_angle_and_the_limit(
+    rig: Rig, camera: Camera, empty: Scene, height: float
+) -> None:
+    """Only the tag on top, from the side."""
+    rig = replace(rig, platform_tags=rig.platform_tags[4:5], frame_tags=())
+    (tag,) = rig.platform_tags
+    side = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    camera = replace(camera, world_from_camera=Pose(np.array([1.4, 0.0, 0.7]), side))
+    truth = Pose.level([0.0, 0.0, height])
+    sight = camera.world_from_camera.position - truth.apply(tag.pose.position[None])[0]
+    angle = np.degrees(np.arccos(sight[2] / np.linalg.norm(sight)))
+    image = SyntheticCamera(rig, empty, camera, seed=4).render(truth, 0)
+    found = Tracker(rig, camera).observe(image, 0.0)
+    assert isinstance(found, NoPose)
+    stated = re.fullmatch(
+        rf"tags {tag.id} are seen (\d+)° from their normal, the limit is 76°", found.reason
+    )
+    assert stated, found.reason
+    assert float(stated[1]) == pytest.approx(angle, abs=1.5)
+
+
 def test_two_prints_of_one_tag_are_ambiguous(rig: Rig, camera: Camera, empty: Scene) -> None:
     """A platform with a single tag, and the same print within the frame."""
     one = replace(rig, platform_tags=rig.platform_tags[4:5])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from drivers.cameras.live import Frame
 from executor.track import track_sources
 from model.errors import BadInput
 from model.pose import Pose
+from model.progress import Listener
 from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import SyntheticCamera
@@ -162,6 +164,38 @@ def test_an_image_that_a_camera_lost_shifts_none_of_its_others(
     assert [found.time for found in result.poses] == pytest.approx([0.0, 0.1, 0.2])
     for found, pose in zip(result.poses, TRUTH, strict=True):
         assert found.pose.distance_to(pose) < 1e-3
+
+
+@pytest.mark.parametrize("behind", [0.0, 0.05])
+def test_images_of_the_same_name_that_are_not_simultaneous_are_remarked_on(
+    rig: Rig, scene: Scene, tmp_path: Path, behind: float
+) -> None:
+    """The platform accelerates to 0.1 m/s and back to rest."""
+
+    class Remarks(Listener):
+        def __init__(self) -> None:
+            self.texts: list[str] = []
+
+        def remark(self, text: str) -> None:
+            self.texts.append(text)
+
+    front, remarks = rig.cameras[0], Remarks()
+    cameras = (front, other_side(front))
+    for camera, late in zip(cameras, (0.0, behind), strict=True):
+        eye = SyntheticCamera(rig, replace(scene, obstacles=()), camera, seed=4)
+        (tmp_path / camera.name).mkdir()
+        for k in range(16):
+            shift = 0.05 * np.cos(2.0 * (0.1 * k + late))
+            image = eye.render(Pose.level([0.05 + shift, 0.1, 0.4]), k)
+            cv2.imwrite(str(tmp_path / camera.name / f"{k:02}.png"), image)
+    sources = {camera: str(tmp_path / camera.name) for camera in cameras}
+    track_sources(replace(rig, cameras=cameras), sources, listener=remarks)
+    found = [text for text in remarks.texts if "latency_ms" in text]
+    assert len(found) == (behind > 0.0)
+    for text in found:
+        stated = re.search(r"images of side are taken (\d+) ± (\d+) ms", text)
+        assert stated, text
+        assert float(stated[1]) == pytest.approx(50.0, abs=3.0 + float(stated[2]))
 
 
 def test_folders_without_common_names_are_refused(rig: Rig, scene: Scene, tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
-"""Diagnosis of images: unexpected tags, motion blur, sharpening, overexposure."""
+"""Diagnosis of images: unexpected tags, grids of tags, motion blur, sharpening, overexposure."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +14,7 @@ from model.rig import Camera
 from model.tag_families import APRILTAG_FAMILIES
 from tracking.camera_model import Image, distort_pixels, linear
 from tracking.detection.detector import TagDetector
+from tracking.detection.tags import CORNER_SIGNS
 from tracking.edges.refine import RefinedTag
 
 #: Families that are tried to identify a wrong one. The largest ArUco dictionary of a size includes
@@ -36,6 +38,86 @@ def diagnose_tags(image: Image, family: str, expected: Sequence[int]) -> str:
     if any(d.id in expected for d in TagDetector(family).detect(flipped)):
         text += "; the expected tags appear mirrored, so the images are mirrored"
     return text
+
+
+# Numbers of neighbouring tags in a grid.
+
+
+#: A neighbour is farther away than this, in sides of a tag, and by no more than this slope off the
+#: direction.
+_APART, _SLOPE = 0.5, 0.3
+#: Share of the neighbours whose numbers differ by the same, in a grid numbered row by row.
+_LEAST_SHARE = 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class RowNumbering:
+    """How a grid of tags is numbered.
+
+    Attributes:
+        columns: Tags along a row.
+        upward: Whether the numbers increase from row to row upward, not downward.
+        start: Remainder of the first number of a row by ``columns``; None if unknown.
+    """
+
+    columns: int
+    upward: bool
+    start: int | None
+
+
+def tag_offsets(squares: Mapping[int, Array]) -> Array:
+    """Offsets between the middles of tags, each by the four corners of one tag only.
+
+    So lens distortion hardly changes those of neighbours.
+
+    Args:
+        squares: Corners of n tags by number, in the order of
+            `tracking.detection.tags.CORNER_SIGNS`, shape (4, 2) each, [px].
+
+    Returns:
+        From the tag of the first axis to that of the second, shape (n, n, 2): x right and y down,
+        in sides of the first tag.
+    """
+    plane = (CORNER_SIGNS * [0.5, -0.5]).astype(np.float32)
+    quads = [square.astype(np.float32) for square in squares.values()]
+    middles = np.array([[cv2.getPerspectiveTransform(plane, quad)[:2, 2]] for quad in quads])
+    return np.array(
+        [
+            cv2.perspectiveTransform(middles, cv2.getPerspectiveTransform(quad, plane))[:, 0]
+            for quad in quads
+        ]
+    )
+
+
+def row_numbering(squares: Mapping[int, Array]) -> RowNumbering | None:
+    """How a grid of tags, as in `tag_offsets`, is numbered; None if not row by row, or unknown."""
+    if not squares:
+        return None
+    numbers, offsets = list(squares), tag_offsets(squares)
+    right, down = _neighbours(numbers, offsets), _neighbours(numbers, offsets[..., ::-1])
+    along, across = _common_step(right), _common_step(down)
+    columns = abs(across)
+    if abs(along) != 1 or columns < 2:  # -1: OpenCV draws some families upside down
+        return None
+    # Only the last number of a row, of all remainders, has no neighbour with the next number.
+    ends = set(range(columns)) - {min(pair) % columns for pair in right if np.ptp(pair) == 1}
+    start = (ends.pop() + 1) % columns if len(ends) == 1 else None
+    return RowNumbering(columns, along * across < 0, start)
+
+
+def _neighbours(numbers: Sequence[int], offsets: Array) -> list[tuple[int, int]]:
+    """Each tag's number and that of the next tag in the direction of the first coordinate."""
+    x, y = offsets[..., 0], offsets[..., 1]
+    ahead = np.where((x > _APART) & (np.abs(y) < _SLOPE * x), x, np.inf)
+    nearest = ahead.argmin(axis=1)
+    return [(numbers[k], numbers[j]) for k, j in enumerate(nearest) if np.isfinite(ahead[k, j])]
+
+
+def _common_step(pairs: Sequence[tuple[int, int]]) -> int:
+    """The usual difference of neighbours' numbers; 0 where there is none."""
+    steps = Counter(after - before for before, after in pairs)
+    step, count = max(steps.items(), key=lambda item: item[1], default=(0, 0))
+    return step if count >= _LEAST_SHARE * len(pairs) else 0
 
 
 #: Wider edges are out of focus or blurred by motion, [px].

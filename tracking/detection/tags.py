@@ -11,6 +11,7 @@ or with low contrast.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -65,6 +66,13 @@ def tag_corners(tag: Tag) -> Array:
     """Corners of a tag in the frame of its carrier (platform or world), shape (4, 3), [m]."""
     flat = np.column_stack([CORNER_SIGNS * tag.size / 2.0, np.zeros(4)])
     return tag.pose.apply(flat)
+
+
+def view_angle(tag: Tag, camera_from_body: Pose) -> float:
+    """Angle between the line of sight and a tag's normal, [rad]; beyond π/2 from behind."""
+    camera_from_tag = camera_from_body.compose(tag.pose)
+    away = camera_from_tag.position / np.linalg.norm(camera_from_tag.position)
+    return math.acos(float(np.clip(-camera_from_tag.rotation[:, 2] @ away, -1.0, 1.0)))
 
 
 # Tags mounted with another side up.

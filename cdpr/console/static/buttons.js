@@ -3,7 +3,7 @@
 `situation` is `{ state, stale, preview, form }`: the server's last state, why it is stale (text) or null, the loaded
 plan, and what is selected on the page: `{ plan_file, scene_file, from_here }`. */
 
-import { mark, write } from "./elements.js";
+import { capital, mark, write } from "./elements.js";
 
 const MOVING = ["enabling", "approaching", "moving", "holding", "stopping", "securing"];
 const ACTIVE = ["preparing", ...MOVING];
@@ -93,7 +93,7 @@ export const BUTTONS = {
 export function whyNot(button, situation) {
   for (const name of BUTTONS[button]) {
     const reason = REQUIREMENTS[name](situation);
-    if (reason) return reason;
+    if (reason) return capital(reason);
   }
   return null;
 }

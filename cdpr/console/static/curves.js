@@ -11,7 +11,7 @@ function options(lines, { x, zero = false, least = 0 }) {
   return {
     width: 300, height: HEIGHT, legend: { show: false }, cursor: { drag: { x: false, y: false } }, padding: [8, 10, 0, 0],
     scales: { x: { time: false, range: x }, y: { range: (_, low, high) => range(low, Math.max(high, least), zero) } },
-    axes: [axis({ size: 28, gap: 6 }), axis({ size: 42, gap: 4 })],
+    axes: [axis({ size: 20, gap: 4, label: "Time [s]", labelSize: 16, labelGap: 0, labelFont: "11px system-ui, sans-serif" }), axis({ size: 42, gap: 4 })],
     series: [{}, ...lines.map(({ label, role, dash, limit }) => ({
       label, stroke: () => colour(role), width: 1.5, dash, auto: !limit, points: { show: false }, spanGaps: false,
     }))],

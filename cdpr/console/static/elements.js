@@ -24,6 +24,9 @@ export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
+/** A reason as a line of its own, which begins with a capital letter. */
+export const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+
 /** Sets an attribute only if it differs; null removes it. */
 export function mark(element, name, value) {
   if (value === null) element.removeAttribute(name);

@@ -1,6 +1,6 @@
 /* The jog panels of the platform and of one cable: buttons, keys and a gamepad hold the single press of hold.js. */
 
-import { at, chosen, known, make, mark, write } from "./elements.js";
+import { at, capital, chosen, known, make, mark, write } from "./elements.js";
 import { Hold } from "./hold.js";
 import { whyNot } from "./buttons.js";
 
@@ -102,7 +102,7 @@ function stateText(jog, isHeld, moving, ready) {
 
 function showPad(panel, jog, text, isHeld) {
   at(`${panel}-pad`).classList.toggle("ready", jog.ready);
-  write(at(`${panel}-state`), text);
+  write(at(`${panel}-state`), capital(text));
   if (jog.speed_mm_s) mark(at(`${panel}-speed`), "max", String(jog.speed_mm_s)); // the limit of the session
   showSpeed(panel);
   const limit = jog.not_begun ? `Not begun: ${jog.not_begun}. End jogging, then enable it again.` : jog.moving || isHeld ? ahead(jog) : "";

@@ -1,7 +1,7 @@
 /* Live figures: lamps, position, clearance, next stop, tensions and their limits, timing of the loop. */
 
 import { isActive } from "./buttons.js";
-import { at, duration, known, make, mark, write } from "./elements.js";
+import { at, capital, duration, known, make, mark, write } from "./elements.js";
 
 /** Lamps: text, and level: good (pass), bad (fail), attention (stop) or neutral (quiet). */
 const LAMPS = {
@@ -30,7 +30,7 @@ const BEFORE = { run: "Preparing the run", home: "Preparing to home", plan: "Pla
 /** Where values at rest come from: no run reports the drives, and they may be moved or lose power unnoticed. */
 function readText({ drives_read: read, tensions_n: tensions }) {
   if (!read) return "";
-  const why = read.why_not ? ` ${read.why_not[0].toUpperCase()}${read.why_not.slice(1)}.` : "";
+  const why = read.why_not ? ` ${capital(read.why_not)}.` : "";
   return `${read.at && tensions ? `Read at ${read.at}, not watched.` : ""}${why}`.trim();
 }
 

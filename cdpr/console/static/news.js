@@ -4,7 +4,7 @@ The strip always has its space, so no message moves or covers a control. */
 
 import { isActive } from "./buttons.js";
 import { address } from "./connection.js";
-import { at, link, write } from "./elements.js";
+import { at, capital, link, write } from "./elements.js";
 import { STATES } from "./live.js";
 
 const VERBS = { run: "Run", home: "Homing", reset: "Reset", release: "Release", plan: "Planning", jog: "Jogging" };
@@ -14,7 +14,8 @@ const DISMISSED = "cdpr dismissed outcome";
 export function headline(text) {
   const lines = text.trim().split("\n");
   const found = lines.findLast((line) => /^\S/.test(line) && !line.startsWith("report:")) ?? lines.at(-1);
-  return found.replace(/^(STOPPED|PASSED|FAILED) +(?=\S)/, "").trim();
+  const sentence = found.replace(/^(STOPPED|PASSED|FAILED) +(?=\S)/, "").trim();
+  return sentence === found.trim() ? sentence : capital(sentence);
 }
 
 /** The verb in progress. Of a run that moves, its state: the last line of its output may be long past. */

@@ -177,16 +177,17 @@ export class Operate {
 
   // Confirmations.
 
-  async #confirmed(button, question) {
-    const { say, situation } = this.#page;
-    return ask({ ...question, say, possible: () => whyNot(button, situation()) });
+  /** `seen` returns what the question is about: it is withdrawn when that changes. */
+  async #confirmed(button, question, seen = () => null) {
+    const { say, situation } = this.#page, asked = seen();
+    return ask({ ...question, say, possible: () => whyNot(button, situation()) ?? (seen() === asked ? null : "What it showed has changed") });
   }
 
   async #takeControl() {
     const holder = this.#page.situation().state.control.held_by;
     if (holder === null) return this.#page.command("take_control");
     const lines = [`${holder} has control, and loses it immediately. Talk to its operator first.`, "Control cannot be taken while the robot moves."];
-    if (await this.#confirmed("take_control", { title: "Take control away?", lines, confirm: "Take control" })) this.#page.command("take_control", { force: true });
+    if (await this.#confirmed("take_control", { title: "Take control away?", lines, confirm: "Take control" }, () => this.#page.situation().state.control.held_by)) this.#page.command("take_control", { force: true, held_by: holder });
   }
 
   async #service() {
@@ -221,7 +222,7 @@ export class Operate {
   async #reset() {
     const { latched } = this.#page.situation().state;
     const lines = [make("p", { class: "cause" }, make("b", {}, "Cause: "), latched), "Remove the cause first.", "Reset releases the fault latch and resets drives in fault. Nothing moves; drives that hold keep holding."];
-    if (await this.#confirmed("reset", { title: "Reset the latched fault?", lines, confirm: "Cause removed: reset" })) this.#page.command("reset");
+    if (await this.#confirmed("reset", { title: "Reset the latched fault?", lines, confirm: "Cause removed: reset" }, () => this.#page.situation().state.latched)) this.#page.command("reset", { cause: latched });
   }
 
   async #release() {
@@ -243,8 +244,8 @@ export class Operate {
     // Drives on a bus have to be at the start; simulated ones are put there.
     const elsewhere = simulated && off > 1 ? [`The simulated platform is put at the plan’s start, ${known(off, 0, "mm")} from where it is shown.`] : [];
     const lines = [facts, ...elsewhere, "The drives are enabled and the platform moves. Keep clear of the platform and of its cables."];
-    if (await this.#confirmed("run", { title: "Run this plan?", lines, confirm: "Run: the platform moves" })) {
-      this.#page.command("run");
+    if (await this.#confirmed("run", { title: "Run this plan?", lines, confirm: "Run: the platform moves" }, () => this.plan)) {
+      this.#page.command("run", { plan: plan.hash });
       at("motion").scrollIntoView({ block: "nearest" });
     }
   }

@@ -120,9 +120,10 @@ def test_margins_of_many_cables_are_those_at_every_five_columns(cables: int) -> 
 def test_two_cables_in_one_line_span_no_facet() -> None:
     """As if one cable were twice as strong: the margin follows from the others."""
     rig, rng = ring(10), np.random.default_rng(5)
+    (x, y, z), *others = rig.document.outlets_mm[:9]  # a rig file refuses the same cable twice
     twice = changed_rig(
         rig,
-        outlets_mm=[rig.document.outlets_mm[i] for i in [0, *range(9)]],
+        outlets_mm=[[x, y, z], [x + 1e-9, y, z], *others],
         anchors_mm=[rig.document.anchors_mm[i] for i in [0, *range(9)]],
     )
     positions = rng.uniform(rig.workspace_lower, rig.workspace_upper, (20, 3))

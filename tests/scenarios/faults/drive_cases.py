@@ -10,13 +10,16 @@ from dataclasses import replace
 
 from executor.state_machine import State
 from tests.scenarios.faults.bench import Bench, Script
-from tests.scenarios.faults.cases import TABLE, Fault, late, then
+from tests.scenarios.faults.cases import TABLE, Fault, broken, late, then
 
 WARNED = 60.0
 """Cycles from arming until an enabled drive sends its first warning."""
 
 WHOLE_RUN = 500.0
 """Cycles of the short plan, and of an enabling that takes as long as it may."""
+
+POLLED = 11.0
+"""Cycles until the state of each drive between its replies was read and all have stopped."""
 
 IMPATIENT = {"sync_timeout_periods": 1.5}
 ONCE_ENABLED = {"mode_display_when_enabled": True}
@@ -66,6 +69,13 @@ def answers_of(**changes: object) -> Callable[[], Script]:
             drive._server._behaviour = replace(drive.behaviour, **changes)  # type: ignore[arg-type]
 
     return then(happens)
+
+
+def at_limit_switch(bench: Bench) -> None:
+    """From now on the third drive is beyond its limit switch, and coasts from SYNC to SYNC."""
+    drive = bench.drives[2]
+    drive.behaviour = replace(drive.behaviour, limit_switch=1.0)
+    drive._deceleration /= 50.0
 
 
 DRIVES: dict[str, Fault] = {
@@ -128,6 +138,13 @@ DRIVES: dict[str, Fault] = {
         behaviour=("warning=4210",),
     ),
     "D status bits flicker": with_drives("status-flicker"),
+    "D a limit switch after each reply": Fault(
+        broken(2, by=at_limit_switch),
+        within=POLLED,
+        mixed=POLLED,
+        words=("drive 3) stopped on its own: quick stop active between two replies",),
+        live=False,
+    ),
     "D mode shown 5 s after enabling": stopped_by_rule(
         "mode-when-enabled", "mode-late=5000", words=("6061h",), profile=ONCE_ENABLED
     ),
