@@ -10,6 +10,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from model.errors import CdprError
+
 Counts = NDArray[np.int64]
 Pump = Callable[[], None]
 """Steps drives simulated in this process, which process the waiting frames."""
@@ -19,6 +21,19 @@ Pace = Callable[[], float]
 
 OnRestarted = Callable[[tuple[int, ...]], None]
 """Called with nodes found without this program's configuration; see `DriveGroup.configure`."""
+
+
+def how_to_reset(*, braked: bool) -> str:
+    """How to reset a drive in fault while others hold the platform.
+
+    Args:
+        braked: Every winch has a brake.
+    """
+    release = "run `cdpr release RIG`, which closes all brakes together, or " if braked else ""
+    return (
+        f"support the platform; {release}press the emergency stop, which removes all torque, and"
+        " release it; then run `cdpr reset RIG`"
+    )
 
 
 WHOLE_BUS = 0
@@ -145,16 +160,18 @@ class CycleStatus:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveSnapshot:
-    """State of drives read without configuring them, in the order of the winches.
+    """State of the n drives that answered, read without configuring them, in order of the winches.
 
     Attributes:
-        positions: Shape (m,), [counts].
-        torques: Positive when winding in, shape (m,), [per mille of rated torque].
-        status_words: Shape (m,); see `drive_states`.
+        positions: Shape (n,), [counts].
+        torques: Positive when winding in, shape (n,), [per mille of rated torque].
+        status_words: Shape (n,); see `drive_states`.
         restarted: Nodes without this program's configuration: power-cycled, or never configured.
             For drives with non-volatile settings, all without an absolute encoder.
         errors: The error that each drive in fault stores, or why one at rest cannot be enabled, as
             text; empty without one, and for drives that show it in their state.
+        silent: Nodes that did not answer; only of a partial reading.
+        silence: The error that names them.
     """
 
     positions: Counts
@@ -162,6 +179,8 @@ class DriveSnapshot:
     status_words: Counts
     restarted: tuple[int, ...]
     errors: tuple[str, ...]
+    silent: tuple[int, ...] = ()
+    silence: CdprError | None = None
 
 
 class DriveGroup(Protocol):

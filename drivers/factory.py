@@ -77,6 +77,23 @@ def unready_remarks(rig: Rig, status_words: Sequence[int]) -> list[str]:
     return [f"{', '.join(found)}: {reason}" for reason, found in names.items()]
 
 
+def blocked_in_fault(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
+    """Nodes of drives in fault that cannot be reset, as others hold the platform.
+
+    None for ODrives: if one disarms itself, all are disarmed.
+
+    Args:
+        rig: The robot.
+        status_words: Reported status word of each drive.
+    """
+    if rig.document.drives.type == "odrive":
+        return ()
+    from drivers.cia402.monitor import blocked
+    from drivers.cia402.state_machine import state_of
+
+    return tuple(blocked(dict(zip(rig.drive_names, map(state_of, status_words), strict=True))))
+
+
 def cycles_until_reported(rig: Rig) -> int:
     """Cycles from the one that sends a set-point to the one that reports the position it commands.
 
@@ -87,7 +104,12 @@ def cycles_until_reported(rig: Rig) -> int:
 
 
 def read_drives(
-    rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, to_reset: bool = False
+    rig: Rig,
+    bus: can.BusABC,
+    pump: Pump | None = None,
+    *,
+    to_reset: bool = False,
+    partial: bool = False,
 ) -> DriveSnapshot:
     """Reads the state of drives at rest; changes nothing, not even their configuration.
 
@@ -96,20 +118,22 @@ def read_drives(
         bus: An open bus, owned by the caller.
         pump: As for `make_drive_group`.
         to_reset: Takes drives in NMT *stopped*, which answer nothing, to *pre-operational*.
+        partial: Reads those that answer, if some do not.
 
     Raises:
-        HardwareMissing: A drive does not answer.
-        Refused: A drive refuses to answer, or is in NMT *stopped* without ``to_reset``.
+        HardwareMissing: A drive does not answer; if ``partial``, it stopped answering.
+        Refused: A drive refuses a request, or is in NMT *stopped* without ``to_reset`` or
+            ``partial``.
         Fault: The bus failed.
     """
     document = rig.document.drives
     if document.type == "odrive":
         from drivers.odrive.group import read_axes
 
-        return read_axes(rig, document, bus, pump)
+        return read_axes(rig, document, bus, pump, partial=partial)
     from drivers.cia402.inspection import read_states
 
-    return read_states(rig, bus, pump, to_reset=to_reset)
+    return read_states(rig, bus, pump, to_reset=to_reset, partial=partial)
 
 
 def make_drive_group(

@@ -15,9 +15,17 @@ from can import BusABC
 
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
 from drivers.can_errors import TorqueLost
-from drivers.drive_group import DriveSnapshot
-from drivers.factory import drive_states, make_drive_group, read_drives, stop_alone
+from drivers.drive_group import DriveSnapshot, how_to_reset
+from drivers.factory import (
+    blocked_in_fault,
+    drive_states,
+    make_drive_group,
+    read_drives,
+    stop_alone,
+)
 from executor.control.preconditions import counted_here, require_below, set_up_here
+from executor.control.standstill import is_braked
+from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import SetUpLock
 from executor.kernels import ready_to_simulate
@@ -309,6 +317,81 @@ def resting_drives_of(
     load = empty_scene(rig).load
     configure_as = partial(set_up_here, rig)
     return open_drives(rig, rig.home, load, to_reset=to_reset, configure_as=configure_as)
+
+
+# Status of drives at rest.
+
+
+@dataclass(frozen=True, slots=True)
+class DriveStatus:
+    """Status of one drive.
+
+    Attributes:
+        node: Its node ID.
+        state: Of its state machine, as text.
+        position: Of its encoder, [counts].
+        tension: Of its cable, from the drive's torque, [N].
+        set_up: It has the configuration for this rig: no power cycle or other cycle time since.
+        error: The error that a drive in fault stores, or why one at rest cannot be enabled; empty
+            without one.
+    """
+
+    node: int
+    state: str
+    position: int
+    tension: float
+    set_up: bool
+    error: str = ""
+
+
+def drive_statuses(rig: Rig, seen: DriveSnapshot) -> tuple[DriveStatus, ...]:
+    """The status of each drive that answered."""
+    columns = zip(
+        [winch for winch in rig.winches if winch.node_id not in seen.silent],
+        drive_states(rig, seen.status_words.tolist()),
+        seen.positions.tolist(),
+        seen.torques.tolist(),
+        seen.errors,
+        strict=True,
+    )
+    return tuple(
+        DriveStatus(
+            node=winch.node_id,
+            state=state,
+            position=position,
+            tension=torque / 1000.0 * winch.torque_constant,
+            set_up=winch.node_id not in seen.restarted,
+            error=error,
+        )
+        for winch, state, position, torque, error in columns
+    )
+
+
+def faults_to_release_under(rig: Rig) -> tuple[LatchedFault | None, tuple[str, ...]]:
+    """The latched fault, and names of the drives in fault, that a release leaves as they are.
+
+    Raises:
+        Refused: A reset must clear the fault first, or winches without a brake cannot hold.
+        CdprError: The drives cannot be read.
+    """
+    latch = FaultLatch(BusSettings.of(rig))
+    latched = latch.read()
+    if latched is None or latched.rig != rig.name:
+        latch.require_disengaged()
+    latch.require_no_run()
+    seen = read_snapshot(rig, rig.home, empty_scene(rig).load)
+    nodes = blocked_in_fault(rig, seen.status_words.tolist())
+    names = tuple(rig.drive_names[node] for node in nodes)
+    if not nodes:
+        latch.require_disengaged()
+    elif not is_braked(rig):
+        raise Refused(
+            f"{', '.join(names)}: in fault, while other drives hold the platform",
+            where="release",
+            why="not every winch has a brake (winches[].brake in the rig file)",
+            next_step=how_to_reset(braked=False),
+        )
+    return latched, names
 
 
 # Forward kinematics from drive positions.

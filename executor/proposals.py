@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from drivers.can_bus import IN_PROCESS
 from executor.interlock.fault_latch import LatchedFault
-from executor.interlock.interlock import MotionInterlock, ReferenceStatus, reference_status
+from executor.interlock.interlock import MotionInterlock, reference_status
+from executor.interlock.reference import ReferenceStatus
 from model.errors import (
     BadInput,
     StoppedByOperator,
@@ -319,6 +320,7 @@ class ReleaseProposal:
         bus: Interface and channel.
         braked: Whether brakes hold the drums afterwards.
         reference: Homing reference, which is discarded without brakes.
+        in_fault: Names of drives that stay in fault, and cannot be reset before the release.
     """
 
     question: ClassVar[str] = "Is the platform supported, so that no cable carries it?"
@@ -329,14 +331,17 @@ class ReleaseProposal:
     bus: str
     braked: bool
     reference: ReferenceStatus
+    in_fault: tuple[str, ...] = ()
 
     def facts(self) -> Facts:
         """See `Proposal`."""
         held = "the brakes hold the drums" if self.braked else "nothing holds the cables"
         gone = "discarded: run `cdpr home` before the next motion"
+        stays = f"{', '.join(self.in_fault)}: not enabled, stays so until `cdpr reset RIG`"
         return [
             ("rig", self.rig.name),
             ("bus", self.bus),
+            *([("in fault", stays)] if self.in_fault else []),
             ("afterwards", held),
             ("reference", str(self.reference) if self.braked else gone),
         ]

@@ -84,6 +84,11 @@ class RunResult:
             return "check the report for exceeded limits before the next run"
         if self.summary.get("interface") == IN_PROCESS:
             return "find the cause, then run again into a new folder"
+        if "drive_fault" in {event["code"] for event in self.summary["events"]}:
+            return (
+                "find the cause and check the platform; `cdpr status RIG` shows whether to run"
+                " `cdpr release RIG` or to press the emergency stop before `cdpr reset RIG`"
+            )
         return "find the cause and check the platform, then run `cdpr reset RIG`"
 
     def missing_text(self) -> str:

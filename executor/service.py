@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,15 @@ from typing import Any
 import numpy as np
 
 from drivers.can_bus import BusSettings, open_bus
-from drivers.drive_group import CycleStatus
-from drivers.factory import drive_states, read_drives, unready_remarks, without_torque
+from drivers.drive_group import CycleStatus, how_to_reset
+from drivers.factory import (
+    blocked_in_fault,
+    drive_states,
+    read_drives,
+    stop_alone,
+    unready_remarks,
+    without_torque,
+)
 from drivers.plausibility import HOMING_OPTIONS
 from executor.control.standstill import (
     FaultReset,
@@ -25,17 +32,20 @@ from executor.control.standstill import (
     reset_drives,
 )
 from executor.drives import (
+    DriveStatus,
     abandoned_drives_fault,
     current_pose,
+    drive_statuses,
+    faults_to_release_under,
     require_other_process,
     resting_drives_of,
 )
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
-from executor.interlock.interlock import MotionInterlock, ReferenceStatus, reference_status
+from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.interlock.locks import SetUpLock
-from executor.interlock.reference import RESTARTED
+from executor.interlock.reference import RESTARTED, ReferenceStatus
 from executor.proposals import Facts, ReleaseProposal, ResetProposal, require_confirmed
-from executor.realtime.process import real_time_process
+from executor.realtime.process import RealTimeProcess, real_time_process
 from executor.realtime.scheduling import require_imported_script
 from executor.realtime.shared_memory import SharedRequests
 from executor.remote.client import preparations
@@ -51,28 +61,6 @@ from model.rig import Rig
 from model.scene import empty_scene
 
 
-@dataclass(frozen=True, slots=True)
-class DriveStatus:
-    """Status of one drive.
-
-    Attributes:
-        node: Its node ID.
-        state: Of its state machine, as text.
-        position: Of its encoder, [counts].
-        tension: Of its cable, from the drive's torque, [N].
-        set_up: It has the configuration for this rig: no power cycle or other cycle time since.
-        error: The error that a drive in fault stores, or why one at rest cannot be enabled; empty
-            without one.
-    """
-
-    node: int
-    state: str
-    position: int
-    tension: float
-    set_up: bool
-    error: str = ""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class StatusResult:
     """Status of a rig; None for what was not read or is unknown.
@@ -85,10 +73,12 @@ class StatusResult:
         latched: Cause of a latched fault.
         being_set_up: Another program configures or reads the drives.
         reference: Homing reference of the drives.
-        drives: All drives, in the order of the rig file.
+        drives: The drives that answered, in the order of the rig file.
         pose: By forward kinematics of the empty platform, ``world_from_platform``.
         why_no_pose: Why there is no pose, though the drives were read.
-        missing: Why the drives could not be read.
+        missing: Why drives could not be read; the reference is unknown then, unless it is lost.
+        silent: Nodes of the drives that did not answer.
+        how_to_reset: How to reset a drive in fault while others hold the platform; None without.
     """
 
     rig: str
@@ -102,6 +92,8 @@ class StatusResult:
     pose: Pose | None = None
     why_no_pose: str | None = None
     missing: CdprError | None = None
+    silent: tuple[int, ...] = ()
+    how_to_reset: str | None = None
 
     def facts(self, rig_file: Path) -> Facts:
         """Human-readable status, with the next step before a run.
@@ -138,11 +130,14 @@ class StatusResult:
         if self.run is not None or self.being_set_up:
             return ""
         file, steps = quote(str(rig_file)), []
-        if self.latched is not None:
+        if self.how_to_reset is not None:
+            how = self.how_to_reset.replace("`", "").replace("RIG", file)
+            steps.append(f"find the cause; {how}")
+        elif self.latched is not None or self.reference.valid_after_reset:
             steps.append(f"find the cause and check the platform, then run cdpr reset {file}")
         if failed := [str(drive.node) for drive in self.drives or () if drive.error]:
             steps.insert(0, f"remove the cause shown for drive {', '.join(failed)}")
-        if not self.reference.counts:
+        if self.reference.known and not (self.reference.counts or self.reference.valid_after_reset):
             steps.append(f"cdpr home {file} with {HOMING_OPTIONS}")
         return "; then ".join(steps)
 
@@ -152,13 +147,13 @@ class StatusResult:
         Args:
             names: Of the drives, by node (`Rig.drive_names`).
         """
-        return [
-            f"{names[drive.node]:<19} {drive.state:<24} {drive.position:>11} counts"
-            f" {drive.tension:8.2f} N"
+        lines = {
+            drive.node: f"{drive.state:<24} {drive.position:>11} counts {drive.tension:8.2f} N"
             f"{'' if drive.set_up else '  not set up, or for another cycle'}"
             f"{f'  {drive.error}' if drive.error else ''}"
             for drive in self.drives or ()
-        ]
+        } | dict.fromkeys(self.silent, "does not answer")
+        return [f"{name:<19} {lines[node]}" for node, name in names.items() if node in lines]
 
     def as_dict(self) -> dict[str, Any]:
         """Values for `--json`, rounded, with units in the keys."""
@@ -187,6 +182,8 @@ class StatusResult:
             "being_set_up": self.being_set_up,
             "reference": asdict(self.reference),
             "drives": None if self.drives is None else drives,
+            "silent": list(self.silent),
+            "how_to_reset": self.how_to_reset,
             "pose": pose,
         }
 
@@ -205,7 +202,7 @@ def status(rig: Rig) -> StatusResult:
     require_other_process(rig)
     settings = BusSettings.of(rig)
     interlock = MotionInterlock(rig)
-    latched, in_motion = _latch_of(FaultLatch(settings))
+    latched, in_motion = FaultLatch(settings).read_in_motion()
     known = StatusResult(
         rig=rig.name,
         bus=str(settings),
@@ -221,54 +218,36 @@ def status(rig: Rig) -> StatusResult:
         with SetUpLock(settings).tried() as alone:
             return _read(rig, interlock, known) if alone else replace(known, being_set_up=True)
     except CdprError as error:  # the state on file is still reported
-        return replace(known, missing=error)
-
-
-def _latch_of(latch: FaultLatch) -> tuple[LatchedFault | None, bool]:
-    """The latched fault, and whether a motion is active, consistently."""
-    latched = latch.read()
-    while True:
-        in_motion = latch.held_by_another()
-        again = latch.read()
-        if again == latched:
-            return latched, latched is not None and in_motion
-        latched = again
+        return replace(known, reference=known.reference.if_unread(error.what), missing=error)
 
 
 def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusResult:
-    """Reads the drives and computes the pose.
+    """Reads the drives that answer; if all do, computes the pose.
 
     Raises:
-        CdprError: A drive does not answer, or the bus cannot be opened.
+        CdprError: A drive fails while it is read, or the bus cannot be opened.
     """
     bus = open_bus(BusSettings.of(rig))
     try:
-        seen = read_drives(rig, bus)
+        seen = read_drives(rig, bus, partial=True)
     finally:
         bus.shutdown()
-    positions = seen.positions.tolist()
-    reference = reference_status(interlock, positions)
+    known = replace(known, drives=drive_statuses(rig, seen) or None, silent=seen.silent)
+    if seen.silence is not None:
+        unread = known.reference.if_unread(seen.silence.what)
+        return replace(known, reference=unread, missing=seen.silence)
+    positions, words = seen.positions.tolist(), seen.status_words.tolist()
+    held = not seen.restarted and all(stop_alone(rig, words))
+    reference = reference_status(interlock, positions, held=held)
     restarted = [w.node_id for w in rig.winches if not w.absolute and w.node_id in seen.restarted]
     if reference.counts and restarted:
-        names = ", ".join(rig.drive_names[node] for node in restarted)
-        why = f"{names}: {RESTARTED}"
+        why = f"{', '.join(rig.drive_names[node] for node in restarted)}: {RESTARTED}"
         reference = replace(reference, counts=False, why_not=why)
-    released = without_torque(rig, seen.status_words.tolist())
+    released = without_torque(rig, words)
     if reference.counts and (why := interlock.why_released(seen.restarted, released)):
         reference = replace(reference, counts=False, why_not=why)
-    columns = zip(
-        rig.winches,
-        drive_states(rig, seen.status_words.tolist()),
-        positions,
-        rig.tensions_by(seen.torques).tolist(),
-        seen.errors,
-        strict=True,
-    )
-    drives = tuple(
-        DriveStatus(w.node_id, state, position, tension, w.node_id not in seen.restarted, error)
-        for w, state, position, tension, error in columns
-    )
-    read = replace(known, reference=reference, drives=drives)
+    how = how_to_reset(braked=is_braked(rig)) if blocked_in_fault(rig, words) else None
+    read = replace(known, reference=reference, how_to_reset=how)
     if not reference.counts:
         return read
     as_referenced = interlock.referenced_rig()
@@ -377,7 +356,9 @@ def release(
 ) -> ReleaseResult:
     """Closes the brakes and switches off the torque of all drives; the platform must be supported.
 
-    Winches without brakes release their cables, so that the drives must be homed again.
+    Winches without brakes release their cables, so that the drives must be homed again. Where all
+    have brakes, a drive in fault that cannot be reset while others hold stays in fault, as does a
+    latched fault.
 
     Args:
         rig: The robot and its bus.
@@ -389,21 +370,30 @@ def release(
 
     Raises:
         StoppedByOperator: Cancelled, or stopped.
-        CdprError: The bus is latched, or the drives could not be configured; or they were not
-            released, and a fault is latched.
+        CdprError: The bus is latched, and a reset can clear it; a drive is in fault and not all
+            winches have brakes; the drives could not be configured; or they were not released, and
+            a fault is latched.
     """
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     require_other_process(rig)
     interlock = MotionInterlock(rig)
     with commands_from_start("release", rig, supervisor, realtime=True) as commands:
-        interlock.require_free()
+        under, in_fault = faults_to_release_under(rig)
         bus, braked = str(BusSettings.of(rig)), is_braked(rig)
-        proposal = ReleaseProposal(rig, bus, braked, reference_status(interlock))
+        proposal = ReleaseProposal(rig, bus, braked, reference_status(interlock), in_fault)
         require_confirmed(confirm, proposal)
         commands.require_no_stop()
+        process = partial(
+            real_time_process,
+            StandstillMotion.of(Release, rig),
+            partial(resting_drives_of, rig.document, to_reset=bool(in_fault)),
+            need_real_time=need_real_time_rights,
+            check_drives=partial(abandoned_drives_fault, rig.document),
+            listener=listener,
+        )
         left = commands.supervisor.during(
             commands.board,
-            lambda: _released(rig, interlock, commands, need_real_time_rights, listener),
+            lambda: _released(rig, interlock, commands, process, listener, under),
         )
     commands.supervisor.finish()
     return ReleaseResult(
@@ -416,8 +406,9 @@ def _released(
     rig: Rig,
     interlock: MotionInterlock,
     commands: Commands,
-    need_real_time_rights: bool,
+    make_process: Callable[[SharedRequests], AbstractContextManager[RealTimeProcess]],
     listener: Listener,
+    under: LatchedFault | None,
 ) -> CycleStatus:
     """Releases the drives; returns their last status. Errors as `release_drives`."""
     board = commands.board
@@ -431,18 +422,9 @@ def _released(
 
     with ExitStack() as stack:
         stack.enter_context(commands.during_motion(status))
-        process = stack.enter_context(
-            real_time_process(
-                StandstillMotion.of(Release, rig),
-                partial(resting_drives_of, rig.document),
-                board,
-                need_real_time=need_real_time_rights,
-                check_drives=partial(abandoned_drives_fault, rig.document),
-                listener=listener,
-            )
-        )
+        process = stack.enter_context(make_process(board))
         try:
-            left = release_drives(rig, interlock, process, on_armed)
+            left = release_drives(rig, interlock, process, on_armed, under)
         except CdprError as error:
             status.take_end(State.LATCHED, error.what)
             raise

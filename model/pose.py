@@ -33,11 +33,7 @@ def floats_of(values: ArrayLike) -> Array:
 
 
 def require_unmasked(values: object) -> None:
-    """Requires an array, or a list of arrays, without masked values.
-
-    Raises:
-        BadInput: It has some.
-    """
+    """Requires an array, or a list of arrays, without masked values; errors as for `floats_of`."""
     if isinstance(values, list | tuple):
         for one in values:
             require_unmasked(one)

@@ -35,7 +35,6 @@ from drivers.cia402.state_machine import (
     DriveState,
     Goal,
     ignoring_drives,
-    late_drives,
     next_words,
     stopped_between_replies,
 )
@@ -202,7 +201,7 @@ class Cia402Group(CyclicGroup):
         if self._goal is not Goal.RESET_FAULT:  # faults since the last cycle stop this one
             self._latch(self._new_messages())
         following = self._state is GroupState.ENABLED
-        words = next_words(self._goal, self._watch.states, self._stop_commanded)
+        words = next_words(self._goal, self._watch.states_to_command, self._stop_commanded)
         if self._is_new_goal and self._goal in (Goal.ENABLE, Goal.RELEASE):
             # No further step until every drive has shown the effect of the last words.
             words = self._words
@@ -340,7 +339,7 @@ class Cia402Group(CyclicGroup):
 
     def _advance(self) -> None:
         """Checks whether the goal is reached or overdue."""
-        states = self._watch.states
+        states = self._watch.states_to_command
         self._cycles_to_goal += 1
         self._is_new_goal &= not self._watch.complete
         if self._goal is Goal.RESET_FAULT:
@@ -380,8 +379,7 @@ class Cia402Group(CyclicGroup):
             self._latch([(n, mode_text(self._rig.drive_names[n], m)) for n, m in wrong.items()])
 
     def _late(self, cycles: int) -> list[tuple[int, str]]:
-        names, words = self._rig.drive_names, self._watch.status_words
-        return late_drives(names, words, self._words, self._goal, cycles * self._cycle_s)
+        return self._watch.late(self._words, self._goal, cycles * self._cycle_s)
 
     def _status(self) -> CycleStatus:
         watch = self._watch
@@ -423,21 +421,23 @@ class Cia402Group(CyclicGroup):
         self._goal, self._cycles_to_goal = goal, 0
         self._modes, self._errors = None, SdoJobs({}, 1)
         self._enables, self._is_new_goal = False, True
+        self._watch.leave_in_fault(self._faults if goal is Goal.RELEASE else ())
 
     def require_releasable(self) -> None:
         """Checks whether the drives may be released; see `DriveGroup.require_releasable`."""
-        self._refuse_latched("release the drives")
+        if not (self.capabilities.has_brake and self._watch.only_in_fault(self._faults)):
+            self._refuse_latched("release the drives")
         require_within_limits(self._rig, self._watch.positions)
 
     def _begin_release(self) -> None:
         self.require_releasable()
         self._begin(Goal.RELEASE)
-        if self._state in (GroupState.ENABLING, GroupState.ENABLED):
+        if self._state in (GroupState.ENABLING, GroupState.ENABLED, GroupState.FAULT):
             self._state = GroupState.QUICK_STOP  # set-points are no longer followed
 
     def _reset_fault(self) -> None:
         """Clears the faults; resets drives in fault only if no other holds the platform."""
-        faulted = self._watch.require_resettable()
+        faulted = self._watch.require_resettable(braked=self.capabilities.has_brake)
         self._errors = SdoJobs(dict.fromkeys(faulted, ERROR_REQUESTS), self._again_after)
         self._watch.on_answer = self._errors.take
         self._cycles_to_goal = 0

@@ -41,7 +41,7 @@ from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power
 from drivers.drive_group import DriveSnapshot, Pump
 from drivers.plausibility import WrongScale, winding_signs
-from model.errors import Refused
+from model.errors import CdprError, HardwareMissing, Refused
 from model.files.drive_profile_file import ProfileDocument, object_name
 from model.rig import Rig
 from model.winches import WinchMap
@@ -387,14 +387,27 @@ _STATE = (
 
 
 def read_states(
-    rig: Rig, bus: can.BusABC, pump: Pump | None, *, to_reset: bool = False
+    rig: Rig,
+    bus: can.BusABC,
+    pump: Pump | None,
+    *,
+    to_reset: bool = False,
+    partial: bool = False,
 ) -> DriveSnapshot:
     """Status word, position and torque of every drive; see `drivers.factory.read_drives`."""
-    nodes = [winch.node_id for winch in rig.winches]
+    all_nodes = [winch.node_id for winch in rig.winches]
     timeout = profile_of(rig).sdo_timeout_ms / 1000.0
-    network = SetupNetwork(bus, pump, nodes, timeout=timeout)
+    network = SetupNetwork(bus, pump, all_nodes, timeout=timeout)
     network.discard_waiting()
-    require_answers(network, nodes, revive=to_reset)
+    silence: CdprError | None = None
+    try:
+        require_answers(network, all_nodes, revive=to_reset)
+    except (HardwareMissing, Refused) as error:
+        if not (partial and network.silent):
+            raise
+        silence = error
+    drives = [drive for drive, node in enumerate(all_nodes) if node not in network.silent]
+    nodes = [all_nodes[drive] for drive in drives]
     winch_map = WinchMap(rig)
 
     def read(index: int, name: str, size: int) -> list[int]:
@@ -405,10 +418,12 @@ def read_states(
         words, positions, torques = (read(*each) for each in _STATE)
         restarted = tuple(
             node
-            for drive, node in enumerate(nodes)
+            for drive, node in zip(drives, nodes, strict=True)
             if not is_still_set_up(network, node, settings_for(rig, drive, winch_map, None))
         )
     except Refused:
+        if silence is not None:
+            raise
         require_objects(rig, network, _STATE)  # names all missing ones, not only the first
         raise
     is_faulted = [state_of(word & 0xFFFF) in FAULTED for word in words]
@@ -418,11 +433,13 @@ def read_states(
     ]
     return DriveSnapshot(
         positions=np.array(positions, dtype=np.int64),
-        torques=np.array(torques, dtype=np.int64) * winding_signs(rig),
+        torques=np.array(torques, dtype=np.int64) * winding_signs(rig)[drives],
         status_words=np.array(words, dtype=np.int64) & 0xFFFF,
         restarted=restarted,
         errors=tuple(
             emergency_text(code) if code else " and ".join(without_power(word))
             for code, word in zip(codes, words, strict=True)
         ),
+        silent=tuple(network.silent),
+        silence=silence,
     )

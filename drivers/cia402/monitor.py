@@ -23,19 +23,27 @@ from drivers.cia402.state_machine import (
     FOLLOWS,
     INTERNAL_LIMIT,
     TORQUE_ON,
+    ControlWord,
     DriveState,
     Goal,
     change_on_its_own,
+    late_drives,
     state_of,
     without_power,
 )
-from drivers.drive_group import DriveWarning
+from drivers.drive_group import DriveWarning, how_to_reset
 from drivers.plausibility import ReplyCheck
 from model.errors import Refused
 
 
 def _never(_code: int) -> bool:
     return False
+
+
+def blocked(states: Mapping[int, DriveState]) -> list[int]:
+    """Nodes in fault that may not be reset, as another drive holds the platform."""
+    faulted = [node for node, state in states.items() if state in FAULTED]
+    return faulted if any(state in TORQUE_ON for state in states.values()) else []
 
 
 class DriveMonitor:
@@ -69,6 +77,7 @@ class DriveMonitor:
         self.states = [DriveState.NOT_READY] * count
         self.answered = [False] * count
         self.restarted: set[int] = set()
+        self._left_in_fault: frozenset[int] = frozenset()
         self._wrong_lengths = 0
         self._check = ReplyCheck(names, max_steps)
         self._is_warning = is_warning
@@ -211,7 +220,7 @@ class DriveMonitor:
         """
         found: list[tuple[int, str]] = []
         for node, state in zip(self.nodes, self.states, strict=True):
-            if state not in FAULTED:
+            if state not in FAULTED or self._is_left(node, state):
                 continue
             name = self._names[node]
             stored = self._stored.get(node, "no emergency message received")
@@ -221,8 +230,49 @@ class DriveMonitor:
                 found.append((node, f"{name} is in {state.value}: {cause}{since}"))
         return found + (self._check.faults() if powered else [])
 
-    def require_resettable(self) -> list[int]:
+    def only_in_fault(self, faults: Sequence[tuple[int, str]]) -> frozenset[int]:
+        """Nodes in fault, without torque, if these and nothing else are the faults; else none."""
+        there = zip(self.nodes, self.states, strict=True)
+        faulted = frozenset(node for node, state in there if state is DriveState.FAULT)
+        alone = {node for node, _ in faults} == faulted and not self.restarted
+        return faulted if alone else frozenset()
+
+    def leave_in_fault(self, faults: Sequence[tuple[int, str]]) -> None:
+        """From now on drives `only_in_fault` count as without torque while they stay so.
+
+        Their brakes have closed already; any other fault is still one.
+        """
+        self._left_in_fault = self.only_in_fault(faults)
+
+    def _is_left(self, node: int, state: DriveState) -> bool:
+        return state is DriveState.FAULT and node in self._left_in_fault
+
+    @property
+    def states_to_command(self) -> list[DriveState]:
+        """The states, where those left in fault count as *switch on disabled*."""
+        rows = zip(self.nodes, self.states, strict=True)
+        return [
+            DriveState.SWITCH_ON_DISABLED if self._is_left(node, state) else state
+            for node, state in rows
+        ]
+
+    def late(
+        self, commanded: Sequence[ControlWord], goal: Goal, seconds: float
+    ) -> list[tuple[int, str]]:
+        """`late_drives`, without those left in fault."""
+        rows = [
+            row
+            for row in zip(self._names.items(), self.status_words, commanded, strict=True)
+            if not self._is_left(row[0][0], state_of(row[1]))
+        ]
+        names, words, sent = zip(*rows, strict=True)
+        return late_drives(dict(names), words, sent, goal, seconds)
+
+    def require_resettable(self, *, braked: bool) -> list[int]:
         """Nodes in fault; they may be reset only if no other drive holds the platform.
+
+        Args:
+            braked: Every winch has a brake.
 
         Raises:
             Refused: Another drive holds it, or a drive restarted.
@@ -234,16 +284,15 @@ class DriveMonitor:
                 where="drive group",
                 next_step="configure the drives again and check the homing reference",
             )
-        faulted = [n for n, s in zip(self.nodes, self.states, strict=True) if s in FAULTED]
-        if faulted and any(state in TORQUE_ON for state in self.states):
+        states = dict(zip(self.nodes, self.states, strict=True))
+        if held_up := blocked(states):
             raise Refused(
-                f"{self._names[faulted[0]]} cannot be reset while other drives hold the platform",
+                f"{self._names[held_up[0]]} cannot be reset while other drives hold the platform",
                 where="drive group",
                 why="resetting one drive of a platform under tension moves it",
-                next_step="support the platform, press the emergency stop to disable all drives,"
-                " release it, then reset the fault",
+                next_step=how_to_reset(braked=braked),
             )
-        return faulted
+        return [node for node, state in states.items() if state in FAULTED]
 
     def note_errors(self, codes: Mapping[int, int]) -> None:
         """Takes the error codes that drives in fault store, by node; 0 for none."""

@@ -89,6 +89,7 @@ class SetupNetwork:
 
     Attributes:
         emergencies: Data of the last EMCY of each drive, by identifier.
+        silent: Nodes without an answer when last contacted.
     """
 
     def __init__(
@@ -115,6 +116,7 @@ class SetupNetwork:
         self._states: dict[int, int | None] = {}
         self._nodes, self._refuses_restarts = frozenset(nodes), False
         self.emergencies: dict[int, bytes] = {}
+        self.silent: list[int] = []
         self._own = EchoFilter(
             commanding_ids(nodes), echoes_own_frames=echoes_own_frames(bus), batch=len(nodes)
         )
@@ -159,7 +161,8 @@ class SetupNetwork:
             waiting = [client for client in waiting if client.waits]
         for client in waiting:
             client.give_up()
-        return [client.node for client in waiting]
+        self.silent = [client.node for client in waiting]
+        return self.silent
 
     def _await(self, clients: Sequence[Client], deadline: float) -> None:
         """Receives answers until all have arrived or the deadline has passed."""

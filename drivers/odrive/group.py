@@ -390,13 +390,14 @@ ATTEMPTS, TIMEOUT = 20, 0.1
 
 
 def read_axes(
-    rig: Rig, document: OdriveDocument, bus: can.BusABC, pump: Pump | None
+    rig: Rig, document: OdriveDocument, bus: can.BusABC, pump: Pump | None, *, partial: bool = False
 ) -> DriveSnapshot:
     """State, position and torque of every axis; see `drivers.factory.read_drives`."""
     layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
     nodes = [winch.node_id for winch in rig.winches]
     cyclic = CyclicBus(bus, commanding_ids(nodes), foreign_master_message, is_command)
     watch = OdriveMonitor(rig, document, layouts, largest_steps(rig, rig.cycle))
+    silence: HardwareMissing | None = None
     cyclic.forget_waiting()
     for _ in range(ATTEMPTS):
         watch.begin_cycle()
@@ -408,21 +409,26 @@ def read_axes(
         if watch.states_known and not any(watch.missing):
             break
     else:
-        silent = [n for n, gone in zip(nodes, watch.missing, strict=True) if gone]
-        raise HardwareMissing(
-            f"no {'position' if silent else 'heartbeat'} from drives"
-            f" {', '.join(map(str, silent or nodes))}",
+        mute = watch.missing if any(watch.missing) else watch.stateless
+        silence = HardwareMissing(
+            f"no {'position' if any(watch.missing) else 'heartbeat'} from drives"
+            f" {', '.join(str(n) for n, gone in zip(nodes, mute, strict=True) if gone)}",
             where="listening to the drives",
             why="a drive has no power, is not on the bus, or its message periods are longer"
             " than in the rig file",
             next_step="check power, wiring and the message periods",
         )
+        if not partial:
+            raise silence
+    heard = ~(np.array(watch.missing) | watch.stateless)
     per_mille = winding_signs(rig) * 1000.0 / [winch.rated_torque for winch in rig.winches]
     return DriveSnapshot(
-        positions=np.array(watch.positions, dtype=np.int64),
-        torques=np.rint(np.array(watch.torques) * per_mille).astype(np.int64),
-        status_words=np.array(watch.status_words, dtype=np.int64),
+        positions=np.array(watch.positions, dtype=np.int64)[heard],
+        torques=np.rint(np.array(watch.torques) * per_mille).astype(np.int64)[heard],
+        status_words=np.array(watch.status_words, dtype=np.int64)[heard],
         # Their settings are non-volatile, so a loss of power leaves no trace.
         restarted=tuple(winch.node_id for winch in rig.winches if not winch.absolute),
-        errors=("",) * rig.cable_count,
+        errors=("",) * int(heard.sum()),
+        silent=tuple(np.array(nodes)[~heard].tolist()),
+        silence=silence,
     )

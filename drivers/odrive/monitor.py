@@ -117,7 +117,12 @@ class OdriveMonitor:
     @property
     def states_known(self) -> bool:
         """Whether every drive has sent a heartbeat since `forget_heartbeats`, none overdue."""
-        return all(age <= self._most["heartbeat"] for age in self._ages["heartbeat"])
+        return not any(self.stateless)
+
+    @property
+    def stateless(self) -> list[bool]:
+        """True for drives whose heartbeat is overdue, so that their state is unknown."""
+        return [age > self._most["heartbeat"] for age in self._ages["heartbeat"]]
 
     def take(self, can_id: int, data: bytes | bytearray, *, stale: bool = False) -> None:
         """Processes one frame; drives send asynchronously, so the newest always counts."""

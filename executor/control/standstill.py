@@ -15,6 +15,7 @@ from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.factory import without_torque
 from executor.control.preconditions import require_capabilities
 from executor.control.sync_master import ReplyTimeout, SyncMaster, changed_states, late_fault
+from executor.interlock.fault_latch import LatchedFault
 from executor.interlock.interlock import MotionInterlock
 from executor.realtime.child import Armed, Ended, ReadyDrives
 from executor.realtime.process import RealTimeProcess
@@ -317,7 +318,11 @@ def is_braked(rig: Rig) -> bool:
 
 
 def release_drives(
-    rig: Rig, interlock: MotionInterlock, process: RealTimeProcess, on_armed: Callable[[str], None]
+    rig: Rig,
+    interlock: MotionInterlock,
+    process: RealTimeProcess,
+    on_armed: Callable[[str], None],
+    under: LatchedFault | None = None,
 ) -> CycleStatus:
     """Switches off the torque, and updates latch and reference.
 
@@ -326,6 +331,7 @@ def release_drives(
         interlock: Of that rig.
         process: For `Release`.
         on_armed: Called when armed, with what the system denied.
+        under: Latched fault that stays; see `MotionInterlock.begin`.
 
     Returns:
         The drives' last status, without torque.
@@ -338,7 +344,7 @@ def release_drives(
     armed = process.arm(Unrecorded())
     on_armed(armed.denied)
     interlock.found_released(armed.restarted, armed.released)
-    interlock.begin(record, interlock.still_counts(armed.positions))
+    interlock.begin(record, interlock.still_counts(armed.positions), under=under)
     ended = _CUT_SHORT
     try:
         ended = process.run()

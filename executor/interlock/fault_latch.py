@@ -83,6 +83,16 @@ class FaultLatch:
             cause = f"the latch file cannot be read: {why}"
             return LatchedFault(self._bus, _UNKNOWN, cause, _UNKNOWN, _UNKNOWN, 0)
 
+    def read_in_motion(self) -> tuple[LatchedFault | None, bool]:
+        """The latched fault, and whether it is that of an active motion, consistently."""
+        latched = self.read()
+        while True:
+            in_motion = self.held_by_another()
+            again = self.read()
+            if again == latched:
+                return latched, latched is not None and in_motion
+            latched = again
+
     def require_disengaged(self) -> None:
         """Requires the latch to be disengaged.
 
@@ -127,24 +137,36 @@ class FaultLatch:
         if shown is None:
             self.engage(rig, self.path.parent, "a reset did not finish")
         else:
-            self._hold()
+            self.hold_engaged(shown)
         try:
-            if shown is not None and self.read() != shown:
-                raise Refused(
-                    "the latched fault changed since it was shown",
-                    where=f"bus {self._bus}",
-                    why="another user reset this bus, or moved it",
-                    next_step="run `cdpr reset RIG` again; nothing was reset",
-                )
             yield
         except BaseException as error:
             if shown is None and isinstance(error, Refused | BadInput | StoppedByOperator):
                 self.disengage()
             elif shown is None and isinstance(error, CdprError):
                 self.settle(rig, State.LATCHED, error.what, self.path.parent)
-            self._release()
+            self.let_go()
             raise
         self.disengage()
+
+    def hold_engaged(self, shown: LatchedFault) -> None:
+        """Blocks runs and resets, with the latch engaged, until `let_go`.
+
+        Args:
+            shown: The fault that the operator confirmed.
+
+        Raises:
+            Refused: Another fault is latched now, or another program moves or resets the drives.
+        """
+        self._hold()
+        if self.read() != shown:
+            self.let_go()
+            raise Refused(
+                "the latched fault changed since it was shown",
+                where=f"bus {self._bus}",
+                why="another user reset this bus, or moved it",
+                next_step="run the command again; nothing was changed",
+            )
 
     def engage(self, rig: str, folder: Path, cause: str = _CUT_SHORT) -> None:
         """Engages the latch before a run; it stays if the run does not finish.
@@ -167,7 +189,7 @@ class FaultLatch:
             self.require_disengaged()  # no other program engages it from here on
             self._write(self._latched(rig, cause, folder))
         except BaseException:
-            self._release()
+            self.let_go()
             raise
 
     def settle(self, rig: str, state: State, cause: str, folder: Path) -> None:
@@ -176,7 +198,7 @@ class FaultLatch:
             self.disengage()
         else:
             self._write(self._latched(rig, cause, folder))
-            self._release()
+            self.let_go()
 
     def disengage(self) -> None:
         """Disengages the latch: drives may be moved again."""
@@ -185,7 +207,7 @@ class FaultLatch:
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise self._not_kept(error.strerror) from None
-        self._release()
+        self.let_go()
 
     def _hold(self) -> None:
         """Takes the lock until it is released or this program ends; waits for readers.
@@ -207,7 +229,8 @@ class FaultLatch:
             raise
         self._held = weakref.finalize(self, os.close, lock)
 
-    def _release(self) -> None:
+    def let_go(self) -> None:
+        """Ends the block of other programs; the latch stays as it is."""
         if self._held is not None:
             self._held()
             self._held = None

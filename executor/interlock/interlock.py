@@ -7,16 +7,16 @@ the rig file.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.can_bus import IN_PROCESS, BusSettings
-from executor.interlock.fault_latch import FaultLatch
+from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.reference import (
     AGAIN,
     RESTARTED,
     HomingReference,
     ReferenceFile,
+    ReferenceStatus,
     as_in_the_file,
     counting_hash,
     moved_since,
@@ -38,6 +38,7 @@ class MotionInterlock:
         self._is_kept = settings.interface != IN_PROCESS
         self._latch, self.file = FaultLatch(settings), ReferenceFile(settings)
         self._counted_from: HomingReference | None = None
+        self._under: LatchedFault | None = None  # the fault of an earlier motion, which stays
 
     def require_free(self) -> None:
         """Requires a bus without a latched fault or an active run.
@@ -189,7 +190,12 @@ class MotionInterlock:
             self.file.write(reference.model_copy(update=update))
 
     def begin(
-        self, record: Path, reference: HomingReference | None, *, rehome: bool = False
+        self,
+        record: Path,
+        reference: HomingReference | None,
+        *,
+        rehome: bool = False,
+        under: LatchedFault | None = None,
     ) -> None:
         """Engages the latch before a motion; it stays if the motion does not finish.
 
@@ -199,18 +205,23 @@ class MotionInterlock:
             record: Path of the motion's record.
             reference: The drives' valid reference; None if unknown.
             rehome: The drives will be homed again; the present reference is discarded.
+            under: Latched fault that a release does not need cleared: it stays, however it ends.
 
         Raises:
-            Refused: The bus is latched, the reference changed since it was read, or latch or
-                reference cannot be written.
+            Refused: The bus is latched, but not by `under`; the reference changed since it was
+                read; or latch or reference cannot be written.
         """
         if not self._is_kept:
             return
-        self._latch.engage(self._rig.name, record)
+        if under is None:
+            self._latch.engage(self._rig.name, record)
+        else:
+            self._latch.hold_engaged(under)
+        self._under = under
         try:
             self._counted_from = self._expect_to_hold(reference, rehome=rehome)
         except BaseException:
-            self._latch.disengage()
+            self._settle(State.STOPPED, "", record)  # nothing was enabled
             raise
 
     def _expect_to_hold(
@@ -287,10 +298,16 @@ class MotionInterlock:
             lost = release_reason or f"drives released cables under tension ({cause})"
             self._note_end(lost, holding, positions, released)
         except Refused as error:
-            self._latch.settle(self._rig.name, State.LATCHED, cause or error.what, record)
+            self._settle(State.LATCHED, cause or error.what, record)
             raise
         self._counted_from = None
-        self._latch.settle(self._rig.name, state, cause, record)
+        self._settle(state, cause, record)
+
+    def _settle(self, state: State, cause: str, record: Path) -> None:
+        if self._under is None:
+            self._latch.settle(self._rig.name, state, cause, record)
+        else:
+            self._latch.let_go()
 
     def _note_end(
         self,
@@ -380,43 +397,24 @@ class MotionInterlock:
 # Status of a bus's reference.
 
 
-@dataclass(frozen=True, slots=True)
-class ReferenceStatus:
-    """The homing reference of a bus.
-
-    Attributes:
-        counts: Whether it is valid.
-        why_not: Why it is not.
-        made: Time of homing; None if there is none.
-        how: How the pose was known.
-        file: Its path.
-    """
-
-    counts: bool
-    why_not: str | None
-    made: str | None
-    how: str | None
-    file: str | None
-
-    def __str__(self) -> str:
-        """Whether it is valid and how it was made, or why not."""
-        if not self.counts:
-            return f"not valid: {self.why_not}"
-        if not self.made:
-            return "none: absolute encoders match the rig file"
-        return f"valid, made {self.made} ({self.how})"
-
-
 def reference_status(
-    interlock: MotionInterlock, positions: Sequence[int] | None = None
+    interlock: MotionInterlock, positions: Sequence[int] | None = None, *, held: bool = False
 ) -> ReferenceStatus:
     """The reference of a bus.
 
     Args:
         interlock: Of the bus.
         positions: Of its drives, [counts]; None if not read.
+        held: All drives hold on their own, none without its configuration, so that a reset stores
+            their positions.
     """
     why = interlock.why_unreferenced(positions)
+    unrecorded = held and bool(why) and not interlock.why_unreferenced()
+    if unrecorded:
+        why = (
+            f"the end of the last motion was not recorded ({why}), but all drives held:"
+            " `cdpr reset RIG` stores their positions, and no homing is needed"
+        )
     try:
         kept = interlock.kept_reference()
     except Refused:  # reported in `why`
@@ -428,4 +426,5 @@ def reference_status(
         made=kept.made if kept and kept.made else None,
         how=kept.how if kept and kept.made else None,
         file=str(path) if path.exists() else None,
+        valid_after_reset=unrecorded,
     )

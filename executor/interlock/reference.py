@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Annotated, Literal
 
@@ -218,3 +219,46 @@ class ReferenceFile:
                 why=error.why if isinstance(error, CdprError) else error.strerror or str(error),
                 next_step="make the folder writable for the rig's operators, then run `cdpr home`",
             ) from None
+
+
+# Status of a reference, for operators and scripts.
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceStatus:
+    """The homing reference of a bus.
+
+    Attributes:
+        counts: Whether it is valid.
+        why_not: Why it is not.
+        made: Time of homing; None if there is none.
+        how: How the pose was known.
+        file: Its path.
+        known: False where drives that decide about it could not be read.
+        valid_after_reset: `cdpr reset` makes it valid, as all drives held: it stores their
+            positions.
+    """
+
+    counts: bool
+    why_not: str | None
+    made: str | None
+    how: str | None
+    file: str | None
+    known: bool = True
+    valid_after_reset: bool = False
+
+    def if_unread(self, why: str) -> ReferenceStatus:
+        """The same, where not all drives could be read: unknown, unless lost by its file."""
+        return replace(self, counts=False, why_not=why, known=False) if self.counts else self
+
+    def __str__(self) -> str:
+        """Whether it is valid and how it was made, or why not."""
+        if not self.known:
+            return f"unknown: {self.why_not}"
+        if self.valid_after_reset:
+            return f"not valid before a reset: {self.why_not}"
+        if not self.counts:
+            return f"not valid: {self.why_not}"
+        if not self.made:
+            return "none: absolute encoders match the rig file"
+        return f"valid, made {self.made} ({self.how})"

@@ -118,7 +118,7 @@ def judge(
         *(Check("record", False, f"{trouble}.") for trouble in troubles),
     ]
     failures = [check for check in measured if not check.passed]
-    at = f"after {_motion_time(cycles):.1f} s and {_travelled(cycles):.0f} mm"
+    at = f"after {_motion_time(cycles):.1f} s and {_travelled(cycles)} mm"
     if final_state == "finished":
         end = Check("finished", True, f"The platform reached the goal {at}.")
         if failures:
@@ -178,8 +178,10 @@ def _motion_time(cycles: CycleTable) -> float:
     return float(cycles.time[in_motion[-1]]) if in_motion.size else 0.0
 
 
-def _travelled(cycles: CycleTable) -> float:
-    return float(cycles.travelled[-1]) * 1e3 if len(cycles) else 0.0
+def _travelled(cycles: CycleTable) -> str:
+    """Length of the path covered, in mm: two decimals of a short jog, else none."""
+    distance = float(cycles.travelled[-1]) * 1e3 if len(cycles) else 0.0
+    return f"{distance:.0f}" if distance >= 10.0 else f"{round(distance, 2):g}"
 
 
 def following(cycles: CycleTable, limit: float) -> Check:

@@ -164,13 +164,6 @@ class WinchDocument(Document):
         default=None, description="E·A of its cable; left out, cables.stiffness_n"
     )
 
-    @field_validator("direction", mode="before")
-    @classmethod
-    def _no_truth_value(cls, direction: object) -> object:
-        if isinstance(direction, bool):  # which equals 1 in Python
-            raise ValueError(f"must be -1 or 1; it is {str(direction).lower()}")
-        return direction
-
 
 class MotionDocument(Document):
     """Limits of motion along a plan."""
@@ -444,14 +437,11 @@ def _point_or_line(points: Sequence[Sequence[float]]) -> str:
 
 
 def _repeated(
-    kind: str,
-    values: Sequence[tuple[tuple[str | int, ...], int]]
-    | Sequence[tuple[tuple[str | int, ...], str]],
+    kind: str, values: Sequence[tuple[tuple[str | int, ...], int | str]]
 ) -> list[Finding]:
-    seen: set[int | str] = set()
-    found: list[Finding] = []
-    for key, value in values:
-        if value in seen:
-            found.append((key, f"{kind} {value!r} appears twice"))
-        seen.add(value)
-    return found
+    plain = [value for _, value in values]
+    return [
+        (key, f"{kind} {value!r} appears twice")
+        for k, (key, value) in enumerate(values)
+        if value in plain[:k]
+    ]

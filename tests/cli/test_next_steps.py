@@ -17,13 +17,14 @@ from calibration.results import write_result
 from cdpr.cli.operate.run import show
 from cdpr.cli.output import progress_bar
 from executor import service
-from executor.interlock.interlock import ReferenceStatus
+from executor.drives import DriveStatus
 from executor.interlock.locks import SetUpLock
+from executor.interlock.reference import ReferenceStatus
 from executor.recording.verdict import page_text
 from executor.remote.client import request_run as request
 from executor.remote.command_server import commands_from_start
 from executor.run_result import RunResult
-from executor.service import DriveStatus, StatusResult
+from executor.service import StatusResult
 from executor.supervision import Supervisor
 from model.errors import Fault
 from model.rig import load_rig

@@ -24,10 +24,11 @@ from cdpr.console.view import (
     nearest_data,
 )
 from cdpr.console.watch import USED_FOR, RobotWatch
-from executor.interlock.interlock import ReferenceStatus
+from executor.drives import DriveStatus
+from executor.interlock.reference import ReferenceStatus
 from executor.recording.run_folder import RunFolder
 from executor.remote import status
-from executor.service import DriveStatus, StatusResult
+from executor.service import StatusResult
 from model.clearance import ClearanceModel
 from model.errors import HardwareMissing, Refused
 from model.kinematics import cable_lengths

@@ -609,6 +609,23 @@ def test_reading_alone_sends_nothing(bench: OdriveBench) -> None:
     assert reported == {HEARTBEAT, ENCODER_ESTIMATES, TORQUES}
 
 
+@pytest.mark.parametrize(
+    ("kinds", "missing"), [({"heartbeat"}, "heartbeat"), ({"heartbeat", "estimates"}, "position")]
+)
+def test_those_that_answer_are_read_beside_a_silent_one(
+    bench: OdriveBench, kinds: set[str], missing: str
+) -> None:
+    bench.drives[4].silent |= kinds
+    with pytest.raises(HardwareMissing, match=f"no {missing} from drives 5"):
+        read_drives(bench.rig, bench.group._bus, bench.rehearsal.pump)
+    seen = read_drives(bench.rig, bench.group._bus, bench.rehearsal.pump, partial=True)
+    there = [drive for k, drive in enumerate(bench.drives) if k != 4]
+    assert seen.positions.tolist() == [round(drive.motor.position) for drive in there]
+    assert seen.silent == (5,)
+    assert len(seen.torques) == len(seen.status_words) == len(seen.errors) == 7
+    assert f"no {missing} from drives 5" in str(seen.silence)
+
+
 def test_released_drives_are_disarmed_and_their_brakes_hold(bench: OdriveBench) -> None:
     bench.enable()
     bench.group.command(GroupCommand.RELEASE)

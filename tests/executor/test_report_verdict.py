@@ -56,6 +56,25 @@ def test_a_good_run_passes_and_says_by_how_much(run: fake_run.FakeRun) -> None:
     assert all(any(sign.isdigit() for sign in reason) for reason in made["reasons"])
 
 
+@pytest.mark.parametrize(
+    ("travelled_mm", "said"),
+    [
+        (0.0, "0 mm"),
+        (0.3, "0.3 mm"),
+        (0.5, "0.5 mm"),
+        (0.04, "0.04 mm"),
+        (9.876, "9.88 mm"),
+        (57.6, "58 mm"),
+    ],
+)
+def test_a_short_jog_is_not_rounded_to_whole_millimetres(
+    run: fake_run.FakeRun, travelled_mm: float, said: str
+) -> None:
+    travelled = np.linspace(0.0, travelled_mm / 1e3, len(run.cycles))
+    made = replace(run, cycles=replace(run.cycles, travelled=travelled)).summary
+    assert any(f"s and {said}." in reason for reason in made["reasons"])
+
+
 def test_the_figures_are_those_of_the_tables(run: fake_run.FakeRun) -> None:
     made, cycles, poses = run.summary, run.cycles, run.poses
     off = np.linalg.norm(cycles.encoder - cycles.planned, axis=1) * 1e3

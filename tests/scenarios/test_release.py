@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from cdpr.cli.options import rig_on_bus
 from drivers.can_bus import BusSettings
-from drivers.cia402.state_machine import DriveState
+from drivers.cia402.state_machine import TORQUE_ON, DriveState
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import as_in_the_file
@@ -121,6 +122,105 @@ def _within_limits(drive: SimulatedDrive) -> bool:
 
 def _on(channel: str, file: Path) -> Rig:
     return rig_on_bus(file, "udp_multicast", channel)
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+@pytest.mark.parametrize("braked", [True, False])
+@pytest.mark.parametrize("latched", [True, False])
+@pytest.mark.parametrize("holding", [True, False])
+def test_the_next_steps_after_a_drive_in_fault_lead_out_of_it(
+    slow_run: PreparedRun,
+    slow_rig: Path,
+    tmp_path: Path,
+    braked: bool,
+    latched: bool,
+    holding: bool,
+) -> None:
+    """Release and reset referred to each other, and neither could be done."""
+    case = braked * 4 + latched * 2 + holding
+    channel = f"239.74.163.37:{20000 + (os.getpid() * 29 + case) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    rig = tmp_path / "rig.yaml"
+    brake = "encoder: absolute, brake: true" if braked else "encoder: absolute"
+    rig.write_text(slow_rig.read_text().replace("encoder: absolute", brake))
+    latch = FaultLatch(BusSettings("udp_multicast", channel))
+    if latched:
+        latch.engage("gachon_8_6", tmp_path, "cable 4 (drive 4): DC link under-voltage")
+        latch.let_go()
+    fault = latch.read()
+    with drives_on(channel, slow_run) as rehearsal:
+        if holding:
+            hold(rehearsal.drives)
+        rehearsal.drives[3].state = DriveState.FAULT
+        done: list[str] = []
+        wants = ["status"] if latched or holding else ["reset"]
+        while wants:
+            step = wants.pop(0)
+            done.append(step)
+            assert len(done) < 8, f"the next steps do not end: {done}"
+            if step == "emergency stop":
+                for drive in rehearsal.drives:
+                    drive.state = DriveState.SWITCH_ON_DISABLED
+                continue
+            arguments = {"release": ("--yes", "--without-real-time"), "reset": ("--yes",)}
+            answer = call(step, rig, *bus, *arguments.get(step, ()))
+            said = answer.said if step == "status" or answer.code else ""
+            wants = steps_in(said) if said else wants
+            if step == "release" and answer.code == 0:
+                assert {drive.state for drive in rehearsal.drives} == {
+                    DriveState.FAULT,
+                    DriveState.READY_TO_SWITCH_ON,
+                }
+                assert latch.read() == fault, "a latched fault stays latched"
+        assert done[-1] == "reset"
+        assert ("release" in done) == (braked and holding)
+        assert ("emergency stop" in done) == (holding and not braked)
+        assert len(done) == len({*done}), "each step was done once"
+        assert not {drive.state for drive in rehearsal.drives} & {*TORQUE_ON, DriveState.FAULT}
+    latch.require_disengaged()
+
+
+def steps_in(text: str) -> list[str]:
+    """What the next step of an output asks for; of two alternatives the first."""
+    step = re.split(r"\bnext:? ", text)[-1]
+    found = re.findall(r"cdpr (release|reset)|(?<!or press the )(emergency stop)", step)
+    return [verb or stop for verb, stop in found]
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+@pytest.mark.parametrize("first", ["reset", "release"])
+@pytest.mark.parametrize("braked", [True, False])
+def test_no_refusal_after_a_drive_in_fault_refers_back(
+    slow_run: PreparedRun, slow_rig: Path, tmp_path: Path, first: str, braked: bool
+) -> None:
+    """Whichever command an operator tries first: reset names release or the emergency stop."""
+    channel = f"239.74.163.38:{20000 + (os.getpid() * 29 + braked) % 20000}"
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    rig = tmp_path / "rig.yaml"
+    brake = "encoder: absolute, brake: true" if braked else "encoder: absolute"
+    rig.write_text(slow_rig.read_text().replace("encoder: absolute", brake))
+    FaultLatch(BusSettings("udp_multicast", channel)).engage("gachon_8_6", tmp_path)
+    with drives_on(channel, slow_run) as rehearsal:
+        hold(rehearsal.drives)
+        rehearsal.drives[3].state = DriveState.FAULT
+        options = ("--without-real-time",) if first == "release" else ()
+        answer = call(first, rig, *bus, *options, answers="n\n")
+        if first == "release" and braked:
+            assert answer.code == 130
+            assert "cable 4 (drive 4): not enabled" in answer.said
+        elif first == "release":
+            assert answer.code == 3
+            assert steps_in(answer.said) == ["emergency stop", "reset"]
+        else:
+            answer = call(first, rig, *bus, "--yes")
+            assert answer.code == 3
+            out = "release" if braked else "emergency stop"
+            assert steps_in(answer.said) == [out, "reset"]
+        assert rehearsal.drives[3].state is DriveState.FAULT
+        others = {drive.state for k, drive in enumerate(rehearsal.drives) if k != 3}
+        assert others == {DriveState.QUICK_STOP_ACTIVE}
 
 
 @pytest.mark.slow

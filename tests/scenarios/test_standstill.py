@@ -19,7 +19,7 @@ from executor.realtime.scheduling import SimulatedClock
 from executor.state_machine import CycleRecord, State
 from executor.supervision import OperatorRequests
 from model.errors import CdprError, Refused, StoppedByOperator
-from model.rig import load_rig
+from model.rig import Rig, load_rig, rig_from_document
 from simulation.drives.cia402 import SimulatedDrive
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.ground_truth import PowerLoss
@@ -56,9 +56,21 @@ class Held:
         return {drive.state for drive in self.drives}
 
 
+def _braked() -> Rig:
+    document = load_rig(RIG).document
+    winches = [winch.model_copy(update={"brake": True}) for winch in document.winches]
+    return rig_from_document(document.model_copy(update={"winches": winches}))
+
+
 @contextmanager
-def held(*, set_up_where_they_are: bool = True) -> Iterator[Held]:
-    rig, settings = load_rig(RIG), BusSettings("virtual", f"standstill-{next(_CHANNELS)}")
+def held(
+    *,
+    set_up_where_they_are: bool = True,
+    braked: bool = False,
+    in_fault: tuple[int, DriveState] | None = None,
+) -> Iterator[Held]:
+    rig = _braked() if braked else load_rig(RIG)
+    settings = BusSettings("virtual", f"standstill-{next(_CHANNELS)}")
     with open_bus(settings) as near, open_bus(settings) as far:
         rehearsal = SimulatedCia402Rig(rig, far, rig.home)
         loss = PowerLoss.drawn(rig, 3, 0.0, on_a_stand=True)
@@ -66,6 +78,9 @@ def held(*, set_up_where_they_are: bool = True) -> Iterator[Held]:
         for drive in rehearsal.drives:
             drive.objects[0x605A, 0] = 6  # else it lets go at the end of its ramp
             drive.state = HOLDING
+        if in_fault is not None:
+            rehearsal.drives[in_fault[0]].state = in_fault[1]
+            rehearsal.drives[in_fault[0]]._move = lambda _elapsed: None  # type: ignore[method-assign]
         if set_up_where_they_are:
             seen: DriveSnapshot = read_drives(rig, near, rehearsal.pump)
             rig = set_up_here(rig, seen)[0]
@@ -107,6 +122,71 @@ def test_nobody_is_watched_any_more_when_the_program_leaves(kind: type[Standstil
             assert drive.objects[0x1006, 0] == 0
             assert drive.objects[0x1400, 5] == 0
             assert drive.objects[0x1016, 1] == 0
+
+
+@pytest.mark.parametrize("faulted", range(8))
+def test_drives_that_hold_are_released_together_beside_one_in_fault_behind_its_brake(
+    faulted: int,
+) -> None:
+    words: list[int] = []
+    with held(braked=True, in_fault=(faulted, DriveState.FAULT)) as bench:
+        stood = [drive.motor.position for drive in bench.drives]
+        takes = bench.drives[faulted]._take_control_word
+
+        def take(word: int) -> None:
+            words.append(word)
+            takes(word)
+
+        bench.drives[faulted]._take_control_word = take  # type: ignore[method-assign]
+        together: list[int] = []
+
+        def count(_cycle: int) -> bool:
+            together.append([drive.state for drive in bench.drives].count(FOLLOWING))
+            return False
+
+        bench.do(Release, count)
+        assert bench.ended is State.FINISHED
+        assert bench.drives[faulted].state is DriveState.FAULT
+        others = {drive.state for k, drive in enumerate(bench.drives) if k != faulted}
+        assert others == {DriveState.READY_TO_SWITCH_ON}
+        assert set(together) <= {0, 7}
+        assert all(word & 0x02 and not word & 0x80 and word != 0x0F for word in words)
+        assert [drive.motor.position for drive in bench.drives] == pytest.approx(stood, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("braked", "state"),
+    [(False, DriveState.FAULT), (True, DriveState.FAULT_REACTION_ACTIVE)],
+)
+def test_without_brakes_or_with_a_drive_still_in_its_fault_reaction_none_is_enabled(
+    braked: bool, state: DriveState
+) -> None:
+    with held(braked=braked, in_fault=(4, state)) as bench:
+        with pytest.raises(Refused, match="a fault is latched"):
+            bench.do(Release)
+        assert FOLLOWING not in bench.states
+
+
+@pytest.mark.parametrize("state", [DriveState.FAULT, HOLDING])
+def test_a_second_drive_that_fails_during_such_a_release_stops_the_others(
+    state: DriveState,
+) -> None:
+    seen: list[int] = []
+
+    def fails(cycle: int) -> bool:
+        if FOLLOWING in bench.states:
+            seen.append(cycle)
+        if len(seen) == 2:
+            bench.drives[2].state = state
+            seen.append(cycle)
+        return False
+
+    with held(braked=True, in_fault=(6, DriveState.FAULT)) as bench:
+        error = error_of(bench.do(Release, fails))
+        assert "cable 3 (drive 3)" in error.what
+        assert bench.ended is State.LATCHED
+        assert FOLLOWING not in bench.states
+        assert bench.drives[6].state is DriveState.FAULT
 
 
 def test_drives_beyond_their_limits_are_not_enabled() -> None:
