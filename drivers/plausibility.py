@@ -95,7 +95,9 @@ class ReplyCheck:
         count = len(names)
         self.rejected = 0
         self._names, self._max_steps = tuple(names.items()), tuple(max_steps)
+        # Before this cycle and in it: replies of one cycle must not add up to a jump.
         self._positions: list[int | None] = [None] * count
+        self._newest: list[int | None] = [None] * count
         self._age = [1] * count
         self._replies = [0] * count
         self._reasons: list[str] = [""] * count
@@ -105,6 +107,7 @@ class ReplyCheck:
     def forget_positions(self) -> None:
         """Accepts any next position of each drive."""
         self._positions = [None] * len(self._names)
+        self._newest = [None] * len(self._names)
 
     def begin_cycle(self) -> None:
         """Starts a cycle; counts drives that answered the last SYNC more than once."""
@@ -120,17 +123,18 @@ class ReplyCheck:
         self._replies[drive] += 1
 
     def accept(self, drive: int, position: int) -> bool:
-        """Whether a position [counts] is plausible; it then becomes the drive's."""
-        last = self._positions[drive]
-        if last is not None:
-            step, allowed = abs(position - last), self._max_steps[drive] * self._age[drive]
-            if step > allowed:
-                text = f"its position jumped by {step} counts, the limit is {allowed:.0f}"
-                self.reject(drive, text)
-                return False
+        """Whether a position [counts] is plausible; drives may report several in a cycle."""
+        before = self._positions[drive]
+        if before is None:
+            before, self._age[drive] = position, 1
+            self._positions[drive] = position
+        step, allowed = abs(position - before), self._max_steps[drive] * self._age[drive]
+        if step > allowed:
+            text = f"its position jumped by {step} counts, the limit is {allowed:.0f}"
+            self.reject(drive, text)
+            return False
         self._reasons[drive] = ""
-        self._positions[drive] = position
-        self._age[drive] = 0
+        self._newest[drive] = position
         return True
 
     def reject(self, drive: int, reason: str) -> None:
@@ -140,7 +144,12 @@ class ReplyCheck:
 
     def end_cycle(self) -> None:
         """Ends a cycle; counts consecutive cycles without a plausible reply."""
-        self._age = [age + 1 for age in self._age]
+        for drive, newest in enumerate(self._newest):
+            if newest is None:
+                self._age[drive] += 1
+            else:
+                self._positions[drive], self._age[drive] = newest, 1
+        self._newest = [None] * len(self._names)
         self._bad_cycles = [
             bad + 1 if reason else 0
             for bad, reason in zip(self._bad_cycles, self._reasons, strict=True)

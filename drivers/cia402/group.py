@@ -178,13 +178,11 @@ class Cia402Group(CyclicGroup):
             time_left = FIRST_READING_TIMEOUT if pace is None else pace()
             self.send_cycle(self._watch.positions)
             status = self.receive(time_left)
-            if status.missing.any():
-                self._watch.forget_positions()
-                agreed = 0
-                continue
-            agreed += 1
+            agreed = 0 if status.missing.any() else agreed + 1
             if agreed == FIRST_READINGS:
                 return status
+            if not agreed:
+                self._watch.forget_positions()
         names = ", ".join(str(self._nodes[drive]) for drive in np.flatnonzero(status.missing))
         raise HardwareMissing(
             f"no position from drive{'s' if ',' in names else ''} {names}",
@@ -295,15 +293,17 @@ class Cia402Group(CyclicGroup):
         columns = zip(self._watch.states, words, self._stop_commanded, strict=True)
         self._stop_commanded = [s is held and (w is stop or was) for s, w, was in columns]
         self._watch.begin_cycle()
+        stops: Sequence[can.Message] = ()
+        may_follow = False
         try:
             self._cyclic.send(self._frames.set_points(words, self._targets))
-            if not may_send(ControlWord.ENABLE_OPERATION in words):
-                # The drives act on the set-points at SYNC: the last word counts.
-                self._stop()
-                self._words = (ControlWord.QUICK_STOP,) * len(words)
-                self._cyclic.send(self._frames.set_points(self._words, self._targets))
+            may_follow = may_send(ControlWord.ENABLE_OPERATION in words)
         finally:  # a frame that failed must not keep a stop from the other drives
-            self._cyclic.send((self._frames.sync,))
+            if not may_follow:  # the drives act on the set-points at SYNC: the last word counts
+                self._stop()
+                self._words = (stop,) * len(words)
+                stops = self._frames.set_points(self._words, self._targets)
+            self._cyclic.send((*stops, self._frames.sync))
 
     def _look_for_faults(self) -> None:
         powered = self._goal in (Goal.ENABLE, Goal.RELEASE)
@@ -383,10 +383,9 @@ class Cia402Group(CyclicGroup):
 
     def _status(self) -> CycleStatus:
         watch = self._watch
-        positions = np.array(watch.positions, dtype=np.int64)
-        demands = np.array(self._demands, dtype=np.int64)
+        read = watch.positions, self._demands, watch.status_words
+        positions, demands, words = (np.array(values, dtype=np.int64) for values in read)
         torques = np.array(watch.torques, dtype=np.int64) * self._signs
-        words = np.array(watch.status_words, dtype=np.int64)
         missing = ~np.array(watch.answered)
         for array in (positions, demands, torques, words, missing):
             array.setflags(write=False)

@@ -7,6 +7,7 @@ further request is sent before the answer; images due meanwhile count as dropped
 from __future__ import annotations
 
 import multiprocessing
+import signal
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -192,7 +193,7 @@ class CameraProcess:
         self._process = context.Process(
             target=_serve, args=(make_worker, far_end), name=f"cdpr-camera-{name}", daemon=True
         )
-        with interrupts_blocked():
+        with interrupts_blocked(signal.SIGTERM):  # a stopped service sends it to all its processes
             self._process.start()
         far_end.close()
 
@@ -257,16 +258,13 @@ class CameraProcess:
         return sample
 
     def close(self) -> None:
-        """Ends the process, if necessary by a signal; further calls have no effect."""
+        """Ends the process, if necessary by SIGKILL; further calls have no effect."""
         if self._closed:
             return
         self._closed = True
         self._link.close()
         self._process.join(END_TIMEOUT)
-        if self._process.is_alive():
-            self._process.terminate()
-            self._process.join(END_TIMEOUT)
-        if self._process.is_alive():  # a suspended process ends only by SIGKILL
+        if self._process.is_alive():  # suspended, or waiting for its camera
             self._process.kill()
             self._process.join()
         self._process.close()

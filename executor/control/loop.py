@@ -21,7 +21,7 @@ from executor.control.sync_master import SyncMaster, changed_states
 from executor.safety.fault_messages import Alarm, StopReaction, shared_causes
 from executor.safety.gate import Purpose
 from executor.state_machine import ON_PATH, CycleRecord, Event, LoopEvent, Machine, State
-from executor.supervision import OperatorRequests, in_one_line, record_failure
+from executor.supervision import OperatorRequests, StopReason, in_one_line, record_failure
 from executor.trajectory.setpoints import CheckedSetpoints
 from executor.trajectory.time_scaling import smooth_step
 from model.errors import CdprError, Refused
@@ -324,12 +324,9 @@ class Loop:
             return False
         on_hold = self.machine.state is State.HOLDING and self._feed.at_rest
         what_follows = "at rest on hold" if on_hold else f"slowing down {self.motion_phrase}"
-        if requests.for_what is not None:
-            text = f"{requests.for_what.text}; {what_follows}"
-            self._report_cause(requests.for_what.code, text)
-        else:
-            self._requested = f"stop requested; {what_follows}"
-            self._report_cause("stop", self._requested)
+        why = requests.for_what or StopReason("stop", "stop requested")
+        self._requested = f"{why.text}; {what_follows}"
+        self._report_cause(why.code, self._requested)
         self._feed.stop()
         self.machine.on(Event.STOP)
         return True
@@ -425,7 +422,7 @@ class Loop:
         self._report(code, text)
 
     def _note_cause(self, text: str) -> None:
-        """Keeps the first cause, except that a fault outweighs the operator's stop before it."""
+        """Keeps the first cause, except that a fault outweighs a requested stop before it."""
         if self.cause in ("", self._requested):
             self.cause = text
 

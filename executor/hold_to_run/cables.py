@@ -89,7 +89,7 @@ class CableLoop(Loop):
         limits: CableLimits,
         master: SyncMaster,
         *,
-        held: Callable[[float], PressState],
+        held: Callable[[], PressState],
         requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
         on_event: Callable[[LoopEvent], None],
@@ -101,7 +101,7 @@ class CableLoop(Loop):
             begin: Positions of the drives, [counts].
             limits: Of each press.
             master: See `Loop`.
-            held: Returns the press held at a time of the clock [s]; called every cycle.
+            held: Returns the press held now; called every cycle.
             requests: See `Loop`; only a stop counts.
             on_cycle: See `Loop`.
             on_event: See `Loop`.
@@ -123,7 +123,7 @@ class CableLoop(Loop):
         if self._status is None:  # no tension is known yet
             self._status = self._send(Purpose.HOLD, self._sender.resting_targets)
             return
-        held = self._held_now(self._clock.now)
+        held = self._held_now()
         self._steer(held)
         if self._feed.at_rest and (self.machine.state is State.STOPPING or held.ends):
             self.machine.on(Event.AT_REST)
@@ -233,7 +233,7 @@ class CableMotion:
             master.read_positions().positions.tolist(),
             CableLimits(self.limit, self.speed, self.longest, positions),
             master,
-            held=PressReader(self.presses).read,
+            held=PressReader(self.presses, lambda: master.clock.now).read,
             requests=requests,
             on_cycle=on_cycle,
             on_event=on_event,

@@ -46,7 +46,7 @@ class JogLoop(Loop):
         here: CheckedSetpoints,
         master: SyncMaster,
         *,
-        held: Callable[[float], PressState],
+        held: Callable[[], PressState],
         pieces: Callable[[], Iterable[Piece]],
         requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
@@ -57,7 +57,7 @@ class JogLoop(Loop):
         Args:
             here: One row: the positions at rest.
             master: See `Loop`.
-            held: Returns the press held at a time of the clock [s]; called every cycle.
+            held: Returns the press held now; called every cycle.
             pieces: Returns pieces that arrived since the last call; called every cycle.
             requests: See `Loop`; only a stop counts.
             on_cycle: See `Loop`.
@@ -71,7 +71,7 @@ class JogLoop(Loop):
 
     def _follow(self) -> None:
         """One cycle on the line, or at rest."""
-        held = self._held_now(self._clock.now)
+        held = self._held_now()
         for piece in self._pieces():
             if piece.press == held.press:
                 self._take(piece, held.share)
@@ -179,7 +179,7 @@ class JogMotion:
         return JogLoop(
             here,
             master,
-            held=PressReader(self.presses).read,
+            held=PressReader(self.presses, lambda: master.clock.now).read,
             pieces=PieceRing(self.pieces, self.cables).take,
             requests=requests,
             on_cycle=on_cycle,

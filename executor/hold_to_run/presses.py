@@ -262,14 +262,15 @@ class PressBoard:
 class PressReader:
     """The loop's side of a `PressBoard`."""
 
-    def __init__(self, memory: SharedMemory) -> None:
-        """Reads the entries of a `PressBoard`."""
-        self._memory, self._rule = memory, PressRule()
+    def __init__(self, memory: SharedMemory, now: Callable[[], float]) -> None:
+        """Reads the entries of a `PressBoard`, at the times of the loop's clock [s]."""
+        self._memory, self._now, self._rule = memory, now, PressRule()
         self._entry = _ENTRY.pack(0, math.nan, 100, False, 0, False, math.nan)
 
-    def read(self, now: float) -> PressState:
-        """State at a time of the loop's clock [s]; a half-written entry is ignored."""
+    def read(self) -> PressState:
+        """Present state; a half-written entry is ignored."""
         content = bytes(self._memory.view[:_SIZE])
+        now = self._now()  # after the entry: a report must not be later than this
         entry, check = content[: _ENTRY.size], content[_ENTRY.size :]
         if check == _CHECK.pack(zlib.crc32(entry)):
             self._entry = entry

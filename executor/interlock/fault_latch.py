@@ -24,7 +24,7 @@ from pathlib import Path
 from drivers.can_bus import BusSettings
 from executor.interlock.locks import locked_within, open_lock, read_state_file, state_files
 from executor.state_machine import State
-from model.errors import CdprError, Refused
+from model.errors import BadInput, CdprError, Refused, StoppedByOperator
 from model.files.documents import write_atomic
 
 #: Readers of the lock release it within this time, [s].
@@ -117,7 +117,7 @@ class FaultLatch:
     def held_for_reset(self, rig: str, shown: LatchedFault | None) -> Iterator[None]:
         """Blocks runs while the block resets the drives, then disengages the latch.
 
-        If the block fails, the latch stays as it was.
+        If the block is refused, the latch stays as it was; if it fails, the latch is engaged.
 
         Args:
             rig: Name of the rig.
@@ -140,9 +140,11 @@ class FaultLatch:
             self.hold_engaged(shown)
         try:
             yield
-        except BaseException:
-            if shown is None:
+        except BaseException as error:
+            if shown is None and isinstance(error, Refused | BadInput | StoppedByOperator):
                 self.disengage()
+            elif shown is None and isinstance(error, CdprError):
+                self.settle(rig, State.LATCHED, error.what, self.path.parent)
             self.let_go()
             raise
         self.disengage()

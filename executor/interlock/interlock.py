@@ -101,11 +101,11 @@ class MotionInterlock:
             Refused: One of both does not hold.
         """
         self.require_free()
-        reference = self.kept_reference()
-        if reference is not None and reference.lost:
+        reference = self._in_force()
+        if reference is None:
+            return None
+        if reference.lost:
             raise self._lost_refusal(reference)
-        if reference is None or not reference.made:
-            return self._never_homed(reference)
         if reference.home_counts != [winch.home_counts for winch in self._rig.winches]:
             what = "the run was prepared with a different homing reference"
             raise self._refusal(what, f"the drives were homed {reference.made}")
@@ -114,9 +114,7 @@ class MotionInterlock:
     def still_counts(self, positions: Sequence[int]) -> HomingReference | None:
         """The reference, if it is valid for drives at these positions [counts]; else None."""
         try:
-            reference = self.kept_reference()
-            if reference is None or not (reference.made or reference.lost):
-                reference = self._never_homed(reference)
+            reference = self._in_force()
         except Refused:
             return None
         if reference is None or reference.lost or len(reference.stands_at) != len(positions):
@@ -210,8 +208,8 @@ class MotionInterlock:
             under: Latched fault that a release does not need cleared: it stays, however it ends.
 
         Raises:
-            Refused: The bus is latched, but not by `under`; or latch or reference cannot be
-                written.
+            Refused: The bus is latched, but not by `under`; the reference changed since it was
+                read; or latch or reference cannot be written.
         """
         if not self._is_kept:
             return
@@ -220,16 +218,37 @@ class MotionInterlock:
         else:
             self._latch.hold_engaged(under)
         self._under = under
-        self._counted_from = None if rehome else reference
         try:
-            if rehome:
-                if reference is None or reference.made:
-                    self._lose("homing did not finish")
-            elif reference is not None and reference.released:
-                self.file.write(reference.model_copy(update={"released": []}))
+            self._counted_from = self._expect_to_hold(reference, rehome=rehome)
         except BaseException:
             self._settle(State.STOPPED, "", record)  # nothing was enabled
             raise
+
+    def _expect_to_hold(
+        self, reference: HomingReference | None, *, rehome: bool
+    ) -> HomingReference | None:
+        """Notes that no drive is released; returns the reference that this motion counts from.
+
+        The file is read again, as only from now on no other program writes to it: the set-up of
+        the drives may have found some restarted, and another program may have homed them.
+        """
+        if rehome and (reference is None or reference.made):
+            self._lose("homing did not finish")
+            return None
+        now = self._readable() if reference is None else self._in_force()
+        if reference is not None and now is not None:
+            if now.lost:
+                raise self._lost_refusal(now)
+            if (now.made, now.home_counts) != (reference.made, reference.home_counts):
+                raise Refused(
+                    "the homing reference changed while this motion was prepared",
+                    where=f"reference {self.file.path}",
+                    why=f"another program homed the drives or discarded their reference: {now.how}",
+                    next_step="prepare the motion again: repeat the command; nothing was moved",
+                )
+        if now is not None and now.released and not now.lost:
+            self.file.write(now.model_copy(update={"released": []}))
+        return None if rehome or reference is None else now
 
     def take(self, reference: HomingReference) -> None:
         """Stores a new reference, made between `begin` and `end`.
@@ -305,15 +324,17 @@ class MotionInterlock:
             update = {"stands_at": list(positions), "released": list(released)}
             self.file.write(self._counted_from.model_copy(update=update))
 
-    def _never_homed(self, kept: HomingReference | None) -> HomingReference | None:
-        """The reference of absolute encoders as in the rig file; None on a virtual bus.
+    def _in_force(self) -> HomingReference | None:
+        """The reference on file, valid or lost; None on a virtual bus.
 
-        Args:
-            kept: The one on file, which may be of another rig file; None without a file.
+        Absolute encoders never homed have the one of their rig file.
 
         Raises:
-            Refused: Not all encoders are absolute.
+            Refused: It cannot be read, or drives without absolute encoders were never homed.
         """
+        kept = self.kept_reference()
+        if kept is not None and (kept.made or kept.lost):
+            return kept
         self._require_absolute()
         if not self._is_kept:
             return None

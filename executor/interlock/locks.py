@@ -37,12 +37,14 @@ _KINDS = {
 def state_folders() -> tuple[Path, ...]:
     """The state folder, which may not exist yet; then the user's own, where it was before.
 
+    Source: XDG Base Directory Specification, which has relative paths ignored.
+
     Raises:
         Refused: The user has no home folder, such as one without a name in a container.
     """
-    base = os.environ.get("XDG_STATE_HOME")
+    base = os.environ.get("XDG_STATE_HOME", "")
     try:
-        own = (Path(base) if base else Path.home() / ".local" / "state") / "cdpr"
+        own = (Path(base) if os.path.isabs(base) else Path.home() / ".local" / "state") / "cdpr"
     except RuntimeError as error:
         raise Refused(
             "there is no folder for latched faults and homing references",

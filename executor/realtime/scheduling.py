@@ -348,14 +348,18 @@ def take_short_turns() -> None:
 
 
 @contextmanager
-def interrupts_blocked() -> Iterator[None]:
-    """Blocks Ctrl-C in processes started in the block: their parent decides when to end.
+def interrupts_blocked(*others: signal.Signals) -> Iterator[None]:
+    """Blocks signals in processes started in the block: their parent decides when to end.
 
-    Ctrl-C reaches every process of a terminal. A blocked signal stays blocked in the new process,
-    even while it loads its libraries.
+    Those of a terminal (Ctrl-C, or when it is closed) reach all its processes. A blocked signal
+    stays blocked in the new process, even while it loads its libraries.
+
+    Args:
+        others: Further signals to block.
     """
-    resource_tracker.ensure_running()  # its own first start would unblock the signal
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    resource_tracker.ensure_running()  # its own first start would unblock the signals
+    terminal = {signal.SIGINT, signal.SIGHUP, signal.SIGQUIT}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, terminal.union(others))
     try:
         yield
     finally:

@@ -415,12 +415,12 @@ class Recorder:
             raise failure
 
     def take_event(self, event: LoopEvent) -> None:
-        """Records an event.
+        """Records an event; one from before the first cycle is at its time.
 
         Raises:
             CdprError: The record cannot be written; the event is still in log and status.
         """
-        time = 0.0 if self._began is None else event.at - self._began
+        time = 0.0 if self._began is None else max(0.0, event.at - self._began)
         run_event = RunEvent(round(time, 6), event.code, event.text)
         self.log.events.append(run_event)
         self._status.take_event(run_event)

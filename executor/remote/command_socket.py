@@ -64,7 +64,8 @@ def _default_run_time_folder() -> Path:
 
 
 def _run_time_folder() -> Path:
-    return Path(os.environ.get("XDG_RUNTIME_DIR") or _default_run_time_folder())
+    base = os.environ.get("XDG_RUNTIME_DIR", "")
+    return Path(base) if os.path.isabs(base) else _default_run_time_folder()
 
 
 def _temporary_folders() -> list[Path]:

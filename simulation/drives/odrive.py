@@ -11,6 +11,7 @@ prevent enabling.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -284,6 +285,8 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         self._document = document
         self._layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
         self._since_update = 0.0
+        # Drives that report more often than once a cycle do so at different positions.
+        self._steps = max(1, math.ceil(rig.document.bus.cycle_ms / document.estimates_ms))
         super().__init__(rig, bus, start_pose, load)
         self._by_node = {drive.node: drive for drive in self.drives}
 
@@ -311,7 +314,8 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         """Processes every waiting frame, then advances a cycle; see `SimulatedRig.pump`."""
         while (message := receive_frame(self._bus, 0.0)) is not None:
             self._handle(message)
-        self._advance(self._cycle)
+        for _ in range(self._steps):
+            self._advance(self._cycle / self._steps)
         self._finish_torque_update()
 
     def _advance(self, elapsed: float) -> None:

@@ -405,6 +405,56 @@ def test_a_position_is_accepted_exactly_when_the_drum_can_have_rotated_that_far(
     assert believed == (abs(step) <= 500 * (gap + 1))
 
 
+@given(
+    cycles=st.lists(
+        st.tuples(st.integers(-250, 250), st.lists(st.floats(0.0, 1.0), max_size=4)), max_size=20
+    ),
+    start=st.integers(-(2**30), 2**30),
+)
+def test_drives_may_report_at_any_times_of_a_cycle(
+    cycles: list[tuple[int, list[float]]], start: int
+) -> None:
+    """ODrives report on their own clocks; between two cycles that is up to two cycles' motion."""
+    check, position = ReplyCheck({1: "drive 1"}, (500.0,)), start
+    for step, times in cycles:
+        check.begin_cycle()
+        for time in sorted(times):
+            assert check.accept(0, position + round(time * step))
+        check.end_cycle()
+        position += step
+    assert check.faults() == []
+
+
+@given(st.lists(st.lists(st.integers(-600, 600), max_size=6), max_size=10))
+def test_replies_of_one_cycle_do_not_add_up_to_a_jump(cycles: list[list[int]]) -> None:
+    """A drive that runs away in steps each of which is plausible."""
+    check = ReplyCheck({1: "drive 1"}, (500.0,))
+    check.begin_cycle()
+    believed = before = 0
+    assert check.accept(0, believed)
+    age = 1
+    check.end_cycle()
+    for steps in cycles:
+        check.begin_cycle()
+        position, heard = believed, False
+        for step in steps:
+            position += step
+            if check.accept(0, position):
+                believed, heard = position, True
+        check.end_cycle()
+        assert abs(believed - before) <= 500 * age
+        before, age = (believed, 1) if heard else (before, age + 1)
+
+
+def test_the_first_position_is_one_alone() -> None:
+    check = ReplyCheck({1: "drive 1"}, (500.0,))
+    for _ in range(2):
+        check.begin_cycle()
+        assert check.accept(0, 7000)
+        assert not check.accept(0, 7501)
+        check.forget_positions()
+
+
 @given(st.lists(st.sampled_from(["send", "own", "foreign"]), max_size=30))
 def test_where_a_sender_hears_itself_only_what_was_not_sent_is_foreign(script: list[str]) -> None:
     own = EchoFilter(commanding_ids(NODES), echoes_own_frames=True)

@@ -820,6 +820,34 @@ def test_a_cycle_that_may_not_enable_becomes_a_stop_of_all(bench: Bench) -> None
     assert bench.group.state is GroupState.QUICK_STOP
 
 
+@pytest.mark.parametrize("refused", [1, 2])
+def test_a_cycle_with_a_refused_frame_becomes_a_stop_of_all_before_sync(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, refused: int
+) -> None:
+    """SYNC follows at any age: it must not enable drives again that stopped on their own."""
+    bench.enable()
+    for drive in bench.drives:
+        drive._quick_stop()  # their emergencies have not arrived yet
+    send, frames = bench.group._bus.send, [0]
+
+    def full_for_drive_3(message: can.Message) -> None:
+        frames[0] += message.arbitration_id == 0x203
+        if message.arbitration_id == 0x203 and frames[0] <= refused:
+            raise can.CanOperationError("No buffer space available")
+        send(message)
+
+    monkeypatch.setattr(bench.group._bus, "send", full_for_drive_3)
+    with pytest.raises(Fault, match="No buffer space"):
+        bench.group.send_cycle(bench.group.targets.tolist())
+    bench.rehearsal.pump()
+    assert {d.state for d in bench.drives if d.node != 3 or refused == 1} == {HOLDING}
+    assert bench.group.state is GroupState.QUICK_STOP
+    bench.group.receive(0.0)
+    for _ in range(20):
+        bench.cycle()
+        assert [d.state for d in bench.drives] == [HOLDING] * 8
+
+
 def test_a_restarted_master_starts_from_where_the_drives_hold(bench: Bench) -> None:
     bench.enable()
     moved = bench.lifted(0.0002)

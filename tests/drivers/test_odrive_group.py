@@ -223,6 +223,18 @@ def test_messages_at_other_periods_than_the_cycle_are_not_missing() -> None:
             assert status.state is GroupState.ENABLED, status.faults
 
 
+def test_drives_that_report_several_times_a_cycle_follow_without_a_fault() -> None:
+    with odrive_bench(odrive_rig(estimates_ms=3)) as bench:
+        stood = bench.enable().positions
+        per_metre = np.array([w.counts_per_metre for w in bench.rig.winches])
+        for step in range(1, 31):
+            targets = stood + np.rint(per_metre * 2e-4 * step).astype(int)
+            status = bench.cycle(targets.tolist())
+            assert status.state is GroupState.ENABLED, status.faults
+            assert status.rejected == 0
+        assert np.abs(status.positions - targets).max() <= 1
+
+
 READ, WRITE = b"\0", b"\1"
 COMMANDED: dict[str, tuple[int, bytes]] = {
     # ODrive, "CAN Protocol": every message from host to drive, by number

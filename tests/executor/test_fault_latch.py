@@ -14,7 +14,7 @@ from drivers.can_bus import BusSettings
 from executor.interlock import fault_latch, locks
 from executor.interlock.fault_latch import FaultLatch
 from executor.state_machine import State
-from model.errors import BadInput, Refused
+from model.errors import BadInput, Fault, HardwareMissing, Refused, StoppedByOperator
 
 BUS = BusSettings("udp_multicast", "239.74.163.62")
 
@@ -95,19 +95,48 @@ def test_a_reset_keeps_runs_off_the_bus_and_ends_disengaged(folder: Path) -> Non
     assert not other.held_by_another()
 
 
-@pytest.mark.parametrize("latched", [True, False])
-def test_a_reset_that_fails_leaves_the_latch_as_it_was(folder: Path, latched: bool) -> None:
-    mine, other = two()
-    if latched:
-        mine.engage("a rig", folder)
-        mine.settle("a rig", State.LATCHED, "a drive failed", folder)
-    shown = mine.read()
-    reset = mine.held_for_reset("a rig", shown)
+REFUSED = [Refused("other drives hold"), BadInput("no rig"), StoppedByOperator("stopped")]
+FAILED = [
+    Fault("drive 3 stays in fault"),
+    HardwareMissing("drive 3 is silent"),
+    ZeroDivisionError(),
+]
+
+
+def failed_reset(latch: FaultLatch, error: BaseException) -> None:
+    reset = latch.held_for_reset("a rig", latch.read())
     reset.__enter__()
-    assert other.held_by_another()
-    assert not reset.__exit__(ZeroDivisionError, ZeroDivisionError(), None), "it is raised on"
+    assert FaultLatch(BUS).held_by_another()
+    assert not reset.__exit__(type(error), error, None), "it is raised on"
+    assert not FaultLatch(BUS).held_by_another()
+
+
+@pytest.mark.parametrize("error", REFUSED + FAILED, ids=lambda error: type(error).__name__)
+def test_a_reset_that_fails_leaves_the_latch_as_it_was(folder: Path, error: Exception) -> None:
+    mine, other = two()
+    mine.engage("a rig", folder)
+    mine.settle("a rig", State.LATCHED, "a drive failed", folder)
+    shown = mine.read()
+    failed_reset(mine, error)
     assert other.read() == shown
-    assert not other.held_by_another()
+
+
+@pytest.mark.parametrize("error", REFUSED, ids=lambda error: type(error).__name__)
+def test_a_reset_that_is_refused_latches_nothing(error: Exception) -> None:
+    mine, other = two()
+    failed_reset(mine, error)
+    other.require_disengaged()
+
+
+@pytest.mark.parametrize("error", FAILED, ids=lambda error: type(error).__name__)
+def test_a_reset_that_fails_is_latched_where_nothing_was(error: Exception) -> None:
+    """Drives that stopped holding, or are silent; messages say that the latch stays engaged."""
+    mine, other = two()
+    failed_reset(mine, error)
+    latched = other.read()
+    assert latched is not None
+    assert latched.rig == "a rig"
+    assert latched.cause == (getattr(error, "what", "") or "a reset did not finish")
 
 
 def test_a_latch_that_changed_since_it_was_shown_is_not_reset(folder: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from executor.recording.recorder import BEHIND, Recorder, RecordWriter
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.status import RunStatus
-from executor.state_machine import CycleRecord, State
+from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests
 from executor.trajectory.dwell import Dwell
 from model.errors import CdprError, Fault
@@ -162,14 +162,8 @@ def test_what_is_not_a_fault_of_the_disk_is_one_of_the_record(
         writer.take_event(RunEvent(0.0, "stop", "stop requested"))
 
 
-def test_a_full_disk_hides_nothing_else_of_a_cycle(
-    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two events are due in it; the first fault lost the second, and the image."""
-
-    def full(_folder: RunFolder, event: RunEvent) -> None:
-        raise Fault(f"{event.code} cannot be written: No space left on device")
-
+def recorder_of(folder: RunFolder, done: list[str], monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    """A recorder that writes no cycles; ``done`` receives what it calls."""
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     goal = {"position_mm": [0, 0, 445]}
     stops = [{"name": name, "dwell_s": 0.0, **goal} for name in ("one", "two")]
@@ -177,7 +171,6 @@ def test_a_full_disk_hides_nothing_else_of_a_cycle(
     scene = scene_from_document(SceneDocument.model_validate(data))
     table = SimpleNamespace(dwells=(Dwell(0, 0), Dwell(0, 0)))
     prepared: Any = SimpleNamespace(rig=rig, scene=scene, checked=SimpleNamespace(table=table))
-    done: list[str] = []
     recorder = Recorder(
         prepared,
         folder,
@@ -187,15 +180,41 @@ def test_a_full_disk_hides_nothing_else_of_a_cycle(
         progress=lambda _row: done.append("progress"),
         announce=lambda _text: done.append("announced"),
     )
-    monkeypatch.setattr(RunFolder, "append_event", full)
     monkeypatch.setattr(recorder.log, "encoder_pose", lambda _record: None)
     monkeypatch.setattr(recorder.writer, "take_cycles", lambda _at: done.append("cycle"))
+    return recorder
+
+
+def cycle_at(at: float, state: State) -> CycleRecord:
+    rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     counts = tuple(winch.home_counts for winch in rig.winches)
     zeros = (0,) * rig.cable_count
-    record = CycleRecord(
-        0, 5.0, State.MOVING, 0.0, 1.0, counts, counts, zeros, zeros, 0, 0, 0, 0.0, 0.0
-    )
+    return CycleRecord(0, at, state, 0.0, 1.0, counts, counts, zeros, zeros, 0, 0, 0, 0.0, 0.0)
+
+
+def test_a_full_disk_hides_nothing_else_of_a_cycle(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two events are due in it; the first fault lost the second, and the image."""
+
+    def full(_folder: RunFolder, event: RunEvent) -> None:
+        raise Fault(f"{event.code} cannot be written: No space left on device")
+
+    done: list[str] = []
+    recorder = recorder_of(folder, done, monkeypatch)
+    monkeypatch.setattr(RunFolder, "append_event", full)
     with pytest.raises(Fault, match="pass cannot be written"):
-        recorder.take_cycle(record, None)
+        recorder.take_cycle(cycle_at(5.0, State.MOVING), None)
     assert [event.code for event in recorder.log.events] == ["pass", "pass"]
     assert done == ["announced", "announced", "progress", "image", "cycle"]
+
+
+def test_an_event_from_before_the_first_cycle_is_at_its_time(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Events of the real-time process are taken after the cycles of the same interval."""
+    recorder = recorder_of(folder, [], monkeypatch)
+    recorder.take_cycle(cycle_at(36_123.4, State.ENABLING), None)
+    for at in (0.0, 36_123.3, 36_123.5):
+        recorder.take_event(LoopEvent(0, at, "simulated", "the drives are simulated"))
+    assert [event.time_s for event in folder.events()] == [0.0, 0.0, 0.1]

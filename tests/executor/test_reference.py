@@ -149,9 +149,9 @@ def test_it_is_lost_where_a_cable_was_released(encoder: str) -> None:
 
 def test_every_motion_that_counts_from_it_notes_the_drive_positions() -> None:
     rig = rig_with("incremental")
-    interlock = MotionInterlock(rig)
-    interlock.file.write(reference_of(rig))
-    interlock.begin(Path("run"), reference_of(rig))
+    interlock, homed = MotionInterlock(rig), reference_of(rig)
+    interlock.file.write(homed)
+    interlock.begin(Path("run"), homed)
     interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))
     kept = interlock.kept_reference()
     assert kept is not None
@@ -353,6 +353,69 @@ def test_absolute_encoders_may_be_power_cycled_but_not_dropped(homed: bool) -> N
     MotionInterlock(rig).found_restarted(ALL)  # this motion did not begin: they are configured now
     require_still_referenced(rig, ready(), (), dropped)
     assert MotionInterlock(described).why_unreferenced([0] * 8) == ""
+
+
+@pytest.mark.parametrize("homed", [True, False])
+@pytest.mark.parametrize("begins", [True, False])
+def test_a_drive_found_power_cycled_by_the_set_up_holds_once_the_motion_begins(
+    homed: bool, begins: bool
+) -> None:
+    """A run reads the reference first; then its set-up finds a drive that was power-cycled.
+
+    The program is killed while it moves, and the drive is dropped by an emergency stop.
+    """
+    rig = rig_with("absolute")
+    if homed:
+        MotionInterlock(rig).file.write(reference_of(rig))
+        rig = MotionInterlock(rig).referenced_rig()
+    else:
+        first = MotionInterlock(rig)
+        first.begin(Path("run"), first.require_ready())
+        _end(first)
+    killed = MotionInterlock(rig)
+    reference = killed.require_ready()
+    MotionInterlock(rig).found_restarted((4,))
+    killed.begin(Path("run"), reference)
+    if not begins:
+        killed.cancel()
+    later = MotionInterlock(rig)
+    assert bool(later.why_released((), (4,))) is begins
+    assert later.why_released((), (5,))
+
+
+def test_no_motion_begins_with_a_reference_that_was_replaced_meanwhile() -> None:
+    rig = rig_with("absolute")
+    first, second = reference_of(rig), reference_of(rig, shift=1500)
+    MotionInterlock(rig).file.write(first)
+    interlock = MotionInterlock(MotionInterlock(rig).referenced_rig())
+    held = interlock.require_ready()
+    replaced = [
+        second.model_copy(update={"made": first.made}),
+        first.model_copy(update={"made": "2020-01-01T00:00:00+00:00"}),
+        first.model_copy(update={"lost": "cable 1 (drive 1): power-cycled"}),
+        None,
+    ]
+    for on_file in replaced:
+        MotionInterlock(rig).file.remove()
+        if on_file is not None:
+            MotionInterlock(rig).file.write(on_file)
+        with pytest.raises(Refused, match=r"homing reference (is lost|changed)") as caught:
+            interlock.begin(Path("run"), held)
+        assert "nothing was moved" in caught.value.next_step
+        interlock.require_free()
+        assert interlock.kept_reference() == on_file
+    MotionInterlock(rig).file.write(first)
+    interlock.begin(Path("run"), held)
+    _end(interlock)
+
+
+def test_a_motion_of_drives_never_homed_does_not_begin_once_they_are() -> None:
+    rig = rig_with("absolute")
+    interlock = MotionInterlock(rig)
+    never_homed = interlock.require_ready()
+    MotionInterlock(rig).file.write(reference_of(rig))
+    with pytest.raises(Refused, match="homing reference changed"):
+        interlock.begin(Path("run"), never_homed)
 
 
 def test_drives_released_behind_their_brakes_need_not_hold_until_they_are_enabled_again() -> None:

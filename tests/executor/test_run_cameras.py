@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -416,6 +417,20 @@ def quick() -> Quick:
 
 def silent() -> Quick:
     return Quick(silent=True)
+
+
+def test_signals_to_all_processes_of_a_terminal_end_no_camera() -> None:
+    """A closed terminal, or a service that is stopped: the supervisor stops the run first."""
+    signals = (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTERM)
+    with closing(CameraProcess("front", quick, may_wait=False)) as process:  # type: ignore[arg-type]
+        for number in signals:
+            os.kill(child("front"), number)  # while it loads its libraries
+        wait_until_ready([process], lambda: None)
+        for number in signals:
+            os.kill(child("front"), number)
+        process.ask(FrameRequest(1, 0.0, 0.0, None))
+        assert process.answer_within(60.0) is not None
+    assert not [c for c in multiprocessing.active_children() if c.name.startswith("cdpr-camera")]
 
 
 @pytest.mark.parametrize("how", ["stopped", "silent"])

@@ -99,15 +99,17 @@ def test_a_run_is_reached_also_from_a_terminal_without_a_run_time_folder(
         assert _reached() == []
 
 
-@pytest.mark.parametrize("base", ["", "default", "apart"])
+@pytest.mark.parametrize("base", ["", "default", "apart", "relative"])
 def test_a_run_is_reached_from_a_terminal_with_another_temporary_folder(
     tmp_path, monkeypatch, base
 ):
-    """Only a run-time folder of another name keeps runs apart."""
+    """Only a run-time folder of another name keeps runs apart; a relative one is ignored."""
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(command_socket, "FIXED", tmp_path / "fixed")
     default = tmp_path / "default"
     monkeypatch.setattr(command_socket, "_default_run_time_folder", lambda: default)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / base) if base else "")
+    value = str(tmp_path / base) if base in ("default", "apart") else base
+    monkeypatch.setenv("XDG_RUNTIME_DIR", value)
     for name in ("fixed", "here", "there", *([base] if base else [])):
         (tmp_path / name).mkdir()
 

@@ -236,6 +236,24 @@ def test_a_serial_adapter_is_the_same_bus_by_each_of_its_names(tmp_path: Path) -
         assert names == {f"slcan {device}{speed}"}
 
 
+@pytest.mark.parametrize("relative", ["state", "./state", "~/state", ""])
+def test_a_relative_state_folder_is_ignored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, relative: str
+) -> None:
+    """XDG Base Directory Specification: paths must be absolute; a latch would depend on `cd`."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(state_folder, "SHARED", tmp_path / "absent")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_STATE_HOME", relative)
+    FaultLatch(BUS).engage("rig", tmp_path)
+    other = tmp_path / "elsewhere"
+    other.mkdir()
+    monkeypatch.chdir(other)
+    with pytest.raises(Refused, match="did not finish"):
+        FaultLatch(BUS).require_disengaged()
+    assert FaultLatch(BUS).path.is_relative_to(tmp_path / ".local/state/cdpr")
+
+
 def test_a_user_without_a_home_is_told_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
     """As one without a name, in a container: its latched faults would have no place."""
     for name in ("HOME", "XDG_STATE_HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):

@@ -17,6 +17,7 @@ from executor import evaluation as run_module
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.state_machine import State
+from executor.supervision import StopReason
 from executor.trajectory.setpoints import PreparedRun, Trajectory, prepare
 from model.errors import Fault, Refused
 from model.files.drive_profile_file import ProfileDocument
@@ -349,11 +350,16 @@ def test_after_the_drives_stopped_on_their_own_no_set_point_follows(
     assert stage.folder.cycles().lateness.max() == pytest.approx(lateness * 0.01)
 
 
+@pytest.mark.parametrize(
+    "reason", [None, StopReason("clearance_low", "9.1 mm"), StopReason("camera", "all failed")]
+)
 @pytest.mark.usefixtures("no_pictures")
-def test_a_stop_request_does_not_hide_a_fault(prepared: PreparedRun, tmp_path: Path) -> None:
+def test_a_stop_request_does_not_hide_a_fault(
+    prepared: PreparedRun, tmp_path: Path, reason: StopReason | None
+) -> None:
     def both(stage: Stage) -> None:
         if stage.cycle == CRUISING:
-            stage.board.ask_stop()
+            stage.board.ask_stop(reason)
         elif stage.cycle == CRUISING + 5:
             stage.drives[3].silent = True
 
@@ -363,7 +369,8 @@ def test_a_stop_request_does_not_hide_a_fault(prepared: PreparedRun, tmp_path: P
     assert outcome.state is State.LATCHED
     assert summary["verdict"] == "FAILED"
     assert any("(drive 4) did not answer" in event["text"] for event in summary["events"])
-    assert "(drive 4) did not answer" in outcome.cause, "what is latched is not the operator's stop"
+    assert "(drive 4) did not answer" in outcome.cause, "what is latched is not the requested stop"
+    assert (reason.code if reason else "stop") in [event["code"] for event in summary["events"]]
 
 
 @pytest.mark.usefixtures("no_pictures")
@@ -379,12 +386,9 @@ def test_after_a_fault_no_target_moves_a_drive(prepared: PreparedRun, tmp_path: 
         assert np.abs(np.diff(positions[-3:], axis=0)).max() == 0, "at rest at the end"
 
 
-def die(kind: str) -> Callable[[], None]:
-    def kill() -> None:
-        (child,) = multiprocessing.active_children()
-        child.kill() if kind == "killed" else child.terminate()
-
-    return kill
+def kill_camera() -> None:
+    (child,) = multiprocessing.active_children()
+    child.kill()
 
 
 @pytest.mark.parametrize(
@@ -408,12 +412,12 @@ def test_a_camera_process_that_dies_is_named_and_the_run_is_on_record(
         nonlocal cycles
         cycles += 1
         if cycles == cycle:
-            die("killed")()
+            kill_camera()
         return real(clock)
 
     def die_or_answer(process: CameraProcess, patience: float) -> Any:
         if cycles < cycle and patience == ROUND:
-            die("killed")()
+            kill_camera()
         return answer_within(process, patience)
 
     monkeypatch.setattr(SimulatedClock, "next_cycle", next_cycle)
