@@ -302,37 +302,38 @@ class _PairsFit:
 
 
 def _fit(observed: Sequence[tuple[BodyObservation, BodyObservation]]) -> _PairsFit:
-    """The best ``reference_from_camera``."""
-    guesses = [
-        far.camera_from_body.compose(near.camera_from_body.inverse()) for near, far in observed
-    ]
+    """The best ``reference_from_camera``, with the noise from the residuals if that is larger."""
+    guesses = [b.camera_from_body.compose(a.camera_from_body.inverse()) for a, b in observed]
     middle = np.median([guess.position for guess in guesses], axis=0)
     start = min(guesses, key=lambda guess: float(np.linalg.norm(guess.position - middle)))
     turn = np.kron(np.eye(2), start.rotation)
-    whitening = [
-        np.linalg.inv(np.linalg.cholesky(far.covariance + turn @ near.covariance @ turn.T))
-        for near, far in observed
-    ]
+    covariances = [far.covariance + turn @ near.covariance @ turn.T for near, far in observed]
+    whitening = np.linalg.inv(np.linalg.cholesky(covariances))
 
     def errors(x: Array) -> Array:
         camera = moved(start, x)
         gaps = [_gap(camera.compose(near.camera_from_body), far) for near, far in observed]
-        return np.array([w @ gap for w, gap in zip(whitening, gaps, strict=True)])
+        return np.asarray(np.einsum("nij,nj->ni", whitening, gaps))
 
-    found = least_squares(
-        lambda x: errors(x).ravel(), np.zeros(6), loss="huber", f_scale=_HUBER, x_scale=1e-3
-    )
+    def fitted(x: Array) -> Array:
+        loss = {"loss": "huber", "f_scale": _HUBER, "x_scale": 1e-3}
+        return np.asarray(least_squares(lambda x: errors(x).ravel(), x, **loss).x)
+
+    x = fitted(np.zeros(6))
+    # Errors of the tags' layout and print are not among those stated.
+    whitening /= max(1.4826 * float(np.median(np.abs(errors(x)))), 1.0)
+    x = fitted(x)
     steps = 1e-6 * np.eye(6)
-    slopes = np.stack([(errors(found.x + d) - errors(found.x - d)) / 2e-6 for d in steps], axis=-1)
-    residuals = errors(found.x)
+    slopes = np.stack([(errors(x + d) - errors(x - d)) / 2e-6 for d in steps], axis=-1)
+    residuals = errors(x)
     weight = np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12))
     scale = max(float(np.sum(weight * residuals**2)) / max(residuals.size - 6, 1), 1.0)
     weighted = np.swapaxes(slopes * weight[..., None], 1, 2)
     information = weighted @ slopes / scale
     scores = np.einsum("nij,nj->ni", weighted, residuals) / scale
-    by_gaps = weighted @ np.array(whitening) / scale
+    by_gaps = weighted @ whitening / scale
     gains = -np.linalg.solve(information.sum(axis=0), by_gaps)
-    return _PairsFit(moved(start, found.x), information, scores, gains)
+    return _PairsFit(moved(start, x), information, scores, gains)
 
 
 def _gap(here: Pose, there: BodyObservation) -> Array:

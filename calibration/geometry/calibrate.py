@@ -14,6 +14,7 @@ from calibration.geometry.identifiability import (
     Observability,
     RigUncertainty,
     identified,
+    pose_scales,
     sentences,
     uncertainty_of_rig,
 )
@@ -23,7 +24,7 @@ from calibration.geometry.parameters import Parameters, RigGeometry, rig_with
 from calibration.statistics import Interval
 from model.errors import BadInput
 from model.kinematics import cables_to, poses_near
-from model.pose import Array
+from model.pose import Array, read_only
 from model.rig import Rig
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
@@ -35,6 +36,9 @@ FAR_OFF = 4.0
 """A sample is rejected if its error is this many times the median,"""
 OFF = 2.0
 """and this many times the stated standard deviation."""
+MOST_SCATTER = 20.0
+"""Poses that scatter more, relative to what is stated, are wrong rather than noisy, such as in
+another unit: they keep their weights."""
 
 
 def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> RigMeasurements:
@@ -153,12 +157,14 @@ class RigCalibration:
 
     Attributes:
         parameters: The unknowns and the rig file.
-        measured: The samples used, without outliers.
+        measured: The samples used, without outliers, with deviations by `pose_scales`.
         fit: Best fit; unidentifiable directions are left as in the rig file.
         observability: Directions that the data determine.
         uncertainty: Of the unknowns.
         held_out: Cross-validation errors.
         length_deviation: Of a cable's length from the encoder, with measured tension, [m].
+        pose_scales: Ratios of the deviations of measured positions and rotations to the stated
+            ones, shape (2,).
     """
 
     parameters: Parameters
@@ -168,6 +174,7 @@ class RigCalibration:
     uncertainty: RigUncertainty
     held_out: HeldOut
     length_deviation: float
+    pose_scales: Array
 
     @property
     def rig(self) -> Rig:
@@ -323,6 +330,10 @@ def fit_rig(
     if len(agreeing) < len(measured):
         measured = agreeing
         fit, observability = identified(parameters, measured, length_deviation)
+    scales = pose_scales(measured, fit, observability)
+    if 1.0 < scales.max() <= MOST_SCATTER:
+        measured = measured.with_scaled_deviations(scales)
+        fit, observability = identified(parameters, measured, length_deviation)
     return RigCalibration(
         parameters,
         measured,
@@ -331,6 +342,7 @@ def fit_rig(
         uncertainty_of_rig(parameters, measured, fit, observability),
         held_out(parameters, measured, length_deviation),
         length_deviation,
+        read_only(scales),
     )
 
 

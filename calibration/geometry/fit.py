@@ -218,17 +218,6 @@ class RigFitter:
         positions[points] = measured.positions[points] - arms
         return positions, rotations
 
-    def _pose_errors(self, positions: Array, rotations: Array) -> Array:
-        """Estimated minus measured poses, shape (n, 6), [m, rad]; 0 where not measured."""
-        errors = np.zeros((len(positions), 6))
-        points = self._measured.measured_points(positions, rotations)
-        errors[:, :3] = points - self._measured.positions
-        turns = rotations @ np.swapaxes(self._measured.rotations, 1, 2)
-        for k in np.flatnonzero(self._posed & self._rotated):
-            errors[k, 3:] = rotation_vector_from_matrix(turns[k])
-        errors[~self._posed] = 0.0
-        return errors
-
     def _distances(self, errors: Array, weights: Array) -> Array:
         """Distances from the measured poses, in standard deviations, shape (n,)."""
         squares = np.einsum("ni,nij,nj->n", errors, weights, errors)
@@ -242,7 +231,7 @@ class RigFitter:
             return float("inf")
         distances = np.abs(residuals) / self._deviations
         weights = self._measured.pose_information(rotations)
-        poses = self._distances(self._pose_errors(positions, rotations), weights)
+        poses = self._distances(self._measured.pose_errors(positions, rotations), weights)
         return float(z @ z + huber(distances, RESIDUAL_BEND).sum() + huber(poses, POSE_BEND).sum())
 
     def _system(
@@ -250,7 +239,7 @@ class RigFitter:
     ) -> NormalEquations:
         line = self._model.linearised(values, positions, rotations)
         weights = self._weights(line.residuals) / self._deviations**2
-        errors = self._pose_errors(positions, rotations)
+        errors = self._measured.pose_errors(positions, rotations)
         pose_weights = self._pose_weights(positions, rotations)
         by_z = line.by_values @ spread
         weighted = weights[..., None] * line.by_pose
@@ -267,7 +256,8 @@ class RigFitter:
     def _pose_weights(self, positions: Array, rotations: Array) -> Array:
         """Information of the measured poses with Huber weights, shape (n, 6, 6)."""
         informations = self._measured.pose_information(rotations)
-        distances = self._distances(self._pose_errors(positions, rotations), informations)
+        errors = self._measured.pose_errors(positions, rotations)
+        distances = self._distances(errors, informations)
         return np.asarray(huber_weight(distances, POSE_BEND)[:, None, None] * informations)
 
     def _weights(self, residuals: Array) -> Array:
@@ -288,7 +278,8 @@ class RigFitter:
             read_only(self._deviations),
             self._weights(residuals),
             self._distances(
-                self._pose_errors(positions, rotations), self._measured.pose_information(rotations)
+                self._measured.pose_errors(positions, rotations),
+                self._measured.pose_information(rotations),
             ),
             *system.reduced_by_sample(),
             self._common_scores(system, positions, rotations),

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.geometry.fit import RigFit, RigFitter
+from calibration.geometry.fit import POSE_BEND, RigFit, RigFitter
 from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.parameters import AXES, Parameters
-from calibration.statistics import rms_bound, student_factor
+from calibration.statistics import huber_weight, rms_bound, student_factor
 from model.pose import Array, read_only, skew
 
 LEAST_INFORMATION = 1.0
@@ -172,10 +172,56 @@ def identified(
     return fitter.fit(observability.known), observability
 
 
+# Scatter of the measurements, relative to what is stated.
+
+
+def _numbers(measured: RigMeasurements, fit: RigFit) -> int:
+    """Number of measurements beyond those that determine the poses."""
+    return int(np.isfinite(fit.deviations).sum() - measured.unmeasured.sum())
+
+
+def _residual_squares(fit: RigFit) -> float:
+    """Sum of weighted squares of the residuals of cables and sensors, in deviations."""
+    return float(np.sum(fit.weights * (fit.residuals / fit.deviations) ** 2))
+
+
+_MEDIAN_DISTANCE, _MEDIAN_DEVIATION = 1.54, 0.87
+"""Median of a distance along three axes, in deviations; its own deviation with n samples, by √n."""
+
+
+def pose_scales(measured: RigMeasurements, fit: RigFit, observability: Observability) -> Array:
+    """Deviations of measured positions and rotations, relative to the stated ones, shape (2,).
+
+    They follow from the medians of the distances from estimated poses, since ten cables fit their
+    lengths whatever the poses. Where cables and sensors scatter more than stated as well, only the
+    excess beyond that counts. Excess within chance, two standard deviations, does not: 1.
+
+    Args:
+        measured: Stationary samples.
+        fit: In the directions that the samples determine.
+        observability: These directions.
+    """
+    numbers, unknowns = _numbers(measured, fit), observability.known.shape[1]
+    usual = max(numbers - unknowns, _residual_squares(fit), 1.0) / max(numbers, 1)
+    errors = measured.pose_errors(fit.positions, fit.rotations)
+    rotated = measured.has_position & measured.has_rotation
+    scales = np.ones(2)
+    for k, known in enumerate((measured.has_position, rotated)):
+        if not known.any():
+            continue
+        axes = slice(3 * k, 3 * k + 3)
+        own, gaps = measured.covariances[known, axes, axes], errors[known, axes, None]
+        distances = np.sqrt(np.sum(gaps * np.linalg.solve(own, gaps), axis=(1, 2)))
+        scale = float(np.median(distances)) / (_MEDIAN_DISTANCE * np.sqrt(usual))
+        by_chance = 2.0 * _MEDIAN_DEVIATION / (_MEDIAN_DISTANCE * np.sqrt(len(own)))
+        scales[k] = scale if scale > 1.0 + by_chance else 1.0
+    return scales
+
+
 # Uncertainty of a rig's parameters: from the scatter of residuals, and by the jackknife.
 #
-# Scatter alone is too optimistic if residuals within a sample are correlated: a pose error, a cable
-# model that differs from the rig file's. The jackknife over samples, to first order, covers that.
+# Scatter alone is too optimistic if residuals within a sample are correlated, as by a cable model
+# that differs from the rig file's. The jackknife over samples, to first order, covers that.
 # The rig file acts as a prior that is never left out. Neither shows errors that all measured poses
 # share, such as of the camera's pose: the fit follows them, and what it does is added to both.
 #
@@ -191,7 +237,8 @@ class RigUncertainty:
         by_jackknife: The same, from leaving out each sample.
         common: Changes of the unknowns by one deviation of each error common to all measured
             poses, shape (p, q); no scatter shows them.
-        scatter: Ratio of the residuals' variance to the stated one, at least 1.
+        scatter: Ratio of the variance of residuals and measured poses to the stated one, at
+            least 1.
         quantile: Half width of a 95 % interval in standard deviations.
     """
 
@@ -250,9 +297,9 @@ def uncertainty_of_rig(
     informations = known.T @ fit.informations @ known
     scores = fit.scores @ known
     whole = informations.sum(axis=0) + np.eye(known.shape[1])
-    squares = float(np.sum(fit.weights * (fit.residuals / fit.deviations) ** 2))
-    freedom = int(np.isfinite(fit.deviations).sum() - measured.unmeasured.sum()) - known.shape[1]
-    scatter = max(1.0, squares / max(freedom, 1))
+    of_poses = float(np.sum(huber_weight(fit.pose_misfits, POSE_BEND) * fit.pose_misfits**2))
+    freedom = _numbers(measured, fit) - known.shape[1]
+    scatter = max(1.0, (_residual_squares(fit) + of_poses) / max(freedom, 1))
     count = len(measured)
     without = np.linalg.solve(whole - informations, scores[..., None])[..., 0]
     apart = without - without.mean(axis=0)

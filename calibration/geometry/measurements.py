@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from calibration.results import data_hash
 from model.files.csv_table import CsvTable
-from model.pose import Array, Pose, matrix_from_quaternion, read_only, skew
+from model.pose import (
+    Array,
+    Pose,
+    matrix_from_quaternion,
+    read_only,
+    rotation_vector_from_matrix,
+    skew,
+)
 from model.rig import Rig
 from model.statics.gravity import PRETENSION_SHARE, STANDARD_GRAVITY, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
@@ -106,6 +113,21 @@ class RigMeasurements:
         arms = np.where(self.has_rotation[:, None], 0.0, rotations @ self.reflector)
         return np.asarray(positions + arms)
 
+    def pose_errors(self, positions: Array, rotations: Array) -> Array:
+        """Given minus measured poses, shape (n, 6), [m, rad]; 0 where not measured.
+
+        Args:
+            positions: World frame, shape (n, 3), [m].
+            rotations: ``world_from_platform``, shape (n, 3, 3).
+        """
+        errors = np.zeros((len(self), 6))
+        errors[:, :3] = self.measured_points(positions, rotations) - self.positions
+        turns = rotations @ np.swapaxes(self.rotations, 1, 2)
+        for k in np.flatnonzero(self.has_position & self.has_rotation):
+            errors[k, 3:] = rotation_vector_from_matrix(turns[k])
+        errors[~self.has_position] = 0.0
+        return errors
+
     def pose_information(self, rotations: Array) -> Array:
         """Information of the measured poses on twists, shape (n, 6, 6); 0 where not measured.
 
@@ -152,6 +174,11 @@ class RigMeasurements:
         """
         more = self.covariances + np.diag(np.square([length] * 3 + [turn] * 3))
         return replace(self, covariances=read_only(more), common_deviations=(length, turn))
+
+    def with_scaled_deviations(self, scales: Array) -> RigMeasurements:
+        """The same with the deviations of measured positions and rotations times two factors."""
+        each = np.repeat(scales, 3)
+        return replace(self, covariances=read_only(self.covariances * np.outer(each, each)))
 
     @property
     def common_errors(self) -> Array:

@@ -178,7 +178,7 @@ def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Arra
 FAR = 5.0
 """Largest credible deviation from the rig file, in stated standard deviations."""
 SCATTERED = 2.0
-"""Largest acceptable RMS residual of a sensor, in stated standard deviations."""
+"""Largest acceptable scatter of a sensor or of measured poses, in stated standard deviations."""
 _INSET = 0.15
 """The workspace is assessed at its centre and this share inside its corners."""
 _COMMON = (
@@ -242,7 +242,7 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
     issues = _deviation_issues(result) + _stiffness_issues(result) + _tension_issues(result)
-    issues += _sensor_issues(result)
+    issues += _sensor_issues(result) + _pose_issues(result)
     if missed > wanted:
         what = "samples" if out.poses else "cable lengths of samples"
         issues.append(
@@ -384,6 +384,24 @@ def _sensor_issues(result: RigCalibration) -> list[Issue]:
             "check feed_directions in the rig file and the axes of the IMU (--imu-mounting-deg"
             " finds its mounting), or pass a larger --swivel-deg or --imu-deg",
         )
+    ]
+
+
+def _pose_issues(result: RigCalibration) -> list[Issue]:
+    """An issue for measured positions or rotations that scatter more than stated."""
+    return [
+        Issue(
+            f"the measured {what} scatter {times:.3g} times as much as stated",
+            "check the camera's lens, the layout of the tags and the stated errors of the poses, or"
+            f" pass a larger {option}",
+        )
+        for what, times, option in zip(
+            ("positions", "rotations"),
+            result.pose_scales,
+            ("--pose-mm", "--pose-deg"),
+            strict=True,
+        )
+        if times > SCATTERED
     ]
 
 

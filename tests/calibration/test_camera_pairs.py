@@ -29,7 +29,13 @@ from calibration.targets.boards import Chessboard, DetectedBoard
 from calibration.targets.grids import TagGrid
 from model.errors import BadInput
 from model.files.documents import PoseDocument, content_hash
-from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.pose import (
+    Pose,
+    matrix_from_rotation_vector,
+    moved,
+    rotation_vector_from_matrix,
+    step_between,
+)
 from model.rig import Camera, Rig, load_rig, rig_from_document
 from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
@@ -162,6 +168,31 @@ def test_pairs_that_agree_but_for_one_are_not_led_astray(two) -> None:
     few = dict(list(pairs.items())[:2])
     with pytest.raises(BadInput, match="2 of 4 required"):
         locate_by_pairs(rig, rig.cameras[1], front, few, {}, "sha256:0")
+
+
+@pytest.mark.parametrize("times", [1.0, 3.0, 10.0])
+def test_intervals_hold_the_truth_whatever_noise_is_stated(two, times: float) -> None:
+    """Errors of the tags' layout and print are not in the covariance of an observation."""
+    rig, truth = two
+    reference, rng = replace(rig.cameras[0], pose_covariance=None), np.random.default_rng(8)
+    deviations = np.repeat([2e-4, 1e-3], 3)
+    inside = []
+    for _ in range(8):
+        pairs = {}
+        for k, pose in enumerate(where_it_goes(rig, 12)):
+            there = (one.inverse().compose(pose) for one in (truth, reference.world_from_camera))
+            pairs[str(k)] = tuple(
+                BodyObservation(
+                    moved(body, times * deviations * rng.standard_normal(6)),
+                    np.diag(deviations**2),
+                    0.1,
+                )
+                for body in there
+            )
+        found = locate_by_pairs(rig, rig.cameras[1], reference, pairs, {}, "sha256:0")
+        gap = step_between(found.world_from_camera, truth)
+        inside.append(np.abs(gap) <= found.half_widths)
+    assert np.mean(inside) >= 0.92
 
 
 def test_pairs_of_a_body_at_rest_count_once(two) -> None:

@@ -1,4 +1,4 @@
-"""Rig calibration with errors that all measured poses share, as of the camera's pose."""
+"""Rig calibration with pose errors that all poses share, or that are larger than stated."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from calibration.geometry.calibrate import RigCalibration, fit_rig
 from calibration.geometry.fit import RigFitter
@@ -16,7 +17,16 @@ from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.quality import judge_rig, workspace_poses
 from model.pose import Array, matrix_from_rotation_vector, read_only
 from model.rig import Rig, load_rig
-from tests.calibration.synthetic_rig import LENGTH_NOISE, BuiltRig, built_rig, measured
+from model.winches import WinchMap
+from tests.calibration.synthetic_rig import (
+    LENGTH_NOISE,
+    POSITION_NOISE,
+    TURN_NOISE,
+    BuiltRig,
+    built_rig,
+    measured,
+    only,
+)
 
 LENGTH, TURN = 1e-3, float(np.radians(0.05))
 GEOMETRY = ("outlets", "anchors", "drum_scale", "offsets")
@@ -129,3 +139,67 @@ def test_poses_that_were_not_measured_share_no_error(rig: Rig) -> None:
     assert points[:, :, 3:] == pytest.approx(0.0)
     assert points[0, :3, :3] == pytest.approx(LENGTH * np.eye(3))
     assert data.part(np.arange(12) < 5).common_errors.shape == (5, 6, 9)
+
+
+def scattered(rig: Rig, seed: int, position: float, turn: float, length: float) -> RigCalibration:
+    """The calibration of a rig with noise that is larger than stated, by these factors.
+
+    Args:
+        rig: As in its file.
+        seed: Of the rig and the noise.
+        position: Of the measured positions.
+        turn: Of the measured rotations.
+        length: Of the cable lengths.
+    """
+    data, rng = only(measured(built_rig(rig, seed, alike=True), 40, 100 + seed)), default_rng(seed)
+    added = np.sqrt(np.square([position, turn, length]) - 1.0)
+    shifts, turns = rng.standard_normal((2, *data.positions.shape))
+    paid_out = WinchMap(rig).counts_per_metre * rng.standard_normal(data.counts.shape)
+    rotated = [matrix_from_rotation_vector(v) for v in added[1] * TURN_NOISE * turns]
+    data = replace(
+        data,
+        positions=read_only(data.positions + added[0] * POSITION_NOISE * shifts),
+        rotations=read_only(np.array(rotated) @ data.rotations),
+        counts=read_only(data.counts + added[2] * LENGTH_NOISE * paid_out),
+    )
+    return fit_rig(rig, data, DEFAULT_DEVIATIONS, LENGTH_NOISE)
+
+
+def test_poses_that_scatter_more_than_stated_are_weighted_and_reported(rig: Rig) -> None:
+    """Ten cables follow the lengths: only the poses themselves show it."""
+    there, shares = workspace_poses(rig, 0.0), []
+    for seed in RIGS:
+        found = scattered(rig, seed, 5.0, 1.0, 1.0)
+        assert found.pose_scales == pytest.approx([5.0, 1.0], rel=0.25)
+        truth = built_rig(rig, seed, alike=True).values(found.parameters.groups)
+        as_built = replace(found, fit=replace(found.fit, values=truth))
+        off = np.linalg.norm(found.reached(*there) - as_built.reached(*there), axis=1)
+        shares.append(off / found.position_errors(*there)[0])
+    # Errors of equal deviation along all three axes; less where they differ.
+    assert np.sqrt(np.mean(np.square(shares))) <= np.sqrt(3.0) / 1.96
+    quality = judge_rig(found, LENGTH, 0.0)
+    assert any("measured positions scatter" in why for why in quality.verdict.reasons)
+    assert not any("measured rotations" in why for why in quality.verdict.reasons)
+
+
+def test_poses_are_weighted_as_stated_where_they_do_not_scatter_more(rig: Rig) -> None:
+    """Neither by chance nor where the lengths scatter, which the residuals show."""
+    for seed in RIGS:
+        assert scattered(rig, seed, 1.0, 1.0, 1.0).pose_scales == pytest.approx(1.0)
+    found = scattered(rig, 0, 1.0, 1.0, 5.0)
+    reasons = judge_rig(found, LENGTH, 0.0).verdict.reasons
+    assert not any("measured positions" in why for why in reasons)
+
+
+def test_the_scatter_of_poses_widens_the_intervals(rig: Rig) -> None:
+    """Residuals of ten cables do not show it."""
+    found = scattered(rig, 0, 5.0, 1.0, 1.0)
+    stated = found.measured.with_scaled_deviations(1.0 / found.pose_scales)
+    fit, observability = identified(found.parameters, stated, LENGTH_NOISE)
+    no_misfits = replace(fit, pose_misfits=np.zeros_like(fit.pose_misfits))
+    scatters = [
+        uncertainty_of_rig(found.parameters, stated, one, observability).scatter
+        for one in (fit, no_misfits)
+    ]
+    assert scatters[0] > 2.0
+    assert scatters[1] == 1.0

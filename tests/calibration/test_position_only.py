@@ -77,15 +77,14 @@ def test_a_wrong_reflector_fits_worse(rig: Rig, truth: Truth) -> None:
 def test_what_a_position_says_of_a_pose_is_by_finite_differences(rig: Rig, truth: Truth) -> None:
     """The gradient of the squared distances, at estimated poses."""
     data = followed(truth, REFLECTOR)
-    fitter = RigFitter(Parameters.of(rig, DEFAULT_DEVIATIONS), data, LENGTH_DEVIATION)
     positions, rotations = truth.positions + 1e-3, truth.rotations
-    errors = fitter._pose_errors(positions, rotations)
+    errors = data.pose_errors(positions, rotations)
     information = data.pose_information(rotations)
     slopes = 2.0 * np.einsum("nij,nj->ni", information, errors)
     step = 1e-6
     for axis in range(3):
         moved = positions + step * np.eye(3)[axis]
-        there = fitter._pose_errors(moved, rotations)
+        there = data.pose_errors(moved, rotations)
         costs = [np.einsum("ni,nij,nj->n", e, information, e) for e in (there, errors)]
         np.testing.assert_allclose((costs[0] - costs[1]) / step, slopes[:, axis], rtol=1e-2)
 

@@ -291,11 +291,7 @@ def test_correlated_errors_within_samples_widen_the_intervals(rig: Rig, tilted: 
     shaken = tilted.measured.positions + 2e-3 * random.standard_normal((60, 3))
     data = replace(tilted.measured, positions=shaken)
     result = fit_rig(rig, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
-    scatter, by_jackknife = (
-        np.sqrt(np.diag(covariance))
-        for covariance in (result.uncertainty.by_scatter, result.uncertainty.by_jackknife)
-    )
-    assert np.median(by_jackknife / scatter) > 1.3
+    assert result.pose_scales == pytest.approx([10.0, 1.0], rel=0.2)
     assert share_inside(result.intervals, true_numbers(rig)) >= 0.9
 
 
