@@ -204,7 +204,7 @@ def main() -> int:
             me.until(lambda state: state["motion"] is None and state["busy"] is None)
             if me.state["latched"]:
                 print(f"latched, reset: {me.state['latched']}", flush=True)
-                assert me.does("reset")["ok"]
+                assert me.does("reset", cause=me.state["latched"])["ok"]
             assert me.command("jog_begin")["ok"]
             me.until(lambda state: state["jog"]["ready"] or state["outcome"])
             holder = Holder(me)

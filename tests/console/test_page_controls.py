@@ -199,10 +199,10 @@ def test_every_button_is_in_the_table_and_says_why_it_is_not_possible(desk: Visi
     desk.fake.ask(state={"control": {"yours": False, "held_by": "page 7"}})
     hold = desk.page.locator("#hold")
     expect(hold).to_have_attribute("aria-disabled", "true")
-    expect(hold).to_have_attribute("title", "page 7 has control")
-    expect(hold).to_have_attribute("aria-description", "page 7 has control")
+    expect(hold).to_have_attribute("title", "Page 7 has control")
+    expect(hold).to_have_attribute("aria-description", "Page 7 has control")
     hold.click(force=True)
-    expect(desk.page.locator("#notice")).to_have_text("Hold: page 7 has control.")
+    expect(desk.page.locator("#notice")).to_have_text("Hold: Page 7 has control.")
     names = desk.page.evaluate(
         "() => [...document.querySelectorAll('[data-button]')].map(e => e.dataset.button)"
     )

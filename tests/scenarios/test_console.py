@@ -215,9 +215,10 @@ def taught_and_run(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         planned = me.does("plan")
         assert planned["ok"], planned["text"]
         loaded = me.until(lambda state: state["preview"])
-        assert loaded["preview"] == "console/taught.plan.json"
+        name, _, shown = loaded["preview"].partition(" ")
+        assert name == "console/taught.plan.json"
         assert loaded["plan_start_off_mm"] < 0.2
-        assert me.command("run")["ok"]
+        assert me.command("run", plan=shown)["ok"]
         me.until(lambda state: state["motion"] and state["motion"]["state"] == "moving")
         assert me.command("hold")["ok"]
         held = me.until(lambda state: state["motion"] and state["motion"]["feed_percent"] == 0.0)
@@ -233,7 +234,7 @@ def taught_and_run(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
         assert ended["stopped"]
         assert "STOPPED" in ended["text"]
         assert me.state["plan_start_off_mm"] > 1.0
-        assert "plan from its current pose" in me.command("run")["what"]
+        assert "plan from its current pose" in me.command("run", plan=shown)["what"]
         assert me.command("plan", scene=None, pose="beside")["ok"]
         me.until(lambda state: state["plan_start_off_mm"] is not None)
         assert me.state["plan_start_off_mm"] < 0.2, "the path begins where the platform stopped"
@@ -354,4 +355,4 @@ def nothing_to_stop(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
     with console(slow_rig, bus) as (_, address), operator(address) as me:
         assert me.command("stop")["what"] == "nothing moves"
         assert "nothing moves" in me.command("hold")["what"]
-        assert "plan" in me.command("run")["what"]
+        assert "plan" in me.command("run", plan="")["what"]
