@@ -394,7 +394,7 @@ def faults_to_release_under(rig: Rig) -> tuple[LatchedFault | None, tuple[str, .
     return latched, names
 
 
-# Forward kinematics from drive positions.
+# The pose from drive positions.
 
 
 def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:

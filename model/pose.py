@@ -46,7 +46,8 @@ def require_unmasked(values: object) -> None:
 
 def read_only(values: ArrayLike) -> Array:
     """A float copy of ``values`` that cannot be written to; errors as for `floats_of`."""
-    array = np.array(floats_of(values))
+    require_unmasked(values)
+    array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
 
@@ -293,7 +294,7 @@ class Pose(ReadOnly):
     def turn(self) -> float:
         """Angle about z that is left without the tilt, as in `RotationLimits`, −π to π, [rad]."""
         w, _, _, z = self.quaternion
-        return 2.0 * math.atan2(z, w) if w >= 0.0 else 2.0 * math.atan2(-z, -w)
+        return 2.0 * math.atan2(z, w)
 
     def apply(self, points: ArrayLike) -> Array:
         """Maps points, shape (..., 3), [m], of the inner frame into the outer one."""

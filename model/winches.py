@@ -14,9 +14,10 @@ from model.errors import Fault
 from model.kinematics import (
     NoCable,
     cable_lengths,
+    cables_at,
     forward_kinematics,
     step_scale,
-    structure_matrix,
+    structure_matrix_of,
 )
 from model.pose import Array, Pose, moved, read_only
 from model.rig import Rig
@@ -146,9 +147,10 @@ class WinchMap:
     def _balance(self, pose: Pose, unstrained: Array, load: Load | None) -> Array:
         """Wrench on the platform, moments over the anchors' radius, shape (6,), [N]; or NaN."""
         try:
-            pull = self.tensions(unstrained, cable_lengths(self._rig, pose))
-            wrench = structure_matrix(self._rig, pose) @ pull
+            cables = cables_at(self._rig, pose)
         except NoCable:
             return np.full(6, np.nan)
+        pull = self.tensions(unstrained, cables.lengths)
+        wrench = structure_matrix_of(cables, pose.position) @ pull
         balance: Array = step_scale(self._rig) * (wrench + weight_wrench(self._rig, pose, load))
         return balance

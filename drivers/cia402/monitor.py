@@ -250,6 +250,8 @@ class DriveMonitor:
     @property
     def states_to_command(self) -> list[DriveState]:
         """The states, where those left in fault count as *switch on disabled*."""
+        if not self._left_in_fault:
+            return self.states
         rows = zip(self.nodes, self.states, strict=True)
         return [
             DriveState.SWITCH_ON_DISABLED if self._is_left(node, state) else state

@@ -31,7 +31,8 @@ class WindingOptions:
     """Settings of pretension and pose measurement; every field is an option."""
 
     tension_n: float | None = option(
-        "pretension of every cable (default: the tensions planned there)"
+        "pretension of every cable (default: the tensions planned at a stated pose; with --camera"
+        " twice the rig's smallest tension)"
     )
     limit_n: float | None = option("tension limit of any cable (default: 60 % of the range)")
     reach_mm: float = option(
