@@ -28,11 +28,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
-from tests.held_up import LIMIT_S, REPEATS, HoldUp  # noqa: E402
+from tests.held_up import LIMIT_S, REPEATS, HoldUp, reports_late_cycles  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 GRACE_S = 2.0  # for a thread that was told to end and is just returning
 HELD_UP = pytest.StashKey[HoldUp]()
+LATE = pytest.StashKey[bool]()
 
 settings.register_profile("ci", derandomize=True, deadline=None, max_examples=40, print_blob=True)
 settings.register_profile("explore", deadline=None, max_examples=1000, print_blob=True)
@@ -100,7 +101,17 @@ def _in_real_time(item: pytest.Item) -> bool:
 
 
 def _was_held_up(item: pytest.Item) -> bool:
-    return item.stash[HELD_UP].worst_s > LIMIT_S
+    return item.stash[HELD_UP].worst_s > LIMIT_S or item.stash.get(LATE, False)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    if call.excinfo is not None:
+        item.stash[LATE] = reports_late_cycles(str(call.excinfo.value))
+    return report
 
 
 @pytest.hookimpl(tryfirst=True)

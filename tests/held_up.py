@@ -1,12 +1,14 @@
 """Whether this computer was busy with something else while a test ran in real time.
 
 Such a test depends on programs that are woken on time. Where they were not, a run rightly stops,
-and its failure says nothing about the code: it is done again. On a computer that kept time a
+and its failure says nothing about the code: it is done again. So is one in which a process of a
+run, which no thread of the test can watch, began a cycle late. On a computer that kept time a
 failure counts at once.
 """
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 
@@ -14,6 +16,11 @@ PERIOD_S = 0.01
 LIMIT_S = 0.02
 """A quiet computer wakes a thread within a few milliseconds, also beside one that computes."""
 REPEATS = 4
+
+
+def reports_late_cycles(failure: str) -> bool:
+    """Whether the text of a failure holds the message of a run that ended for late cycles."""
+    return re.search(r"a cycle began \d+\.\d cycles late", failure) is not None
 
 
 class HoldUp:
