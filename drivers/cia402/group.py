@@ -18,7 +18,6 @@ from drivers.cia402.sdo_jobs import (
     ASKED_AGAIN_AFTER,
     ERROR_REQUESTS,
     MODE_WAIT,
-    REQUESTS_A_CYCLE,
     STATE_REQUESTS,
     AnswerListener,
     ModeCheck,
@@ -26,6 +25,7 @@ from drivers.cia402.sdo_jobs import (
     StatePoll,
     mode_text,
     monitoring_off,
+    requests_per_cycle,
     time_to_end,
 )
 from drivers.cia402.state_machine import (
@@ -76,6 +76,7 @@ class Cia402Group(CyclicGroup):
         cycle = rig.cycle
         self._cycle_s, self._profile = cycle, profile_of(rig)
         self._answer_time = self._profile.sdo_timeout_ms / 1000.0
+        self._requests = requests_per_cycle(self._cycle_s)
         self._heartbeat_cycles = heartbeat_cycles(cycle)
         self._patience = max(3, round(self._profile.enable_timeout_ms / 1000.0 / cycle))
         self._reset_cycles = round(RESET_WITHIN / cycle)
@@ -220,7 +221,7 @@ class Cia402Group(CyclicGroup):
             self._cyclic.send((self._frames.heartbeat,))
         for jobs in (self._modes, self._monitoring_off, self._errors):
             if jobs is not None:
-                self._ask(jobs, REQUESTS_A_CYCLE)
+                self._ask(jobs, self._requests)
 
     def command(self, command: GroupCommand) -> None:
         """Sets the goal of the group; see `DriveGroup.command`."""
@@ -347,7 +348,7 @@ class Cia402Group(CyclicGroup):
             if self._cycles_to_goal > self._reset_cycles or DriveState.FAULT not in states:
                 self._goal = Goal.IDLE
         elif self._state is GroupState.ENABLED:
-            self._ask(self._poll, REQUESTS_A_CYCLE)  # late in the cycle: drives stop after SYNC
+            self._ask(self._poll, self._requests)  # late in the cycle: drives stop after SYNC
         elif self._state is GroupState.ENABLING:
             names, words = self._rig.drive_names, self._watch.status_words
             seconds, needs_bit = self._patience * self._cycle_s, self._profile.follows_bit

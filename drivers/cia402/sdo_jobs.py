@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from drivers.cia402.pdo import SDO_REQUEST_BASE
 from drivers.cia402.profile import rpdo_parameters
 
-REQUESTS_A_CYCLE = 1
-"""SDO requests per cycle: as many as fit on a bus with 90 % load."""
+REQUEST_PERIOD = 0.01
+"""Part of a cycle for each SDO request and its answer, [s]; they fit on a bus with 90 % load."""
 
 ASKED_AGAIN_AFTER = 0.5
 """Time without an answer after which a request is repeated, [s]; double answers are harmless."""
@@ -73,6 +73,11 @@ STATE_REQUESTS = (
 ERROR_REQUESTS = (SdoRequest(0x603F, 0, size=2), SdoRequest(0x1003, 1))
 
 
+def requests_per_cycle(cycle: float) -> int:
+    """Largest number of SDO requests in a cycle of that period [s]; at least one."""
+    return max(1, int(cycle / REQUEST_PERIOD + 1e-9))
+
+
 def time_to_end(heartbeats: Iterable[int], cycle: float, answer: float) -> float:
     """Longest time to end all monitoring, [s].
 
@@ -82,7 +87,7 @@ def time_to_end(heartbeats: Iterable[int], cycle: float, answer: float) -> float
         answer: Time of one SDO answer, [s].
     """
     jobs = [len(monitoring_off(count)) for count in heartbeats]
-    return sum(jobs) * cycle / REQUESTS_A_CYCLE + max(jobs) * answer
+    return sum(jobs) * cycle / requests_per_cycle(cycle) + max(jobs) * answer
 
 
 def monitoring_off(heartbeats: int, rpdo: int = 1) -> tuple[SdoRequest, ...]:

@@ -6,7 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cia402.sdo_jobs import ModeCheck, SdoJobs, SdoRequest, StatePoll, monitoring_off
+from drivers.cia402.sdo_jobs import (
+    REQUEST_PERIOD,
+    ModeCheck,
+    SdoJobs,
+    SdoRequest,
+    StatePoll,
+    monitoring_off,
+    requests_per_cycle,
+    time_to_end,
+)
 
 NODE = 5
 NEVER = 1_000_000
@@ -46,6 +55,26 @@ def test_every_drive_gets_its_first_request_before_any_gets_its_second() -> None
         )
     assert asked == [(1, 0x23), (2, 0x23), (3, 0x23), (1, 0x40), (2, 0x40), (3, 0x40)]
     assert jobs.unfinished() == set()
+
+
+@given(cycle_ms=st.integers(1, 250), drives=st.integers(1, 12), heartbeats=st.integers(1, 12))
+def test_a_long_cycle_ends_the_monitoring_no_later_than_a_short_one(
+    cycle_ms: int, drives: int, heartbeats: int
+) -> None:
+    """At 100 ms, one request a cycle took 7 s from the end of a motion to the prompt."""
+    cycle = cycle_ms / 1000.0
+    jobs = {node: monitoring_off(heartbeats) for node in range(1, drives + 1)}
+    queue, turns = SdoJobs(jobs, NEVER), 0
+    while queue.unfinished():
+        requests = queue.next_requests(requests_per_cycle(cycle))
+        assert requests, "drives answer within the cycle here"
+        assert len(requests) == 1 or len(requests) * REQUEST_PERIOD <= cycle * (1.0 + 1e-9)
+        for can_id, data in requests:
+            queue.take(can_id - 0x600, bytes((0x60, *data[1:])))
+        turns += 1
+    of_each, of_all = len(jobs[1]), sum(map(len, jobs.values()))
+    assert turns * cycle <= of_each * cycle + 2 * of_all * REQUEST_PERIOD
+    assert turns * cycle <= time_to_end([heartbeats] * drives, cycle, answer=cycle) + 1e-9
 
 
 @pytest.mark.parametrize(
