@@ -101,7 +101,9 @@ def test_the_drives_that_answer_are_shown_beside_one_that_does_not(
         answer = call("status", slow_rig, *bus, "--json")
         assert answer.code == 4
         assert "drive 5 does not answer" in answer.err
-        result, _ = json.JSONDecoder().raw_decode(answer.out)  # the error follows
+        result = json.loads(answer.out)
+        assert (result["error"], result["exit_code"]) == ("hardware_missing", 4)
+        assert "drive 5 does not answer" in result["what"]
         without = [drive for drive in everything["drives"] if drive["node"] != 5]
         assert result["drives"] == without
         assert result["silent"] == [5]

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
+import typer
+
 from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
 from cdpr.cli.options import JSON, NO_QUESTION, RIG, WITHOUT_REAL_TIME, BusOptions
-from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
+from cdpr.cli.output import Terminal, err, out, show_facts, show_json, show_line
 from executor import service
 
 
@@ -26,14 +28,16 @@ def status(
     """
     the_rig = bus.rig(rig)
     result = service.status(the_rig)
+    missing = result.missing
     if as_json:
-        show_json(result.as_dict())
+        show_json({**result.as_dict(), **(missing.as_dict() if missing else {})})
     else:
         show_facts("state of the rig", result.facts(rig))
         for line in result.drive_lines(the_rig.drive_names):
             show_line(f"  {line}")
-    if result.missing is not None:
-        raise result.missing
+    if missing is not None:
+        show_line(f"error: {missing}", err)
+        raise typer.Exit(missing.exit_code)
 
 
 # `cdpr reset`: the only command that clears a latched fault.
