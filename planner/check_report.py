@@ -75,14 +75,23 @@ class Violation:
 
     def sentence(self) -> str:
         """The violation in words, with figures and platform position."""
-        scale = _SCALE[self.unit]
         x, y, z = (float(c) * 1000.0 for c in self.position)
-        bound = "" if self.proved is None else f", proved {self.proved * scale:.4g} {self.unit}"
+        figures = (self.measured, self.limit, *(() if self.proved is None else (self.proved,)))
+        measured, limit, *proved = _told_apart([figure * _SCALE[self.unit] for figure in figures])
+        bound = f", proved {proved[0]} {self.unit}" if proved else ""
         return (
-            f"{self.what}: {self.measured * scale:.4g} {self.unit}{bound}"
-            f" (limit {self.limit * scale:.4g} {self.unit})"
+            f"{self.what}: {measured} {self.unit}{bound} (limit {limit} {self.unit})"
             f" with the platform at [{x:.1f}, {y:.1f}, {z:.1f}] mm"
         )
+
+
+def _told_apart(values: list[float]) -> list[str]:
+    """Numbers with four digits, or as many as show which of them differ."""
+    for digits in range(4, 18):
+        texts = [f"{value:.{digits}g}" for value in values]
+        if len({*texts}) == len({*values}):
+            break
+    return texts
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -199,8 +199,8 @@ def following(cycles: CycleTable, limit: float) -> Check:
         f"No cable was more than {_rounded_up(value):.3f} mm off its set-point"
         f" (limit {limit * 1e3:g} mm)."
         if passed
-        else f"A cable was {value * 1e3:.3f} mm off its set-point at {cycles.time[worst]:.2f} s;"
-        f" the limit is {limit * 1e3:g} mm."
+        else f"A cable was {_rounded_up(value):.3f} mm off its set-point at"
+        f" {cycles.time[worst]:.2f} s; the limit is {limit * 1e3:g} mm."
     )
     return Check("following_error", passed, text)
 
@@ -292,6 +292,8 @@ def _against_required(rows: ClearanceTable, required: float, source_name: str) -
     worst = int(np.nanargmin(rows.distance if passed else rows.at_most))
     distance, high = rows.distance[worst] * 1e3, rows.at_most[worst] * 1e3
     low = distance - rows.uncertainty[worst] * 1e3
+    if not passed:  # rounded down, so that they do not look like the required one
+        low, distance, high = (math.floor(round(x * 10.0, 6)) / 10.0 for x in (low, distance, high))
     bounds = f"{INTERVAL} {low:.1f} to {high:.1f} mm"
     text = (
         f"Smallest clearance measured by {source_name}: {distance:.1f} mm, {bounds}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, replace
 from typing import Any
 
@@ -279,6 +280,8 @@ def test_a_clearance_fails_only_when_too_small_beyond_its_uncertainty(
     assert check.passed is passed
     assert "cable 3 to box" in check.text
     assert "required 10 mm" in check.text
+    (upper,) = re.findall(r"to (\d+\.\d) mm \(", check.text)
+    assert (float(upper) >= 10.0) is passed, "a verdict contradicts its own figures"
 
 
 @pytest.mark.parametrize("side", [9.9, 10.1])
@@ -355,7 +358,7 @@ def test_one_bad_row_among_good_ones_is_found(run: fake_run.FakeRun) -> None:
     both = joined(good, bad)
     check = distances(both, 0.010)[0]
     assert not check.passed
-    assert "9.9 mm, 95 % interval 9.8 to 10.0 mm" in check.text
+    assert "9.9 mm, 95 % interval 9.8 to 9.9 mm" in check.text
 
 
 def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRun) -> None:

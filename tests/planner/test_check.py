@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -16,7 +19,7 @@ from model.plan import plan_from_document, sealed
 from model.pose import Pose, interpolate
 from model.rig import Rig, rig_from_document
 from planner.check import _Check, axis_distances, check_path, verify
-from planner.check_report import VerifiedPlan
+from planner.check_report import VerifiedPlan, Violation
 from planner.costs import capacity_margins
 from planner.path import PosePath
 from planner.planning import make_plan
@@ -301,3 +304,24 @@ def test_a_report_is_plain_json(gachon, document) -> None:
     plan = plan_from_document(document)
     text = json.dumps(check_path(gachon, plan.scene, plan.waypoints).as_dict(), allow_nan=False)
     assert json.loads(text)["passed"] is True
+
+
+@given(
+    limit=st.floats(1e-4, 1e3),
+    short=st.floats(1e-12, 0.9),
+    unit=st.sampled_from(["mm", "mm/s", "°", "N"]),
+    proves=st.booleans(),
+)
+def test_a_violation_never_shows_a_value_equal_to_its_limit(
+    limit: float, short: float, unit: str, proves: bool
+) -> None:
+    """9.9999 mm of 10 mm was "10 mm (limit 10 mm)"."""
+    below = limit * (1.0 - short)
+    figures = (
+        (limit * 2.0, limit, unit, np.zeros(3), below)
+        if proves
+        else (below, limit, unit, np.zeros(3))
+    )
+    sentence = Violation("too near", *figures).sentence()
+    shown = dict(re.findall(r"(: |proved |limit )(-?[\d.e+-]+) ", sentence))
+    assert float(shown["proved " if proves else ": "]) < float(shown["limit "])
