@@ -6,6 +6,7 @@ or a tilt not covered yet, or a position far from all others.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ import cv2
 import numpy as np
 
 from calibration.targets.boards import Board, DetectedBoard
-from drivers.cameras.files import ImageFolder, OneCamerasPictures
+from drivers.cameras.files import PICTURE_ENDINGS, ImageFolder, OneCamerasPictures
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from executor.cameras.sources import require_camera_source
 from model.cameras import generic_camera
@@ -325,7 +326,7 @@ def same_images(sets: Sequence[ImageSet]) -> list[ImageSet]:
     videos = [one.video for one in sets if one.video is not None]
     if len(videos) < len(sets):
         return list(sets)
-    total, most = min(map(_length, videos)), min(one.count for one in sets)
+    total, most = min(video.readable for video in videos), min(one.count for one in sets)
     rates = [video.rate for video in videos]
     if total * (max(rates) - min(rates)) > 0.5 * min(rates):
         raise BadInput(
@@ -337,14 +338,9 @@ def same_images(sets: Sequence[ImageSet]) -> list[ImageSet]:
     return [_sampled(video, most, total) for video in videos]
 
 
-def _length(video: VideoFile) -> int:
-    """Number of its images, counted if the file does not state it."""
-    return len(video) or sum(1 for _ in video)
-
-
 def _sampled(video: VideoFile, most: int, total: int | None = None) -> ImageSet:
     """Evenly spaced images of a video, of its first ``total`` (default: all)."""
-    total = _length(video) if total is None else total
+    total = video.readable if total is None else total
     count = min(most, total)
     numbers = {k * total // count for k in range(count)}
     return ImageSet(_Sample(video, numbers), count, video=video)
@@ -383,7 +379,8 @@ def capture_images(
 
     Args:
         source: A camera's index, device or address, or a video file.
-        folder: Existing folder for the images.
+        folder: Existing folder for the images, ``live_001.png`` …; the first one replaces all
+            images of an earlier session.
         board: The target to detect.
         wanted: Minimum number of images.
         size: Width and height of the camera's images, [px]; a video has its own.
@@ -395,15 +392,19 @@ def capture_images(
 
     Raises:
         HardwareMissing: The camera does not open.
-        BadInput: The source is unknown, its images are of another size, or none was captured.
+        BadInput: The source is unknown, its images are of another size, none was captured, or the
+            folder has images from elsewhere.
     """
     guide, last = CaptureGuide(board, wanted), ""
+    earlier = _captured(folder)
     with _frames(source, size) as frames:
         for image in frames:
             if stopped():
                 break
             advice = guide.judge(image)
             if advice.taken:
+                while earlier:
+                    earlier.pop().unlink(missing_ok=True)
                 data = cv2.imencode(".png", image)[1].tobytes()
                 write_bytes_atomic(folder / f"live_{len(guide.views):03}.png", data)
                 on_advice(guide.coverage_map())
@@ -420,6 +421,24 @@ def capture_images(
             next_step="check the board's kind, its dimensions and the light, and hold it still",
         )
     return len(guide.views)
+
+
+def _captured(folder: Path) -> list[Path]:
+    """The images that earlier sessions captured into a folder.
+
+    Raises:
+        BadInput: It has others too, which a calibration would mix with new ones.
+    """
+    images = [path for path in folder.iterdir() if path.suffix.lower() in PICTURE_ENDINGS]
+    others = [path.name for path in images if not re.fullmatch(r"live_\d{3,}\.png", path.name)]
+    if others:
+        raise BadInput(
+            "the folder has images that were not captured by --live",
+            where=str(folder),
+            why=", ".join(sorted(others)[:4]),
+            next_step="choose another folder, so that they are not mixed with new images",
+        )
+    return images
 
 
 @contextmanager

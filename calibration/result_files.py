@@ -16,8 +16,10 @@ from calibration.intrinsics.result import CameraResult
 from calibration.results import ResultDocument
 from calibration.statistics import Interval
 from calibration.tag_map.result import TagsResult
+from model.cameras import left_out_errors
 from model.errors import BadInput
 from model.files.documents import load_yaml, read_yaml, write_atomic
+from model.progress import SILENT, Listener
 from model.rig import Rig, in_order
 
 KINDS: dict[str, type[ResultDocument]] = {
@@ -61,15 +63,19 @@ def _kind_of(path: Path) -> type[ResultDocument]:
     return KINDS[kind]
 
 
-def write_calibrated_rig(path: Path, rig: Rig, results: Sequence[ResultDocument]) -> Rig:
+def write_calibrated_rig(
+    path: Path, rig: Rig, results: Sequence[ResultDocument], listener: Listener = SILENT
+) -> Rig:
     """Writes a new rig file with results applied to a rig; returns the new rig.
 
-    Comments of the rig's own file are not copied; a comment at its top names the results.
+    Comments of the rig's own file are not copied; comments at its top name the results, and each
+    ``error_mm`` that a new lens leaves out.
 
     Args:
         path: The file to write; an existing file is never replaced.
         rig: As in its own file.
         results: In any order.
+        listener: Receives the remarks too.
 
     Raises:
         BadInput: The file exists or cannot be written, or a result is not about this rig.
@@ -81,12 +87,13 @@ def write_calibrated_rig(path: Path, rig: Rig, results: Sequence[ResultDocument]
             why="a calibration never replaces a rig file",
             next_step="choose a new name",
         )
-    better = rig.with_calibration(*results)
+    better = rig.with_calibration(*results, listener=listener)
     used = [f"{one.kind} {one.name} of {one.date}" for one in in_order(results)]
     plain = better.document.model_dump(mode="json", exclude_unset=True)
     body = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None)
-    head = f"# {rig.name} with calibration {', '.join(used)}; written by `cdpr calibrate apply`"
-    write_atomic(path, f"{head}\n{body}")
+    head = [f"{rig.name} with calibration {', '.join(used)}; written by `cdpr calibrate apply`"]
+    head += left_out_errors(rig.document.cameras, better.document.cameras)
+    write_atomic(path, "".join(f"# {line}\n" for line in head) + body)
     return better
 
 

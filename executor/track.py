@@ -224,7 +224,9 @@ def track_sources(
                 result.count,
                 give_up_after=PATIENCE if length is None and not several else None,
                 model=model,
-                on_picture=drawing.enter_context(_overlay(target, rig, camera, replace_overlay)),
+                on_picture=drawing.enter_context(
+                    _overlay(target, rig, camera, _rate(frames, camera), replace_overlay)
+                ),
             )
         try:
             _measure(_together(streams, within, result.together, model), result, advance)
@@ -356,13 +358,13 @@ def _together(
 
 @contextmanager
 def _overlay(
-    target: Path | None, rig: Rig, camera: Camera, replace: bool
+    target: Path | None, rig: Rig, camera: Camera, rate: float, replace: bool
 ) -> Iterator[Callable[[Picture, LoggedPicture], None] | None]:
     """A function that writes images with measurements drawn in; None without a target."""
     if target is None:
         yield None
         return
-    with PictureOutput(target, camera.rate, replace) as out:
+    with PictureOutput(target, rate, replace) as out:
 
         def draw(picture: Picture, logged: LoggedPicture) -> None:
             found = logged.observation
@@ -371,6 +373,11 @@ def _overlay(
             )
 
         yield draw
+
+
+def _rate(frames: Iterable[Picture], camera: Camera) -> float:
+    """Images per second of a source, for a video of them, [Hz]."""
+    return frames.rate if isinstance(frames, VideoFile) else camera.rate
 
 
 def _opened(

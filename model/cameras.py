@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -113,6 +114,21 @@ def camera_from(document: CameraDocument) -> Camera:
         latency=document.latency_ms / 1e3,
         gamma=document.gamma,
     )
+
+
+def left_out_errors(before: Sequence[CameraDocument], after: Sequence[CameraDocument]) -> list[str]:
+    """Remarks on operators' errors that a new lens left out: they were stated for another one.
+
+    Args:
+        before: The cameras with their former lenses.
+        after: The same cameras in the same order.
+    """
+    return [
+        f"error_mm of camera {own.name!r}, {own.error_mm:g}, was stated for another lens and is"
+        " left out; state it again in a rig file with the new lens before clearance is measured"
+        for own, new in zip(before, after, strict=True)
+        if own.error_mm is not None and new.error_mm is None
+    ]
 
 
 _SCALES = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)

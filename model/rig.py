@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from model.cameras import Camera, Tag, camera_from, tag_from
+from model.cameras import Camera, Tag, camera_from, left_out_errors, tag_from
 from model.errors import BadInput, path_of, require_types
 from model.files.documents import document_hash, document_of, key_path, load_yaml, millimetres
 from model.files.rig_file import MotionDocument, RigDocument, WinchDocument
 from model.pages.page import html_table
 from model.pose import Array, Pose, ReadOnly, floats_of, read_only
 from model.posed_rig import PosedRig, posed_rig
+from model.progress import SILENT, Listener
 from model.scene import Load, Scene
 
 if TYPE_CHECKING:
@@ -284,11 +285,12 @@ class Rig(ReadOnly):
         bus = self.document.bus.model_copy(update=given)
         return rig_from_document(self.document.model_copy(update={"bus": bus}))
 
-    def with_calibration(self, *results: CalibrationResult) -> Rig:
+    def with_calibration(self, *results: CalibrationResult, listener: Listener = SILENT) -> Rig:
         """The rig with its file's numbers replaced by calibration results, in memory only.
 
         Args:
             results: From calibration functions or `calibration.load_result`, in any order.
+            listener: Receives a remark for each ``error_mm`` that a new lens leaves out.
 
         Raises:
             BadInput: A result does not fit this rig, or two calibrate the same thing.
@@ -308,6 +310,8 @@ class Rig(ReadOnly):
         document = self.document
         for result in in_order(results):
             document = result.corrected(document)
+        for remark in left_out_errors(self.document.cameras, document.cameras):
+            listener.remark(remark)
         return rig_from_document(document)
 
     def plot(self, pose: Pose | None = None, scene: Scene | None = None) -> Figure:

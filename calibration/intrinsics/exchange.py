@@ -22,7 +22,7 @@ import yaml
 from pydantic import ValidationError
 
 from calibration.intrinsics.result import camera_named, with_camera
-from model.cameras import camera_from, is_camera_matrix, principal_point_doubt
+from model.cameras import camera_from, is_camera_matrix, left_out_errors, principal_point_doubt
 from model.errors import BadInput
 from model.files.camera_file import FISHEYE, CameraDocument
 from model.files.documents import read_text, read_yaml, write_atomic
@@ -203,10 +203,7 @@ def _remarks(own: CameraDocument, new: CameraDocument, path: Path, assumed: bool
         remarks.insert(0, f"{path.name}: {doubt}")
     if assumed:
         remarks.insert(0, f"{path.name} has no distortion_model; plumb_bob is assumed, as by ROS")
-    if own.error_mm is not None:
-        what = f"error_mm, {own.error_mm:g}, was stated for another lens and is left out"
-        remarks.append(f"{what}; state it again before clearance is measured")
-    return remarks
+    return remarks + left_out_errors([own], [new])
 
 
 def _found(path: Path, entry: str | None) -> dict[str, Any]:

@@ -277,6 +277,8 @@ class CameraResult(ResultDocument):
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with this camera's parameters.
 
+        Errors stated for another lens are left out: the pose's and the operator's ``error_mm``.
+
         Raises:
             BadInput: The rig has no camera of this name, or one of another size.
         """
@@ -292,6 +294,7 @@ class CameraResult(ResultDocument):
         changes = {k: getattr(self, k) for k in keys} | {
             "pose_by_lens": None,
             "pose_covariance": None,
+            "error_mm": None,
         }
         return with_camera(rig, camera.model_copy(update=changes))
 

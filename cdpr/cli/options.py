@@ -69,7 +69,7 @@ def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
     if not files:
         return rig
     results = [calibration.load_result(file) for file in files]
-    better = rig.with_calibration(*results)
+    better = rig.with_calibration(*results, listener=Terminal())
     for one in results:
         if not one.good_enough:
             Terminal().remark(f"calibration {one.kind} {one.name}, {one.date}: {one.verdict}")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.live import Frame, Image, eight_bits, is_too_large, stated_size
+from drivers.cameras.live import Frame, Image, eight_bits, is_too_large
 from model.errors import AlreadyExists, BadInput, Fault
 from model.files.documents import write_bytes_atomic
 from model.files.reading import PICTURE_LIMIT, read_bytes
@@ -26,14 +25,14 @@ PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".w
 #: An EXIF block begins within so many bytes and is no longer, [bytes].
 EXIF_WITHIN = 65536
 _GREY_LEVELS = (np.uint8, np.uint16)
+_ON_ITS_SIDE = range(5, 9)  # EXIF orientations that swap width and height
 _NO_PICTURE, _CAMERA = "is not a readable image", "the camera has"
 
 
 class ImageFolder:
     """The images of a folder in natural order of their names.
 
-    They are rotated according to their EXIF orientation or all used as stored, by the rule of
-    `OneCamerasPictures`: a calibration and a measurement see the same pixels.
+    They are rotated by the rule of `read_picture`, as in a calibration.
 
     Args:
         folder: Folder of the images.
@@ -74,16 +73,11 @@ class ImageFolder:
         """
         self.unused.clear()
         wanted = (self._camera.width, self._camera.height)
-        none_read, upright = True, _are_upright_by_headers(self.files, wanted)
+        none_read = True
         for number, path in enumerate(self.files):
-            image = read_picture(path, upright is not False)
-            if upright is None and image is not None and _size(image) != wanted:
-                other = read_picture(path, upright=False)  # formats whose orientation is not parsed
-                if _size(other) == wanted:
-                    image, upright = other, False
+            image = read_picture(path, wanted)
             none_read &= image is None
             if image is not None and _size(image) == wanted:
-                upright = upright is not False
                 yield Frame(number / self.rate, image, path.name, number)
                 continue
             why = _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
@@ -97,11 +91,9 @@ class ImageFolder:
 
 
 class OneCamerasPictures:
-    """The images of a folder with one size, rotated according to their EXIF orientation.
+    """The images of a folder with one size, rotated by the rule of `read_picture`.
 
-    If more images have this size without the rotation, or their orientations differ, they are used
-    as stored. Files of another size do not count in this; those that cannot be used are listed in
-    `unused`.
+    Files that cannot be used are listed in `unused`.
 
     Args:
         folder: Folder of the images.
@@ -111,8 +103,6 @@ class OneCamerasPictures:
         size: Width and height, [px].
         names: Names of the images used, in order.
         unused: Reason by name of each file that is not used.
-        upright: Whether the EXIF orientation is applied; not if it differs between images, which a
-            camera that points down states at random.
 
     Raises:
         BadInput: The folder is missing, has no images, or none that can be read or has the
@@ -120,42 +110,33 @@ class OneCamerasPictures:
     """
 
     def __init__(self, folder: Path, wanted: tuple[int, int] | None = None) -> None:
-        files = picture_files(folder)
         self.unused: dict[str, str] = {}
         sizes: dict[Path, tuple[int, int]] = {}
-        orientations: dict[Path, int] = {}
-        for path in files:
+        orientations: list[int] = []
+        for path in picture_files(folder):
             data = _data(path)
             image = _decoded(data)
             if image is None:
                 self.unused[path.name] = _unreadable(path)
             else:
                 sizes[path] = _size(image)
-                orientations[path] = exif_orientation(data)
+                orientations.append(exif_orientation(data))
         if not sizes:
             raise _no_picture(folder, self.unused)
-        self.upright = True
-        mixed = len(set(orientations.values())) > 1
-        if mixed or set(sizes.values()) != {wanted or next(iter(sizes.values()))}:
-            stored = {path: _size(read_picture(path, upright=False)) for path in sizes}
-            self.upright = _are_upright(
-                list(orientations.values()), list(sizes.values()), list(stored.values()), wanted
-            )
-            sizes = sizes if self.upright else stored
-        self.size = wanted or _most_frequent(sizes.values())
+        self.size = wanted or _most_frequent([*zip(sizes.values(), orientations, strict=True)])
         for path, size in sizes.items():
-            if size != self.size:
+            if size != self.size and _size(read_picture(path, self.size)) != self.size:
                 owner = _CAMERA if wanted else "most have"
                 self.unused[path.name] = _other_size(size, owner, self.size)
-        if self.size not in sizes.values():
-            raise _wrong_sizes(folder, self.unused, self.size)
         self._files = [path for path in sizes if path.name not in self.unused]
+        if not self._files:
+            raise _wrong_sizes(folder, self.unused, self.size)
         self.names = tuple(path.name for path in self._files)
 
     def __iter__(self) -> Iterator[tuple[str, Image]]:
         """Yields names and grey images."""
         for path in self._files:
-            image = read_picture(path, self.upright)
+            image = read_picture(path, self.size)
             if image is not None and _size(image) == self.size:
                 yield path.name, image
 
@@ -178,14 +159,23 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
     return tuple(sorted(found, key=lambda path: natural_order(path.name)))
 
 
-def read_picture(path: Path, upright: bool = True) -> Image | None:
+def read_picture(path: Path, size: tuple[int, int] | None = None) -> Image | None:
     """The grey image of a file, or None if it has none; also for names that OpenCV cannot open.
+
+    It is as the sensor stored it, like that of a live camera: a camera that points down states its
+    orientation at random, and an image rotated by 180° has another principal point. Only one that
+    has the camera's size once rotated as its EXIF data say, by 90°, is rotated.
 
     Args:
         path: The file.
-        upright: Whether to apply the EXIF orientation.
+        size: Width and height of the camera's images, [px]; None for as stored.
     """
-    return _decoded(_data(path), upright)
+    data = _data(path)
+    image = _decoded(data)
+    if image is None or size in (None, _size(image)):
+        return image
+    rotated = _decoded(data, upright=True)
+    return rotated if _size(rotated) == size else image
 
 
 def _data(path: Path) -> bytes:
@@ -196,57 +186,30 @@ def _data(path: Path) -> bytes:
         return b""
 
 
-def _are_upright(
-    orientations: Sequence[int],
-    upright: Sequence[tuple[int, int]],
-    stored: Sequence[tuple[int, int]],
-    wanted: tuple[int, int] | None,
-) -> bool:
-    """Whether the EXIF orientation of a camera's images is applied.
+def _most_frequent(images: Sequence[tuple[tuple[int, int], int]]) -> tuple[int, int]:
+    """The size that most of a camera's images have, as stored or rotated by 90° as stated.
+
+    Of two equally frequent ones, that of the images as rotated if all state the same rotation.
 
     Args:
-        orientations: Of each image.
-        upright: Width and height of each with its orientation applied, [px].
-        stored: The same without.
-        wanted: The camera's (default: the most frequent).
+        images: Width and height as stored, [px], and EXIF orientation of each.
     """
-    size, size_stored = wanted or _most_frequent(upright), wanted or _most_frequent(stored)
-    count, count_stored = upright.count(size), stored.count(size_stored)
-    if count != count_stored:
-        return count > count_stored
-    each = zip(orientations, upright, stored, strict=True)
-    return len({one for one, a, b in each if a == size or b == size_stored}) <= 1
+
+    def rank(size: tuple[int, int]) -> tuple[int, int, tuple[int, int]]:
+        used = [(stored, turn) for stored, turn in images if size in (stored, _shown(stored, turn))]
+        is_one_turn = len({turn for _, turn in used if turn in _ON_ITS_SIDE}) < 2
+        as_wanted = [(_shown(one, turn) if is_one_turn else one) == size for one, turn in used]
+        return len(used), sum(as_wanted), size
+
+    return max((size for one, turn in images for size in (one, _shown(one, turn))), key=rank)
 
 
-def _are_upright_by_headers(files: Sequence[Path], wanted: tuple[int, int]) -> bool | None:
-    """The same by the beginnings of files; None where none states a rotation."""
-    orientations = {path: exif_orientation(_head(path)) for path in files}
-    if set(orientations.values()) == {1}:
-        return None
-    stored = {path: stated_size(_head(path)) or _size(read_picture(path, False)) for path in files}
-    stored = {path: size for path, size in stored.items() if all(size)}
-    turned = [size[::-1] if 4 < orientations[path] < 9 else size for path, size in stored.items()]
-    return _are_upright(
-        [orientations[path] for path in stored], turned, list(stored.values()), wanted
-    )
+def _shown(stored: tuple[int, int], orientation: int) -> tuple[int, int]:
+    """Width and height of an image rotated by 90° if its EXIF orientation says so, [px]."""
+    return stored[::-1] if orientation in _ON_ITS_SIDE else stored
 
 
-def _most_frequent(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
-    """The most frequent size, of two equally frequent ones the larger."""
-    counted = Counter(sizes)
-    return max(counted, key=lambda size: (counted[size], size))
-
-
-def _head(path: Path) -> bytes:
-    """The beginning of a file, as far as its EXIF data may reach; empty if it cannot be read."""
-    with suppress(OSError):
-        if path.is_file():
-            with path.open("rb") as stream:
-                return stream.read(EXIF_WITHIN)
-    return b""
-
-
-def _decoded(data: bytes, upright: bool = True) -> Image | None:
+def _decoded(data: bytes, upright: bool = False) -> Image | None:
     picture = _raw(data, upright)
     return None if picture is None or picture.dtype not in _GREY_LEVELS else eight_bits(picture)
 
@@ -259,7 +222,7 @@ def _unreadable(path: Path) -> str:
     return f"has values of type {picture.dtype}; only integers of 8 to 16 bits can be used"
 
 
-def _raw(data: bytes, upright: bool = True) -> NDArray[np.generic] | None:
+def _raw(data: bytes, upright: bool = False) -> NDArray[np.generic] | None:
     if not data or is_too_large(data):
         return None
     flags = (

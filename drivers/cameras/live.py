@@ -10,6 +10,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -207,7 +208,7 @@ class VideoFile:
         if not path.is_file():
             raise BadInput("no such file", where=str(path), next_step="check the path")
         self._path, self._camera = path, camera
-        capture = _opened(str(path))
+        capture = _opened_video(path, camera)
         if not capture.isOpened():
             raise BadInput(
                 "the file is not a readable video",
@@ -235,13 +236,22 @@ class VideoFile:
         """Number of images that the file states, for progress."""
         return self._count
 
+    @cached_property
+    def readable(self) -> int:
+        """Number of its images, counted by reading all; that which the file states may be wrong.
+
+        Raises:
+            BadInput: As when they are read.
+        """
+        return sum(1 for _ in self)
+
     def __iter__(self) -> Iterator[Frame]:
         """Yields every image.
 
         Raises:
             BadInput: They have another size than the camera, or none can be read.
         """
-        capture = _opened(str(self._path))
+        capture = _opened_video(self._path, self._camera)
         number, seconds = 0, -1.0 / self.rate
         try:
             while True:
@@ -372,20 +382,36 @@ def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
 
 
 def video_size(path: Path) -> tuple[int, int]:
-    """Width and height of a video's images, [px]; zero if it is not a video."""
+    """Width and height of a video's images as it is shown, [px]; zero if it is not a video."""
     capture = _opened(str(path))
     try:
-        width, height = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
-        return int(capture.get(width)), int(capture.get(height))
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+        return _size(capture)
     finally:
         capture.release()
 
 
+def _opened_video(path: Path, camera: Camera) -> cv2.VideoCapture:
+    """Opens a video, whose images are rotated as it states only if they need it for their size."""
+    capture = _opened(str(path))
+    if _size(capture) != (camera.width, camera.height):
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+    return capture
+
+
+def _size(capture: cv2.VideoCapture) -> tuple[int, int]:
+    """Width and height of its images, [px]."""
+    width, height = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
+    return int(capture.get(width)), int(capture.get(height))
+
+
 def _opened(source: int | str) -> cv2.VideoCapture:
-    """Opens a source without the log output of OpenCV and FFmpeg."""
+    """Opens a source of images as stored, without the log output of OpenCV and FFmpeg."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     with silent_opencv():
-        return cv2.VideoCapture(source)
+        capture = cv2.VideoCapture(source)
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        return capture
 
 
 @contextmanager

@@ -199,7 +199,11 @@ def test_an_import_leaves_out_the_error_of_measurements_and_states_the_next_step
     assert [f"# {text}" for text in remarks.texts] == new.read_text().splitlines()[1:4]
     for text, part in zip(
         remarks.texts,
-        ("plumb_bob is assumed", "cdpr calibrate extrinsics", "error_mm, 0.5, was stated"),
+        (
+            "plumb_bob is assumed",
+            "cdpr calibrate extrinsics",
+            "error_mm of camera 'front', 0.5, was stated",
+        ),
         strict=True,
     ):
         assert part in text

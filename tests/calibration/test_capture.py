@@ -148,19 +148,32 @@ def video_of(path: Path, length: int) -> Path:
 
 
 @pytest.mark.parametrize("length", [7, VIDEO_IMAGES, VIDEO_IMAGES + 1, 100, 3 * VIDEO_IMAGES])
-@pytest.mark.parametrize("states_length", [True, False])
+@pytest.mark.parametrize("stated", [None, 0, 10.0, 0.1])
 def test_as_many_images_of_a_video_as_wanted_are_spaced_evenly(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int, states_length: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int, stated: float | None
 ) -> None:
+    """Also if the file states none, or another number, as a cut one or one of variable rate."""
     path = video_of(tmp_path / "board.avi", length)
-    if not states_length:
-        monkeypatch.setattr(VideoFile, "__len__", lambda _: 0)
+    if stated is not None:
+        monkeypatch.setattr(VideoFile, "__len__", lambda _: int(stated * length))
     images = open_images(path)
     numbers = [int(name.removeprefix("image ")) for name, _ in images.images]
     assert images.count == len(numbers) == min(length, VIDEO_IMAGES)
     gaps = np.diff([*numbers, length])
     assert numbers[0] == 0
     assert np.ptp(gaps) <= 1
+
+
+def test_a_cut_video_is_sampled_over_what_is_left_of_it(tmp_path: Path) -> None:
+    """Its header states all images."""
+    path = video_of(tmp_path / "board.avi", 1000)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 10])
+    video = VideoFile(path, generic_camera((64, 48)))
+    assert len(video) > 5 * video.readable > 5 * VIDEO_IMAGES
+    numbers = [int(name.removeprefix("image ")) for name, _ in open_images(path).images]
+    assert len(numbers) == VIDEO_IMAGES
+    assert np.ptp(np.diff([*numbers, video.readable])) <= 1
 
 
 @pytest.mark.parametrize("lengths", [(60, 62), (300, 310), (310, 12)])

@@ -91,9 +91,8 @@ def test_orientations_that_change_between_images_are_those_of_a_camera_that_poin
     one, other = (image for _, image in OneCamerasPictures(tmp_path))
     assert np.array_equal(one, other)
     (tmp_path / "a.jpg").write_bytes(jpeg(grey, 3))
-    one, other = (image for _, image in OneCamerasPictures(tmp_path))
-    assert np.abs(one.astype(int) - np.rot90(grey, 2)).mean() < 2.0, "all are turned alike"
-    assert np.array_equal(one, other)
+    for _, image in OneCamerasPictures(tmp_path):
+        assert np.abs(image.astype(int) - grey).mean() < 2.0, "as stored, whatever they state"
 
 
 def test_corners_are_found_in_twelve_megapixels() -> None:

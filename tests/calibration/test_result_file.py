@@ -22,6 +22,8 @@ from calibration.statistics import Interval
 from model.errors import BadInput
 from model.rig import Rig, load_rig, rig_from_document
 from tests.calibration.results import camera_result_of
+from tests.calibration.test_camera_files_of_others import Remarks
+from tracking.shared_errors import require_stated_errors
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -82,6 +84,21 @@ def test_a_pose_found_with_another_lens_states_no_error(rig: Rig) -> None:
     assert known.cameras[0].pose_covariance is not None
     camera = known.with_calibration(camera_result_of()).cameras[0]
     assert (camera.pose_covariance, camera.pose_by_lens) == (None, None)
+
+
+def test_an_error_stated_for_another_lens_is_left_out(rig: Rig) -> None:
+    """Clearance is not measured with it, until the operator states it for the new lens."""
+    stated = rig.document.cameras[0].model_copy(update={"error_mm": 0.5})
+    known = rig_from_document(rig.document.model_copy(update={"cameras": [stated]}))
+    remarks = Remarks([])
+    better = known.with_calibration(camera_result_of(), listener=remarks)
+    with pytest.raises(BadInput, match="measuring error of camera 'front' is unknown"):
+        require_stated_errors(better, better.cameras)
+    (remark,) = remarks.texts
+    assert remark.startswith("error_mm of camera 'front', 0.5, was stated for another lens")
+    remarks.texts.clear()
+    better.with_calibration(camera_result_of(), listener=remarks)
+    assert remarks.texts == []
 
 
 @pytest.mark.parametrize(

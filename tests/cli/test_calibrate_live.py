@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from calibration.pictures import capture_images
+from calibration.targets.boards import Chessboard
 from model.pose import Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import SIZE, picture_of
 from tests.cli.program import call, nothing_written, one_message
@@ -95,3 +97,60 @@ def test_pictures_of_before_are_not_mixed_with_new_ones(video: Path, tmp_path: P
     with nothing_written(tmp_path):
         answer = call("calibrate", "camera", tmp_path, "--live", video, *BOARD)
     one_message(answer, 2, "the folder is not empty")
+
+
+@pytest.fixture
+def earlier(tmp_path: Path) -> Path:
+    """Images of an earlier session, with another lens."""
+    for number in range(1, 21):
+        image = np.full(SIZE[::-1], number, np.uint8)
+        cv2.imwrite(str(tmp_path / f"live_{number:03}.png"), image)
+    return tmp_path
+
+
+def test_force_replaces_the_images_of_an_earlier_session(video: Path, earlier: Path) -> None:
+    old = {path.read_bytes() for path in earlier.iterdir()}
+    options = ("--live", video, "--pictures", "12", *BOARD, "--force", "--json")
+    answer = call("calibrate", "camera", earlier, *options)
+    assert answer.code in (0, 3), answer
+    found = json.loads(answer.out)
+    taken = {path.read_bytes() for path in earlier.iterdir()}
+    assert not taken & old
+    assert found["pictures_used"] == len(taken)
+    assert found["unused"] == {}
+
+
+def test_force_keeps_an_earlier_session_until_an_image_is_captured(
+    video: Path, earlier: Path
+) -> None:
+    other = ("--board", "charuco", "--columns", "5", "--rows", "4", "--square-mm", "25")
+    other += ("--marker-mm", "20", "--force")
+    with nothing_written(earlier):
+        answer = call("calibrate", "camera", earlier, "--live", video, *other)
+    one_message(answer, 2, "no image was captured")
+
+
+def test_images_of_another_source_are_not_mixed_with_new_ones(video: Path, earlier: Path) -> None:
+    """Nor deleted: only captured images are replaced."""
+    (earlier / "live_001.png").rename(earlier / "mine.PNG")
+    with nothing_written(earlier):
+        answer = call("calibrate", "camera", earlier, "--live", video, *BOARD, "--force")
+    one_message(answer, 2, "mine.PNG", "choose another folder")
+
+
+def test_an_interrupted_session_is_not_mixed_with_an_earlier_one(
+    video: Path, earlier: Path
+) -> None:
+    """As by Ctrl-C after its fifth image."""
+    texts: list[str] = []
+    taken = capture_images(
+        str(video),
+        earlier,
+        Chessboard(9, 6, 0.025),
+        on_advice=texts.append,
+        stopped=lambda: sum(text.startswith("5 of") for text in texts) > 0,
+    )
+    assert taken == 5
+    assert sorted(path.name for path in earlier.iterdir()) == [
+        f"live_00{number}.png" for number in range(1, 6)
+    ]

@@ -79,6 +79,11 @@ def test_a_result_is_applied_to_a_new_rig_file(tmp_path: Path) -> None:
     expected = load_rig(Path(RIG)).with_calibration(load_result(result))
     assert load_rig(new).document == expected.document
     assert load_rig(new).document.cameras[0].fx_px == 905.0
+    remark = "error_mm of camera 'front', 0.5, was stated for another lens and is left out"
+    assert f"remark {remark}" in " ".join(answer.err.split())
+    assert new.read_text().splitlines()[1].startswith(f"# {remark}")
+    answer = call("status", RIG, "--calibration", result)
+    assert f"remark {remark}" in " ".join(answer.err.split())
 
 
 def test_applying_a_result_never_replaces_a_file(tmp_path: Path) -> None:

@@ -139,6 +139,22 @@ def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -
     assert frames == 2
 
 
+def test_the_overlay_of_a_video_has_its_rate(tmp_path: Path) -> None:
+    """Not the camera's, at which it would be shown too slowly."""
+    video, drawn = tmp_path / "recorded.avi", tmp_path / "drawn.mp4"
+    size = cv2.imread(str(picture_files(SESSION)[0])).shape[1::-1]
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 29.97, size)
+    for path in picture_files(SESSION)[:2]:
+        writer.write(cv2.imread(str(path)))
+    writer.release()
+    arguments = (video, "-o", tmp_path / "poses.csv", "--overlay", drawn)
+    assert call("track", RIG, *arguments).code == 0
+    capture = cv2.VideoCapture(str(drawn))
+    rate = capture.get(cv2.CAP_PROP_FPS)
+    capture.release()
+    assert rate == pytest.approx(29.97, abs=0.01)
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [

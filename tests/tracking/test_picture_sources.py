@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from drivers.cameras.files import ImageFolder, OneCamerasPictures
-from drivers.cameras.live import Frame, LiveCamera, VideoFile
+from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from model.errors import BadInput, HardwareMissing
 from model.pose import Pose
 from model.rig import Camera, Rig
@@ -60,7 +61,9 @@ def test_a_broken_file_among_good_ones_is_named_and_skipped(
     assert results[1].observation.time == pytest.approx(0.3)  # the gap stays a gap
 
 
-@pytest.mark.parametrize("orientations", [(1, 1), (3, 3), (6, 6), (1, 3), (1, 6)])
+@pytest.mark.parametrize(
+    "orientations", [(1, 1), (3, 3), (6, 6), (1, 3), (1, 6), (2, 4), (6, 8), (3, 6)]
+)
 @pytest.mark.parametrize("stored", ["wide", "tall"])
 @pytest.mark.parametrize("stray", [None, "0.png", "z.png"])
 def test_a_measurement_sees_the_pixels_that_a_calibration_saw(
@@ -86,6 +89,75 @@ def test_a_measurement_sees_the_pixels_that_a_calibration_saw(
         assert (frame.name, other[0]) == (name, name)
         np.testing.assert_array_equal(frame.image, expected)
         np.testing.assert_array_equal(other[1], expected)
+
+
+CORNER = np.add.outer(np.arange(48) * 2, np.arange(64)).astype(np.uint8)
+"""An image that differs in every orientation, 64 x 48 px."""
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("others", [(), (1,), (3, 4)])
+def test_images_of_the_cameras_size_are_as_the_sensor_stored_them(
+    tmp_path: Path, camera: Camera, orientation: int, others: tuple[int, ...]
+) -> None:
+    """Whatever a camera that points down states, in this folder and in that of the calibration."""
+    for name, stated in zip("abc", (orientation, *others), strict=False):
+        (tmp_path / f"{name}.jpg").write_bytes(jpeg(CORNER, stated))
+    camera = replace(camera, width=64, height=48)
+    for frame in ImageFolder(tmp_path, camera):
+        assert np.abs(frame.image.astype(int) - CORNER).max() < 8
+    for _, image in OneCamerasPictures(tmp_path, (64, 48)):
+        assert np.abs(image.astype(int) - CORNER).max() < 8
+
+
+@pytest.mark.parametrize(
+    ("orientation", "expected"),
+    [(5, CORNER.T), (6, np.rot90(CORNER, -1)), (7, np.rot90(CORNER, 2).T), (8, np.rot90(CORNER))],
+)
+@pytest.mark.parametrize("beside", [False, True])
+def test_images_in_portrait_are_rotated_as_stated(
+    tmp_path: Path, camera: Camera, orientation: int, expected: np.ndarray, beside: bool
+) -> None:
+    """Alone, and beside images of the wrong size."""
+    (tmp_path / "a.jpg").write_bytes(jpeg(CORNER, orientation))
+    if beside:
+        (tmp_path / "b.jpg").write_bytes(jpeg(CORNER, 1))
+        (tmp_path / "c.jpg").write_bytes(jpeg(CORNER, 3))
+    (frame,) = ImageFolder(tmp_path, replace(camera, width=48, height=64))
+    assert np.abs(frame.image.astype(int) - expected).max() < 8
+    if not beside:
+        assert OneCamerasPictures(tmp_path).size == (48, 64)
+
+
+DEGREES = {0: (1, 0, 0, 1), 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}
+
+
+@pytest.mark.parametrize("degrees", DEGREES)
+@pytest.mark.parametrize("is_portrait", [False, True])
+def test_videos_follow_the_rule_of_images(
+    tmp_path: Path, camera: Camera, degrees: int, is_portrait: bool
+) -> None:
+    """As stored if of the camera's size, else rotated as the file states, clockwise."""
+    path = tmp_path / "a.mp4"
+    image = np.kron([[0, 80], [160, 240]], np.ones((48, 64))).astype(np.uint8)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (128, 96), False)
+    writer.write(image)
+    writer.release()
+    a, b, c, d = (value << 16 for value in DEGREES[degrees])
+    data = path.read_bytes()
+    at = data.index(b"tkhd") + 4 + 40  # its matrix, ISO/IEC 14496-12, 8.3.2
+    matrix = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(data[:at] + matrix + data[at + 36 :])
+    size = (96, 128) if is_portrait else (128, 96)
+    video = VideoFile(path, replace(camera, width=size[0], height=size[1]))
+    if is_portrait and degrees in (0, 180):
+        with pytest.raises(BadInput, match="the image has 128 x 96 px"):
+            list(video)
+        return
+    expected = np.rot90(image, -degrees // 90) if is_portrait else image
+    (frame,) = video
+    assert np.median(np.abs(frame.image.astype(int) - expected)) < 8
+    assert video_size(path) == ((96, 128) if degrees in (90, 270) else (128, 96))
 
 
 def test_a_folder_of_broken_files_only_is_refused(tmp_path: Path, camera: Camera) -> None:
@@ -157,6 +229,9 @@ class Capture:
 
     def get(self, what: int) -> float:
         return self._times[self._at] if what == cv2.CAP_PROP_POS_MSEC else 10.0
+
+    def set(self, what: int, value: float) -> bool:
+        return False
 
     def release(self) -> None:
         pass

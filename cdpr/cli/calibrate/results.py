@@ -105,7 +105,7 @@ def apply(
       cdpr calibrate apply rig.yaml calibration_rig_rig_2026-03-14.yaml -o rig_calibrated.yaml
     """
     loaded = [load_result(path) for path in results]
-    new = write_calibrated_rig(output, load_rig(rig), loaded)
+    new = write_calibrated_rig(output, load_rig(rig), loaded, Terminal())
     for result in loaded:
         if not result.good_enough:
             what = f"calibration {result.kind} {result.name}, {result.date}"
