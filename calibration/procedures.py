@@ -158,7 +158,7 @@ def calibrate_camera_from_corners(
     require_file_name(name, "`name=`")
     to = Destination.of(output)
     to.require_free("camera", name)
-    found = fit_corners(read_corners(path_of(corners)), size, lens, str(corners))
+    found = fit_corners(*read_corners(path_of(corners)), size, lens, str(corners))
     return _judged_camera(found, name, wanted, distance, to)
 
 

@@ -6,7 +6,7 @@ the same in every image and do not average out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -119,9 +119,9 @@ def locate_by_frame_tags(
         survey: Standard deviations of the survey.
 
     Raises:
-        BadInput: No camera pose fits the tags.
+        BadInput: The camera moved between the images, or no pose fits the tags.
     """
-    observations = _without_moved_images(observations)
+    observations = _without_moved_images(camera, observations)
     start = _initial_pose(rig, camera, observations)
     if start is None:
         raise BadInput(
@@ -181,22 +181,51 @@ def _rotation_issues(
     return [] if found is None else [Issue(*found)]
 
 
-def _without_moved_images(observations: TagObservations) -> TagObservations:
-    """Without images whose tags have moved relative to most images."""
-    middle = {
-        number: np.median(
-            [s[number].corners for s in observations.squares.values() if number in s], 0
-        )
-        for number in observations.numbers
+def _without_moved_images(camera: Camera, observations: TagObservations) -> TagObservations:
+    """Without images whose tags have moved relative to the largest group that agrees.
+
+    Raises:
+        BadInput: Half of the images or more have moved.
+    """
+    corners = {
+        name: {number: square.corners for number, square in squares.items()}
+        for name, squares in observations.squares.items()
     }
-    unused = {}
-    for name, squares in observations.squares.items():
-        off = [np.linalg.norm(s.corners - middle[k], axis=1).mean() for k, s in squares.items()]
-        if len(observations.squares) > 2 and np.median(off) > MOVED_PX:
-            unused[name] = (
-                f"shows the tags {np.median(off):.1f} px off the other images: the camera moved"
-            )
+    groups = [
+        [one for one in corners.values() if _shift(one, other) <= MOVED_PX]
+        for other in corners.values()
+    ]
+    group = max(groups, key=len)
+    middle = {
+        number: np.median([one[number] for one in group if number in one], axis=0)
+        for number in {number for one in group for number in one}
+    }
+    shifts = {name: _shift(one, middle) for name, one in corners.items()}
+    unused = {
+        name: f"shows the tags {shift:.1f} px off the other images: the camera moved"
+        for name, shift in shifts.items()
+        if shift > MOVED_PX
+    }
+    if 2 * len(unused) >= len(corners):
+        reasons = "; ".join(f"{name} {why}" for name, why in list(unused.items())[:3])
+        raise BadInput(
+            "the camera moved between the images",
+            where=f"camera {camera.name}",
+            why=f"only {len(corners) - len(unused)} of {len(corners)} images agree; {reasons}",
+            next_step="fix the camera in place and take the images again, or pass only those taken"
+            " since it last moved",
+        )
     return observations.without(unused)
+
+
+def _shift(corners: Mapping[int, Array], others: Mapping[int, Array]) -> float:
+    """Median motion of the tags in both, by number, [px]; NaN if there is none."""
+    off = [
+        np.linalg.norm(own - others[number], axis=1).mean()
+        for number, own in corners.items()
+        if number in others
+    ]
+    return float(np.median(off)) if off else np.nan
 
 
 def _initial_pose(rig: Rig, camera: Camera, observations: TagObservations) -> Pose | None:

@@ -7,13 +7,12 @@ image, and the fits of two halves of the images, each to first order.
 
 Scatter alone is too optimistic: corner errors within an image are correlated (a bent board, blur,
 the lens model). The jackknife over images covers that; the larger of both is stated.
-
-Source: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -24,10 +23,8 @@ from calibration.results import data_hash
 from calibration.statistics import (
     EvenSample,
     Interval,
-    duplicate_reason,
-    is_duplicate_view,
+    duplicate_views,
     jackknife,
-    leverage_factor,
     rms_bound,
     student_factor,
     widened,
@@ -61,8 +58,7 @@ class Uncertainty:
 
         That of the scatter, scaled up by `widened`.
         """
-        quantile = _quantile(len(self.without)) / Z_95
-        return widened(self.covariance, self.without) * quantile**2
+        return widened(self.covariance, self.without) * (_quantile(len(self.without)) / Z_95) ** 2
 
     def error_of(self, slopes: Array) -> float:
         """95 % error of quantities that depend on the parameters, RMS.
@@ -74,8 +70,7 @@ class Uncertainty:
             slopes: Their derivatives by the parameters, shape (..., n).
         """
         flat = slopes.reshape(-1, slopes.shape[-1])
-        by_images = jackknife(self.without) * leverage_factor(*self.without.shape)
-        larger = max(rms_bound(one, flat) for one in (self.covariance, by_images))
+        larger = max(rms_bound(one, flat) for one in (self.covariance, jackknife(self.without)))
         return _quantile(len(self.without)) / Z_95 * larger
 
 
@@ -113,15 +108,10 @@ def uncertainty_of(
     information, count = np.sum(parts, axis=0), len(parts)
     scale = np.sqrt(np.diag(information))
     if not (scale > 0.0).all() or np.linalg.cond(information / np.outer(scale, scale)) > 1e13:
-        raise BadInput(
-            "these images do not determine a camera",
-            why="other parameters would explain them as well",
-            next_step="take more images, with the board tilted up to 40° in every direction",
-        )
+        raise _undetermined("other parameters would explain them as well")
     by_scatter = np.linalg.inv(information) * squares / max(residuals - len(information), 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
-    by_images = jackknife(without)
-    larger = np.maximum(np.diag(by_scatter), np.diag(by_images) * leverage_factor(*without.shape))
+    larger = np.maximum(np.diag(by_scatter), np.diag(jackknife(without)))
     return Uncertainty(
         covariance=read_only(by_scatter),
         half_widths=read_only(_quantile(count) * np.sqrt(larger)),
@@ -137,10 +127,8 @@ def _without(information: Array, part: Array, score: Array) -> Array:
 
 def _half(parts: Sequence[Array], scores: Sequence[Array], which: int) -> Array:
     """Change of the parameters when only the even or only the odd images are used."""
-    information = np.sum(parts[which::2], axis=0)
-    return np.asarray(
-        np.linalg.pinv(information, hermitian=True) @ np.sum(scores[which::2], axis=0)
-    )
+    information, score = (np.sum(one[which::2], axis=0) for one in (parts, scores))
+    return np.asarray(np.linalg.pinv(information, hermitian=True) @ score)
 
 
 def _quantile(count: int) -> float:
@@ -249,12 +237,11 @@ def fit_camera(
         if seen is None:
             left_out[name] = NOT_FOUND
             without.add((name, image))
-        elif first := next((n for n, before in views.items() if _same(seen, before)), None):
-            left_out[name] = duplicate_reason(first)
         else:
             views[name] = seen
             previews[name] = _reduced(image)
             left_out |= {f"{name}, {k}": "is detected more than once" for k in seen.twice}
+    views, left_out = _without_duplicates(views, left_out)
     if size is None or len(views) < LEAST_VIEWS:
         raise _too_few(views, left_out, board, without.chosen())
     found = calibrate_from_views(views, size, left_out, lens)
@@ -305,18 +292,30 @@ def _reduced(image: Image) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _same(seen: DetectedBoard, before: DetectedBoard) -> bool:
-    same_points = np.array_equal(seen.points, before.points)
-    return same_points and is_duplicate_view(seen.corners, before.corners)
+def _without_duplicates(
+    views: Mapping[str, DetectedBoard], unused: Mapping[str, str]
+) -> tuple[dict[str, DetectedBoard], dict[str, str]]:
+    """The views without duplicates, and why others are not used."""
+    corners = {
+        name: dict(zip(map(tuple, seen.points.tolist()), seen.corners, strict=True))
+        for name, seen in views.items()
+    }
+    reasons = duplicate_views(corners)
+    return {k: seen for k, seen in views.items() if k not in reasons}, {**unused, **reasons}
 
 
 def fit_corners(
-    views: Mapping[str, DetectedBoard], size: tuple[int, int], lens: str, where: str
+    views: Mapping[str, DetectedBoard],
+    unused: Mapping[str, str],
+    size: tuple[int, int],
+    lens: str,
+    where: str,
 ) -> CameraCalibration:
     """Fits a camera to corners detected by another program.
 
     Args:
         views: By image name.
+        unused: Images already left out, with the reasons.
         size: Width and height of the images, [px].
         lens: As in `fit_camera`.
         where: Names the source in messages.
@@ -326,15 +325,17 @@ def fit_corners(
     """
     every = np.concatenate([seen.corners for seen in views.values()])
     low, high = every.min(axis=0), every.max(axis=0)
+    views, left_out = _without_duplicates(views, unused)
     if (low < -0.5).any() or (high > np.array(size) - 0.5).any() or len(views) < LEAST_VIEWS:
         raise BadInput(
             f"{len(views)} images have corners from ({low[0]:.0f}, {low[1]:.0f}) to"
             f" ({high[0]:.0f}, {high[1]:.0f}) px; {LEAST_VIEWS} are required, within {size[0]} x"
             f" {size[1]} px",
             where=where,
+            why="; ".join(f"{name} {reason}" for name, reason in list(left_out.items())[:5]),
             next_step="check the columns and the size of the images",
         )
-    return calibrate_from_views(views, size, lens=lens)
+    return calibrate_from_views(views, size, left_out, lens)
 
 
 def calibrate_from_views(
@@ -388,13 +389,11 @@ def calibrate_from_views(
 
 
 def _fit(views: Mapping[str, DetectedBoard], size: tuple[int, int], lens: str) -> LensFit:
-    try:
+    with suppress(cv2.error, np.linalg.LinAlgError):
         fit = choose_lens(views, size) if lens == AUTO else fit_lens(LENSES[lens], views, size)
-    except (cv2.error, np.linalg.LinAlgError):
-        raise _undetermined() from None
-    if not fit.finite:
-        raise _undetermined()
-    return fit
+        if fit.finite:
+            return fit
+    raise _undetermined("the fit has no finite solution, as with one tilt in all images")
 
 
 def _errors(fit: LensFit, views: Mapping[str, DetectedBoard]) -> dict[str, float]:
@@ -405,10 +404,10 @@ def _errors(fit: LensFit, views: Mapping[str, DetectedBoard]) -> dict[str, float
     }
 
 
-def _undetermined() -> BadInput:
+def _undetermined(why: str) -> BadInput:
     return BadInput(
         "these images do not determine a camera",
-        why="the fit has no finite solution, such as with the same tilt of the board in all images",
+        why=why,
         next_step="take more images, with the board tilted up to 40° in every direction",
     )
 

@@ -8,7 +8,8 @@ is summed as in `calibration.intrinsics.calibrate`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -138,28 +139,39 @@ def fix_gauge(tags: Sequence[Tag], fixed: int | None) -> Array:
     return np.concatenate([slopes.sum(axis=0), turns / 0.05])
 
 
-# Locatable tags: those that images connect to each other.
+# Locatable tags: those that images connect to each other, whichever image is left out. What hangs
+# on one image alone has no jackknife, and an error of that image would go unnoticed.
 
 
 def connected_tags(pictures: Sequence[Iterable[int]], fixed: int | None = None) -> list[int]:
-    """The largest group of tags connected by images that show two or more of them.
+    """The largest group of tags that stay connected without any one of the images.
 
     Args:
         pictures: Tag numbers in each image.
         fixed: Select the group of this tag instead.
 
     Returns:
-        Their numbers in order; empty when no image shows a tag.
+        Their numbers in order; empty when no two images show the same tag.
     """
-    groups: list[set[int]] = []
-    for numbers in map(set, pictures):
-        tied = [group for group in groups if group & numbers]
-        groups = [group for group in groups if not group & numbers]
-        groups.append(numbers.union(*tied))
+    counts = Counter(frozenset(numbers) for numbers in pictures)
+    groups = _groups(counts)
+    for single in [numbers for numbers, count in counts.items() if count == 1]:
+        parts = _groups(counts.keys() - {single})
+        groups = [group & part for group in groups for part in parts if group & part]
     if fixed is not None:
         groups = [group for group in groups if fixed in group]
     largest: set[int] = max(groups, key=lambda group: (len(group), -min(group)), default=set())
     return sorted(largest)
+
+
+def _groups(pictures: Iterable[frozenset[int]]) -> list[set[int]]:
+    """Groups of tags that images connect."""
+    groups: list[set[int]] = []
+    for numbers in pictures:
+        tied = [group for group in groups if group & numbers]
+        groups = [group for group in groups if not group & numbers]
+        groups.append(set(numbers).union(*tied))
+    return groups
 
 
 LEAST_PICTURES = 4
@@ -261,38 +273,56 @@ def measure_layout(
     observations = observations.without(single).without_duplicates()
     starts, observations = initial_poses(camera, nominal, observations)
     located = connected_tags([tuple(squares) for squares in observations.squares.values()], fixed)
-    among = fixed if fixed is not None else next(iter(located), None)
-    observations = observations.without(
-        {
-            name: f"shows only tags that no image shows together with tag {among}"
-            for name, squares in observations.squares.items()
-            if not set(squares) <= set(located)
-        }
-    )
-    if len(observations.squares) < LEAST_PICTURES:
-        raise _too_few(observations, fixed)
+    used = _only_located(observations, located, fixed)
+    if len(used.squares) < LEAST_PICTURES:
+        raise _too_few(used, fixed)
     tags = tuple(nominal[number] for number in located)
-    views = TagViews.of(camera, observations, tags)
-    fit = adjust_bundle(views, [starts[name] for name in observations.squares], tags)
-    if outliers := outlier_image(observations, views.picture_errors(*fit)):
-        observations = observations.without(outliers)
-        if len(observations.squares) < LEAST_PICTURES:
-            raise _too_few(observations, fixed)
-        return measure_layout(rig, camera, observations, fixed)
-    return _result(rig, views, *fit, fixed, observations)
+    views = TagViews.of(camera, used, tags)
+    fit = adjust_bundle(views, [starts[name] for name in used.squares], tags)
+    if outliers := outlier_image(used, views.picture_errors(*fit)):
+        return measure_layout(rig, camera, observations.without(outliers), fixed)
+    unseen = {
+        number: _unseen_reason(number, observations, located)
+        for number in nominal
+        if number not in located
+    }
+    return _result(tags, unseen, views, *fit, fixed, used)
+
+
+def _only_located(
+    observations: TagObservations, located: Collection[int], fixed: int | None
+) -> TagObservations:
+    """The located tags in images that show two of them or more."""
+    to = "each other" if fixed is None else f"tag {fixed}"
+    remaining = {
+        name: {number: square for number, square in squares.items() if number in located}
+        for name, squares in observations.squares.items()
+    }
+    single = {
+        name: f"shows fewer than two tags that several images connect to {to}"
+        for name, squares in remaining.items()
+        if len(squares) < 2
+    }
+    return replace(observations, squares=remaining).without(single)
+
+
+def _unseen_reason(number: int, observations: TagObservations, located: Collection[int]) -> str:
+    for name, squares in observations.squares.items():
+        if number in squares and any(other in located for other in squares):
+            return f"is connected to the others by {name} alone"
+    return "was not detected together with the others"
 
 
 def _result(
-    rig: Rig,
+    nominal: tuple[Tag, ...],
+    unseen: Mapping[int, str],
     views: TagViews,
     cameras: list[Pose],
     tags: tuple[Tag, ...],
     fixed: int | None,
     observations: TagObservations,
 ) -> TagLayout:
-    nominal = {tag.id: tag for tag in rig.platform_tags}
-    located_nominal = tuple(nominal[tag.id] for tag in tags)
-    shift, scale = align_to_nominal(tags, located_nominal, fixed)
+    shift, scale = align_to_nominal(tags, nominal, fixed)
     tags = tuple(replace(tag, pose=shift.compose(tag.pose)) for tag in tags)
     cameras = [pose.compose(shift.inverse()) for pose in cameras]
     informations, scores, misfit = views.tag_information(cameras, tags, HUBER)
@@ -306,18 +336,14 @@ def _result(
     ]
     numbers = [number for squares in observations.squares.values() for number in squares]
     return TagLayout(
-        nominal=located_nominal,
+        nominal=nominal,
         tags=tags,
         covariance=read_only(covariance),
         half_widths=read_only(widths_of(covariance, without)),
         fixed=fixed,
         errors=dict(zip(observations.squares, views.picture_errors(cameras, tags), strict=True)),
         seen={tag.id: numbers.count(tag.id) for tag in tags},
-        unseen={
-            number: "was not detected together with the others"
-            for number in nominal
-            if number not in {tag.id for tag in tags}
-        },
+        unseen=unseen,
         sides=_sides(cameras),
         scale=scale,
         unused=observations.unused,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.results import data_hash
-from calibration.statistics import duplicate_reason, is_duplicate_view
+from calibration.statistics import duplicate_views
 from model.errors import BadInput
 from model.pose import Array, Pose, moved
 from model.rig import Camera, Rig, Tag
@@ -48,15 +48,11 @@ class TagObservations:
 
     def without_duplicates(self) -> TagObservations:
         """Without images that duplicate the view of another image with as many tags or more."""
-        kept: dict[str, Mapping[int, RefinedTag]] = {}
-        unused = {}
-        for name, squares in sorted(self.squares.items(), key=lambda sight: -len(sight[1])):
-            first = next((n for n, before in kept.items() if _alike(squares, before)), None)
-            if first is None:
-                kept[name] = squares
-            else:
-                unused[name] = duplicate_reason(first)
-        return self.without(unused)
+        corners = {
+            name: {number: square.corners for number, square in squares.items()}
+            for name, squares in self.squares.items()
+        }
+        return self.without(duplicate_views(corners))
 
     def data_hash(self) -> str:
         """Hash of the observations."""
@@ -136,14 +132,6 @@ def platform_views(rig: Rig, squares: Mapping[int, RefinedTag]) -> list[TagView]
     """The platform's tags with their corners in one image, by tag number."""
     tags = {tag.id: tag for tag in rig.platform_tags}
     return [TagView(tags[number], square) for number, square in squares.items()]
-
-
-def _alike(squares: Mapping[int, RefinedTag], before: Mapping[int, RefinedTag]) -> bool:
-    both = squares.keys() & before.keys()
-    if not both:
-        return False
-    corners, earlier = (np.array([one[k].corners for k in both]) for one in (squares, before))
-    return is_duplicate_view(corners, earlier)
 
 
 def _whole(

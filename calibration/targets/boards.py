@@ -95,8 +95,8 @@ def require_board(
 _COLUMNS = ("picture", "x_px", "y_px", "board_x_mm", "board_y_mm")
 
 
-def read_corners(path: Path) -> dict[str, DetectedBoard]:
-    """Corners of a flat board by image, as detected by another program.
+def read_corners(path: Path) -> tuple[dict[str, DetectedBoard], dict[str, str]]:
+    """Corners of a flat board by image, as detected by another program; why others are unused.
 
     Raises:
         BadInput: The file cannot be read, a column is missing, a value is not a number, or no
@@ -108,9 +108,10 @@ def read_corners(path: Path) -> dict[str, DetectedBoard]:
     found: dict[str, list[Array]] = {}
     for picture, values in zip(pictures, numbers, strict=True):
         found.setdefault(picture, []).append(values)
-    seen = {}
+    seen, unused = {}, {}
     for picture, corners in found.items():
         if len(corners) < LEAST_POINTS:
+            unused[picture] = f"has fewer than {LEAST_POINTS} corners"
             continue
         corners_of = np.array(corners)
         flat = np.column_stack([corners_of[:, 2:] / 1e3, np.zeros(len(corners_of))])
@@ -121,7 +122,7 @@ def read_corners(path: Path) -> dict[str, DetectedBoard]:
             where=str(path),
             next_step="write a line for every corner: its image, pixels and position on the board",
         )
-    return seen
+    return seen, unused
 
 
 _WINDOW = 0.3

@@ -276,6 +276,28 @@ def test_the_camera_comes_back_from_parts_of_a_board(board: Charuco | TagGrid) -
     assert found.size == SIZE
 
 
+@pytest.mark.parametrize("board", [CHARUCO, TAGS])
+def test_copies_with_fewer_corners_count_once(board: Charuco | TagGrid) -> None:
+    """In the first, a corner is below glare; in the second, half of the board is covered."""
+    whole = [(f"{k}.png", image) for k, (image, _) in enumerate(pictures(board))]
+    corners = {name: seen.corners for name, image in whole if (seen := board.find(image))}
+    copies = []
+    for k, (name, image) in enumerate((n, i) for n, i in whole if n in corners):
+        image, (x, y) = image.copy(), np.round(corners[name][0]).astype(int).tolist()
+        if k % 2:
+            image[:, : int(np.median(corners[name][:, 0]))] = 255
+        else:
+            cv2.circle(image, (x, y), 12, 255, -1)
+        copies.append((f"copy of {name}", image))
+    found, plain = fit_camera([*copies, *whole], board), fit_camera(whole, board)
+    assert found.views.keys() == plain.views.keys()
+    np.testing.assert_allclose(
+        found.uncertainty.half_widths, plain.uncertainty.half_widths, rtol=1e-6
+    )
+    reasons = [found.unused[name] for name, _ in copies]
+    assert sum(reason.startswith("duplicates ") for reason in reasons) > len(copies) / 2
+
+
 BARREL = (-0.3, 0.1, 0.0, 0.0, 0.0)
 
 

@@ -105,6 +105,27 @@ def test_correlated_corner_errors_widen_the_intervals() -> None:
     assert (unsure[:4] > 3.0 * sure[:4]).all()
 
 
+@pytest.mark.parametrize("count", [4, 5, 6, 8])
+def test_intervals_from_few_images_cover_correlated_errors(count: int) -> None:
+    """Smooth shifts of 0.2 px in each image: by scatter alone, half of the intervals hold."""
+    x, y = (BOARD.points()[:, :2] - BOARD.points()[:, :2].mean(axis=0)).T / 0.1
+    shapes = np.column_stack([x**2, x * y, y**2, x**3, y**3, x**2 * y, x * y**2])
+    inside, nees = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        shifted = {}
+        for name, seen in views(count, 0.05, seed).items():
+            wave = shapes @ rng.standard_normal((7, 2))
+            wave *= 0.2 / np.sqrt(np.mean(wave**2))
+            shifted[name] = DetectedBoard(seen.points, seen.corners + wave)
+        found = calibrate_from_views(shifted, SIZE)
+        off = np.array([interval.value for interval in found.intervals.values()]) - TRUTH
+        inside.append(np.abs(off) <= found.uncertainty.half_widths)
+        nees.append(off @ np.linalg.solve(found.uncertainty.stated_covariance, off))
+    assert np.mean(inside) >= 0.9
+    assert np.median(nees) < 1.5 * len(TRUTH)
+
+
 def test_the_change_without_an_image_is_that_of_a_fit_without_it() -> None:
     all_views = views(12, 0.1)
     found = calibrate_from_views(all_views, SIZE)

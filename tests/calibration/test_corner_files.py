@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from calibration.intrinsics.calibrate import calibrate_from_views
@@ -37,10 +38,36 @@ def test_corners_of_a_file_calibrate_as_those_that_were_found(tmp_path: Path) ->
     assert result["pictures_used"] == 14
 
 
-def test_pictures_with_few_corners_are_left_out(tmp_path: Path) -> None:
+def test_pictures_with_few_corners_and_copies_are_left_out_by_name(tmp_path: Path) -> None:
+    """Copies with noise, and with other corners than the first, add nothing."""
+    seen, rng = views("five", 6), np.random.default_rng(2)
+    copies = {
+        f"copy {k}{name}": DetectedBoard(
+            view.points[k:], (view.corners + 0.03 * rng.standard_normal(view.corners.shape))[k:]
+        )
+        for k in range(3)
+        for name, view in seen.items()
+    }
+    results = []
+    for text in (text_of(seen), text_of(seen | copies) + "few,1,2,3,4\n"):
+        file = tmp_path / "corners.csv"
+        file.write_text(text)
+        answer = call("calibrate", "camera", file, "--size-px", *SIZE, "--json")
+        assert answer.code in (0, 3), answer
+        results.append(json.loads(answer.out))
+    plain, found = results
+    assert found["pictures_used"] == 6
+    assert found["intervals"] == plain["intervals"]
+    reasons = {name: f"duplicates {name[6:]}: nothing moved in between" for name in copies}
+    assert found["unused"] == {"few": "has fewer than 8 corners"} | reasons
+
+
+def test_copies_do_not_make_up_for_too_few_pictures(tmp_path: Path) -> None:
+    seen = views("five", 3)
     file = tmp_path / "corners.csv"
-    file.write_text(text_of(views("five", 2)) + "few,1,2,3,4\n")
-    assert set(read_corners(file)) == {"0", "1"}
+    file.write_text(text_of(seen | {f"copy {name}": view for name, view in seen.items()}))
+    answer = call("calibrate", "camera", file, "--size-px", *SIZE)
+    one_message(answer, 2, "3 images have corners", "copy 0 duplicates 0: nothing moved")
 
 
 @pytest.mark.parametrize(

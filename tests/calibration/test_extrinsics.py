@@ -19,7 +19,7 @@ from calibration.extrinsics.result import (
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
 from calibration.result_files import load_result
 from calibration.results import write_result
-from calibration.tag_map.observations import observe_tags
+from calibration.tag_map.observations import TagObservations, observe_tags
 from model.cameras import Z_95
 from model.errors import BadInput
 from model.files.documents import content_hash
@@ -213,6 +213,56 @@ def test_a_picture_of_a_camera_that_was_moved_is_left_out_by_name(rig: Rig) -> N
     assert list(found.unused) == ["3.png"]
     assert "the camera moved" in found.unused["3.png"]
     assert found.pictures == 3
+
+
+BUMPED = np.array([0.01, 0, 0, 0, 0, 0])
+"""Step of a camera between two images."""
+
+
+@pytest.mark.parametrize(("before", "after"), [(1, 1), (2, 2), (3, 3), (4, 4)])
+def test_a_camera_that_was_moved_half_way_is_refused(rig: Rig, before: int, after: int) -> None:
+    """Neither half has a majority, and a pose between both is wrong for either."""
+    camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
+    poses = {f"{k}.png": truth.inverse() for k in range(before + after)}
+    poses |= {f"{k}.png": moved(truth.inverse(), BUMPED) for k in range(before, before + after)}
+    observations = observe(camera, rig.frame_tags, poses, 0.02, rng)
+    with pytest.raises(BadInput, match="the camera moved between the images") as caught:
+        locate_by_frame_tags(rig, camera, observations, Survey(1e-4))
+    assert f"{before} of {before + after} images" in caught.value.why
+    assert f"{before}.png shows the tags" in caught.value.why
+    assert "take the images again" in caught.value.next_step
+
+
+@pytest.mark.parametrize(("count", "off"), [(3, 1), (5, 2), (7, 3)])
+@pytest.mark.parametrize("together", [True, False])
+def test_the_majority_of_images_locates_the_camera(
+    rig: Rig, count: int, off: int, together: bool
+) -> None:
+    """In any order, and however often the camera was moved meanwhile."""
+    camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(count)
+    steps = {f"{k}.png": BUMPED if together else (k + 1) * BUMPED for k in range(off)}
+    steps |= {f"{k}.png": 0.0 * BUMPED for k in range(off, count)}
+    mixed = {name: moved(truth.inverse(), steps[name]) for name in rng.permutation(list(steps))}
+    found = locate_by_frame_tags(
+        rig, camera, observe(camera, rig.frame_tags, mixed, 0.02, rng), Survey(1e-4)
+    )
+    assert sorted(found.unused) == [f"{k}.png" for k in range(off)]
+    assert found.pictures == count - off
+    assert found.world_from_camera.distance_to(truth) < 1e-3
+
+
+def test_images_of_different_tags_do_not_contradict_each_other(rig: Rig) -> None:
+    """As where the platform hides others in each."""
+    camera, truth, rng = rig.cameras[0], elsewhere(rig), np.random.default_rng(3)
+    poses = {"a.png": truth.inverse(), "b.png": truth.inverse()}
+    whole = observe(camera, rig.frame_tags, poses, 0.02, rng)
+    half = {
+        name: {k: s for k, s in squares.items() if (k % 2 == 0) == (name == "a.png")}
+        for name, squares in whole.squares.items()
+    }
+    found = locate_by_frame_tags(rig, camera, TagObservations(half, {}), Survey(1e-4))
+    assert found.pictures == 2
+    assert found.unused == {}
 
 
 def test_the_inverse_of_a_pose_changes_as_predicted() -> None:

@@ -219,7 +219,53 @@ def test_a_fixed_tag_that_no_picture_shows_is_refused_by_name(rig: Rig) -> None:
     unseen, *seen = rig.platform_tags
     with pytest.raises(BadInput, match=f"^0 images show .* linked to tag {unseen.id}") as caught:
         measure_layout(rig, rig.cameras[0], session(rig, seen, 6, seed=3), unseen.id)
-    assert f"no image shows together with tag {unseen.id}" in caught.value.why
+    assert f"two tags that several images connect to tag {unseen.id}" in caught.value.why
+
+
+@pytest.mark.parametrize("fixed", [None, 301])
+def test_a_tag_in_a_single_image_is_not_located(rig: Rig, fixed: int | None) -> None:
+    """Without that image it could be anywhere; the others keep their intervals."""
+    whole = session(rig, rig.platform_tags, 24, seed=4)
+    first = next(n for n, seen in whole.squares.items() if 306 in seen and len(seen) == 3)
+    squares = {
+        name: {k: s for k, s in seen.items() if k != 306 or name == first}
+        for name, seen in whole.squares.items()
+    }
+    without = {name: {k: s for k, s in seen.items() if k != 306} for name, seen in squares.items()}
+    found, plain = (
+        measure_layout(rig, rig.cameras[0], TagObservations(one, {}), fixed)
+        for one in (squares, without)
+    )
+    assert found.unseen == {306: f"is connected to the others by {first} alone"}
+    np.testing.assert_allclose(found.half_widths, plain.half_widths, rtol=1e-6)
+    assert found.half_widths.reshape(-1, 6)[:, :3].max() < 1e-3
+    verdict = judge_layout(found, 1e-3)
+    assert "take images that show tag 306 together with others" in verdict.next_steps
+
+
+@pytest.mark.parametrize("fixed", [301, 302])
+def test_groups_of_tags_that_a_single_image_connects_are_measured_apart(
+    rig: Rig, fixed: int
+) -> None:
+    whole = session(rig, rig.platform_tags, 40, seed=4)
+    groups = ({301, 303, 305}, {302, 304, 306})
+    mine, others = groups if fixed in groups[0] else groups[::-1]
+    squares = {
+        f"{name} {k}": own
+        for name, seen in whole.squares.items()
+        for k, group in enumerate(groups)
+        if len(own := {n: s for n, s in seen.items() if n in group}) >= 2
+    }
+    bridge = next(n for n, s in whole.squares.items() if len(mine & s.keys()) == 2 and len(s) == 3)
+    del squares[f"{bridge} {groups.index(mine)}"]
+    squares[bridge] = whole.squares[bridge]
+    (linked,) = others & squares[bridge].keys()
+    found = measure_layout(rig, rig.cameras[0], TagObservations(squares, {}), fixed)
+    assert {tag.id for tag in found.tags} == mine
+    assert found.half_widths.reshape(-1, 6)[:, :3].max() < 1e-3
+    assert found.unseen == {n: "was not detected together with the others" for n in others} | {
+        linked: f"is connected to the others by {bridge} alone"
+    }
 
 
 def test_the_result_replaces_the_nominal_layout(rig: Rig, tmp_path: Path) -> None:
@@ -264,19 +310,24 @@ def test_results_are_compared_tag_by_tag(rig: Rig) -> None:
 
 
 @given(
-    pictures=st.lists(st.sets(st.integers(0, 7), min_size=1, max_size=3), max_size=8),
+    pictures=st.lists(st.sets(st.integers(0, 7), min_size=1, max_size=3), max_size=10),
     fixed=st.one_of(st.none(), st.integers(0, 7)),
 )
-def test_tags_are_connected_as_by_a_walk_from_image_to_image(pictures, fixed) -> None:
+def test_tags_are_connected_as_by_walks_around_each_image(pictures, fixed) -> None:
     found = connected_tags(pictures, fixed)
 
-    def walked(start: int) -> set[int]:
+    def walked(start: int, around: int) -> set[int]:
         reached = {start}
         for _ in range(8):
-            reached |= {n for p in pictures if p & reached for n in p}
+            rest = (p for k, p in enumerate(pictures) if k != around)
+            reached |= {n for p in rest if p & reached for n in p}
         return reached
 
+    def group(start: int) -> set[int]:
+        return set.intersection(*(walked(start, k) for k in range(len(pictures))))
+
     seen = {n for p in pictures for n in p}
-    groups = [walked(n) for n in seen if fixed is None or fixed in walked(n)]
+    twice = {n for n in seen if sum(n in p for p in pictures) > 1}
+    groups = [group(n) for n in twice if fixed is None or fixed in group(n)]
     assert len(found) == max((len(group) for group in groups), default=0)
     assert not found or set(found) in groups
