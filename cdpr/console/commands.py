@@ -266,7 +266,7 @@ class Inbox:
     """Messages of a page that are not yet executed: bounded, however many it sends.
 
     Attributes:
-        commands: To be executed in order.
+        commands: To be executed in order, with the time of arrival, [s] of `CLOCK_BOOTTIME`.
         refused: Refused commands, by number, and why.
         held: The newest report of a press: its number, the message, and when it arrived.
         released: The newest press that is over.
@@ -274,7 +274,7 @@ class Inbox:
 
     def __init__(self) -> None:
         """Starts empty."""
-        self.commands: asyncio.Queue[Message] = asyncio.Queue(MOST_WAITING)
+        self.commands: asyncio.Queue[tuple[Message, float]] = asyncio.Queue(MOST_WAITING)
         self.refused: asyncio.Queue[tuple[int, str]] = asyncio.Queue(MOST_WAITING)
         self.held = Newest[tuple[int, Held, float]]()
         self.released = Newest[int]()

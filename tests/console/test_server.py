@@ -16,7 +16,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -33,10 +33,11 @@ from websockets.sync.client import ClientConnection, connect
 from cdpr.console import server
 from cdpr.console.commands import MOST_WAITING, Held, LetGo, Seen, parse_message
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
-from cdpr.console.session import Console, ConsoleFiles
+from cdpr.console.session import Console
 from cdpr.console.state import MOST_IN_TRANSIT, StateFlow, StoredState
-from cdpr.console.verbs import VerbOutcome, _outcome, _without_commands
+from cdpr.console.verbs import ConsoleFiles, VerbOutcome, _outcome, _without_commands
 from cdpr.console.watch import RunWatch
+from executor.remote.client import stop_runs
 from executor.remote.command_server import commands_from_start
 from executor.remote.command_server import serving as commands
 from executor.remote.command_socket import advertised
@@ -52,6 +53,11 @@ from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan, w
 from tests.cli.program import call
 from tests.console import fake_server
 from tests.console.cut import acknowledgement, receive
+from tests.console.sequences import arrived_now
+
+
+def wanted() -> None:
+    """Of a verb that is still to be started."""
 
 
 class Served:
@@ -81,7 +87,8 @@ class Served:
         self.said.append((command, values))
         return ""
 
-    def _start(self, verb: str, arguments: Any) -> None:
+    def _start(self, verb: str, arguments: Any, require: Callable[[], None]) -> None:
+        require()
         self.started.append((verb, list(arguments)))
 
     def get(self, path: str, *, token: bool = True, **headers: str) -> tuple[int, bytes, Any]:
@@ -297,7 +304,7 @@ def test_the_output_of_a_verb_needs_no_disk_and_leaves_no_file(
     del console.verbs.start
     before = sorted(tmp_path.iterdir())
     monkeypatch.setattr("tempfile.mkstemp", lambda **_: pytest.fail("a file is written"))
-    console.verbs.start("run", ["no-such-plan.json"])
+    console.verbs.start("run", ["no-such-plan.json"], wanted)
     process = console.verbs._process
     assert process is not None
     assert process.wait() == 2
@@ -321,7 +328,7 @@ def test_stop_ends_a_verb_that_is_still_being_prepared(verb: str) -> None:
     """It reads files and drives for seconds before it can be asked to stop."""
     console = Served().console
     del console.verbs.start
-    console.verbs.start(verb, ["--help"])
+    console.verbs.start(verb, ["--help"], wanted)
     process = console.verbs._process
     assert process is not None
     os.kill(process.pid, signal.SIGSTOP)  # however soon it would end
@@ -343,7 +350,7 @@ def test_a_verb_that_is_still_being_prepared_ends_with_the_console(
     console = Served().console
     del console.verbs.start
     console.watch.send = lambda *_, **__: "nothing moves"  # type: ignore[method-assign]
-    console.verbs.start(verb, ["--help"])
+    console.verbs.start(verb, ["--help"], wanted)
     process = console.verbs._process
     assert process is not None
     os.kill(process.pid, signal.SIGSTOP)
@@ -359,7 +366,7 @@ def test_stop_leaves_what_moves_nothing_and_what_writes_its_report_alone() -> No
     console = Served().console
     del console.verbs.start
     for verb, is_under_way in (("plan", False), ("reset", False), ("run", True)):
-        console.verbs.start(verb, ["--help"])
+        console.verbs.start(verb, ["--help"], wanted)
         process = console.verbs._process
         assert process is not None
         if is_under_way:
@@ -491,6 +498,113 @@ def test_stop_waits_for_no_other_command_of_any_page(
         assert "not finished yet" in command(me, "hold")["what"]
 
 
+@pytest.mark.parametrize(
+    ("name", "stopped_by"),
+    [
+        *((name, "a page") for name in ("home", "release", "jog_begin", "run", "reset", "plan")),
+        ("home", "another terminal"),
+    ],
+)
+def test_a_stop_cancels_commands_that_wait_for_another_one(
+    served: Served, name: str, stopped_by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, slow = threading.Event(), threading.Event()
+    load = served.console.plan.load
+
+    def load_slowly(path: Path) -> None:
+        begun.set()
+        slow.wait(60)
+        load(path)
+
+    monkeypatch.setattr(served.console.plan, "load", load_slowly)
+    values = {"run": {"plan": "hash"}, "reset": {"cause": None}, "plan": {"scene": "s.yaml"}}
+    with served.page() as page, served.page() as other:
+        assert command(page, "take_control")["ok"]
+        asked = [("load_plan", {"file": "short.json"}), (name, values.get(name, {}))]
+        for number, (asks, with_values) in enumerate(asked, 1):
+            word = {"kind": "command", "id": number, "command": asks, **with_values}
+            page.send(json.dumps(word))
+        assert begun.wait(60)
+        page.send(json.dumps({"kind": "seen", "seq": 0, "at_ms": 0.0}) + "nonsense")
+        while receive(page)["kind"] != "answer":  # by then the commands have arrived
+            pass
+        if stopped_by == "a page":
+            assert command(other, "stop")["to"] == 7
+        else:
+            stop_runs()
+        slow.set()
+        while (answer := receive(page)).get("to") != 2:
+            pass
+        assert (answer["ok"], "STOP was pressed" in answer["what"]) == (False, True)
+        assert served.started == []
+        assert command(page, "home")["ok"], "who asks after the stop is heard"
+        assert [verb for verb, _ in served.started] == ["home"]
+
+
+@pytest.mark.parametrize("end", ["stop", "leave", "give", "taken", "none"])
+def test_a_run_that_waits_for_its_drives_begins_only_if_it_is_still_wanted(
+    folder: Path, end: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever happens between the check of who has control and the start."""
+    monkeypatch.chdir(folder)
+    served = Served()
+    console = served.console
+    page, other = console.control.join("here"), console.control.join("there")
+    console.plan.load(Path("short.json"))
+    shown = console.plan.preview
+    assert shown is not None
+
+    def asked(name: str, by: int = page, **values: object) -> str:
+        message = parse_message(json.dumps({"kind": "command", "command": name, **values}))
+        assert not isinstance(message, Held | LetGo | Seen)
+        return console.command(by, message, arrived_now())
+
+    ends: dict[str, Callable[[], object]] = {
+        "stop": console.stop,
+        "leave": lambda: console.leave(page),
+        "give": lambda: asked("give_control"),
+        "taken": lambda: asked(
+            "take_control", other, force=True, held_by=console.control.holder_name()
+        ),
+        "none": lambda: None,
+    }
+    assert asked("take_control") == ""
+    monkeypatch.setattr(console.robot, "pose_at_rest", lambda: None if ends[end]() else None)
+    why_not = asked("run", plan=shown["hash"])
+    if end == "none":
+        assert (why_not, len(served.started)) == ("", 1)
+    else:
+        assert "before this command began" in why_not
+        assert served.started == []
+    console.close()
+
+
+def test_a_stop_finds_each_verb_either_started_or_refused() -> None:
+    """It waits for a start that has passed the check, and ends what was started."""
+    console = Served().console
+    del console.verbs.start
+    stopping, stopped = threading.Event(), threading.Event()
+
+    def stop() -> None:
+        stopping.set()
+        console.stop()
+        stopped.set()
+
+    stop_now = threading.Thread(target=stop)
+
+    def stop_meanwhile() -> None:
+        stop_now.start()
+        assert stopping.wait(60)
+        assert not stopped.is_set()
+
+    console.verbs.start("run", ["no-such-plan.json"], stop_meanwhile)
+    process = console.verbs._process
+    assert process is not None
+    stop_now.join()
+    assert process.wait() == -signal.SIGTERM
+    console.close()
+
+
 def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
     served = Served()
     console = served.console
@@ -500,7 +614,7 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
         shown = {"cause": None} if name == "reset" else {}
         message = parse_message(json.dumps({"kind": "command", "command": name, **shown}))
         assert not isinstance(message, Held | LetGo)
-        return console.command(page, message)
+        return console.command(page, message, arrived_now())
 
     assert asked("take_control") == ""
     with advertised() as listeners:
@@ -589,7 +703,7 @@ def test_one_page_of_all_consoles_of_a_robot_has_control(monkeypatch: pytest.Mon
         shown = {"cause": None} if name == "reset" else {}
         message = parse_message(json.dumps({"kind": "command", "command": name, **shown}))
         assert not isinstance(message, Held | LetGo)
-        return console.command(page, message)
+        return console.command(page, message, arrived_now())
 
     assert asked(one, mine, "take_control") == ""
     name = f"page {mine} on here (console {os.getpid()} of "
@@ -695,7 +809,7 @@ def test_no_fault_is_reset_but_the_one_that_was_shown(
     def asked(name: str, **values: object) -> str:
         message = parse_message(json.dumps({"kind": "command", "command": name, **values}))
         assert not isinstance(message, Held | LetGo)
-        return console.command(page, message)
+        return console.command(page, message, arrived_now())
 
     assert asked("take_control") == ""
     for shown in ("drive 3: over-current", None):
