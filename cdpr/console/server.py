@@ -7,7 +7,7 @@ import errno
 import secrets
 import socket
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
 from importlib.resources import files
@@ -236,7 +236,7 @@ class ConsoleServer:
         number = self._console.control.join("?" if page.client is None else page.client.host)
         inbox, flow = Inbox(), StateFlow()
         tasks = [
-            asyncio.create_task(work)
+            asyncio.create_task(_or_disconnect(page, work))
             for work in (
                 self._send_states(page, number, flow),
                 self._execute_commands(page, number, inbox),
@@ -328,6 +328,15 @@ class ConsoleServer:
 async def _run_in(pool: ThreadPoolExecutor, work: Callable[..., T], *arguments: Any) -> T:
     """Works in threads of its own, so that it waits for no other request."""
     return await asyncio.get_running_loop().run_in_executor(pool, work, *arguments)
+
+
+async def _or_disconnect(page: WebSocket, work: Coroutine[Any, Any, None]) -> None:
+    """Serves a page; if that fails, disconnects it: no page is left open without a state."""
+    try:
+        await work
+    except Exception:
+        await _disconnect(page)
+        raise
 
 
 async def _disconnect(page: WebSocket) -> None:

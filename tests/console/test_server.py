@@ -396,6 +396,24 @@ def test_a_failure_of_the_computer_is_answered_and_later_commands_are_executed(
             pass
 
 
+def test_a_page_that_cannot_be_served_is_disconnected(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it would show old data for ever; it connects again on its own."""
+
+    def broken(_page: int) -> dict[str, object]:
+        raise KeyError(_page)
+
+    with served.page() as page:
+        state(page)
+        with monkeypatch.context() as patch:
+            patch.setattr(served.console.control, "as_dict", broken)
+            with pytest.raises(ConnectionClosed):
+                list(page)
+    with served.page() as page:
+        state(page)
+
+
 def test_messages_are_not_compressed(served: Served) -> None:
     with served.page() as page:
         assert page.protocol.extensions == []
@@ -569,7 +587,11 @@ def test_a_run_that_waits_for_its_drives_begins_only_if_it_is_still_wanted(
         "none": lambda: None,
     }
     assert asked("take_control") == ""
-    monkeypatch.setattr(console.robot, "pose_at_rest", lambda: None if ends[end]() else None)
+
+    def read_drives() -> None:
+        ends[end]()
+
+    monkeypatch.setattr(console.robot, "pose_at_rest", read_drives)
     why_not = asked("run", plan=shown["hash"])
     if end == "none":
         assert (why_not, len(served.started)) == ("", 1)
