@@ -39,6 +39,7 @@ from cdpr.console.state import (
     jog_state,
     local_file,
     measured_state,
+    not_stopped,
     read_stored,
     stored_state,
 )
@@ -204,6 +205,8 @@ class Console:
         result, ended = stop_runs(), self.verbs.stop_before_motion()
         if result.silent:
             return "a run does not answer: press the emergency stop"
+        if why_not := not_stopped(self.rig):
+            return why_not
         return "" if result.stopped or ended else "nothing moves"
 
     def command(self, page: int, message: Message, arrived: float) -> str:

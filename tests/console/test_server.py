@@ -36,7 +36,9 @@ from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
 from cdpr.console.session import Console
 from cdpr.console.state import MOST_IN_TRANSIT, StateFlow, StoredState
 from cdpr.console.verbs import ConsoleFiles, VerbOutcome, _outcome, _without_commands
-from cdpr.console.watch import RunWatch
+from cdpr.console.watch import RobotWatch, RunWatch
+from drivers.can_bus import BusSettings
+from executor.interlock.fault_latch import FaultLatch
 from executor.remote.client import stop_runs
 from executor.remote.command_server import commands_from_start
 from executor.remote.command_server import serving as commands
@@ -738,6 +740,41 @@ def test_one_page_of_all_consoles_of_a_robot_has_control(monkeypatch: pytest.Mon
     assert asked(other, theirs, "take_control") == ""
     for console in (one, other):
         console.close()
+
+
+def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("cdpr.console.session.read_status", lambda _: pytest.fail("read"))
+    rig = load_rig(RIG).with_bus("udp_multicast", "239.74.9.14")
+    monkeypatch.setattr(RobotWatch, "update", lambda *_, **__: None)
+    console = Console(replace(Served().console.files, rig=rig))
+    latch = FaultLatch(BusSettings.of(rig))
+    for process, moved_by in ((HIDDEN, HIDDEN), (os.getpid(), None)):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "getpid", lambda process=process: process)
+            latch.engage(rig.name, Path("runs/theirs"))
+        console._stored_for = float("-inf"), None
+        state = console.update()
+        assert (state["latched"], state["moved_by"]) == (None, moved_by)
+        answer = console.stop()
+        if moved_by is None:
+            assert answer == "nothing moves", "a run of this user takes the stop itself"
+        else:
+            assert f"process {HIDDEN}, is not stopped from here" in answer
+            assert "press the emergency stop" in answer
+        latch.let_go()  # as if it was killed
+        console._stored_for = float("-inf"), None
+        state = console.update()
+        assert "was killed" in state["latched"]
+        assert state["moved_by"] is None
+        assert console.stop() == "nothing moves"
+        latch.disengage()
+    console.close()
+
+
+#: Of no process that is visible here.
+HIDDEN = 2**30
 
 
 @pytest.mark.parametrize("path", ["/", "/scene", "/api/files", "/runs/one/report.html"])
