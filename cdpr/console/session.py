@@ -307,14 +307,14 @@ class Console:
             return ""
         if command in ("service_begin", "service_end"):
             return self._service(on=command == "service_begin")
-        requests = {"hold": "hold", "resume": "resume", "jog_end": "end"}
-        if command in requests:
-            return self.watch.send(requests[command])
+        if command in ("hold", "resume"):
+            return self.watch.send(command)
         verbs: dict[str, Callable[[], str]] = {
             "home": self._home,
-            "release": self._release,
+            "release": partial(self._start_verb, "release", [str(self.files.rig_file)]),
             "jog_begin": self._jog_begin,
             "cable_begin": self._cable_begin,
+            "jog_end": self._jog_end,
         }
         return verbs[command]()
 
@@ -327,9 +327,6 @@ class Console:
         if stored.latched != shown:
             return "another fault is latched now: read its cause first"
         return self._start_verb("reset", [str(self.files.rig_file)], real_time=False)
-
-    def _release(self) -> str:
-        return self._start_verb("release", [str(self.files.rig_file)])
 
     def _run(self, shown: str) -> str:
         if self.plan.preview is None or not self.plan.preview["passed"]:
@@ -360,6 +357,12 @@ class Console:
         how = ["--hold-to-run", "--one-cable", "--speed-mm-s", f"{1e3 * FASTEST:g}"]
         return self._start_verb("jog", [str(self.files.rig_file), *how])
 
+    def _jog_end(self) -> str:
+        """Ends the session of jogs; one that is being prepared takes only a stop."""
+        if self.verbs.verb == "jog" and self.verbs.stop_before_motion():
+            return ""
+        return self.watch.send("end")
+
     def _service(self, *, on: bool) -> str:
         """Enters or leaves service mode, the only mode that jogs single cables."""
         status = self.watch.last.status
@@ -370,7 +373,8 @@ class Console:
         with self._control_lock:
             press = None if page is None else self.control.set_service(page, on)
         self.end_press(press)
-        return self.watch.send("end") if jogs_cables and not on else ""
+        is_prepared = self.verbs.verb == "jog" and not self.verbs.is_under_way
+        return self._jog_end() if not on and (jogs_cables or is_prepared) else ""
 
     def _start_verb(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
         if why_not := self.watch.why_busy():

@@ -36,7 +36,7 @@ from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
 from cdpr.console.session import Console
 from cdpr.console.state import MOST_IN_TRANSIT, StateFlow, StoredState
 from cdpr.console.verbs import ConsoleFiles, VerbOutcome, _outcome, _without_commands
-from cdpr.console.watch import RobotWatch, RunWatch
+from cdpr.console.watch import RobotWatch, RunReport, RunWatch
 from drivers.can_bus import BusSettings
 from executor.interlock.fault_latch import FaultLatch
 from executor.remote.client import stop_runs
@@ -362,6 +362,33 @@ def test_a_verb_that_is_still_being_prepared_ends_with_the_console(
     console.close()
     os.kill(process.pid, signal.SIGCONT)
     assert process.wait() == -signal.SIGTERM
+
+
+@pytest.mark.parametrize("name", ["jog_end", "service_end"])
+def test_a_session_that_is_being_prepared_ends_when_its_end_is_asked_for(name: str) -> None:
+    """Else its drives were enabled afterwards, in service mode those of single cables."""
+    console, said = (served := Served()).console, served.said
+    del console.verbs.start
+    page = console.control.join("here")
+    console.control.take(page, moving=False)
+    console.control.set_service(page, name == "service_end")
+    message = parse_message(json.dumps({"kind": "command", "command": name}))
+    assert not isinstance(message, Held | LetGo | Seen)
+    for is_under_way in (False, True):
+        console.verbs.start("jog", ["--help"], wanted)
+        process = console.verbs._process
+        assert process is not None
+        os.kill(process.pid, signal.SIGSTOP)
+        if is_under_way:
+            status = {"process": process.pid, "state": "moving", "cable_jog": {}}
+            console.verbs.follow(status)
+            console.watch.last = RunReport(status, 0.0)
+        assert console.command(page, message, arrived_now()) == ""
+        assert [word for word, _ in said if word == "end"] == ["end"] * is_under_way
+        os.kill(process.pid, signal.SIGCONT)
+        assert process.wait() == (0 if is_under_way else -signal.SIGTERM)
+        console.verbs.update()
+    console.close()
 
 
 def test_stop_leaves_what_moves_nothing_and_what_writes_its_report_alone() -> None:
