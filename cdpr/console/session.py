@@ -386,15 +386,16 @@ class Console:
         return ""
 
     def _plan(self, message: PlanCommand) -> None:
+        MADE.mkdir(exist_ok=True)
         scene = self._taught_scene(message) if message.scene is None else local_file(message.scene)
         output = MADE / f"{scene.stem}.plan.json"
         cost = [] if message.objective == "shortest" else ["--cost", message.objective]
         if load_scene(scene).rotation_limits is not None:
             cost.append("--free-rotation")
-        self.plan.forget()
         rig = str(self.files.rig_file)
         options = ["-o", str(output), "--force", *cost, *self.files.calibration_options]
         self.verbs.start("plan", [rig, str(scene), *options], self._require_wanted)
+        self.plan.forget()
         self._planned = output
 
     def _taught_scene(self, message: PlanCommand) -> Path:
@@ -402,7 +403,6 @@ class Console:
         begin = self._pose_now() if message.from_here or message.pose is not None else None
         document = self.poses.scene(around, "taught", begin=begin, only=message.pose)
         path = MADE / "taught.yaml"
-        MADE.mkdir(exist_ok=True)
         write_atomic(path, scene_text(document))
         return path
 

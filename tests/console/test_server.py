@@ -46,7 +46,7 @@ from executor.remote.command_socket import advertised
 from executor.remote.status import bus_name
 from executor.state_machine import State
 from executor.supervision import LocalRequests, Supervisor
-from model.errors import BadInput
+from model.errors import BadInput, Refused
 from model.plan import load_plan, save_plan
 from model.pose import Pose
 from model.rig import load_rig
@@ -493,6 +493,38 @@ def test_a_plan_that_was_made_here_is_loaded(served: Served) -> None:
     assert scene.start.distance_to(served.console.rig.home) < 1e-9
     for name in ("one", "two"):
         served.console.poses.forget(name)
+
+
+def test_a_scene_is_planned_in_a_folder_in_which_nothing_was_taught(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And a plan that is loaded stays, unless another one is being made."""
+    monkeypatch.chdir(tmp_path)
+    scene = RIG.parent / "environment_1.yaml"
+    Path("scene.yaml").write_bytes(scene.read_bytes())
+    Path("short.json").write_bytes((folder / "short.json").read_bytes())
+    served = Served()
+    console = served.console
+    console.plan.load(Path("short.json"))
+    page = console.control.join("here")
+    console.control.take(page, moving=False)
+    text = '{"kind": "command", "command": "plan", "scene": "scene.yaml"}'
+    message = parse_message(text)
+    assert not isinstance(message, Held | LetGo | Seen)
+
+    def is_busy(*_: object) -> None:
+        raise Refused("`cdpr plan` is still running")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(console.verbs, "start", is_busy)
+        assert "still running" in console.command(page, message, arrived_now())
+    assert console.plan.preview is not None
+    assert console.command(page, message, arrived_now()) == ""
+    ((verb, arguments),) = served.started
+    assert verb == "plan"
+    assert Path(arguments[arguments.index("-o") + 1]).parent.is_dir(), "`cdpr plan` makes none"
+    assert console.plan.preview is None
+    console.close()
 
 
 def test_simulated_drives_continue_where_the_platform_was_seen(served: Served) -> None:
