@@ -266,7 +266,7 @@ class Inbox:
     """Messages of a page that are not yet executed: bounded, however many it sends.
 
     Attributes:
-        commands: To be executed in order.
+        commands: To be executed in order, with the time of arrival, [s] of `CLOCK_BOOTTIME`.
         refused: Refused commands, by number, and why.
         held: The newest report of a press: its number, the message, and when it arrived.
         released: The newest press that is over.
@@ -274,7 +274,7 @@ class Inbox:
 
     def __init__(self) -> None:
         """Starts empty."""
-        self.commands: asyncio.Queue[Message] = asyncio.Queue(MOST_WAITING)
+        self.commands: asyncio.Queue[tuple[Message, float]] = asyncio.Queue(MOST_WAITING)
         self.refused: asyncio.Queue[tuple[int, str]] = asyncio.Queue(MOST_WAITING)
         self.held = Newest[tuple[int, Held, float]]()
         self.released = Newest[int]()
@@ -339,20 +339,20 @@ class PageControl:
 
     def leave(self, page: int) -> int | None:
         """Removes a page and its control; returns the press that it held, if any."""
-        held = self.let_go(page)
+        held = self.give(page)
         del self._pages[page]
-        if self.holder == page:
-            self._free()
         return held
 
     def take(self, page: int, *, moving: bool, force: bool = False) -> str:
         """Gives a page control; returns the reason if refused, else an empty text.
 
         Args:
-            page: Number of the page.
+            page: Number of the page; one that has left while it waited is refused.
             moving: Whether a motion is in progress.
             force: Take control from another page; only at rest.
         """
+        if page not in self._pages:
+            return "the page has left"
         if self.holder not in (None, page):
             assert self.holder is not None
             if moving or not force:
@@ -389,7 +389,8 @@ class PageControl:
 
     def holder_name(self) -> str | None:
         """Name of the page that has control, here or at another console."""
-        return self.elsewhere if self.holder is None else self.name(self.holder)
+        page = self._pages.get(self.holder or 0)  # read once: other threads change it
+        return self.elsewhere if page is None else page.name
 
     def name(self, page: int) -> str:
         """Name of a page."""

@@ -6,7 +6,8 @@ import asyncio
 import errno
 import secrets
 import socket
-from collections.abc import AsyncIterator, Callable, Iterator
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
 from importlib.resources import files
@@ -235,7 +236,7 @@ class ConsoleServer:
         number = self._console.control.join("?" if page.client is None else page.client.host)
         inbox, flow = Inbox(), StateFlow()
         tasks = [
-            asyncio.create_task(work)
+            asyncio.create_task(_or_disconnect(page, work))
             for work in (
                 self._send_states(page, number, flow),
                 self._execute_commands(page, number, inbox),
@@ -294,22 +295,22 @@ class ConsoleServer:
         elif isinstance(message, LetGo):
             inbox.let_go(self._console.let_go(number, message))
         elif message.command == "stop":
-            stopping = asyncio.create_task(self._stop_and_answer(page, number, message))
+            stopping = asyncio.create_task(self._stop_and_answer(page, message))
             self._stopping.add(stopping)  # completes even if the page disconnects
             stopping.add_done_callback(self._stopping.discard)
         elif inbox.commands.full():
             inbox.refuse(message.id, "earlier commands of this page are not finished yet")
         else:
-            inbox.commands.put_nowait(message)
+            inbox.commands.put_nowait((message, time.clock_gettime(time.CLOCK_BOOTTIME)))
 
-    async def _stop_and_answer(self, page: WebSocket, number: int, message: Message) -> None:
-        why_not = await _run_in(self._stops, self._console.command, number, message)
+    async def _stop_and_answer(self, page: WebSocket, message: Message) -> None:
+        why_not = await _run_in(self._stops, self._console.stop)
         await _answer(page, message.id, why_not)
 
     async def _execute_commands(self, page: WebSocket, number: int, inbox: Inbox) -> None:
         while True:
-            message = await inbox.commands.get()
-            why_not = await run_in_threadpool(self._console.command, number, message)
+            message, arrived = await inbox.commands.get()
+            why_not = await run_in_threadpool(self._console.command, number, message, arrived)
             await _answer(page, message.id, why_not)
 
     async def _forward_held(self, inbox: Inbox) -> None:
@@ -327,6 +328,15 @@ class ConsoleServer:
 async def _run_in(pool: ThreadPoolExecutor, work: Callable[..., T], *arguments: Any) -> T:
     """Works in threads of its own, so that it waits for no other request."""
     return await asyncio.get_running_loop().run_in_executor(pool, work, *arguments)
+
+
+async def _or_disconnect(page: WebSocket, work: Coroutine[Any, Any, None]) -> None:
+    """Serves a page; if that fails, disconnects it: no page is left open without a state."""
+    try:
+        await work
+    except Exception:
+        await _disconnect(page)
+        raise
 
 
 async def _disconnect(page: WebSocket) -> None:

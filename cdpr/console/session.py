@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +39,12 @@ from cdpr.console.state import (
     jog_state,
     local_file,
     measured_state,
+    not_stopped,
     read_stored,
     stored_state,
 )
 from cdpr.console.teach import TaughtPoses, picked_pose, scene_text
-from cdpr.console.verbs import StartedVerb, outcome_state, start_options
+from cdpr.console.verbs import ConsoleFiles, StartedVerb, outcome_state, start_options
 from cdpr.console.view import (
     LoadedPlan,
     RobotView,
@@ -55,42 +56,17 @@ from cdpr.console.watch import CameraPictures, RobotWatch, RunWatch
 from executor.drives import is_simulated
 from executor.jogging import FASTEST
 from executor.remote.client import stop_runs
+from executor.remote.command_socket import is_stopped_since
 from executor.remote.status import bus_name
 from executor.service import StatusResult
 from executor.service import status as read_status
-from model.errors import CdprError, without_passwords
+from model.errors import CdprError, Refused, without_passwords
 from model.files.documents import write_atomic
 from model.pose import Pose
-from model.rig import Rig
 from model.scene import empty_scene, load_scene
 
 #: Shortest period of reading the fault latch and the reference, [s].
 STORED_EVERY = 0.5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ConsoleFiles:
-    """Files and options of a console.
-
-    Attributes:
-        rig_file: Path passed to verbs.
-        rig: The robot and its bus.
-        bus_options: Command-line options for that bus.
-        calibration_options: Command-line options for the rig's calibration results.
-        cameras: Sources that measure runs, the first also homing; may be empty.
-        scene_file: Obstacles and payload, if given.
-        without_real_time: Verbs move even if real-time scheduling is denied.
-        read_only: Only STOP is accepted.
-    """
-
-    rig_file: Path
-    rig: Rig
-    bus_options: tuple[str, ...]
-    calibration_options: tuple[str, ...]
-    cameras: tuple[str, ...]
-    scene_file: Path | None
-    without_real_time: bool
-    read_only: bool
 
 
 class Console:
@@ -115,6 +91,8 @@ class Console:
         self.plan = LoadedPlan(self.rig)
         self._control_lock, self._one_at_a_time = threading.Lock(), threading.RLock()
         self._bus_control = BusControl(self.rig, self.control, self._control_lock)
+        self._stopped = -math.inf  # when STOP was last pressed
+        self._require_wanted: Callable[[], None]  # of the command that is being executed
         self._line = ""
         self._planned: Path | None = None
         self._asks = ThreadPoolExecutor(1, "cdpr-drives")
@@ -219,20 +197,30 @@ class Console:
     # Commands.
 
     def stop(self) -> str:
-        """Stops every run of this user, and a verb in preparation; returns why not, or nothing."""
+        """Stops every run of this user, and a verb in preparation; returns why not, or nothing.
+
+        Commands that arrived before, and have started nothing yet, will start nothing.
+        """
+        self._stopped = time.clock_gettime(time.CLOCK_BOOTTIME)
         result, ended = stop_runs(), self.verbs.stop_before_motion()
         if result.silent:
             return "a run does not answer: press the emergency stop"
+        if why_not := not_stopped(self.rig):
+            return why_not
         return "" if result.stopped or ended else "nothing moves"
 
-    def command(self, page: int, message: Message) -> str:
-        """Executes a page's command; returns why not, or an empty text."""
-        if message.command == "stop":
-            return self.stop()
+    def command(self, page: int, message: Message, arrived: float) -> str:
+        """Executes a page's command except STOP; returns why not, or an empty text.
+
+        Args:
+            page: Number of the page.
+            message: The command.
+            arrived: When, [s] of `CLOCK_BOOTTIME`; a later stop cancels it unless it has begun.
+        """
         if self.files.read_only:
             return "this console is read-only"
         try:
-            return self._command(page, message)
+            return self._command(page, message, arrived)
         except CdprError as error:
             return str(error)
         except Exception as error:  # such as a full disk; the page's next command is executed
@@ -248,7 +236,7 @@ class Console:
         if is_simulated(self.rig) and self.plan.start is not None:
             self.robot.simulate_at(self.plan.start)
 
-    def _command(self, page: int, message: Message) -> str:
+    def _command(self, page: int, message: Message, arrived: float) -> str:
         if isinstance(message, TakeCommand):
             if message.force and message.held_by != self.control.holder_name():
                 return "control has changed hands meanwhile: look who has it"
@@ -265,7 +253,24 @@ class Console:
         with self._one_at_a_time:
             if self.control.holder != page:
                 return "take control first"
+            self._require_wanted = partial(self._require, page, arrived)
+            self._require_wanted()
             return self._operate(message)
+
+    def _require(self, page: int, arrived: float) -> None:
+        """Requires that no stop came after a command, and that its page still has control.
+
+        Raises:
+            Refused: A command that waited, such as for the drives to be read, is not wanted now.
+        """
+        if self._stopped >= arrived or is_stopped_since(arrived):
+            raise Refused(
+                "STOP was pressed before this command began",
+                where="console",
+                next_step="give it again when ready; nothing was moved",
+            )
+        if self.control.holder != page:
+            raise Refused("the page lost control before this command began", where="console")
 
     def _operate(self, message: Message) -> str:
         match message:
@@ -302,14 +307,14 @@ class Console:
             return ""
         if command in ("service_begin", "service_end"):
             return self._service(on=command == "service_begin")
-        requests = {"hold": "hold", "resume": "resume", "jog_end": "end"}
-        if command in requests:
-            return self.watch.send(requests[command])
+        if command in ("hold", "resume"):
+            return self.watch.send(command)
         verbs: dict[str, Callable[[], str]] = {
             "home": self._home,
-            "release": self._release,
+            "release": partial(self._start_verb, "release", [str(self.files.rig_file)]),
             "jog_begin": self._jog_begin,
             "cable_begin": self._cable_begin,
+            "jog_end": self._jog_end,
         }
         return verbs[command]()
 
@@ -322,9 +327,6 @@ class Console:
         if stored.latched != shown:
             return "another fault is latched now: read its cause first"
         return self._start_verb("reset", [str(self.files.rig_file)], real_time=False)
-
-    def _release(self) -> str:
-        return self._start_verb("release", [str(self.files.rig_file)])
 
     def _run(self, shown: str) -> str:
         if self.plan.preview is None or not self.plan.preview["passed"]:
@@ -355,6 +357,12 @@ class Console:
         how = ["--hold-to-run", "--one-cable", "--speed-mm-s", f"{1e3 * FASTEST:g}"]
         return self._start_verb("jog", [str(self.files.rig_file), *how])
 
+    def _jog_end(self) -> str:
+        """Ends the session of jogs; one that is being prepared takes only a stop."""
+        if self.verbs.verb == "jog" and self.verbs.stop_before_motion():
+            return ""
+        return self.watch.send("end")
+
     def _service(self, *, on: bool) -> str:
         """Enters or leaves service mode, the only mode that jogs single cables."""
         status = self.watch.last.status
@@ -365,26 +373,29 @@ class Console:
         with self._control_lock:
             press = None if page is None else self.control.set_service(page, on)
         self.end_press(press)
-        return self.watch.send("end") if jogs_cables and not on else ""
+        is_prepared = self.verbs.verb == "jog" and not self.verbs.is_under_way
+        return self._jog_end() if not on and (jogs_cables or is_prepared) else ""
 
     def _start_verb(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
         if why_not := self.watch.why_busy():
             return why_not
         relaxed = ["--without-real-time"] if real_time and self.files.without_real_time else []
         rig = (*self.files.bus_options, *self.files.calibration_options)
-        self.verbs.start(verb, [*arguments, *rig, *relaxed, "--yes"])
+        arguments = [*arguments, *rig, *relaxed, "--yes"]
+        self.verbs.start(verb, arguments, self._require_wanted)
         return ""
 
     def _plan(self, message: PlanCommand) -> None:
+        MADE.mkdir(exist_ok=True)
         scene = self._taught_scene(message) if message.scene is None else local_file(message.scene)
         output = MADE / f"{scene.stem}.plan.json"
         cost = [] if message.objective == "shortest" else ["--cost", message.objective]
         if load_scene(scene).rotation_limits is not None:
             cost.append("--free-rotation")
-        self.plan.forget()
         rig = str(self.files.rig_file)
         options = ["-o", str(output), "--force", *cost, *self.files.calibration_options]
-        self.verbs.start("plan", [rig, str(scene), *options])
+        self.verbs.start("plan", [rig, str(scene), *options], self._require_wanted)
+        self.plan.forget()
         self._planned = output
 
     def _taught_scene(self, message: PlanCommand) -> Path:
@@ -392,7 +403,6 @@ class Console:
         begin = self._pose_now() if message.from_here or message.pose is not None else None
         document = self.poses.scene(around, "taught", begin=begin, only=message.pose)
         path = MADE / "taught.yaml"
-        MADE.mkdir(exist_ok=True)
         write_atomic(path, scene_text(document))
         return path
 

@@ -17,7 +17,7 @@ from cdpr.console.commands import PageControl, Seen
 from cdpr.console.view import measured_data
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
-from executor.interlock.fault_latch import FaultLatch
+from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.interlock.locks import ControlLock
 from executor.jogging import FASTEST
@@ -130,30 +130,60 @@ class StoredState:
         latched: Cause of the latched fault, if any.
         referenced: Whether the drives are homed.
         why_not: Reason if they are not.
+        moved_by: Process of another user that moves or resets the drives, if any.
     """
 
     latched: str | None
     referenced: bool
     why_not: str | None
+    moved_by: int | None = None
 
 
 def stored_state(stored: StoredState) -> dict[str, Any]:
-    """The fault latch and the homing reference."""
+    """The fault latch, a motion of another user, and the homing reference."""
     reference = {"counts": stored.referenced, "why_not": stored.why_not}
-    return {"latched": stored.latched, "reference": reference}
+    return {"latched": stored.latched, "moved_by": stored.moved_by, "reference": reference}
 
 
 def read_stored(rig: Rig, *, is_moving: bool) -> StoredState:
     """Reads the fault latch and the homing reference of a bus from their files."""
     if is_simulated(rig):
         return StoredState(None, True, None)
-    fault = None
+    fault = moved_by = None
     try:
-        fault = FaultLatch(BusSettings.of(rig)).read()
+        fault, moved_by = _read_latch(rig)
         why = reference_status(MotionInterlock(rig)).why_not
     except CdprError as error:
         why = error.what
-    return StoredState(None if fault is None or is_moving else fault.cause, not why, why)
+    cause = None if fault is None or is_moving else fault.cause
+    return StoredState(cause, not why, why, moved_by)
+
+
+def _read_latch(rig: Rig) -> tuple[LatchedFault | None, int | None]:
+    """The latched fault, or the process of another user that moves or resets the drives."""
+    fault, in_motion = FaultLatch(BusSettings.of(rig)).read_in_motion()
+    if fault is None or not in_motion:
+        return fault, None
+    with suppress(OSError):  # processes of other users may be hidden
+        if os.stat(f"/proc/{fault.process}").st_uid == os.getuid():
+            return None, None
+    return None, fault.process
+
+
+def not_stopped(rig: Rig) -> str:
+    """What a stop of this user's runs leaves moving on a rig's bus; empty if nothing."""
+    if is_simulated(rig):
+        return ""
+    try:
+        _, process = _read_latch(rig)
+    except CdprError as error:
+        return f"whether another user moves the robot is unknown: {error.what}"
+    if process is None:
+        return ""
+    return (
+        f"a motion of another user, process {process}, is not stopped from here:"
+        " press the emergency stop"
+    )
 
 
 def jog_state(status: dict[str, Any] | None) -> dict[str, Any]:

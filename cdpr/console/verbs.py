@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,31 @@ BEFORE_MOTION = "Stopped during the preparation: nothing was moved."
 MOVING = frozenset({"home", "jog", "release", "run"})
 _REPORT = re.compile(r"(\S+/report\.html)")
 _HELP = re.compile(r"docs/faults/(\w+)\.md")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConsoleFiles:
+    """Files and options of a console.
+
+    Attributes:
+        rig_file: Path passed to verbs.
+        rig: The robot and its bus.
+        bus_options: Command-line options for that bus.
+        calibration_options: Command-line options for the rig's calibration results.
+        cameras: Sources that measure runs, the first also homing; may be empty.
+        scene_file: Obstacles and payload, if given.
+        without_real_time: Verbs move even if real-time scheduling is denied.
+        read_only: Only STOP is accepted.
+    """
+
+    rig_file: Path
+    rig: Rig
+    bus_options: tuple[str, ...]
+    calibration_options: tuple[str, ...]
+    cameras: tuple[str, ...]
+    scene_file: Path | None
+    without_real_time: bool
+    read_only: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +92,20 @@ class StartedVerb:
         self.is_under_way = False
         """Whether the running verb's drives may move."""
 
-    def start(self, verb: str, arguments: Sequence[str]) -> None:
+    def start(self, verb: str, arguments: Sequence[str], require: Callable[[], None]) -> None:
         """Starts a verb without a terminal.
 
+        Args:
+            verb: Name.
+            arguments: On its command line.
+            require: Raises `Refused` if it is not to be started any more. A stop after this check
+                finds the verb started, and ends it.
+
         Raises:
-            Refused: Another verb is running.
+            Refused: Another verb is running, or it is not to be started.
         """
         with self._lock:
+            require()
             self._update()
             if self.verb is not None:
                 raise Refused(

@@ -280,12 +280,17 @@ def _pause(seconds: float) -> Sequence[bytes]:
     return ()
 
 
+def _raise_rejected(answer: Answer) -> None:
+    raise no_answer("monitor", [answer])
+
+
 def follow_run(
     process: int | None,
     rate: float,
     *,
     waits: bool = False,
     between: Callable[[float], Sequence[bytes]] = _pause,
+    rejected: Callable[[Answer], None] = _raise_rejected,
 ) -> Iterator[dict[str, Any]]:
     """Yields the status of a run repeatedly over one connection, until it ends.
 
@@ -295,35 +300,44 @@ def follow_run(
         waits: Without a run, wait until one begins.
         between: Waits for a time, [s], and returns lines to send, made by
             `executor.remote.protocol.make_line`.
+        rejected: Called with the answer to a line that the run rejected (default: a `Fault`).
 
     Raises:
-        Fault: There is no run, or it does not answer, or rejects a line.
+        Fault: There is no run, or it does not answer.
         BadInput: The run is ambiguous.
     """
     while True:
         with find_runs() as runs:
             if runs or not waits:
-                yield from _followed(select_run(runs, process, "monitor"), rate, between)
+                run = select_run(runs, process, "monitor")
+                yield from _followed(run, rate, between, rejected)
                 return
         between(POLL_INTERVAL)
 
 
 def _followed(
-    run: RunConnection, rate: float, between: Callable[[float], Sequence[bytes]]
+    run: RunConnection,
+    rate: float,
+    between: Callable[[float], Sequence[bytes]],
+    rejected: Callable[[Answer], None],
 ) -> Iterator[dict[str, Any]]:
     status: dict[str, Any] = {}
     lines: Sequence[bytes] = ()
+    ask_status = make_line("status")
     while True:
-        for line in (*lines, make_line("status")):
+        for line in (*lines, ask_status):
             answer = ask(run, line)
             if answer.ended:
                 last = final_status(run)
                 if last is not None:
                     yield last
                 return
-            if answer.status is None:
+            if answer.status is not None:
+                status = answer.status
+            elif answer.what and line != ask_status:
+                rejected(answer)
+            else:
                 raise no_answer("monitor", [answer])
-            status = answer.status
         yield status
         lines = between(1.0 / rate)
 

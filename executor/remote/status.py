@@ -264,9 +264,9 @@ class RunStatus(MotionStatus):
     def _next_stop(self, row: float, path: float) -> dict[str, Any]:
         """The scene's next stop, or the goal."""
         table, stops = self._prepared.checked.table, self._prepared.scene.stops
-        ahead = [(dwell.first, stop.name) for dwell, stop in zip(table.dwells, stops, strict=True)]
-        ahead.append((len(table) - 1, "goal"))
-        last, name = next(one for one in ahead if one[0] >= row or one[1] == "goal")
+        rows = [(dwell.first, stop.name) for dwell, stop in zip(table.dwells, stops, strict=True)]
+        goal = (len(table) - 1, "goal")  # its name may also be that of a stop
+        last, name = next((one for one in rows if one[0] >= row), goal)
         left = (last - row) * table.cycle / self._board.read().speed
         return {
             "name": name,

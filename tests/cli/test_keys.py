@@ -33,7 +33,7 @@ from executor.remote.protocol import make_line, parse_command
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, State
 from executor.supervision import LocalRequests
-from model.errors import BadInput, StoppedByOperator
+from model.errors import BadInput, Fault, StoppedByOperator
 from model.pose import Pose
 from model.rig import load_rig
 from tests.cli.plans import RIG
@@ -229,6 +229,25 @@ def test_a_run_is_waited_for_and_takes_what_it_is_sent(monkeypatch: pytest.Monke
         assert not first["wished"]["hold"]
         assert next(following)["wished"]["hold"]
         following.close()
+
+
+def test_a_key_that_a_session_of_jogs_rejects_ends_no_monitor() -> None:
+    keys = Script("h", "+", "x", "h")
+    operator = monitor._Operator(keys)  # type: ignore[arg-type]
+    board, presses = LocalRequests(), PressBoard(lambda: 0.0)
+    session = WinchStatus(load_rig(RIG), board, simulated_time=False)
+    with advertised() as listeners, serving(listeners, board, session, presses):
+        following = follow_run(
+            os.getpid(), 10.0, between=operator.between, rejected=operator.rejected
+        )
+        for _ in range(4):
+            operator.status = next(following)
+        assert "a session of jogs has no path" in operator.line
+        following.close()
+        strict = follow_run(os.getpid(), 10.0, between=operator.between)
+        next(strict)
+        with pytest.raises(Fault, match="has no path"):
+            next(strict)
 
 
 def test_the_monitor_shows_where_the_platform_is_by_the_runs_own_rig(tmp_path: Path) -> None:

@@ -5,15 +5,19 @@ from __future__ import annotations
 import io
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
 from cdpr.cli.operate.monitor import _lines, _view
 from executor.remote.client import status_text
-from executor.remote.status import WinchStatus
+from executor.remote.status import RunStatus, WinchStatus
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests
 from model.rig import load_rig
@@ -178,3 +182,30 @@ def test_the_monitor_ends_as_the_run_did(
         _lines(iter([status(), status(**last)]), as_json=False)
     assert ended.value.exit_code == code
     assert text in capsys.readouterr().out.splitlines()[-1]
+
+
+class Table:
+    """Rows 1 mm apart, of 1 s each, with stops at some."""
+
+    def __init__(self, rows: int, stops: list[int]) -> None:
+        self.travelled, self.cycle = 1e-3 * np.arange(rows), 1.0
+        self.dwells = [SimpleNamespace(first=row) for row in stops]
+
+    def __len__(self) -> int:
+        return len(self.travelled)
+
+
+@given(
+    stops=st.dictionaries(st.integers(1, 98), st.sampled_from(["goal", "stop 1"]), max_size=4),
+    row=st.floats(0.0, 99.0),
+)
+def test_the_next_stop_is_ahead_whatever_its_name(stops: dict[int, str], row: float) -> None:
+    table = Table(100, sorted(stops))
+    scene = SimpleNamespace(stops=[SimpleNamespace(name=stops[at]) for at in sorted(stops)])
+    prepared: Any = SimpleNamespace(rig=None, checked=SimpleNamespace(table=table), scene=scene)
+    run = RunStatus(prepared, Path(), LocalRequests(), simulated_time=True)
+    shown = run._next_stop(row, 1e-3 * row)
+    at, name = min([one for one in stops.items() if one[0] >= row], default=(99, "goal"))
+    assert shown["name"] == name
+    assert shown["distance_mm"] == pytest.approx(at - row, abs=0.051)
+    assert shown["seconds"] == pytest.approx(at - row, abs=0.051)

@@ -271,6 +271,7 @@ class Fake:
                 "mode": self._mode(reader),
             },
             "latched": self.latched,
+            "moved_by": None,
             "reference": {
                 "counts": self.homed,
                 "why_not": None if self.homed else "cable 3 was switched on again",

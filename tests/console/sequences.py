@@ -14,6 +14,7 @@ import os
 import random
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
@@ -24,7 +25,8 @@ import numpy as np
 
 from cdpr.console import watch
 from cdpr.console.commands import Held, LetGo, parse_message
-from cdpr.console.session import Console, ConsoleFiles
+from cdpr.console.session import Console
+from cdpr.console.verbs import ConsoleFiles
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
 from executor.hold_to_run.session import cable_session, jog_session
 from executor.state_machine import CycleRecord, State
@@ -46,6 +48,11 @@ PATIENCE = 60.0
 #: A page with a pressed control sends a message every 5 cycles of 10 ms.
 SEND_EVERY = 5
 DIRECTIONS = [[*row] for sign in (1.0, -1.0) for row in (sign * np.eye(3)).tolist()]
+
+
+def arrived_now() -> float:
+    """When a command arrived that arrives now, [s]."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 @dataclass
@@ -235,7 +242,7 @@ class Sequences:
             scene = load_scene(SCENE)
             jog_session(rig, scene, speed=SPEED, realtime=False, on_cycle=on_cycle)
 
-    def _start(self, verb: str, _arguments: object) -> None:
+    def _start(self, verb: str, _arguments: object, _require: object) -> None:
         self._started.append(verb)
 
     def _on_cycle(self, record: CycleRecord, board: PressBoard, _: object) -> None:
@@ -284,7 +291,9 @@ class Sequences:
         text = json.dumps({"kind": "command", "id": 1, "command": command, **values})
         message = parse_message(text)
         assert not isinstance(message, Held | LetGo)
-        return self.console.command(page.number, message)
+        if command == "stop":
+            return self.console.stop()
+        return self.console.command(page.number, message, arrived_now())
 
     def _act(self, board: PressBoard) -> None:
         """The next event; a sequence has about four of them."""

@@ -30,6 +30,7 @@ class ControlMachine(RuleBasedStateMachine):
         self.now = 1
         self.control = PageControl(lambda: self.now)
         self.pages: set[int] = set()
+        self.gone: list[int] = []
         self.motion = 1
         self.begun_in: dict[int, int] = {}
         self.begun: dict[int, tuple[int, int]] = {}
@@ -55,6 +56,7 @@ class ControlMachine(RuleBasedStateMachine):
         if page := self._page(number):
             self._end(self.control.leave(page))
             self.pages.discard(page)
+            self.gone.append(page)
 
     @rule(number=st.integers(0, 1), moving=st.booleans(), force=st.booleans())
     def take(self, number: int, moving: bool, force: bool) -> None:
@@ -68,6 +70,14 @@ class ControlMachine(RuleBasedStateMachine):
                 assert self.control.holder == page
                 if before is not None and before != page:
                     self._end_all_of(before)
+
+    @precondition(lambda self: self.gone)
+    @rule(moving=st.booleans(), force=st.booleans())
+    def take_after_leaving(self, moving: bool, force: bool) -> None:
+        """It waited for another console, and the page was closed meanwhile."""
+        before = self.control.holder
+        assert self.control.take(self.gone[-1], moving=moving, force=force)
+        assert self.control.holder == before
 
     @rule(number=st.integers(0, 1))
     def give(self, number: int) -> None:
@@ -111,6 +121,7 @@ class ControlMachine(RuleBasedStateMachine):
     @invariant()
     def one_holder(self) -> None:
         assert self.control.holder is None or self.control.holder in self.pages
+        assert (self.control.holder_name() is None) == (self.control.holder is None)
 
     def _page(self, number: int) -> int | None:
         return sorted(self.pages)[number % len(self.pages)] if self.pages else None
@@ -307,6 +318,35 @@ def test_a_lock_of_control_that_cannot_be_made_gives_no_control(
     with pytest.raises(Refused, match="it is a folder"):
         console.bus.take(console.numbers[0], moving=False, force=True)
     assert console.pages.holder is None
+
+
+def test_a_page_that_left_while_it_waited_for_another_console_gets_no_control(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    one, other = OneConsole(), OneConsole()
+    (page, _), (rival, _) = one.numbers, other.numbers
+    assert other.bus.take(rival, moving=False, force=False) == ""
+
+    class Meanwhile:
+        now = 0.0
+
+        def monotonic(self) -> float:
+            return self.now
+
+        def sleep(self, seconds: float) -> None:
+            self.now += seconds
+            if page in one.pages._pages:
+                one.pages.leave(page)
+            other.bus.update(moving=False)
+
+    monkeypatch.setattr(locks, "time", Meanwhile())
+    assert one.bus.take(page, moving=False, force=True) == "the page has left"
+    one.bus.update(moving=False)
+    assert (one.pages.holder, one.pages.holder_name()) == (None, None)
+    assert other.bus.take(rival, moving=False, force=False) == "", "the lock is free again"
+    for console in (one, other):
+        console.bus.close()
 
 
 def test_control_of_a_console_that_was_killed_is_free(

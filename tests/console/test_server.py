@@ -16,7 +16,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -33,17 +33,20 @@ from websockets.sync.client import ClientConnection, connect
 from cdpr.console import server
 from cdpr.console.commands import MOST_WAITING, Held, LetGo, Seen, parse_message
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
-from cdpr.console.session import Console, ConsoleFiles
+from cdpr.console.session import Console
 from cdpr.console.state import MOST_IN_TRANSIT, StateFlow, StoredState
-from cdpr.console.verbs import VerbOutcome, _outcome, _without_commands
-from cdpr.console.watch import RunWatch
+from cdpr.console.verbs import ConsoleFiles, VerbOutcome, _outcome, _without_commands
+from cdpr.console.watch import RobotWatch, RunReport, RunWatch
+from drivers.can_bus import BusSettings
+from executor.interlock.fault_latch import FaultLatch
+from executor.remote.client import stop_runs
 from executor.remote.command_server import commands_from_start
 from executor.remote.command_server import serving as commands
 from executor.remote.command_socket import advertised
 from executor.remote.status import bus_name
 from executor.state_machine import State
 from executor.supervision import LocalRequests, Supervisor
-from model.errors import BadInput
+from model.errors import BadInput, Refused
 from model.plan import load_plan, save_plan
 from model.pose import Pose
 from model.rig import load_rig
@@ -52,6 +55,11 @@ from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan, w
 from tests.cli.program import call
 from tests.console import fake_server
 from tests.console.cut import acknowledgement, receive
+from tests.console.sequences import arrived_now
+
+
+def wanted() -> None:
+    """Of a verb that is still to be started."""
 
 
 class Served:
@@ -81,7 +89,8 @@ class Served:
         self.said.append((command, values))
         return ""
 
-    def _start(self, verb: str, arguments: Any) -> None:
+    def _start(self, verb: str, arguments: Any, require: Callable[[], None]) -> None:
+        require()
         self.started.append((verb, list(arguments)))
 
     def get(self, path: str, *, token: bool = True, **headers: str) -> tuple[int, bytes, Any]:
@@ -297,7 +306,7 @@ def test_the_output_of_a_verb_needs_no_disk_and_leaves_no_file(
     del console.verbs.start
     before = sorted(tmp_path.iterdir())
     monkeypatch.setattr("tempfile.mkstemp", lambda **_: pytest.fail("a file is written"))
-    console.verbs.start("run", ["no-such-plan.json"])
+    console.verbs.start("run", ["no-such-plan.json"], wanted)
     process = console.verbs._process
     assert process is not None
     assert process.wait() == 2
@@ -321,7 +330,7 @@ def test_stop_ends_a_verb_that_is_still_being_prepared(verb: str) -> None:
     """It reads files and drives for seconds before it can be asked to stop."""
     console = Served().console
     del console.verbs.start
-    console.verbs.start(verb, ["--help"])
+    console.verbs.start(verb, ["--help"], wanted)
     process = console.verbs._process
     assert process is not None
     os.kill(process.pid, signal.SIGSTOP)  # however soon it would end
@@ -343,7 +352,7 @@ def test_a_verb_that_is_still_being_prepared_ends_with_the_console(
     console = Served().console
     del console.verbs.start
     console.watch.send = lambda *_, **__: "nothing moves"  # type: ignore[method-assign]
-    console.verbs.start(verb, ["--help"])
+    console.verbs.start(verb, ["--help"], wanted)
     process = console.verbs._process
     assert process is not None
     os.kill(process.pid, signal.SIGSTOP)
@@ -355,11 +364,38 @@ def test_a_verb_that_is_still_being_prepared_ends_with_the_console(
     assert process.wait() == -signal.SIGTERM
 
 
+@pytest.mark.parametrize("name", ["jog_end", "service_end"])
+def test_a_session_that_is_being_prepared_ends_when_its_end_is_asked_for(name: str) -> None:
+    """Else its drives were enabled afterwards, in service mode those of single cables."""
+    console, said = (served := Served()).console, served.said
+    del console.verbs.start
+    page = console.control.join("here")
+    console.control.take(page, moving=False)
+    console.control.set_service(page, name == "service_end")
+    message = parse_message(json.dumps({"kind": "command", "command": name}))
+    assert not isinstance(message, Held | LetGo | Seen)
+    for is_under_way in (False, True):
+        console.verbs.start("jog", ["--help"], wanted)
+        process = console.verbs._process
+        assert process is not None
+        os.kill(process.pid, signal.SIGSTOP)
+        if is_under_way:
+            status = {"process": process.pid, "state": "moving", "cable_jog": {}}
+            console.verbs.follow(status)
+            console.watch.last = RunReport(status, 0.0)
+        assert console.command(page, message, arrived_now()) == ""
+        assert [word for word, _ in said if word == "end"] == ["end"] * is_under_way
+        os.kill(process.pid, signal.SIGCONT)
+        assert process.wait() == (0 if is_under_way else -signal.SIGTERM)
+        console.verbs.update()
+    console.close()
+
+
 def test_stop_leaves_what_moves_nothing_and_what_writes_its_report_alone() -> None:
     console = Served().console
     del console.verbs.start
     for verb, is_under_way in (("plan", False), ("reset", False), ("run", True)):
-        console.verbs.start(verb, ["--help"])
+        console.verbs.start(verb, ["--help"], wanted)
         process = console.verbs._process
         assert process is not None
         if is_under_way:
@@ -387,6 +423,24 @@ def test_a_failure_of_the_computer_is_answered_and_later_commands_are_executed(
         before = state(page)["seq"]
         while state(page)["seq"] <= before + 1:
             pass
+
+
+def test_a_page_that_cannot_be_served_is_disconnected(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it would show old data for ever; it connects again on its own."""
+
+    def broken(_page: int) -> dict[str, object]:
+        raise KeyError(_page)
+
+    with served.page() as page:
+        state(page)
+        with monkeypatch.context() as patch:
+            patch.setattr(served.console.control, "as_dict", broken)
+            with pytest.raises(ConnectionClosed):
+                list(page)
+    with served.page() as page:
+        state(page)
 
 
 def test_messages_are_not_compressed(served: Served) -> None:
@@ -441,6 +495,38 @@ def test_a_plan_that_was_made_here_is_loaded(served: Served) -> None:
         served.console.poses.forget(name)
 
 
+def test_a_scene_is_planned_in_a_folder_in_which_nothing_was_taught(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And a plan that is loaded stays, unless another one is being made."""
+    monkeypatch.chdir(tmp_path)
+    scene = RIG.parent / "environment_1.yaml"
+    Path("scene.yaml").write_bytes(scene.read_bytes())
+    Path("short.json").write_bytes((folder / "short.json").read_bytes())
+    served = Served()
+    console = served.console
+    console.plan.load(Path("short.json"))
+    page = console.control.join("here")
+    console.control.take(page, moving=False)
+    text = '{"kind": "command", "command": "plan", "scene": "scene.yaml"}'
+    message = parse_message(text)
+    assert not isinstance(message, Held | LetGo | Seen)
+
+    def is_busy(*_: object) -> None:
+        raise Refused("`cdpr plan` is still running")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(console.verbs, "start", is_busy)
+        assert "still running" in console.command(page, message, arrived_now())
+    assert console.plan.preview is not None
+    assert console.command(page, message, arrived_now()) == ""
+    ((verb, arguments),) = served.started
+    assert verb == "plan"
+    assert Path(arguments[arguments.index("-o") + 1]).parent.is_dir(), "`cdpr plan` makes none"
+    assert console.plan.preview is None
+    console.close()
+
+
 def test_simulated_drives_continue_where_the_platform_was_seen(served: Served) -> None:
     served.console.begin_with(Path("short.json"))
     start = load_plan(Path("short.json")).waypoints[0]
@@ -491,6 +577,117 @@ def test_stop_waits_for_no_other_command_of_any_page(
         assert "not finished yet" in command(me, "hold")["what"]
 
 
+@pytest.mark.parametrize(
+    ("name", "stopped_by"),
+    [
+        *((name, "a page") for name in ("home", "release", "jog_begin", "run", "reset", "plan")),
+        ("home", "another terminal"),
+    ],
+)
+def test_a_stop_cancels_commands_that_wait_for_another_one(
+    served: Served, name: str, stopped_by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, slow = threading.Event(), threading.Event()
+    load = served.console.plan.load
+
+    def load_slowly(path: Path) -> None:
+        begun.set()
+        slow.wait(60)
+        load(path)
+
+    monkeypatch.setattr(served.console.plan, "load", load_slowly)
+    values = {"run": {"plan": "hash"}, "reset": {"cause": None}, "plan": {"scene": "s.yaml"}}
+    with served.page() as page, served.page() as other:
+        assert command(page, "take_control")["ok"]
+        asked = [("load_plan", {"file": "short.json"}), (name, values.get(name, {}))]
+        for number, (asks, with_values) in enumerate(asked, 1):
+            word = {"kind": "command", "id": number, "command": asks, **with_values}
+            page.send(json.dumps(word))
+        assert begun.wait(60)
+        page.send(json.dumps({"kind": "seen", "seq": 0, "at_ms": 0.0}) + "nonsense")
+        while receive(page)["kind"] != "answer":  # by then the commands have arrived
+            pass
+        if stopped_by == "a page":
+            assert command(other, "stop")["to"] == 7
+        else:
+            stop_runs()
+        slow.set()
+        while (answer := receive(page)).get("to") != 2:
+            pass
+        assert (answer["ok"], "STOP was pressed" in answer["what"]) == (False, True)
+        assert served.started == []
+        assert command(page, "home")["ok"], "who asks after the stop is heard"
+        assert [verb for verb, _ in served.started] == ["home"]
+
+
+@pytest.mark.parametrize("end", ["stop", "leave", "give", "taken", "none"])
+def test_a_run_that_waits_for_its_drives_begins_only_if_it_is_still_wanted(
+    folder: Path, end: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever happens between the check of who has control and the start."""
+    monkeypatch.chdir(folder)
+    served = Served()
+    console = served.console
+    page, other = console.control.join("here"), console.control.join("there")
+    console.plan.load(Path("short.json"))
+    shown = console.plan.preview
+    assert shown is not None
+
+    def asked(name: str, by: int = page, **values: object) -> str:
+        message = parse_message(json.dumps({"kind": "command", "command": name, **values}))
+        assert not isinstance(message, Held | LetGo | Seen)
+        return console.command(by, message, arrived_now())
+
+    ends: dict[str, Callable[[], object]] = {
+        "stop": console.stop,
+        "leave": lambda: console.leave(page),
+        "give": lambda: asked("give_control"),
+        "taken": lambda: asked(
+            "take_control", other, force=True, held_by=console.control.holder_name()
+        ),
+        "none": lambda: None,
+    }
+    assert asked("take_control") == ""
+
+    def read_drives() -> None:
+        ends[end]()
+
+    monkeypatch.setattr(console.robot, "pose_at_rest", read_drives)
+    why_not = asked("run", plan=shown["hash"])
+    if end == "none":
+        assert (why_not, len(served.started)) == ("", 1)
+    else:
+        assert "before this command began" in why_not
+        assert served.started == []
+    console.close()
+
+
+def test_a_stop_finds_each_verb_either_started_or_refused() -> None:
+    """It waits for a start that has passed the check, and ends what was started."""
+    console = Served().console
+    del console.verbs.start
+    stopping, stopped = threading.Event(), threading.Event()
+
+    def stop() -> None:
+        stopping.set()
+        console.stop()
+        stopped.set()
+
+    stop_now = threading.Thread(target=stop)
+
+    def stop_meanwhile() -> None:
+        stop_now.start()
+        assert stopping.wait(60)
+        assert not stopped.is_set()
+
+    console.verbs.start("run", ["no-such-plan.json"], stop_meanwhile)
+    process = console.verbs._process
+    assert process is not None
+    stop_now.join()
+    assert process.wait() == -signal.SIGTERM
+    console.close()
+
+
 def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
     served = Served()
     console = served.console
@@ -500,7 +697,7 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
         shown = {"cause": None} if name == "reset" else {}
         message = parse_message(json.dumps({"kind": "command", "command": name, **shown}))
         assert not isinstance(message, Held | LetGo)
-        return console.command(page, message)
+        return console.command(page, message, arrived_now())
 
     assert asked("take_control") == ""
     with advertised() as listeners:
@@ -589,7 +786,7 @@ def test_one_page_of_all_consoles_of_a_robot_has_control(monkeypatch: pytest.Mon
         shown = {"cause": None} if name == "reset" else {}
         message = parse_message(json.dumps({"kind": "command", "command": name, **shown}))
         assert not isinstance(message, Held | LetGo)
-        return console.command(page, message)
+        return console.command(page, message, arrived_now())
 
     assert asked(one, mine, "take_control") == ""
     name = f"page {mine} on here (console {os.getpid()} of "
@@ -602,6 +799,41 @@ def test_one_page_of_all_consoles_of_a_robot_has_control(monkeypatch: pytest.Mon
     assert asked(other, theirs, "take_control") == ""
     for console in (one, other):
         console.close()
+
+
+def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("cdpr.console.session.read_status", lambda _: pytest.fail("read"))
+    rig = load_rig(RIG).with_bus("udp_multicast", "239.74.9.14")
+    monkeypatch.setattr(RobotWatch, "update", lambda *_, **__: None)
+    console = Console(replace(Served().console.files, rig=rig))
+    latch = FaultLatch(BusSettings.of(rig))
+    for process, moved_by in ((HIDDEN, HIDDEN), (os.getpid(), None)):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "getpid", lambda process=process: process)
+            latch.engage(rig.name, Path("runs/theirs"))
+        console._stored_for = float("-inf"), None
+        state = console.update()
+        assert (state["latched"], state["moved_by"]) == (None, moved_by)
+        answer = console.stop()
+        if moved_by is None:
+            assert answer == "nothing moves", "a run of this user takes the stop itself"
+        else:
+            assert f"process {HIDDEN}, is not stopped from here" in answer
+            assert "press the emergency stop" in answer
+        latch.let_go()  # as if it was killed
+        console._stored_for = float("-inf"), None
+        state = console.update()
+        assert "was killed" in state["latched"]
+        assert state["moved_by"] is None
+        assert console.stop() == "nothing moves"
+        latch.disengage()
+    console.close()
+
+
+#: Of no process that is visible here.
+HIDDEN = 2**30
 
 
 @pytest.mark.parametrize("path", ["/", "/scene", "/api/files", "/runs/one/report.html"])
@@ -695,7 +927,7 @@ def test_no_fault_is_reset_but_the_one_that_was_shown(
     def asked(name: str, **values: object) -> str:
         message = parse_message(json.dumps({"kind": "command", "command": name, **values}))
         assert not isinstance(message, Held | LetGo)
-        return console.command(page, message)
+        return console.command(page, message, arrived_now())
 
     assert asked("take_control") == ""
     for shown in ("drive 3: over-current", None):

@@ -16,7 +16,8 @@ from cdpr.cli.arguments import flag, option
 from cdpr.cli.operate.run import supervise
 from cdpr.cli.options import RIG, WITHOUT_REAL_TIME, BusOptions
 from cdpr.cli.output import Terminal, out, show_facts, show_line
-from cdpr.console.session import Console, ConsoleFiles
+from cdpr.console.session import Console
+from cdpr.console.verbs import ConsoleFiles
 from executor import runner
 from executor.recording.record_files import free_folder
 from executor.recording.run_folder import RunFolder

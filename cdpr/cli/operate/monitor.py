@@ -25,6 +25,7 @@ from cdpr.cli.output import err, out, show_json, show_line
 from cdpr.console.view import RobotNow, RobotView
 from executor.recording.run_folder import RIG, RunFolder
 from executor.remote.client import (
+    Answer,
     camera_line,
     follow_run,
     next_stop_line,
@@ -143,7 +144,9 @@ def _live(process: int | None, rate: float, stream: console.FoxgloveStream | Non
     ):
         operator = _Operator(keys)
         live.update(Text("waiting for a run to begin; Ctrl-C ends the monitor"), refresh=True)
-        for status in follow_run(process, rate, waits=True, between=operator.between):
+        for status in follow_run(
+            process, rate, waits=True, between=operator.between, rejected=operator.rejected
+        ):
             operator.status = status
             seen = robot.seen(status)
             if stream is not None:
@@ -173,6 +176,10 @@ class _Operator:
             time.sleep(seconds)
             return ()
         return [line for key in self._keys.pressed(seconds) for line in self._request(key)]
+
+    def rejected(self, answer: Answer) -> None:
+        """Shows why the run takes no such request; a session of jogs has no path."""
+        self.line = answer.what
 
     def _request(self, key: str) -> Sequence[bytes]:
         if key == "q":

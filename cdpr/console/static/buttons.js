@@ -10,6 +10,8 @@ const ACTIVE = ["preparing", ...MOVING];
 const VERBS = { run: "A run is in progress", home: "Homing is in progress", reset: "A reset is in progress", release: "The drives are being released", plan: "Planning is in progress", jog: "Jogging is enabled: end it first" };
 
 export const isActive = (motion) => motion !== null && ACTIVE.includes(motion.state);
+/** STOP does not reach such a motion. */
+export const isMovedByAnother = (state) => Number.isInteger(state.moved_by);
 const isJogging = ({ busy, jog, cable }) => jog.ready || cable.ready || busy?.verb === "jog";
 
 /** Each gives a reason, or null if fulfilled; `BUTTONS` orders them. */
@@ -25,6 +27,7 @@ const REQUIREMENTS = {
   idle: ({ state }) => {
     if (state.busy) return VERBS[state.busy.verb] ?? "A command is in progress";
     if (state.jog.ready || state.cable.ready) return VERBS.jog;
+    if (isMovedByAnother(state)) return `Process ${state.moved_by} of another user moves or resets the robot`;
     if (state.motion?.state === "preparing") return "A motion is being prepared";
     return isActive(state.motion) ? "The platform is in motion" : null;
   },

@@ -1,6 +1,6 @@
 /* Live figures: lamps, position, clearance, next stop, tensions and their limits, timing of the loop. */
 
-import { isActive } from "./buttons.js";
+import { isActive, isMovedByAnother } from "./buttons.js";
 import { at, capital, duration, known, make, mark, write } from "./elements.js";
 
 /** Lamps: text, and level: good (pass), bad (fail), attention (stop) or neutral (quiet). */
@@ -48,7 +48,8 @@ function troubleText(tensions, [low, high]) {
 }
 
 /** The present motion, in a few words. */
-export function motionText({ motion, busy, jog, cable, latched }) {
+export function motionText(state) {
+  const { motion, busy, jog, cable, latched } = state;
   if (jog.ready) return jog.moving ? "Jogging" : "Ready to jog";
   if (cable.ready) return cable.moving ? `Jogging cable ${cable.cable}` : "Ready to jog a cable";
   if (motion) {
@@ -56,6 +57,7 @@ export function motionText({ motion, busy, jog, cable, latched }) {
     return (STATES[motion.state] ?? motion.state) + (isActive(motion) ? share : "");
   }
   if (busy) return BEFORE[busy.verb] ?? busy.verb;
+  if (isMovedByAnother(state)) return "Moved by another user";
   return latched === null ? "At rest" : "Fault latched";
 }
 
