@@ -18,13 +18,13 @@ from drivers.cia402.sdo_jobs import (
     ASKED_AGAIN_AFTER,
     ERROR_REQUESTS,
     MODE_WAIT,
-    STATE_REQUESTS,
     AnswerListener,
     ModeCheck,
+    MonitoringEnd,
     SdoJobs,
     StatePoll,
+    StateReading,
     mode_text,
-    monitoring_off,
     requests_per_cycle,
     time_to_end,
 )
@@ -104,7 +104,7 @@ class Cia402Group(CyclicGroup):
         # "Enable operation" was sent for this goal; replies to the former one's words are awaited.
         self._enables = self._is_new_goal = self._known = False
         self._former = self._goal, self._enables
-        self._monitoring_off: SdoJobs | None = None
+        self._monitoring_off: MonitoringEnd | None = None
         self._modes: ModeCheck | None = None
         self._poll = StatePoll((), 1)
         self._errors = SdoJobs({}, 1)
@@ -255,16 +255,12 @@ class Cia402Group(CyclicGroup):
     def read_state(self, pace: Pace) -> CycleStatus:
         """Reads the state of every drive by SDO; see `DriveGroup.read_state`."""
         self._online()
-        jobs = SdoJobs(dict.fromkeys(self._nodes, STATE_REQUESTS), self._again_after)
         silent = {self._nodes[i] for i, heard in enumerate(self._watch.answered) if not heard}
+        answer = round(self._answer_time / self._cycle_s)
+        jobs = StateReading(self._nodes, self._again_after, answer=answer, silent=silent)
         self._watch.begin_cycle()
         self._watch.on_answer = jobs.take
-        for number in range(round(len(STATE_REQUESTS) * self._answer_time / self._cycle_s)):
-            waited_for = jobs.unfinished()
-            if number * self._cycle_s >= self._answer_time:  # drives without any answer are lost
-                waited_for -= silent - {node for node, _ in jobs.values}
-            if not waited_for:
-                break
+        while jobs.waits:
             left = pace()
             self._ask(jobs, len(self._nodes))
             if self._pump is not None:
@@ -282,8 +278,10 @@ class Cia402Group(CyclicGroup):
         """Switches monitoring off, heartbeat first, SYNC last; both are sent until then."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             raise Refused("enabled drives must monitor this program", where="drive group")
-        off = (monitoring_off(count, self._profile.rpdo) for count in self._heartbeats)
-        self._monitoring_off = SdoJobs(dict(zip(self._nodes, off, strict=True)), self._again_after)
+        counts = dict(zip(self._nodes, self._heartbeats, strict=True))
+        self._monitoring_off = MonitoringEnd(
+            counts, self._profile.rpdo, self._again_after, stopped=self._watch.stopped()
+        )
         self._modes, self._errors = None, SdoJobs({}, 1)
         self._watch.on_answer = self._monitoring_off.take
 

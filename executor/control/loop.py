@@ -382,9 +382,10 @@ class Loop:
             text = f"{in_one_line(error)}; the drives stop on loss of the master"
             self._report("bus_lost", text)
             return
-        if before is None or left.holding:
+        if before is None or (left.holding and left.stopped):
             return
-        self.holding = self._held_nothing
+        if not left.holding:
+            self.holding = self._held_nothing
         rig = self._checked.rig
         held = np.array(stop_alone(rig, before.status_words.tolist())) & ~before.missing
         if otherwise := changed_states(rig, before, left, np.flatnonzero(~held).tolist()):

@@ -1117,3 +1117,73 @@ def test_no_script_frees_a_cable_or_enables_some(bench: Bench, script: list) -> 
                     ]
                     assert not lost
     assert all(word & 0x02 for word in [*words, *bench.control_words()])
+
+
+def leave_operational(bench: Bench, nodes: Sequence[int]) -> None:
+    """Enabled drives fall back to NMT pre-operational: SDO works, process data does not."""
+    bench.enable()
+    for node in nodes:
+        bench.drives[node - 1].on_nmt(NmtCommand.PRE_OPERATIONAL, node)
+    for _ in range(20):
+        bench.cycle()
+    assert bench.group.state is GroupState.FAULT
+    assert bench.drives[nodes[0] - 1].state is DriveState.OPERATION_ENABLED
+
+
+def end_monitoring(bench: Bench) -> None:
+    bench.group.command(GroupCommand.END_MONITORING)
+    for _ in range(round(bench.group.capabilities.unmonitored_within / bench.rig.cycle)):
+        if not bench.group.ending:
+            break
+        bench.cycle()
+    assert not bench.group.ending
+
+
+@pytest.mark.parametrize("nodes", [(5,), range(1, 9)])
+def test_a_drive_without_process_data_is_stopped_by_sdo_before_its_monitoring_ends(
+    bench: Bench, nodes: Sequence[int]
+) -> None:
+    leave_operational(bench, nodes)
+    end_monitoring(bench)
+    assert {drive.state for drive in bench.drives} == {HOLDING}
+    assert not bench.group.is_monitored
+    assert {drive.objects[0x1016, 1] for drive in bench.drives} == {0}
+
+
+def ignores_words(drive: SimulatedDrive) -> None:
+    drive._take_control_word = lambda _word: None  # type: ignore[method-assign]
+
+
+def refuses_words(drive: SimulatedDrive) -> None:
+    asked = drive.on_sdo
+
+    def refuses(data: bytes) -> None:
+        if data[1:4] == b"\x40\x60\0":
+            drive._send(0x580 + drive.node, b"\x80" + data[1:4] + b"\x22\0\0\x08")
+        else:
+            asked(data)
+
+    drive.on_sdo = refuses  # type: ignore[method-assign, assignment]
+
+
+def hides_its_state(drive: SimulatedDrive) -> None:
+    ignores_words(drive)
+    drive.objects.measured(0x6041, 0, lambda: 0x0010)
+
+
+@pytest.mark.parametrize("spoil", [ignores_words, refuses_words, hides_its_state])
+def test_a_drive_that_sdo_does_not_stop_keeps_the_monitoring_that_stops_it(
+    bench: Bench, spoil: Callable[[SimulatedDrive], None]
+) -> None:
+    leave_operational(bench, [5])
+    drive = bench.drives[4]
+    spoil(drive)
+    kept = drive.objects[0x1016, 1], drive.objects[0x1006, 0]
+    assert min(kept) > 0
+    end_monitoring(bench)
+    assert drive.state is DriveState.OPERATION_ENABLED
+    assert bench.group.is_monitored
+    assert (drive.objects[0x1016, 1], drive.objects[0x1006, 0]) == kept
+    bench.rehearsal.advance(0.5)
+    bench.rehearsal.pump()
+    assert {drive.state for drive in bench.drives} == {HOLDING}

@@ -14,11 +14,17 @@ import pytest
 
 from drivers import cyclic_group
 from drivers.drive_group import GroupCommand, GroupState
-from drivers.factory import drive_states, read_drives
+from drivers.factory import drive_states, enabled_drives, read_drives
 from drivers.odrive import configure
 from drivers.odrive.configure import check_resolution
 from drivers.odrive.endpoints import read_endpoints, wanted_settings
-from drivers.odrive.messages import AxisError, AxisState, can_id, node_and_command
+from drivers.odrive.messages import (
+    AxisError,
+    AxisState,
+    can_id,
+    node_and_command,
+    status_word,
+)
 from model.errors import BadInput, Fault, HardwareMissing, Refused
 from model.rig import Rig, rig_from_document
 from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
@@ -53,7 +59,13 @@ def test_all_drives_are_enabled_at_their_positions_and_follow(bench: OdriveBench
         assert np.abs(error).max() < 1e-5
         assert not status.missing.any()
     assert np.abs(status.positions - targets).max() <= 1
-    assert drive_states(bench.rig, status.status_words.tolist()) == ("closed loop control",) * 8
+    words = status.status_words.tolist()
+    assert drive_states(bench.rig, words) == ("closed loop control",) * 8
+    in_error = status_word(AxisState.CLOSED_LOOP_CONTROL, 1)
+    assert enabled_drives(bench.rig, [in_error, AxisState.IDLE, *words[2:]]) == (
+        *(True, False),
+        *(True,) * 6,
+    )
 
 
 def test_torques_are_tensions_in_per_mille_of_rated_torque(bench: OdriveBench) -> None:

@@ -10,6 +10,7 @@ import can
 import pytest
 
 from drivers.can_bus import BusSettings
+from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.state_machine import DriveState
 from executor.control.path_runs import Outcome
 from executor.interlock.fault_latch import FaultLatch
@@ -183,6 +184,47 @@ def test_a_cycle_without_replies_does_not_cut_the_end_short(
     assert len(ending) > later, "the end went on"
     assert outcome.state is State.FINISHED, outcome.cause
     assert states == {DriveState.QUICK_STOP_ACTIVE}
+
+
+def falls_back(stage: Stage) -> None:
+    """To NMT pre-operational: its set-points have no effect any more, requests do."""
+    stage.drives[FIFTH].on_nmt(NmtCommand.PRE_OPERATIONAL, FIFTH + 1)
+
+
+def test_a_drive_that_left_nmt_operational_is_not_left_enabled_and_unmonitored(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with staged(prepared, tmp_path / "run", at(CRUISING, falls_back)) as stage:
+        outcome = stage.run()
+        events = stage.events()
+        states = {drive.state for drive in stage.drives}
+    assert outcome.state is State.LATCHED
+    assert "cable 5 (drive 5) left the NMT state operational" in outcome.cause
+    assert states == {DriveState.QUICK_STOP_ACTIVE}
+    assert outcome.holding
+    assert "not_held" not in [event.code for event in events], "it holds"
+
+
+@pytest.mark.parametrize("also_dead", [False, True])
+def test_a_drive_that_nothing_stops_is_reported_as_still_enabled(
+    prepared: PreparedRun, tmp_path: Path, also_dead: bool
+) -> None:
+    def fault(stage: Stage) -> None:
+        falls_back(stage)
+        stuck = stage.drives[FIFTH]
+        stuck._take_control_word = lambda _word: None  # type: ignore[method-assign]
+        stuck._connection_lost = lambda _code: None  # type: ignore[method-assign]
+        stage.drives[SIXTH].silent = also_dead
+
+    with staged(prepared, tmp_path / "run", at(CRUISING, fault)) as stage:
+        outcome = stage.run()
+        events = stage.events()
+        assert stage.drives[FIFTH].state is DriveState.OPERATION_ENABLED
+    assert outcome.state is State.LATCHED
+    assert events[-1].code == "not_held"
+    assert "still enabled: cable 5 (drive 5)" in events[-1].text
+    assert "drive 4" not in events[-1].text
+    assert "drive 6" not in events[-1].text, "its silence is the cause"
 
 
 THREE_LINES = Fault("frames cannot be sent", where="can0", why="it is down", next_step="set it up")
