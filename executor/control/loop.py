@@ -93,6 +93,7 @@ class Loop:
         require_capabilities(self._group.capabilities, self._checked.cycle)
         require_unchanged(self._checked)
         self._held_before = (seen := self._master.read_positions()).holding
+        self._master.require_no_fault()
         self._take_positions()
         require(seen)
         self._require_at_start()
@@ -123,6 +124,7 @@ class Loop:
             self._take_positions()
             self._require_at_start()
             self._master.refresh()
+            self._master.require_no_fault()
             self.machine.on(Event.ENABLE)
             while self.machine.state in _ACTIVE:
                 self._one_step()

@@ -16,13 +16,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand
+from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
 from drivers.factory import drive_states, enabled_drives
 from executor.realtime.scheduling import Clock
 from executor.safety.fault_messages import name_drives
 from executor.safety.monitor import MISSING_CYCLES
 from executor.safety.sync_timeout import USUAL_TIMEOUT, SyncAge
-from model.errors import CdprError, Fault, HardwareMissing
+from model.errors import CdprError, Fault, HardwareMissing, Refused
 from model.rig import Rig
 
 # Detection of silent drives where no monitor runs: before and after a motion.
@@ -152,6 +152,20 @@ class SyncMaster:
 
         self.status = self.group.read_positions(pace)
         return self.status
+
+    def require_no_fault(self) -> None:
+        """Requires drives without a fault since their set-up, as last reported.
+
+        Raises:
+            Refused: There is one; with the drive and its cause.
+        """
+        if self.status is not None and self.status.state is GroupState.FAULT:
+            raise Refused(
+                "; ".join(text for _, text in self.status.faults),
+                where="arming",
+                why="this happened after the drives were set up",
+                next_step="remove the cause, then run `cdpr reset RIG`; nothing was enabled",
+            )
 
     def rest(self) -> CycleStatus:
         """One cycle with unchanged targets.
