@@ -8,7 +8,7 @@ import can
 import numpy as np
 
 from drivers.can_bus import SentFrame
-from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout
+from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout, requests_per_cycle
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.monitor import DriveMonitor
 from drivers.cia402.object_dictionary import peer_timeout_ms
@@ -24,9 +24,9 @@ from drivers.cia402.sdo_jobs import (
     SdoJobs,
     StatePoll,
     StateReading,
+    answer_cycles,
+    cycles_to_end,
     mode_text,
-    requests_per_cycle,
-    time_to_end,
 )
 from drivers.cia402.state_machine import (
     HOLDS,
@@ -75,8 +75,8 @@ class Cia402Group(CyclicGroup):
         self._signs = winding_signs(rig)
         cycle = rig.cycle
         self._cycle_s, self._profile = cycle, profile_of(rig)
-        self._answer_time = self._profile.sdo_timeout_ms / 1000.0
-        self._requests = requests_per_cycle(self._cycle_s)
+        self._answer_cycles = answer_cycles(self._profile.sdo_timeout_ms / 1000.0, cycle)
+        self._requests = requests_per_cycle(rig.cable_count, cycle, rig.document.bus.bitrate)
         self._heartbeat_cycles = heartbeat_cycles(cycle)
         self._patience = max(3, round(self._profile.enable_timeout_ms / 1000.0 / cycle))
         self._reset_cycles = round(RESET_WITHIN / cycle)
@@ -124,7 +124,8 @@ class Cia402Group(CyclicGroup):
                 heartbeat_timeout(self._cycle_s), self._profile.sync_timeout_periods * self._cycle_s
             ),
             released_within=2.0 * self._profile.enable_timeout_ms / 1000.0 + 1.0,
-            unmonitored_within=time_to_end(self._heartbeats, self._cycle_s, self._answer_time),
+            unmonitored_within=self._cycle_s
+            * cycles_to_end(self._heartbeats, self._requests, self._answer_cycles),
             simulated=self._simulated,
         )
 
@@ -256,8 +257,7 @@ class Cia402Group(CyclicGroup):
         """Reads the state of every drive by SDO; see `DriveGroup.read_state`."""
         self._online()
         silent = {self._nodes[i] for i, heard in enumerate(self._watch.answered) if not heard}
-        answer = round(self._answer_time / self._cycle_s)
-        jobs = StateReading(self._nodes, self._again_after, answer=answer, silent=silent)
+        jobs = StateReading(self._nodes, self._again_after, self._answer_cycles, silent=silent)
         self._watch.begin_cycle()
         self._watch.on_answer = jobs.take
         while jobs.waits:
@@ -365,7 +365,7 @@ class Cia402Group(CyclicGroup):
     def _check_modes(self) -> None:
         """Enters ENABLED once every drive shows CSP; most profiles check it when configuring."""
         if self._profile.mode_display_when_enabled and self._modes is None:
-            cycles = len(self._nodes) + round((MODE_WAIT + self._answer_time) / self._cycle_s)
+            cycles = len(self._nodes) + round(MODE_WAIT / self._cycle_s) + self._answer_cycles
             self._modes = ModeCheck(self._nodes, cycles, self._again_after)
             self._watch.on_answer = self._modes.take
         wrong = self._modes.wrong() if self._modes is not None else {}

@@ -6,6 +6,7 @@ four bytes only; source: CiA 301, 7.2.4.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
@@ -13,9 +14,6 @@ from dataclasses import dataclass
 from drivers.cia402.pdo import SDO_REQUEST_BASE
 from drivers.cia402.profile import rpdo_parameters
 from drivers.cia402.state_machine import MAY_FOLLOW, ControlWord, state_of
-
-REQUEST_PERIOD = 0.01
-"""Part of a cycle for each SDO request and its answer, [s]; they fit on a bus with 90 % load."""
 
 ASKED_AGAIN_AFTER = 0.5
 """Time without an answer after which a request is repeated, [s]; double answers are harmless."""
@@ -74,21 +72,27 @@ STATE_REQUESTS = (
 ERROR_REQUESTS = (SdoRequest(0x603F, 0, size=2), SdoRequest(0x1003, 1))
 
 
-def requests_per_cycle(cycle: float) -> int:
-    """Largest number of SDO requests in a cycle of that period [s]; at least one."""
-    return max(1, int(cycle / REQUEST_PERIOD + 1e-9))
+def answer_cycles(timeout: float, cycle: float) -> int:
+    """Cycles until the answer to an SDO request at most: it is awaited to the end of a cycle.
+
+    Args:
+        timeout: Time of one SDO answer, [s].
+        cycle: [s].
+    """
+    return max(1, math.ceil(timeout / cycle - 1e-9))
 
 
-def time_to_end(heartbeats: Iterable[int], cycle: float, answer: float) -> float:
-    """Longest time to end all monitoring, [s].
+def cycles_to_end(heartbeats: Iterable[int], most: int, answer: int) -> int:
+    """Largest number of cycles to end all monitoring.
 
     Args:
         heartbeats: As for `monitoring_off`, one number per drive.
-        cycle: [s].
-        answer: Time of one SDO answer, [s].
+        most: Requests per cycle.
+        answer: From `answer_cycles`.
     """
     jobs = [len(_STOP) + len(monitoring_off(count)) for count in heartbeats]
-    return sum(jobs) * cycle / requests_per_cycle(cycle) + max(jobs) * answer
+    # In each cycle as many requests are sent as may be, or every drive waits for an answer.
+    return sum(jobs) // most + max(jobs) * answer
 
 
 def monitoring_off(heartbeats: int, rpdo: int = 1) -> tuple[SdoRequest, ...]:
@@ -223,14 +227,14 @@ class StateReading(SdoJobs):
     """Reads the state of every drive once."""
 
     def __init__(
-        self, nodes: Iterable[int], again_after: int, *, answer: int, silent: set[int]
+        self, nodes: Iterable[int], again_after: int, answer: int, *, silent: set[int]
     ) -> None:
         """Sends nothing yet.
 
         Args:
             nodes: Of all drives.
             again_after: As for `SdoJobs`.
-            answer: Turns until an answer at most.
+            answer: Turns until an answer at most, from `answer_cycles`.
             silent: Nodes that missed the last cycle; lost without any answer in this time.
         """
         super().__init__(dict.fromkeys(nodes, STATE_REQUESTS), again_after)

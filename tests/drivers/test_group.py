@@ -4,28 +4,33 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import can
 import numpy as np
 import pytest
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from drivers.can_bus import BusSettings
 from drivers.can_errors import TorqueLost
 from drivers.cia402.object_dictionary import PDO_NO_RTR, Setting, settings_for
 from drivers.cia402.pdo import NmtCommand, NmtState
+from drivers.cia402.profile import load_profile
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import GroupCommand, GroupState
 from drivers.factory import make_drive_group
 from model.errors import Fault, HardwareMissing, Refused
 from model.files.rig_file import RigDocument
-from model.rig import rig_from_document
+from model.rig import Rig, rig_from_document
 from simulation.drives.behaviour import STRICT
 from simulation.drives.cia402 import SimulatedDrive
-from tests.drivers.drive_bench import Bench
+from simulation.drives.cia402_rig import SimulatedCia402Rig
+from tests.drivers.drive_bench import Bench, three_on_a_bus
 
 HOLDING = DriveState.QUICK_STOP_ACTIVE
 
@@ -1187,3 +1192,30 @@ def test_a_drive_that_sdo_does_not_stop_keeps_the_monitoring_that_stops_it(
     bench.rehearsal.advance(0.5)
     bench.rehearsal.pump()
     assert {drive.state for drive in bench.drives} == {HOLDING}
+
+
+@pytest.fixture
+def short_of_time(rig: Rig, tmp_path: Path) -> Iterator[Bench]:
+    """A cycle as long as `enable_timeout_ms` and longer than `sdo_timeout_ms`."""
+    profile = tmp_path / "profile.yaml"
+    document = load_profile("cia402").model_dump(mode="json", exclude_defaults=True)
+    document |= {"enable_timeout_ms": 100, "sdo_timeout_ms": 50}
+    profile.write_text(yaml.safe_dump(document))
+    drives = rig.document.drives.model_copy(update={"profile": str(profile)})
+    bus = rig.document.bus.model_copy(update={"cycle_ms": 100.0})
+    slow = rig.document.model_copy(update={"bus": bus})
+    short = rig_from_document(slow.model_copy(update={"drives": drives}))
+    with three_on_a_bus(BusSettings("virtual", "short-of-time")) as (master, far, ear):
+        rehearsal = SimulatedCia402Rig(rig_from_document(slow), far, rig.home)
+        yield Bench(short, make_drive_group(short, master, rehearsal.pump), rehearsal, ear)
+
+
+def test_all_states_are_read_in_cycles_longer_than_an_answer(short_of_time: Bench) -> None:
+    """Two cycles were allowed for three requests, so that every run ended as not held."""
+    bench = short_of_time
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.cycle()
+    end_monitoring(bench)
+    assert not bench.group.is_monitored
+    assert not bench.group.read_state(lambda: 0.0).missing.any()
