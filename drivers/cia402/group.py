@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import can
@@ -30,6 +31,7 @@ from drivers.cia402.sdo_jobs import (
 )
 from drivers.cia402.state_machine import (
     HOLDS,
+    STEP_CYCLES,
     WITHOUT_TORQUE,
     ControlWord,
     DriveState,
@@ -78,7 +80,8 @@ class Cia402Group(CyclicGroup):
         self._answer_cycles = answer_cycles(self._profile.sdo_timeout_ms / 1000.0, cycle)
         self._requests = requests_per_cycle(rig.cable_count, cycle, rig.document.bus.bitrate)
         self._heartbeat_cycles = heartbeat_cycles(cycle)
-        self._patience = max(3, round(self._profile.enable_timeout_ms / 1000.0 / cycle))
+        self._enable_s = self._profile.enable_timeout_ms / 1000.0
+        self._patience = STEP_CYCLES + math.ceil(self._enable_s / cycle - 1e-9)
         self._reset_cycles = round(RESET_WITHIN / cycle)
         self._again_after = max(1, round(ASKED_AGAIN_AFTER / cycle))
         self._max_tension = max_tension
@@ -123,7 +126,7 @@ class Cia402Group(CyclicGroup):
             master_timeout=max(
                 heartbeat_timeout(self._cycle_s), self._profile.sync_timeout_periods * self._cycle_s
             ),
-            released_within=2.0 * self._profile.enable_timeout_ms / 1000.0 + 1.0,
+            released_within=2.0 * self._patience * self._cycle_s + 1.0,
             unmonitored_within=self._cycle_s
             * cycles_to_end(self._heartbeats, self._requests, self._answer_cycles),
             simulated=self._simulated,
@@ -349,18 +352,19 @@ class Cia402Group(CyclicGroup):
             self._ask(self._poll, self._requests)  # late in the cycle: drives stop after SYNC
         elif self._state is GroupState.ENABLING:
             names, words = self._rig.drive_names, self._watch.status_words
-            seconds, needs_bit = self._patience * self._cycle_s, self._profile.follows_bit
+            seconds, needs_bit = self._enable_s, self._profile.follows_bit
             idle = ignoring_drives(names, words, seconds) if needs_bit else []
             follow = set(self._words) == {ControlWord.ENABLE_OPERATION}
             if follow and set(states) == {DriveState.OPERATION_ENABLED} and not idle:
                 self._check_modes()
             elif self._cycles_to_goal > self._patience:
-                self._latch(self._late(self._patience) or idle)
+                late = self._watch.late(self._words, self._goal, self._enable_s)
+                self._latch(late or idle)
         elif self._goal is Goal.RELEASE:
             if all(state in WITHOUT_TORQUE for state in states):
                 self._goal, self._state = Goal.IDLE, GroupState.RELEASED
             elif self._cycles_to_goal > 2 * self._patience:  # it enables the drives first
-                self._latch(self._late(2 * self._patience))
+                self._latch(self._watch.late(self._words, self._goal, 2.0 * self._enable_s))
 
     def _check_modes(self) -> None:
         """Enters ENABLED once every drive shows CSP; most profiles check it when configuring."""
@@ -376,9 +380,6 @@ class Cia402Group(CyclicGroup):
         elif self._modes is not None and self._modes.is_overdue:
             self._modes = None
             self._latch([(n, mode_text(self._rig.drive_names[n], m)) for n, m in wrong.items()])
-
-    def _late(self, cycles: int) -> list[tuple[int, str]]:
-        return self._watch.late(self._words, self._goal, cycles * self._cycle_s)
 
     def _status(self) -> CycleStatus:
         watch = self._watch

@@ -261,6 +261,10 @@ _STEPS = {
 }
 """States short of a goal: drives in a later one wait for those in an earlier one."""
 
+STEP_CYCLES = 6
+"""Cycles from the command to enable to the one with 0Fh, for drives that follow at once: each word
+after the first, which repeats the last one, waits a cycle for the replies to the one before."""
+
 _NEXT_WORD = (
     ControlWord.SHUTDOWN,
     ControlWord.SWITCH_ON,

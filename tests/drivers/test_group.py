@@ -1210,6 +1210,31 @@ def short_of_time(rig: Rig, tmp_path: Path) -> Iterator[Bench]:
         yield Bench(short, make_drive_group(short, master, rehearsal.pump), rehearsal, ear)
 
 
+def test_a_drive_has_all_of_its_time_to_enable_besides_the_control_words(
+    short_of_time: Bench,
+) -> None:
+    """At 100 ms the words took 400 ms of it; below 350 ms no drive was ever enabled."""
+    bench = short_of_time
+    for drive in bench.drives:
+        drive.behaviour = replace(drive.behaviour, enable_delay=0.1)
+    bench.enable()
+
+
+def test_a_drive_that_exceeds_its_time_to_enable_is_named_with_this_time(
+    short_of_time: Bench,
+) -> None:
+    bench = short_of_time
+    bench.drives[2].behaviour = replace(bench.drives[2].behaviour, enable_delay=60.0)
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    bench.until(GroupState.FAULT, limit=10)
+    assert bench.status is not None
+    ((node, text),) = bench.status.faults
+    assert node == 3
+    assert "after 0.1 s (enable_timeout_ms" in text
+
+
 def test_all_states_are_read_in_cycles_longer_than_an_answer(short_of_time: Bench) -> None:
     """Two cycles were allowed for three requests, so that every run ended as not held."""
     bench = short_of_time
