@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -117,23 +118,33 @@ def test_a_disturbed_bus_still_ends_in_order_so_that_no_drive_misses_its_master(
     assert states == {DriveState.QUICK_STOP_ACTIVE}
 
 
+@pytest.mark.parametrize(
+    ("held", "lets_go"),
+    [
+        (range(8), True),
+        ((), False),
+        ((SIXTH,), True),
+        ((FIFTH, SIXTH), True),
+        ((0, 1, FIFTH), False),
+    ],
+)
 def test_a_drive_that_held_and_lets_go_while_all_are_enabled_is_no_longer_held(
-    prepared: PreparedRun, tmp_path: Path
+    prepared: PreparedRun, tmp_path: Path, held: Sequence[int], lets_go: bool
 ) -> None:
-    """The usual start: all drives hold since the last run."""
+    """All drives usually hold since the last run, but some may have been released."""
 
     def fault(stage: Stage) -> None:
         if stage.cycle == 1:
             stage.drives[SIXTH].fail(0x2310)
 
-    for held in (True, False):
-        with staged(prepared, tmp_path / str(held), fault) as stage:
-            for drive in stage.drives:
-                drive.state = DriveState.QUICK_STOP_ACTIVE if held else drive.state
-            outcome = stage.run()
-        assert "drive 6" in outcome.cause
-        assert "enabled" not in [event.code for event in stage.events()]
-        assert outcome.holding is not held
+    with staged(prepared, tmp_path / "run", fault) as stage:
+        for drive in held:
+            stage.drives[drive].state = DriveState.QUICK_STOP_ACTIVE
+        outcome = stage.run()
+        codes = [event.code for event in stage.events()]
+    assert "drive 6" in outcome.cause
+    assert "enabled" not in codes
+    assert outcome.holding is not lets_go
 
 
 def test_a_second_drive_that_releases_after_a_fault_is_reported_although_the_first_does_not_hold(
