@@ -27,8 +27,12 @@ HEARTBEAT_TIMEOUT = 0.1
 HEARTBEATS_WAITED = 3.2
 """Periods after which a heartbeat counts as lost; two in a row may be missed."""
 
+SDO_PERIOD = 0.01
+"""Part of a cycle for each SDO request and its answer, [s]."""
+
 _SET_POINT_BYTES = 6
 _REPLY_BYTES = 8
+_SDO_BYTES = 8
 _ODRIVE_BYTES = 8
 _SYNC_BYTES = 0
 _HEARTBEAT_BYTES = 1
@@ -63,7 +67,7 @@ def heartbeat_timeout(cycle: float) -> float:
 def bus_load(drives: int, cycle: float, bitrate: int) -> float:
     """Bus load of CiA 402 drives with heartbeats, as a fraction, with worst-case stuffing.
 
-    Without the SDO request and answer of each cycle, to which all these frames have priority.
+    Without SDO (`requests_per_cycle`), to which all these frames have priority.
 
     Args:
         drives: Number of drives m.
@@ -72,6 +76,16 @@ def bus_load(drives: int, cycle: float, bitrate: int) -> float:
     """
     heartbeats = (drives + 1) * frame_bits(_HEARTBEAT_BYTES) / heartbeat_cycles(cycle)
     return (cycle_bits(drives) + heartbeats) / (cycle * bitrate)
+
+
+def requests_per_cycle(drives: int, cycle: float, bitrate: int) -> int:
+    """Largest number of SDO requests in a cycle; at least one.
+
+    Several are sent only where they and their answers keep the load below `MAX_LOAD`. Arguments as
+    for `bus_load`.
+    """
+    free = (MAX_LOAD - bus_load(drives, cycle, bitrate)) * cycle * bitrate
+    return max(1, int(min(cycle / SDO_PERIOD + 1e-9, free / (2 * frame_bits(_SDO_BYTES)))))
 
 
 def odrive_bus_load(drives: int, cycle: float, bitrate: int, settings: OdriveDocument) -> float:

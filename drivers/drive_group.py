@@ -69,7 +69,7 @@ class GroupCommand(Enum):
     """Close brakes, then remove the torque of all drives together; needs a supported platform."""
     RESET_FAULT = auto()
     END_MONITORING = auto()
-    """Drives at rest stop monitoring this master, which is about to leave; one step per cycle until
+    """Drives at rest stop monitoring this master, which is about to leave, in the next cycles until
     `DriveGroup.is_monitored` is false."""
 
 

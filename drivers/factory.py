@@ -40,6 +40,22 @@ def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
     return tuple(state_of(word) is DriveState.QUICK_STOP_ACTIVE for word in status_words)
 
 
+def enabled_drives(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
+    """Whether drives are enabled, so that they follow set-points.
+
+    Args:
+        rig: The robot.
+        status_words: Reported status word of each drive.
+    """
+    if rig.document.drives.type == "odrive":
+        from drivers.odrive.messages import AxisState, state_in
+
+        return tuple(state_in(word) == AxisState.CLOSED_LOOP_CONTROL for word in status_words)
+    from drivers.cia402.state_machine import DriveState, state_of
+
+    return tuple(state_of(word) is DriveState.OPERATION_ENABLED for word in status_words)
+
+
 def without_torque(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
     """Nodes of drives that do not hold their cables under torque.
 

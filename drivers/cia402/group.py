@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import can
 import numpy as np
 
 from drivers.can_bus import SentFrame
-from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout
+from drivers.can_load import TESTED_HZ, heartbeat_cycles, heartbeat_timeout, requests_per_cycle
 from drivers.cia402.configure import configure_drives
 from drivers.cia402.monitor import DriveMonitor
 from drivers.cia402.object_dictionary import peer_timeout_ms
@@ -18,18 +19,19 @@ from drivers.cia402.sdo_jobs import (
     ASKED_AGAIN_AFTER,
     ERROR_REQUESTS,
     MODE_WAIT,
-    STATE_REQUESTS,
     AnswerListener,
     ModeCheck,
+    MonitoringEnd,
     SdoJobs,
     StatePoll,
+    StateReading,
+    answer_cycles,
+    cycles_to_end,
     mode_text,
-    monitoring_off,
-    requests_per_cycle,
-    time_to_end,
 )
 from drivers.cia402.state_machine import (
     HOLDS,
+    STEP_CYCLES,
     WITHOUT_TORQUE,
     ControlWord,
     DriveState,
@@ -75,10 +77,11 @@ class Cia402Group(CyclicGroup):
         self._signs = winding_signs(rig)
         cycle = rig.cycle
         self._cycle_s, self._profile = cycle, profile_of(rig)
-        self._answer_time = self._profile.sdo_timeout_ms / 1000.0
-        self._requests = requests_per_cycle(self._cycle_s)
+        self._answer_cycles = answer_cycles(self._profile.sdo_timeout_ms / 1000.0, cycle)
+        self._requests = requests_per_cycle(rig.cable_count, cycle, rig.document.bus.bitrate)
         self._heartbeat_cycles = heartbeat_cycles(cycle)
-        self._patience = max(3, round(self._profile.enable_timeout_ms / 1000.0 / cycle))
+        self._enable_s = self._profile.enable_timeout_ms / 1000.0
+        self._patience = STEP_CYCLES + math.ceil(self._enable_s / cycle - 1e-9)
         self._reset_cycles = round(RESET_WITHIN / cycle)
         self._again_after = max(1, round(ASKED_AGAIN_AFTER / cycle))
         self._max_tension = max_tension
@@ -104,7 +107,7 @@ class Cia402Group(CyclicGroup):
         # "Enable operation" was sent for this goal; replies to the former one's words are awaited.
         self._enables = self._is_new_goal = self._known = False
         self._former = self._goal, self._enables
-        self._monitoring_off: SdoJobs | None = None
+        self._monitoring_off: MonitoringEnd | None = None
         self._modes: ModeCheck | None = None
         self._poll = StatePoll((), 1)
         self._errors = SdoJobs({}, 1)
@@ -123,8 +126,9 @@ class Cia402Group(CyclicGroup):
             master_timeout=max(
                 heartbeat_timeout(self._cycle_s), self._profile.sync_timeout_periods * self._cycle_s
             ),
-            released_within=2.0 * self._profile.enable_timeout_ms / 1000.0 + 1.0,
-            unmonitored_within=time_to_end(self._heartbeats, self._cycle_s, self._answer_time),
+            released_within=2.0 * self._patience * self._cycle_s + 1.0,
+            unmonitored_within=self._cycle_s
+            * cycles_to_end(self._heartbeats, self._requests, self._answer_cycles),
             simulated=self._simulated,
         )
 
@@ -255,16 +259,11 @@ class Cia402Group(CyclicGroup):
     def read_state(self, pace: Pace) -> CycleStatus:
         """Reads the state of every drive by SDO; see `DriveGroup.read_state`."""
         self._online()
-        jobs = SdoJobs(dict.fromkeys(self._nodes, STATE_REQUESTS), self._again_after)
         silent = {self._nodes[i] for i, heard in enumerate(self._watch.answered) if not heard}
+        jobs = StateReading(self._nodes, self._again_after, self._answer_cycles, silent=silent)
         self._watch.begin_cycle()
         self._watch.on_answer = jobs.take
-        for number in range(round(len(STATE_REQUESTS) * self._answer_time / self._cycle_s)):
-            waited_for = jobs.unfinished()
-            if number * self._cycle_s >= self._answer_time:  # drives without any answer are lost
-                waited_for -= silent - {node for node, _ in jobs.values}
-            if not waited_for:
-                break
+        while jobs.waits:
             left = pace()
             self._ask(jobs, len(self._nodes))
             if self._pump is not None:
@@ -282,8 +281,10 @@ class Cia402Group(CyclicGroup):
         """Switches monitoring off, heartbeat first, SYNC last; both are sent until then."""
         if self._state in (GroupState.ENABLING, GroupState.ENABLED):
             raise Refused("enabled drives must monitor this program", where="drive group")
-        off = (monitoring_off(count, self._profile.rpdo) for count in self._heartbeats)
-        self._monitoring_off = SdoJobs(dict(zip(self._nodes, off, strict=True)), self._again_after)
+        counts = dict(zip(self._nodes, self._heartbeats, strict=True))
+        self._monitoring_off = MonitoringEnd(
+            counts, self._profile.rpdo, self._again_after, stopped=self._watch.stopped()
+        )
         self._modes, self._errors = None, SdoJobs({}, 1)
         self._watch.on_answer = self._monitoring_off.take
 
@@ -351,23 +352,24 @@ class Cia402Group(CyclicGroup):
             self._ask(self._poll, self._requests)  # late in the cycle: drives stop after SYNC
         elif self._state is GroupState.ENABLING:
             names, words = self._rig.drive_names, self._watch.status_words
-            seconds, needs_bit = self._patience * self._cycle_s, self._profile.follows_bit
+            seconds, needs_bit = self._enable_s, self._profile.follows_bit
             idle = ignoring_drives(names, words, seconds) if needs_bit else []
             follow = set(self._words) == {ControlWord.ENABLE_OPERATION}
             if follow and set(states) == {DriveState.OPERATION_ENABLED} and not idle:
                 self._check_modes()
             elif self._cycles_to_goal > self._patience:
-                self._latch(self._late(self._patience) or idle)
+                late = self._watch.late(self._words, self._goal, self._enable_s)
+                self._latch(late or idle)
         elif self._goal is Goal.RELEASE:
             if all(state in WITHOUT_TORQUE for state in states):
                 self._goal, self._state = Goal.IDLE, GroupState.RELEASED
             elif self._cycles_to_goal > 2 * self._patience:  # it enables the drives first
-                self._latch(self._late(2 * self._patience))
+                self._latch(self._watch.late(self._words, self._goal, 2.0 * self._enable_s))
 
     def _check_modes(self) -> None:
         """Enters ENABLED once every drive shows CSP; most profiles check it when configuring."""
         if self._profile.mode_display_when_enabled and self._modes is None:
-            cycles = len(self._nodes) + round((MODE_WAIT + self._answer_time) / self._cycle_s)
+            cycles = len(self._nodes) + round(MODE_WAIT / self._cycle_s) + self._answer_cycles
             self._modes = ModeCheck(self._nodes, cycles, self._again_after)
             self._watch.on_answer = self._modes.take
         wrong = self._modes.wrong() if self._modes is not None else {}
@@ -378,9 +380,6 @@ class Cia402Group(CyclicGroup):
         elif self._modes is not None and self._modes.is_overdue:
             self._modes = None
             self._latch([(n, mode_text(self._rig.drive_names[n], m)) for n, m in wrong.items()])
-
-    def _late(self, cycles: int) -> list[tuple[int, str]]:
-        return self._watch.late(self._words, self._goal, cycles * self._cycle_s)
 
     def _status(self) -> CycleStatus:
         watch = self._watch

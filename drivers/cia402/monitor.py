@@ -22,6 +22,7 @@ from drivers.cia402.state_machine import (
     FAULTED,
     FOLLOWS,
     INTERNAL_LIMIT,
+    MAY_FOLLOW,
     TORQUE_ON,
     ControlWord,
     DriveState,
@@ -119,6 +120,11 @@ class DriveMonitor:
     def complete(self) -> bool:
         """Whether every drive has answered in this cycle."""
         return all(self.answered)
+
+    def stopped(self) -> set[int]:
+        """Nodes that reported in this cycle that they follow no set-points."""
+        rows = zip(self.nodes, self.answered, self.states, strict=True)
+        return {node for node, heard, state in rows if heard and state not in MAY_FOLLOW}
 
     def take(self, can_id: int, data: bytes | bytearray, *, stale: bool = False) -> None:
         """Processes one frame.

@@ -6,15 +6,14 @@ four bytes only; source: CiA 301, 7.2.4.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
 
 from drivers.cia402.pdo import SDO_REQUEST_BASE
 from drivers.cia402.profile import rpdo_parameters
-
-REQUEST_PERIOD = 0.01
-"""Part of a cycle for each SDO request and its answer, [s]; they fit on a bus with 90 % load."""
+from drivers.cia402.state_machine import MAY_FOLLOW, ControlWord, state_of
 
 ASKED_AGAIN_AFTER = 0.5
 """Time without an answer after which a request is repeated, [s]; double answers are harmless."""
@@ -73,21 +72,27 @@ STATE_REQUESTS = (
 ERROR_REQUESTS = (SdoRequest(0x603F, 0, size=2), SdoRequest(0x1003, 1))
 
 
-def requests_per_cycle(cycle: float) -> int:
-    """Largest number of SDO requests in a cycle of that period [s]; at least one."""
-    return max(1, int(cycle / REQUEST_PERIOD + 1e-9))
+def answer_cycles(timeout: float, cycle: float) -> int:
+    """Cycles until the answer to an SDO request at most: it is awaited to the end of a cycle.
+
+    Args:
+        timeout: Time of one SDO answer, [s].
+        cycle: [s].
+    """
+    return max(1, math.ceil(timeout / cycle - 1e-9))
 
 
-def time_to_end(heartbeats: Iterable[int], cycle: float, answer: float) -> float:
-    """Longest time to end all monitoring, [s].
+def cycles_to_end(heartbeats: Iterable[int], most: int, answer: int) -> int:
+    """Largest number of cycles to end all monitoring.
 
     Args:
         heartbeats: As for `monitoring_off`, one number per drive.
-        cycle: [s].
-        answer: Time of one SDO answer, [s].
+        most: Requests per cycle.
+        answer: From `answer_cycles`.
     """
-    jobs = [len(monitoring_off(count)) for count in heartbeats]
-    return sum(jobs) * cycle / requests_per_cycle(cycle) + max(jobs) * answer
+    jobs = [len(_STOP) + len(monitoring_off(count)) for count in heartbeats]
+    # In each cycle as many requests are sent as may be, or every drive waits for an answer.
+    return sum(jobs) // most + max(jobs) * answer
 
 
 def monitoring_off(heartbeats: int, rpdo: int = 1) -> tuple[SdoRequest, ...]:
@@ -105,6 +110,9 @@ def monitoring_off(heartbeats: int, rpdo: int = 1) -> tuple[SdoRequest, ...]:
         SdoRequest(0x1006, 0, bytes(4)),
     )
 
+
+_STOP = SdoRequest(0x6040, 0, ControlWord.QUICK_STOP.to_bytes(2, "little")), STATE_REQUESTS[0]
+"""Stops a drive that takes no process data, as in NMT *pre-operational*, and reads its state."""
 
 MODE_DISPLAY = SdoRequest(0x6061, 0, size=1)
 
@@ -213,6 +221,72 @@ class SdoJobs:
         job = self._asked.pop(node)
         if self._endless:
             self._waiting[node].append(job)
+
+
+class StateReading(SdoJobs):
+    """Reads the state of every drive once."""
+
+    def __init__(
+        self, nodes: Iterable[int], again_after: int, answer: int, *, silent: set[int]
+    ) -> None:
+        """Sends nothing yet.
+
+        Args:
+            nodes: Of all drives.
+            again_after: As for `SdoJobs`.
+            answer: Turns until an answer at most, from `answer_cycles`.
+            silent: Nodes that missed the last cycle; lost without any answer in this time.
+        """
+        super().__init__(dict.fromkeys(nodes, STATE_REQUESTS), again_after)
+        self._turn, self._answer, self._silent = 0, answer, silent
+
+    def next_requests(self, most: int) -> list[tuple[int, bytes]]:
+        """Requests of one turn; see `SdoJobs.next_requests`."""
+        self._turn += 1
+        return super().next_requests(most)
+
+    @property
+    def waits(self) -> bool:
+        """Whether another turn may bring an answer."""
+        waited_for = self.unfinished()
+        if self._turn >= self._answer:
+            waited_for -= self._silent - {node for node, _ in self.values}
+        return bool(waited_for) and self._turn < len(STATE_REQUESTS) * self._answer
+
+
+class MonitoringEnd(SdoJobs):
+    """Ends the monitoring of this master, except by drives that may still be enabled.
+
+    Only this monitoring stops an enabled drive that takes no commands.
+    """
+
+    def __init__(
+        self, heartbeats: Mapping[int, int], rpdo: int, again_after: int, *, stopped: Container[int]
+    ) -> None:
+        """Sends nothing yet.
+
+        Args:
+            heartbeats: As for `monitoring_off`, by node.
+            rpdo: As for `monitoring_off`.
+            again_after: As for `SdoJobs`.
+            stopped: Nodes that reported in this cycle that they are not enabled. The others are
+                stopped by SDO first.
+        """
+        first = {node: () if node in stopped else _STOP for node in heartbeats}
+        off = {node: monitoring_off(count, rpdo) for node, count in heartbeats.items()}
+        super().__init__({node: (*first[node], *off[node]) for node in off}, again_after)
+        self._kept: set[int] = set()
+
+    def refused(self) -> set[int]:
+        """Nodes that still monitor: they refused a request, or did not stop."""
+        return super().refused() | self._kept
+
+    def _finish(self, node: int) -> None:
+        job = self._asked[node]
+        super()._finish(node)
+        if job == _STOP[-1] and state_of(self.values.get((node, job), 0)) in MAY_FOLLOW:
+            self._waiting[node].clear()
+            self._kept.add(node)
 
 
 class AnswerListener:

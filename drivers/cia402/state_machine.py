@@ -67,6 +67,9 @@ TORQUE_ON = frozenset(
 HOLDS = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE})
 """States in which a drive holds its cable, with torque and without a fault."""
 
+MAY_FOLLOW = frozenset({DriveState.NOT_READY, DriveState.OPERATION_ENABLED})
+"""States in which a drive may follow set-points; NOT_READY includes unknown codes."""
+
 FAULTED = frozenset({DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT})
 
 WITHOUT_TORQUE = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON})
@@ -257,6 +260,10 @@ _STEPS = {
     ),
 }
 """States short of a goal: drives in a later one wait for those in an earlier one."""
+
+STEP_CYCLES = 6
+"""Cycles from the command to enable to the one with 0Fh, for drives that follow at once: each word
+after the first, which repeats the last one, waits a cycle for the replies to the one before."""
 
 _NEXT_WORD = (
     ControlWord.SHUTDOWN,

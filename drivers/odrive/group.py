@@ -8,6 +8,7 @@ they are fed by the same batch of frames, so they expire together.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from enum import Enum, auto
@@ -16,7 +17,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from drivers.can_load import TESTED_HZ
+from drivers.can_load import HEARTBEATS_WAITED, TESTED_HZ
 from drivers.cyclic_group import CyclicBus, CyclicGroup
 from drivers.drive_group import (
     Capabilities,
@@ -48,15 +49,16 @@ from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 
 STEP_TIMEOUT = 1.0
-"""Time-out of enabling and disarming, [s]: brakes take a few tenths, and heartbeats are slow."""
+"""Time-out of enabling and disarming in addition to the heartbeats, [s]: brakes take tenths."""
 
 SETTLING = 0.1
 """Time under torque before the brakes close, [s]."""
 
-FIRST_READING_ATTEMPTS = 20
 FIRST_READINGS = 2
+FIRST_READING_WITHIN = 2.0
+"""Time for the first messages of all drives in addition to their slowest heartbeat, [s]."""
 FIRST_READING_TIMEOUT = 0.1
-"""Time-out for the messages of all drives, [s]."""
+"""Part of it after which those that have arrived are processed, [s]."""
 
 
 class _Stop(Enum):
@@ -83,7 +85,8 @@ class OdriveGroup(CyclicGroup):
         self._layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
         self._frames = OdriveFrames(rig, self._layouts)
         cycle = rig.cycle
-        self._patience = max(3, round(STEP_TIMEOUT / cycle))
+        self._step_within = STEP_TIMEOUT + heartbeat_within(document)
+        self._patience = round(self._step_within / cycle)
         self._settling = max(1, round(SETTLING / cycle))
         self._max_tension = rig.max_tension if max_tension is None else max_tension
         self._per_mille = winding_signs(rig) * 1000.0 / [w.rated_torque for w in rig.winches]
@@ -114,6 +117,7 @@ class OdriveGroup(CyclicGroup):
             watchdog_ms=self._document.watchdog_ms,
             sync_timeout=None,
             master_timeout=0.0,
+            released_within=SETTLING + self._step_within + 1.0,
         )
 
     @property
@@ -166,7 +170,7 @@ class OdriveGroup(CyclicGroup):
         self._watch.forget_positions()
         self._watch.forget_heartbeats()
         agreed = 0
-        for _ in range(FIRST_READING_ATTEMPTS):
+        for _ in range(first_attempts(self._rig, self._document, self._pump)):
             self._watch.begin_cycle()
             status = self.receive(FIRST_READING_TIMEOUT)
             agreed = 0 if status.missing.any() else agreed + 1
@@ -383,10 +387,18 @@ class OdriveGroup(CyclicGroup):
         self._resetting = int(heartbeat) + 2  # until all heartbeats are newer than the reset
 
 
+def heartbeat_within(document: OdriveDocument) -> float:
+    """Longest time until a drive shows a new state, [s]."""
+    return HEARTBEATS_WAITED * document.heartbeat_ms / 1000.0
+
+
+def first_attempts(rig: Rig, document: OdriveDocument, pump: Pump | None) -> int:
+    """Number of attempts to hear all drives; each lasts `FIRST_READING_TIMEOUT` or one ``pump``."""
+    attempt = FIRST_READING_TIMEOUT if pump is None else rig.cycle
+    return math.ceil((FIRST_READING_WITHIN + heartbeat_within(document)) / attempt)
+
+
 # Reads the state of ODrives from their cyclic messages without changing anything.
-
-
-ATTEMPTS, TIMEOUT = 20, 0.1
 
 
 def read_axes(
@@ -399,11 +411,11 @@ def read_axes(
     watch = OdriveMonitor(rig, document, layouts, largest_steps(rig, rig.cycle))
     silence: HardwareMissing | None = None
     cyclic.forget_waiting()
-    for _ in range(ATTEMPTS):
+    for _ in range(first_attempts(rig, document, pump)):
         watch.begin_cycle()
         if pump is not None:
             pump()
-        cyclic.take_replies(watch, TIMEOUT if pump is None else 0.0)
+        cyclic.take_replies(watch, FIRST_READING_TIMEOUT if pump is None else 0.0)
         cyclic.end_cycle()
         watch.end_cycle()
         if watch.states_known and not any(watch.missing):

@@ -332,7 +332,7 @@ def error_text(errors: int) -> str:
 
 def state_text(word: int) -> str:
     """Text of a `status_word`."""
-    state, error = word & 0xFF, word & ERROR_FLAG
+    state, error = state_in(word), word & ERROR_FLAG
     names = {AxisState.IDLE: "idle", AxisState.CLOSED_LOOP_CONTROL: "closed loop control"}
     text = names.get(AxisState(state)) if state in names else f"axis state {state}"
     return f"{text}, in error" if error else f"{text}"
@@ -344,6 +344,11 @@ ERROR_FLAG = 0x100
 def status_word(state: int, errors: int) -> int:
     """State of an axis as one number, with a flag for errors."""
     return state | (ERROR_FLAG if errors else 0)
+
+
+def state_in(word: int) -> int:
+    """The state of an axis in a `status_word`."""
+    return word & 0xFF
 
 
 # The frames that a master of ODrives sends. No bus.

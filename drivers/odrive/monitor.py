@@ -81,8 +81,8 @@ class OdriveMonitor:
 
     @property
     def complete(self) -> bool:
-        """Whether every drive has reported a position in this cycle."""
-        return all(self._fresh)
+        """Whether every drive has reported a position in this cycle, and its state is known."""
+        return all(self._fresh) and self.states_known
 
     @property
     def missing(self) -> list[bool]:

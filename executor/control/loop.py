@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
-from drivers.factory import stop_alone
+from drivers.factory import stop_alone, without_torque
 from executor.control.cycle import Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
 from executor.control.sync_master import SyncMaster, changed_states
@@ -67,12 +67,11 @@ class Loop:
         self._sender = Cycle(checked, master, slack_counts=self.slack_counts)
         self._feed = Feed(len(checked), checked.cycle, checked.rig.motion)
         self._cycle = self._bus_faults = 0
-        self._taken_over = self._held_before = False
+        self._taken_over, self._held_before = False, set[int]()  # nodes
         self._press = 0  # of jogs: the one whose line is followed
         self._reported: set[tuple[str, str]] = set()
-        self._listener_error = ""
         self._held = _HELD if self._group.capabilities.holds_on_quick_stop else _BRAKED
-        self.cause = self._requested = ""
+        self.cause = self._requested = self._listener_error = ""
         self.error: CdprError | None = None
         """None here: the end of a run is reported by its cause."""
         self.holding = True
@@ -92,18 +91,17 @@ class Loop:
         """
         require_capabilities(self._group.capabilities, self._checked.cycle)
         require_unchanged(self._checked)
-        self._held_before = (seen := self._master.read_positions()).holding
-        self._take_positions()
+        seen = self._master.read_positions()
+        self._master.require_no_fault()
         require(seen)
+        self._held_before = {*self._checked.rig.drive_names} - self._released(seen)
         self._require_at_start()
         self._sender.armed = True
 
-    def _take_positions(self) -> None:
-        """Takes the positions that the drives last reported."""
+    def _require_at_start(self) -> None:
+        """Takes the positions that the drives last reported, which must be at the start."""
         if self._master.status is not None:
             self._sender.actual = tuple(int(p) for p in self._master.status.positions)
-
-    def _require_at_start(self) -> None:
         require_at_start(self._checked, np.array(self.positions, dtype=np.float64))
 
     @property
@@ -120,9 +118,9 @@ class Loop:
         if not self._sender.armed:
             raise Refused("the run was not armed", where="executor")
         try:
-            self._take_positions()
             self._require_at_start()
             self._master.refresh()
+            self._master.require_no_fault()
             self.machine.on(Event.ENABLE)
             while self.machine.state in _ACTIVE:
                 self._one_step()
@@ -245,7 +243,7 @@ class Loop:
     def _record(self, done: CycleResult) -> None:
         if done.status is None:
             return
-        self.holding = done.status.holding or self._held_nothing
+        self.holding = self._is_held(done.status)
         record = CycleRecord(
             cycle=self._cycle,
             at=self._clock.time,
@@ -266,10 +264,15 @@ class Loop:
         self._cycle += 1
         self._call_listener(lambda: self._on_cycle(record))
 
-    @property
-    def _held_nothing(self) -> bool:
-        """Whether no drive can let go of its cable, as none held it, before or in this motion."""
-        return not (self._taken_over or self._held_before)
+    def _is_held(self, status: CycleStatus) -> bool:
+        """Whether no drive has let go of a cable that it held, before or in this motion."""
+        let_go = self._held_before & self._released(status)
+        return status.holding or not (self._taken_over or let_go)
+
+    def _released(self, status: CycleStatus) -> set[int]:
+        """Nodes that do not hold by torque; those of ODrives hold by brakes, all or none."""
+        released = without_torque(self._checked.rig, status.status_words.tolist())
+        return {*released} if status.holding or released else {*self._checked.rig.drive_names}
 
     def _index(self) -> float:
         """Progress of the motion, for the record."""
@@ -382,9 +385,9 @@ class Loop:
             text = f"{in_one_line(error)}; the drives stop on loss of the master"
             self._report("bus_lost", text)
             return
-        if before is None or left.holding:
+        if before is None or (left.holding and left.stopped):
             return
-        self.holding = self._held_nothing
+        self.holding = self._is_held(left)
         rig = self._checked.rig
         held = np.array(stop_alone(rig, before.status_words.tolist())) & ~before.missing
         if otherwise := changed_states(rig, before, left, np.flatnonzero(~held).tolist()):

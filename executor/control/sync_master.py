@@ -16,13 +16,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand
-from drivers.factory import drive_states
+from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
+from drivers.factory import drive_states, enabled_drives
 from executor.realtime.scheduling import Clock
 from executor.safety.fault_messages import name_drives
 from executor.safety.monitor import MISSING_CYCLES
 from executor.safety.sync_timeout import USUAL_TIMEOUT, SyncAge
-from model.errors import CdprError, Fault, HardwareMissing
+from model.errors import CdprError, Fault, HardwareMissing, Refused
 from model.rig import Rig
 
 # Detection of silent drives where no monitor runs: before and after a motion.
@@ -153,6 +153,20 @@ class SyncMaster:
         self.status = self.group.read_positions(pace)
         return self.status
 
+    def require_no_fault(self) -> None:
+        """Requires drives without a fault since their set-up, as last reported.
+
+        Raises:
+            Refused: There is one; with the drive and its cause.
+        """
+        if self.status is not None and self.status.state is GroupState.FAULT:
+            raise Refused(
+                "; ".join(text for _, text in self.status.faults),
+                where="arming",
+                why="this happened after the drives were set up",
+                next_step="remove the cause, then run `cdpr reset RIG`; nothing was enabled",
+            )
+
     def rest(self) -> CycleStatus:
         """One cycle with unchanged targets.
 
@@ -252,27 +266,33 @@ class SyncMaster:
 def changed_states(
     rig: Rig, before: CycleStatus, after: CycleStatus, excluded: Collection[int] = ()
 ) -> str:
-    """Names the drives whose state changed at the end of the cycle; empty if none did.
+    """Names the drives that are enabled or changed their state at the end; empty if none did.
 
     Args:
         rig: The robot.
         before: Status before monitoring was ended.
         after: Status after the last SYNC.
-        excluded: Drives to leave out, from 0: their state is already reported.
+        excluded: Drives, from 0, whose state is already reported: only named while still enabled.
     """
     rows = zip(
         rig.drive_names.values(),
         drive_states(rig, before.status_words.tolist()),
         drive_states(rig, after.status_words.tolist()),
         after.missing.tolist(),
+        enabled_drives(rig, after.status_words.tolist()),
         strict=True,
     )
-    changed = [
-        f"{name} {'does not answer' if silent else f'went from {old} to {new}'}"
-        for drive, (name, old, new, silent) in enumerate(rows)
-        if (silent or old != new) and drive not in excluded
-    ]
-    return f"drives left the state they held in: {', '.join(changed)}" if changed else ""
+    changed, still = [], []
+    for drive, (name, old, new, silent, enabled) in enumerate(rows):
+        if enabled and not silent and (old == new or drive in excluded):
+            still.append(name)
+        elif (silent or old != new) and drive not in excluded:
+            what = "does not answer" if silent else f"went from {old} to {new}"
+            changed.append(f"{name} {what}")
+    found = [f"drives still enabled: {', '.join(still)}"] if still else []
+    if changed:
+        found.append(f"drives left the state they held in: {', '.join(changed)}")
+    return "; ".join(found)
 
 
 def late_fault(age: float) -> Fault:

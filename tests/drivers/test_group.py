@@ -4,28 +4,33 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import can
 import numpy as np
 import pytest
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from drivers.can_bus import BusSettings
 from drivers.can_errors import TorqueLost
 from drivers.cia402.object_dictionary import PDO_NO_RTR, Setting, settings_for
 from drivers.cia402.pdo import NmtCommand, NmtState
+from drivers.cia402.profile import load_profile
 from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import GroupCommand, GroupState
 from drivers.factory import make_drive_group
 from model.errors import Fault, HardwareMissing, Refused
 from model.files.rig_file import RigDocument
-from model.rig import rig_from_document
+from model.rig import Rig, rig_from_document
 from simulation.drives.behaviour import STRICT
 from simulation.drives.cia402 import SimulatedDrive
-from tests.drivers.drive_bench import Bench
+from simulation.drives.cia402_rig import SimulatedCia402Rig
+from tests.drivers.drive_bench import Bench, three_on_a_bus
 
 HOLDING = DriveState.QUICK_STOP_ACTIVE
 
@@ -1117,3 +1122,125 @@ def test_no_script_frees_a_cable_or_enables_some(bench: Bench, script: list) -> 
                     ]
                     assert not lost
     assert all(word & 0x02 for word in [*words, *bench.control_words()])
+
+
+def leave_operational(bench: Bench, nodes: Sequence[int]) -> None:
+    """Enabled drives fall back to NMT pre-operational: SDO works, process data does not."""
+    bench.enable()
+    for node in nodes:
+        bench.drives[node - 1].on_nmt(NmtCommand.PRE_OPERATIONAL, node)
+    for _ in range(20):
+        bench.cycle()
+    assert bench.group.state is GroupState.FAULT
+    assert bench.drives[nodes[0] - 1].state is DriveState.OPERATION_ENABLED
+
+
+def end_monitoring(bench: Bench) -> None:
+    bench.group.command(GroupCommand.END_MONITORING)
+    for _ in range(round(bench.group.capabilities.unmonitored_within / bench.rig.cycle)):
+        if not bench.group.ending:
+            break
+        bench.cycle()
+    assert not bench.group.ending
+
+
+@pytest.mark.parametrize("nodes", [(5,), range(1, 9)])
+def test_a_drive_without_process_data_is_stopped_by_sdo_before_its_monitoring_ends(
+    bench: Bench, nodes: Sequence[int]
+) -> None:
+    leave_operational(bench, nodes)
+    end_monitoring(bench)
+    assert {drive.state for drive in bench.drives} == {HOLDING}
+    assert not bench.group.is_monitored
+    assert {drive.objects[0x1016, 1] for drive in bench.drives} == {0}
+
+
+def ignores_words(drive: SimulatedDrive) -> None:
+    drive._take_control_word = lambda _word: None  # type: ignore[method-assign]
+
+
+def refuses_words(drive: SimulatedDrive) -> None:
+    asked = drive.on_sdo
+
+    def refuses(data: bytes) -> None:
+        if data[1:4] == b"\x40\x60\0":
+            drive._send(0x580 + drive.node, b"\x80" + data[1:4] + b"\x22\0\0\x08")
+        else:
+            asked(data)
+
+    drive.on_sdo = refuses  # type: ignore[method-assign, assignment]
+
+
+def hides_its_state(drive: SimulatedDrive) -> None:
+    ignores_words(drive)
+    drive.objects.measured(0x6041, 0, lambda: 0x0010)
+
+
+@pytest.mark.parametrize("spoil", [ignores_words, refuses_words, hides_its_state])
+def test_a_drive_that_sdo_does_not_stop_keeps_the_monitoring_that_stops_it(
+    bench: Bench, spoil: Callable[[SimulatedDrive], None]
+) -> None:
+    leave_operational(bench, [5])
+    drive = bench.drives[4]
+    spoil(drive)
+    kept = drive.objects[0x1016, 1], drive.objects[0x1006, 0]
+    assert min(kept) > 0
+    end_monitoring(bench)
+    assert drive.state is DriveState.OPERATION_ENABLED
+    assert bench.group.is_monitored
+    assert (drive.objects[0x1016, 1], drive.objects[0x1006, 0]) == kept
+    bench.rehearsal.advance(0.5)
+    bench.rehearsal.pump()
+    assert {drive.state for drive in bench.drives} == {HOLDING}
+
+
+@pytest.fixture
+def short_of_time(rig: Rig, tmp_path: Path) -> Iterator[Bench]:
+    """A cycle as long as `enable_timeout_ms` and longer than `sdo_timeout_ms`."""
+    profile = tmp_path / "profile.yaml"
+    document = load_profile("cia402").model_dump(mode="json", exclude_defaults=True)
+    document |= {"enable_timeout_ms": 100, "sdo_timeout_ms": 50}
+    profile.write_text(yaml.safe_dump(document))
+    drives = rig.document.drives.model_copy(update={"profile": str(profile)})
+    bus = rig.document.bus.model_copy(update={"cycle_ms": 100.0})
+    slow = rig.document.model_copy(update={"bus": bus})
+    short = rig_from_document(slow.model_copy(update={"drives": drives}))
+    with three_on_a_bus(BusSettings("virtual", "short-of-time")) as (master, far, ear):
+        rehearsal = SimulatedCia402Rig(rig_from_document(slow), far, rig.home)
+        yield Bench(short, make_drive_group(short, master, rehearsal.pump), rehearsal, ear)
+
+
+def test_a_drive_has_all_of_its_time_to_enable_besides_the_control_words(
+    short_of_time: Bench,
+) -> None:
+    """At 100 ms the words took 400 ms of it; below 350 ms no drive was ever enabled."""
+    bench = short_of_time
+    for drive in bench.drives:
+        drive.behaviour = replace(drive.behaviour, enable_delay=0.1)
+    bench.enable()
+
+
+def test_a_drive_that_exceeds_its_time_to_enable_is_named_with_this_time(
+    short_of_time: Bench,
+) -> None:
+    bench = short_of_time
+    bench.drives[2].behaviour = replace(bench.drives[2].behaviour, enable_delay=60.0)
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    bench.until(GroupState.FAULT, limit=10)
+    assert bench.status is not None
+    ((node, text),) = bench.status.faults
+    assert node == 3
+    assert "after 0.1 s (enable_timeout_ms" in text
+
+
+def test_all_states_are_read_in_cycles_longer_than_an_answer(short_of_time: Bench) -> None:
+    """Two cycles were allowed for three requests, so that every run ended as not held."""
+    bench = short_of_time
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.cycle()
+    end_monitoring(bench)
+    assert not bench.group.is_monitored
+    assert not bench.group.read_state(lambda: 0.0).missing.any()

@@ -14,11 +14,19 @@ import pytest
 
 from drivers import cyclic_group
 from drivers.drive_group import GroupCommand, GroupState
-from drivers.factory import drive_states, read_drives
+from drivers.factory import drive_states, enabled_drives, read_drives
 from drivers.odrive import configure
 from drivers.odrive.configure import check_resolution
 from drivers.odrive.endpoints import read_endpoints, wanted_settings
-from drivers.odrive.messages import AxisError, AxisState, can_id, node_and_command
+from drivers.odrive.messages import (
+    AxisError,
+    AxisState,
+    can_id,
+    node_and_command,
+    read_layouts,
+    status_word,
+)
+from drivers.odrive.monitor import OdriveMonitor
 from model.errors import BadInput, Fault, HardwareMissing, Refused
 from model.rig import Rig, rig_from_document
 from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
@@ -53,7 +61,13 @@ def test_all_drives_are_enabled_at_their_positions_and_follow(bench: OdriveBench
         assert np.abs(error).max() < 1e-5
         assert not status.missing.any()
     assert np.abs(status.positions - targets).max() <= 1
-    assert drive_states(bench.rig, status.status_words.tolist()) == ("closed loop control",) * 8
+    words = status.status_words.tolist()
+    assert drive_states(bench.rig, words) == ("closed loop control",) * 8
+    in_error = status_word(AxisState.CLOSED_LOOP_CONTROL, 1)
+    assert enabled_drives(bench.rig, [in_error, AxisState.IDLE, *words[2:]]) == (
+        *(True, False),
+        *(True,) * 6,
+    )
 
 
 def test_torques_are_tensions_in_per_mille_of_rated_torque(bench: OdriveBench) -> None:
@@ -374,7 +388,7 @@ def test_a_watchdog_that_stays_expired_is_a_drive_that_is_not_enabled(
     bench.group.command(GroupCommand.ENABLE)
     bench.drives[5].fail(AxisError.WATCHDOG_TIMER_EXPIRED)
     del bench.drives[5]._commands[0x18]  # Clear_Errors
-    status = bench.cycles(105)
+    status = bench.cycles(140)
     assert status.state is GroupState.FAULT
     assert status.faults[0][1].startswith("cable 6 (drive 6) stays idle instead of closed loop")
 
@@ -396,7 +410,7 @@ def test_a_drive_that_is_not_calibrated_is_named_and_no_other_stays_enabled(
     bench.group.configure()
     bench.group.read_positions()
     bench.group.command(GroupCommand.ENABLE)
-    status = bench.cycles(105)
+    status = bench.cycles(140)
     assert status.state is GroupState.FAULT
     reported = status.faults[0][1]
     assert reported.startswith("cable 6 (drive 6) stays idle instead of closed loop control")
@@ -643,3 +657,38 @@ def test_reading_alone_trusts_no_count_that_may_have_restarted() -> None:
     with odrive_bench(rig) as bench:
         seen = read_drives(rig, bench.group._bus, bench.rehearsal.pump)
         assert seen.restarted == bench.group.restarted == tuple(range(1, 9))
+
+
+@pytest.mark.parametrize("heartbeat_ms", [250, 1000])
+def test_slow_heartbeats_are_waited_for(heartbeat_ms: int) -> None:
+    """All that the rig file allows; the drives were named as silent, and then as not enabled."""
+    rig = odrive_rig(heartbeat_ms=heartbeat_ms)
+    with odrive_bench(rig) as bench:
+        seen = read_drives(rig, bench.group._bus, bench.rehearsal.pump)
+        assert seen.silent == ()
+        bench.group.configure()
+        bench.group.read_positions()
+        bench.group.command(GroupCommand.ENABLE)
+        while bench.cycle().state is GroupState.ENABLING:
+            pass
+        assert bench.group.state is GroupState.ENABLED
+        bench.group.command(GroupCommand.RELEASE)
+        within = bench.group.capabilities.released_within
+        for _ in range(round(within / rig.cycle)):
+            status = bench.cycle()
+        assert (status.state, status.faults) == (GroupState.RELEASED, ())
+        assert within >= 4.0 * heartbeat_ms / 1000.0
+
+
+def test_the_first_reading_goes_on_until_every_state_is_known() -> None:
+    """At 1 ms the positions were complete 20 times before the first heartbeat."""
+    rig, layouts = odrive_rig(), read_layouts()
+    watch = OdriveMonitor(rig, rig.document.drives, layouts, [1e9] * 8)  # type: ignore[arg-type]
+    sent = [(layouts.heartbeat, (0, 1, 0)), (layouts.get_encoder_estimates, (0.0, 0.0))]
+    messages = [(can_id(n, each.command), each.pack(*v)) for each, v in sent for n in watch.nodes]
+    for number, message in enumerate(messages[1:]):
+        assert not watch.complete, f"after {number} messages"
+        watch.take(*message)
+    assert not watch.complete
+    watch.take(*messages[0])
+    assert watch.complete

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.can_load import MAX_LOAD, bus_load, frame_bits, requests_per_cycle
 from drivers.cia402.sdo_jobs import (
-    REQUEST_PERIOD,
     ModeCheck,
+    MonitoringEnd,
     SdoJobs,
     SdoRequest,
     StatePoll,
+    StateReading,
+    answer_cycles,
+    cycles_to_end,
     monitoring_off,
-    requests_per_cycle,
-    time_to_end,
 )
 
 NODE = 5
@@ -57,24 +61,68 @@ def test_every_drive_gets_its_first_request_before_any_gets_its_second() -> None
     assert jobs.unfinished() == set()
 
 
-@given(cycle_ms=st.integers(1, 250), drives=st.integers(1, 12), heartbeats=st.integers(1, 12))
-def test_a_long_cycle_ends_the_monitoring_no_later_than_a_short_one(
-    cycle_ms: int, drives: int, heartbeats: int
+def turns_of(jobs: StateReading | MonitoringEnd, most: int, delay: int, word: bytes) -> int:
+    """Turns until all are answered, each in the last turn that the delay allows."""
+    due: list[tuple[int, int, bytes]] = []
+    for turn in itertools.count():
+        for at, node, data in [each for each in due if each[0] <= turn]:
+            jobs.take(node, data)
+            due.remove((at, node, data))
+        if not jobs.unfinished():
+            return turn
+        for can_id, data in jobs.next_requests(most):
+            answer = bytes((0x43, *data[1:4])) + word if data[0] == 0x40 else b"\x60" + data[1:]
+            due.append((turn + delay, can_id - 0x600, answer))
+    raise AssertionError
+
+
+@given(
+    heartbeats=st.lists(st.integers(0, 12), min_size=1, max_size=12),
+    most=st.integers(1, 12),
+    timeout=st.floats(0.001, 0.3),
+    cycle=st.sampled_from([0.004, 0.01, 0.03, 0.1]),
+    stopped=st.sets(st.integers(1, 12)),
+)
+def test_the_time_to_end_monitoring_suffices_for_the_slowest_answers(
+    heartbeats: list[int], most: int, timeout: float, cycle: float, stopped: set[int]
 ) -> None:
-    """At 100 ms, one request a cycle took 7 s from the end of a motion to the prompt."""
+    """A time-out below the cycle counted as less than one, though one answer is taken a cycle."""
+    answer = answer_cycles(timeout, cycle)
+    assert answer * cycle >= max(timeout, cycle) - 1e-9
+    ending = MonitoringEnd(dict(enumerate(heartbeats, 1)), 1, NEVER, stopped=stopped)
+    turns = turns_of(ending, most, answer, b"\x07\x06\0\0")
+    assert turns <= cycles_to_end(heartbeats, most, answer)
+    assert ending.refused() == set()
+
+
+@given(drives=st.integers(1, 12), answer=st.integers(1, 30))
+def test_every_state_is_read_from_the_slowest_answers(drives: int, answer: int) -> None:
+    nodes = range(1, drives + 1)
+    reading = StateReading(nodes, NEVER, answer, silent=set(nodes))
+    assert turns_of(reading, drives, answer, bytes(4)) <= 3 * answer
+    assert len(reading.values) == 3 * drives
+
+
+@given(
+    drives=st.integers(1, 12),
+    cycle_ms=st.integers(1, 100),
+    bitrate=st.sampled_from([50_000, 125_000, 250_000, 500_000, 1_000_000]),
+)
+def test_several_requests_a_cycle_leave_the_bus_below_its_limit(
+    drives: int, cycle_ms: int, bitrate: int
+) -> None:
     cycle = cycle_ms / 1000.0
-    jobs = {node: monitoring_off(heartbeats) for node in range(1, drives + 1)}
-    queue, turns = SdoJobs(jobs, NEVER), 0
-    while queue.unfinished():
-        requests = queue.next_requests(requests_per_cycle(cycle))
-        assert requests, "drives answer within the cycle here"
-        assert len(requests) == 1 or len(requests) * REQUEST_PERIOD <= cycle * (1.0 + 1e-9)
-        for can_id, data in requests:
-            queue.take(can_id - 0x600, bytes((0x60, *data[1:])))
-        turns += 1
-    of_each, of_all = len(jobs[1]), sum(map(len, jobs.values()))
-    assert turns * cycle <= of_each * cycle + 2 * of_all * REQUEST_PERIOD
-    assert turns * cycle <= time_to_end([heartbeats] * drives, cycle, answer=cycle) + 1e-9
+    most = requests_per_cycle(drives, cycle, bitrate)
+    added = most * 2 * frame_bits(8) / (cycle * bitrate)
+    assert most == 1 or bus_load(drives, cycle, bitrate) + added <= MAX_LOAD + 1e-9
+    assert 1 <= most <= max(1, cycle_ms // 10)
+
+
+def test_the_end_of_monitoring_is_short_in_long_cycles_too() -> None:
+    """One request a cycle took 7 s at 100 ms; ten a cycle overloaded a bus of 50 kbit/s."""
+    assert requests_per_cycle(8, 0.1, 1_000_000) == 10
+    assert requests_per_cycle(10, 0.1, 50_000) == 1
+    assert requests_per_cycle(8, 0.01, 1_000_000) == 1
 
 
 @pytest.mark.parametrize(

@@ -354,7 +354,7 @@ def test_silence_counts_in_a_row_and_stays(missed: list[int], silent: bool) -> N
         timeout.require_none("meanwhile", **words)
 
 
-HELD, FAILED = 0x0607, 0x0218
+HELD, FAILED, ENABLED = 0x0607, 0x0218, 0x0627
 
 
 def reported(words: Sequence[int], silent: Sequence[int] = ()) -> Any:
@@ -378,3 +378,34 @@ def test_drives_that_are_not_as_they_were_left_are_named(
 ) -> None:
     said = changed_states(THE_RIG, reported([HELD] * 8), reported(words, silent), but)
     assert said == (f"drives left the state they held in: {expected}" if expected else "")
+
+
+@pytest.mark.parametrize(
+    ("before", "silent", "but", "expected"),
+    [
+        (ENABLED, [], [], "drives still enabled: cable 8 (drive 8)"),
+        (ENABLED, [], [7], "drives still enabled: cable 8 (drive 8)"),
+        (HELD, [], [7], "drives still enabled: cable 8 (drive 8)"),
+        (ENABLED, [7], [7], ""),
+        (
+            HELD,
+            [],
+            [],
+            "drives left the state they held in: cable 8 (drive 8) went from quick stop active to"
+            " operation enabled",
+        ),
+        (
+            ENABLED,
+            [1],
+            [],
+            "drives still enabled: cable 8 (drive 8); drives left the state they held in: cable 2"
+            " (drive 2) does not answer",
+        ),
+    ],
+)
+def test_a_drive_that_is_still_enabled_is_named_even_if_it_was_so_before(
+    before: int, silent: list[int], but: list[int], expected: str
+) -> None:
+    words = [HELD] * 7
+    after = reported([*words, ENABLED], silent)
+    assert changed_states(THE_RIG, reported([*words, before]), after, but) == expected

@@ -464,3 +464,32 @@ def test_a_camera_that_faces_elsewhere_fails_the_run_and_states_why(
     assert summary["final_state"] == "finished"
     assert summary["clearance_mm"]["source"] == "encoder"
     assert summary["tag_error_mm"]["frames_without_pose"] == summary["tag_error_mm"]["frames"] > 15
+
+
+def test_a_drive_that_goes_into_fault_during_the_set_up_is_refused_by_name(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """It was armed, and only 0Fh was refused, without the drive and after a latch."""
+    with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
+        stage.drives[4].fail(0x3210)
+        with pytest.raises(Refused, match=r"cable 5 \(drive 5\).*over-voltage") as caught:
+            stage.run()
+        assert not stage.armed, "no motion was noted, and no reference"
+        assert DriveState.OPERATION_ENABLED not in {drive.state for drive in stage.drives}
+    assert "nothing was enabled" in caught.value.next_step
+
+
+def test_a_drive_that_goes_into_fault_while_the_operator_is_asked_is_the_cause(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
+
+        def asked() -> None:
+            stage.drives[4].fail(0x3210)
+            stage.now += 1.5 * prepared.checked.table.cycle  # the next SYNC shows it
+
+        outcome = stage.run(before_motion=asked)
+    assert outcome.state is State.LATCHED
+    assert "cable 5 (drive 5)" in outcome.cause
+    assert "cannot enable" not in outcome.cause
+    assert not any(DriveState.OPERATION_ENABLED in states for states in stage.drive_states)

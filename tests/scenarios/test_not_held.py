@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import can
 import pytest
 
 from drivers.can_bus import BusSettings
+from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.state_machine import DriveState
 from executor.control.path_runs import Outcome
 from executor.interlock.fault_latch import FaultLatch
@@ -116,23 +118,33 @@ def test_a_disturbed_bus_still_ends_in_order_so_that_no_drive_misses_its_master(
     assert states == {DriveState.QUICK_STOP_ACTIVE}
 
 
+@pytest.mark.parametrize(
+    ("held", "lets_go"),
+    [
+        (range(8), True),
+        ((), False),
+        ((SIXTH,), True),
+        ((FIFTH, SIXTH), True),
+        ((0, 1, FIFTH), False),
+    ],
+)
 def test_a_drive_that_held_and_lets_go_while_all_are_enabled_is_no_longer_held(
-    prepared: PreparedRun, tmp_path: Path
+    prepared: PreparedRun, tmp_path: Path, held: Sequence[int], lets_go: bool
 ) -> None:
-    """The usual start: all drives hold since the last run."""
+    """All drives usually hold since the last run, but some may have been released."""
 
     def fault(stage: Stage) -> None:
         if stage.cycle == 1:
             stage.drives[SIXTH].fail(0x2310)
 
-    for held in (True, False):
-        with staged(prepared, tmp_path / str(held), fault) as stage:
-            for drive in stage.drives:
-                drive.state = DriveState.QUICK_STOP_ACTIVE if held else drive.state
-            outcome = stage.run()
-        assert "drive 6" in outcome.cause
-        assert "enabled" not in [event.code for event in stage.events()]
-        assert outcome.holding is not held
+    with staged(prepared, tmp_path / "run", fault) as stage:
+        for drive in held:
+            stage.drives[drive].state = DriveState.QUICK_STOP_ACTIVE
+        outcome = stage.run()
+        codes = [event.code for event in stage.events()]
+    assert "drive 6" in outcome.cause
+    assert "enabled" not in codes
+    assert outcome.holding is not lets_go
 
 
 def test_a_second_drive_that_releases_after_a_fault_is_reported_although_the_first_does_not_hold(
@@ -183,6 +195,47 @@ def test_a_cycle_without_replies_does_not_cut_the_end_short(
     assert len(ending) > later, "the end went on"
     assert outcome.state is State.FINISHED, outcome.cause
     assert states == {DriveState.QUICK_STOP_ACTIVE}
+
+
+def falls_back(stage: Stage) -> None:
+    """To NMT pre-operational: its set-points have no effect any more, requests do."""
+    stage.drives[FIFTH].on_nmt(NmtCommand.PRE_OPERATIONAL, FIFTH + 1)
+
+
+def test_a_drive_that_left_nmt_operational_is_not_left_enabled_and_unmonitored(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with staged(prepared, tmp_path / "run", at(CRUISING, falls_back)) as stage:
+        outcome = stage.run()
+        events = stage.events()
+        states = {drive.state for drive in stage.drives}
+    assert outcome.state is State.LATCHED
+    assert "cable 5 (drive 5) left the NMT state operational" in outcome.cause
+    assert states == {DriveState.QUICK_STOP_ACTIVE}
+    assert outcome.holding
+    assert "not_held" not in [event.code for event in events], "it holds"
+
+
+@pytest.mark.parametrize("also_dead", [False, True])
+def test_a_drive_that_nothing_stops_is_reported_as_still_enabled(
+    prepared: PreparedRun, tmp_path: Path, also_dead: bool
+) -> None:
+    def fault(stage: Stage) -> None:
+        falls_back(stage)
+        stuck = stage.drives[FIFTH]
+        stuck._take_control_word = lambda _word: None  # type: ignore[method-assign]
+        stuck._connection_lost = lambda _code: None  # type: ignore[method-assign]
+        stage.drives[SIXTH].silent = also_dead
+
+    with staged(prepared, tmp_path / "run", at(CRUISING, fault)) as stage:
+        outcome = stage.run()
+        events = stage.events()
+        assert stage.drives[FIFTH].state is DriveState.OPERATION_ENABLED
+    assert outcome.state is State.LATCHED
+    assert events[-1].code == "not_held"
+    assert "still enabled: cable 5 (drive 5)" in events[-1].text
+    assert "drive 4" not in events[-1].text
+    assert "drive 6" not in events[-1].text, "its silence is the cause"
 
 
 THREE_LINES = Fault("frames cannot be sent", where="can0", why="it is down", next_step="set it up")
