@@ -204,7 +204,8 @@ def move_supervised(
         log = stack.enter_context(
             nullcontext() if is_simulated(rig) else recording(free_folder(name))
         )
-        status.folder = None if log is None else log.folder
+        if log is not None:
+            status.take_folder(log.folder)
         result = move_winches(
             moving,
             rig,

@@ -10,7 +10,7 @@ from pathlib import Path
 from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import Triple
 from cdpr.cli.output import Terminal, out, show_json, show_line
-from model.errors import AlreadyExists, BadInput
+from model.errors import BadInput
 from model.files.documents import load_yaml, write_atomic
 from model.files.examples import (
     copy_examples,
@@ -20,6 +20,7 @@ from model.files.examples import (
     select_examples,
 )
 from model.files.new_rig import RigQuestion, collect_answers, read_coordinates
+from model.files.output import require_new_file
 from model.files.rig_file import RigDocument
 
 
@@ -92,7 +93,7 @@ class RigOptions:
 
 def new(
     *,
-    rig: Path = argument("rig file to write"),
+    output: Path = argument("rig file to write", "RIG"),
     coordinates: Path | None = option(
         "CSV with one line per cable; no questions, defaults for the rest", "--from"
     ),
@@ -108,17 +109,16 @@ def new(
       cdpr new my_rig.yaml
       cdpr new my_rig.yaml --from cables.csv --mass-kg 2.5 --interface socketcan --channel can0
     """
-    if rig.exists() and not force:
-        raise AlreadyExists("the file exists already", str(rig))
+    require_new_file(output, force)
     given = {key: value for key, value in asdict(values).items() if value is not None}
     if coordinates is None:
-        answers = collect_answers(rig.stem, given, _ask, _refuse)
+        answers = collect_answers(output.stem, given, _ask, _refuse)
     else:
-        answers = collect_answers(rig.stem, given | read_coordinates(coordinates))
-    write_atomic(rig, rig_text(answers))
-    name = shlex.quote(str(rig))
-    show_line(f"wrote {rig}: {answers['cables']} cables")
-    Terminal().remarks(load_yaml(rig, RigDocument).remarks())
+        answers = collect_answers(output.stem, given | read_coordinates(coordinates))
+    write_atomic(output, rig_text(answers))
+    name = shlex.quote(str(output))
+    show_line(f"wrote {output}: {answers['cables']} cables")
+    Terminal().remarks(load_yaml(output, RigDocument).remarks())
     show_line(f"next: review it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE")
 
 

@@ -176,7 +176,7 @@ class RunFolder:
     @contextmanager
     def held(self) -> Iterator[None]:
         """Marks the run as active until the block or this program ends."""
-        with (self.path / EVENTS).open("rb") as stream:
+        with (self.path / EVENTS).open("r+b") as stream:  # NFS: LOCK_EX only on writable files
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             yield

@@ -189,8 +189,11 @@ class MotionStatus(ABC):
         self._cycles = CyclesSoFar(rig, simulated_time=simulated_time)
         self._cameras: list[dict[str, Any]] = []
         self._measured: tuple[PoseMeasurement, MeasuredClearance | None] | None = None
-        self.folder: Path | None = None
-        """Record folder, if any."""
+        self._folder: Path | None = None
+
+    def take_folder(self, folder: Path) -> None:
+        """Takes the record folder; readers of the status may run in another current folder."""
+        self._folder = folder.absolute()
 
     def take_release(self) -> None:
         """Reports a release, in which nothing moves and no cycle is reported."""
@@ -203,7 +206,7 @@ class MotionStatus(ABC):
     def as_dict(self) -> dict[str, Any]:
         """See the module docstring."""
         return {
-            **identity(self._rig, self.folder),
+            **identity(self._rig, self._folder),
             **self._cycles.as_dict(),
             **self._position_fields(),
             "cameras": self._cameras,
@@ -229,7 +232,8 @@ class RunStatus(MotionStatus):
     ) -> None:
         """A run in preparation."""
         super().__init__(prepared.rig, board, simulated_time=simulated_time)
-        self._prepared, self.folder = prepared, folder
+        self.take_folder(folder)
+        self._prepared = prepared
         self._events: deque[RunEvent] = deque(maxlen=EVENTS_SHOWN)
 
     def take_cycle(self, record: CycleRecord) -> None:

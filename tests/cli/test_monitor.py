@@ -114,7 +114,7 @@ def test_winches_that_move_without_a_path_are_shown_as_a_run_is(shown: Any) -> N
     rig = load_rig(RIG)
     report = WinchStatus(rig, LocalRequests(), simulated_time=False)
     before = report.as_dict()
-    report.folder = Path("runs/[first]")
+    report.take_folder(Path("runs/[first]"))
     assert before.keys() == status().keys()
     assert "preparing" in shown(before)
     report.take_release()

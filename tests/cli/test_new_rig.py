@@ -210,3 +210,28 @@ def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:
     assert rig.read_text() == "mine"
     assert call("new", rig, "--force", answers="\n" * 50).code == 0
     load_rig(rig)
+
+
+@pytest.mark.parametrize("force", [(), ("--force",)])
+@pytest.mark.parametrize("where", ["missing/rig.yaml", "a file/rig.yaml", "folder"])
+def test_a_file_that_cannot_be_written_is_refused_before_the_first_question(
+    tmp_path: Path, where: str, force: tuple[str, ...]
+) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "a file").touch()
+    with nothing_written(tmp_path):
+        answer = call("new", tmp_path / where, *force, answers="\n" * 50)
+    one_message(answer, 2, where)
+    assert "platform size" not in answer.err
+
+
+@pytest.mark.parametrize("force", [(), ("--force",)])
+def test_the_table_of_cables_is_never_replaced_by_the_rig(
+    tmp_path: Path, force: tuple[str, ...]
+) -> None:
+    table = cables_csv(tmp_path)
+    (tmp_path / "link.yaml").symlink_to(table)
+    for rig in (table, tmp_path / "link.yaml"):
+        with nothing_written(tmp_path):
+            answer = call("new", rig, "--from", table, *force)
+        one_message(answer, 2, "would overwrite an input")

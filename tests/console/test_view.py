@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,7 +30,9 @@ from executor.drives import DriveStatus
 from executor.interlock.reference import ReferenceStatus
 from executor.recording.run_folder import RunFolder
 from executor.remote import status
+from executor.remote.status import MotionStatus, RunStatus, WinchStatus
 from executor.service import StatusResult
+from executor.supervision import LocalRequests
 from model.clearance import ClearanceModel
 from model.errors import HardwareMissing, Refused
 from model.kinematics import cable_lengths
@@ -88,6 +92,30 @@ def test_a_run_that_is_under_way_is_seen_in_its_own_scene(tmp_path: Path) -> Non
         view.take({**status_at(THE_RIG.home), "folder": str(folder.path)})
     assert [one.name for one in view.scene.obstacles] == [o.name for o in plan.scene.obstacles]
     assert view.scene.obstacles != SCENE.obstacles
+
+
+def run_status(folder: Path) -> MotionStatus:
+    prepared: Any = SimpleNamespace(rig=THE_RIG, length=1.0, checked=SimpleNamespace(table=()))
+    return RunStatus(prepared, folder, LocalRequests(), simulated_time=True)
+
+
+def winch_status(folder: Path) -> MotionStatus:
+    status = WinchStatus(THE_RIG, LocalRequests(), simulated_time=True)
+    status.take_folder(folder)
+    return status
+
+
+@pytest.mark.parametrize("made", [run_status, winch_status])
+def test_the_folder_of_a_motion_is_the_same_for_viewers_in_other_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: Callable[[Path], MotionStatus]
+) -> None:
+    """One relative to theirs may hold another run, with other obstacles."""
+    for name in ("running", "viewing"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / "running")
+    status = made(Path("runs/first"))
+    monkeypatch.chdir(tmp_path / "viewing")
+    assert Path(status.as_dict()["folder"]).absolute() == tmp_path / "running/runs/first"
 
 
 class AtOnce(ThreadPoolExecutor):

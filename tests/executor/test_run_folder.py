@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import csv
+import errno
+import fcntl
 import json
 import math
 import os
+from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -192,6 +196,34 @@ def test_a_image_comes_back_as_jpeg(tmp_path: Path) -> None:
     assert folder.picture(name)[:2] == b"\xff\xd8"
     with pytest.raises(BadInput, match="picture"):
         folder.picture("pictures/frame_000008.jpg")
+
+
+def nfs_flock(flock: Callable[[int, int], None], file: IO[bytes] | int, operation: int) -> None:
+    """`flock` as NFS emulates it by byte-range locks, which ask for the file's access mode.
+
+    Source: flock(2), NFS details: an exclusive lock requires a file open for writing, a shared one
+    a file open for reading; otherwise EBADF.
+    """
+    handle = file if isinstance(file, int) else file.fileno()
+    access = fcntl.fcntl(handle, fcntl.F_GETFL) & os.O_ACCMODE
+    if access == (os.O_RDONLY if operation & fcntl.LOCK_EX else os.O_WRONLY):
+        raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+    flock(handle, operation)
+
+
+@pytest.mark.parametrize("system", ["local", "nfs"])
+def test_a_run_is_marked_as_active_on_every_file_system_with_locks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system: str
+) -> None:
+    if system == "nfs":
+        monkeypatch.setattr(fcntl, "flock", partial(nfs_flock, fcntl.flock))
+    folder = RunFolder.create(tmp_path / "run")
+    folder.append_event(RunEvent(0.0, "armed", "all drives"))
+    with folder.held():
+        assert folder.is_active()
+        assert RunFolder(folder.path).is_active()
+    assert not folder.is_active()
+    assert [event.code for event in folder.events()] == ["armed"]
 
 
 def test_a_discarded_folder_is_gone(tmp_path: Path) -> None:
