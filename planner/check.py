@@ -49,6 +49,8 @@ AXIS_RADII = 4.0
 """Smallest distance of an anchor from its pulley's swivel axis, in pulley radii."""
 NEAR_AXIS = "is too close to its pulley's axis to bound its motion"
 """Violation of that distance, after the cable's name."""
+SLOWER = "reduce motion.speed_mm_s, or correct winches[].max_speed_mm_s, in the rig file"
+"""What to do about winches that are slower than a path needs at the rig's path speed."""
 CLEARANCE_TOLERANCE = 0.1e-3
 """Tolerance of the smallest clearances, [m]."""
 SELF_CLEARANCE_SHARE = 0.01
@@ -72,10 +74,11 @@ def verify(plan: Plan, rig: Rig | None = None) -> VerifiedPlan:
     """
     report = check_path(rig or plan.rig, plan.scene, plan.waypoints, plan.stops)
     if not report.passed:
+        too_fast = all(violation.unit == "mm/s" for violation in report.violations)
         raise PlanRejected(
             report,
             where=f"plan for {plan.rig.name} in {plan.scene.name}",
-            next_step="plan again with `cdpr plan`; nothing has moved",
+            next_step=f"{SLOWER if too_fast else 'plan again with `cdpr plan`'}; nothing has moved",
         )
     return verified(plan, report)
 

@@ -13,7 +13,7 @@ from model.kinematics import axis_distances
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Leg, Scene, legs_of
-from planner.check import NEAR_AXIS, least_axis_distance
+from planner.check import NEAR_AXIS, SLOWER, least_axis_distance
 from planner.check_report import CheckReport
 from planner.costs import capacity_margins
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
@@ -91,7 +91,7 @@ def require_limits_not_searched(rig: Rig, report: CheckReport) -> None:
             report.violations[0].sentence(),
             where=f"rig {rig.name}",
             why="the platform moves along every path at motion.speed_mm_s",
-            next_step="reduce motion.speed_mm_s, or correct winches[].max_speed_mm_s",
+            next_step=SLOWER,
         )
 
 
