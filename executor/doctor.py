@@ -381,5 +381,6 @@ def stopping_text(rig: Rig) -> str:
     lost = lost_master(rig)
     return (
         f"without the master, drives stop by {lost.noticed_by} after {lost.notice * 1000:.0f} ms:"
-        f" up to {lost.distance * 1000:.1f} mm at {rig.motion.speed * 1000:g} mm/s"
+        f" up to {lost.distance * 1000:.1f} mm at {rig.motion.speed * 1000:g} mm/s,"
+        f" {lost.distance_turning * 1000:.1f} mm where the platform rotates"
     )

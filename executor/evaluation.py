@@ -47,7 +47,7 @@ from executor.trajectory.setpoints import PreparedRun
 from model.clearance import ClearanceModel
 from model.errors import BadInput, CdprError, Fault
 from model.plan import Plan
-from model.pose import Array, Pose
+from model.pose import Array, Pose, interpolate
 from model.rig import Rig
 from model.scene import Scene
 from model.winches import WinchMap
@@ -374,10 +374,15 @@ def _pose_table(samples: Sequence[CameraSample], cycles: CycleTable) -> PoseTabl
 
 
 def _planned(samples: Sequence[CameraSample], cycles: CycleTable) -> list[Pose]:
-    """Planned poses at the time of each image."""
+    """Planned poses at the time of each image, between those of two cycles."""
     times = np.array([sample.found.time for sample in samples])
-    nearest = np.clip(np.searchsorted(cycles.time, times), 0, len(cycles) - 1)
-    return _poses(_planned_positions(samples, cycles), cycles.planned_rotation[nearest])
+    rows = np.interp(times, cycles.time, np.arange(len(cycles)))
+    before = rows.astype(np.int64)
+    starts, ends = (
+        _poses(cycles.planned[row], cycles.planned_rotation[row])
+        for row in (before, np.minimum(before + 1, len(cycles) - 1))
+    )
+    return list(map(interpolate, starts, ends, rows - before))
 
 
 def _planned_positions(samples: Sequence[CameraSample], cycles: CycleTable) -> Array:

@@ -255,7 +255,8 @@ def _stated_pose(rig: Rig, pose: Pose | None) -> Pose:
         raise BadInput(
             "the pose is outside the workspace",
             where="`pose=`",
-            next_step="give the position of the platform's origin in the world frame, in mm",
+            next_step="give the position of the platform's origin in the world frame, inside the"
+            " workspace box of the rig file",
         )
     return pose
 

@@ -296,3 +296,19 @@ def _residual(rig: Rig, pose: Pose, lengths: Array) -> Array | None:
         return cable_lengths(rig, pose) - lengths
     except NoCable:  # the trial pose puts an anchor inside a pulley
         return None
+
+
+def axis_distances(rig: Rig, anchors: Array) -> Array:
+    """Distances of anchors from the swivel axes of their pulleys.
+
+    Args:
+        rig: The robot.
+        anchors: World frame, shape (..., m, 3), [m].
+
+    Returns:
+        Shape (..., m), [m].
+    """
+    offset = anchors - rig.outlets
+    along = np.sum(offset * rig.feed_directions, axis=-1, keepdims=True)
+    distances: Array = np.linalg.norm(offset - along * rig.feed_directions, axis=-1)
+    return distances

@@ -231,6 +231,12 @@ class Rig(ReadOnly):
         signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
         return read_only(signs * self.half_size)
 
+    @cached_property
+    def reach(self) -> float:
+        """Distance of the farthest corner or anchor from the platform's origin, [m]."""
+        points = np.concatenate([self.platform_corners, self.anchors])
+        return float(np.linalg.norm(points, axis=1).max())
+
     def at(self, pose: Pose, load: Load | None = None) -> PosedRig:
         """Cable lengths, structure matrix, tensions and margins at ``world_from_platform``.
 

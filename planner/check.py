@@ -23,7 +23,7 @@ import numpy as np
 
 from model.clearance import ClearanceModel, Nearest
 from model.errors import BadInput
-from model.kinematics import cables_at, structure_matrix
+from model.kinematics import axis_distances, cables_at, structure_matrix
 from model.plan import Plan
 from model.pose import Array, Pose, interpolate, largest_rotations
 from model.rig import Rig
@@ -47,6 +47,10 @@ from planner.path import PosePath
 SPACING = 0.005
 AXIS_RADII = 4.0
 """Smallest distance of an anchor from its pulley's swivel axis, in pulley radii."""
+NEAR_AXIS = "is too close to its pulley's axis to bound its motion"
+"""Violation of that distance, after the cable's name."""
+SLOWER = "reduce motion.speed_mm_s, or correct winches[].max_speed_mm_s, in the rig file"
+"""What to do about winches that are slower than a path needs at the rig's path speed."""
 CLEARANCE_TOLERANCE = 0.1e-3
 """Tolerance of the smallest clearances, [m]."""
 SELF_CLEARANCE_SHARE = 0.01
@@ -70,10 +74,11 @@ def verify(plan: Plan, rig: Rig | None = None) -> VerifiedPlan:
     """
     report = check_path(rig or plan.rig, plan.scene, plan.waypoints, plan.stops)
     if not report.passed:
+        too_fast = all(violation.unit == "mm/s" for violation in report.violations)
         raise PlanRejected(
             report,
             where=f"plan for {plan.rig.name} in {plan.scene.name}",
-            next_step="plan again with `cdpr plan`; nothing has moved",
+            next_step=f"{SLOWER if too_fast else 'plan again with `cdpr plan`'}; nothing has moved",
         )
     return verified(plan, report)
 
@@ -246,17 +251,15 @@ class _Check:
         An anchor's motion dB moves its exit by at most 2 r dB / ρ about the axis and r dB / l along
         the pulley, with ρ the anchor's distance from the axis and l the free length, then > 2.8 r.
         """
-        radius = self.rig.pulley_radius
-        if radius == 0.0:
+        least = least_axis_distance(self.rig)
+        if least == 0.0:
             return
         for sample in self.samples.tolist():
             pose = self._pose(sample)
-            reach = axis_distances(self.rig, pose)
+            reach = axis_distances(self.rig, pose.apply(self.rig.anchors))
             k = int(np.argmin(reach))
-            least = AXIS_RADII * radius + SPACING  # it may come nearer between samples
             if not reach[k] >= least:
-                what = f"cable {k + 1} is too close to its pulley's axis to bound its motion"
-                self._violation(what, reach[k], least, "mm", pose.position)
+                self._violation(f"cable {k + 1} {NEAR_AXIS}", reach[k], least, "mm", pose.position)
                 return
 
     def _obstacle_clearance(self) -> tuple[Closest | None, Smallest | None]:
@@ -436,9 +439,7 @@ class _Check:
         self.violations.append(Violation(what, *figures, unit, position, proved))
 
 
-def axis_distances(rig: Rig, pose: Pose) -> Array:
-    """Distances of the anchors from the swivel axes of their pulleys, shape (m,), [m]."""
-    offset = pose.apply(rig.anchors) - rig.outlets
-    along = np.sum(offset * rig.feed_directions, axis=-1, keepdims=True)
-    distances: Array = np.linalg.norm(offset - along * rig.feed_directions, axis=-1)
-    return distances
+def least_axis_distance(rig: Rig) -> float:
+    """Smallest distance of an anchor from its pulley's swivel axis, [m]; 0 without pulleys."""
+    # An anchor may come nearer between samples.
+    return AXIS_RADII * rig.pulley_radius + SPACING if rig.pulley_radius > 0.0 else 0.0

@@ -202,7 +202,7 @@ class CheckReport:
             "self_clearance": self.self_clearance.as_dict(),
             "proved_self_clearance_mm": _finite(self.proved_self_clearance * 1000.0),
             "required_self_clearance_mm": self.required_self_clearance * 1000.0,
-            "exactness_mm": self.exactness * 1000.0,
+            "exactness_mm": _finite(self.exactness * 1000.0),
             "min_tension_n": _finite(self.min_tension),
             "max_tension_n": _finite(self.max_tension),
             "capacity_margin_n": _finite(self.capacity_margin),

@@ -1,4 +1,4 @@
-"""Whether a path can begin and end at start, stops and goal, with the reasons where it cannot."""
+"""What rig and scene must allow for a plan: at start, stops and goal, and along the path found."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ import numpy as np
 from model.clearance import PLATFORM, ClearanceModel, Nearest, SelfModel, cable_name
 from model.errors import BadInput
 from model.files.new_rig import CABLES_MOST
+from model.kinematics import axis_distances
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Leg, Scene, legs_of
-from planner.check import AXIS_RADII, SPACING, axis_distances
+from planner.check import NEAR_AXIS, SLOWER, least_axis_distance
+from planner.check_report import CheckReport
 from planner.costs import capacity_margins
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
 SAME_ROTATION = 1e-7
 """Angle up to which two orientations are the same, [rad]: files round quaternions to nine digits.
 The path keeps the start's, and its check allows ten times this."""
+_NEAR_AXIS_WHY = "nearer than four pulley radii the motion of the cable's exit cannot be bounded"
 
 
 def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) -> None:
@@ -65,6 +68,31 @@ def require_feasible_length(scene: Scene, longest: float) -> None:
         next_step="allow a longer path with `longest=`, or leave it out",
         values={"longest_mm": longest * 1e3, "straight_mm": straight * 1e3},
     )
+
+
+def require_limits_not_searched(rig: Rig, report: CheckReport) -> None:
+    """Refuses a path for what is checked but not searched for.
+
+    Raises:
+        BadInput: An anchor comes too near its pulley's swivel axis, or all violations are of
+            winches that are slower than every path needs.
+    """
+    for violation in report.violations:
+        if violation.what.endswith(NEAR_AXIS):
+            raise BadInput(
+                violation.sentence(),
+                where=f"path found for rig {rig.name}",
+                why=f"{_NEAR_AXIS_WHY}, and the search does not avoid such poses",
+                next_step="add a stop to the scene that leads the platform around that pose, or"
+                " give waypoints to `cdpr.plan_from_waypoints`; no plan was written",
+            )
+    if all(violation.unit == "mm/s" for violation in report.violations):
+        raise BadInput(
+            report.violations[0].sentence(),
+            where=f"rig {rig.name}",
+            why="the platform moves along every path at motion.speed_mm_s",
+            next_step=SLOWER,
+        )
 
 
 def _require_few_cables(rig: Rig) -> None:
@@ -138,10 +166,8 @@ def _require_in_workspace(rig: Rig, name: str, pose: Pose) -> None:
 
 
 def _require_off_pulley_axes(rig: Rig, name: str, pose: Pose) -> None:
-    """As the check of a path requires: four pulley radii, and its distance between samples."""
-    if rig.pulley_radius == 0.0:
-        return
-    reach, needed = axis_distances(rig, pose), AXIS_RADII * rig.pulley_radius + SPACING
+    """As the check of a path requires."""
+    reach, needed = axis_distances(rig, pose.apply(rig.anchors)), least_axis_distance(rig)
     cable = int(np.argmin(reach))
     if reach[cable] >= needed:
         return
@@ -149,7 +175,7 @@ def _require_off_pulley_axes(rig: Rig, name: str, pose: Pose) -> None:
         f"at the {name} the anchor of cable {cable + 1} is {reach[cable] * 1e3:.1f} mm from the"
         f" swivel axis of its pulley, less than the required {needed * 1e3:.1f} mm",
         where=f"scene {name}",
-        why="nearer than four pulley radii the motion of the cable's exit cannot be bounded",
+        why=_NEAR_AXIS_WHY,
         next_step=f"move the {name}, or the outlet in the rig file",
         values={"cable": cable + 1, "distance_mm": float(reach[cable]) * 1e3},
     )

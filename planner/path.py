@@ -134,10 +134,7 @@ class PosePath:
         if not poses:
             raise BadInput("a path without poses cannot be checked")
         self.poses = tuple(poses)
-        self.radius = max(
-            float(np.linalg.norm(rig.half_size)),
-            float(np.linalg.norm(rig.anchors, axis=1).max()),
-        )
+        self.radius = rig.reach
         self._positions = np.array([pose.position for pose in self.poses])
         lengths = np.linalg.norm(np.diff(self._positions, axis=0), axis=1)
         rotations = np.array([pose.rotation for pose in self.poses])

@@ -24,7 +24,11 @@ from model.scene import Leg, Scene, legs_of
 from planner.check import check_path
 from planner.check_report import CheckReport, PlanRejected
 from planner.costs import KinematicCost
-from planner.endpoints import require_feasible_length, require_usable_ends
+from planner.endpoints import (
+    require_feasible_length,
+    require_limits_not_searched,
+    require_usable_ends,
+)
 from planner.kernels.jit import planner_compilation
 from planner.path import Progress, Route
 from planner.rrt.variants import AlgorithmVariant
@@ -200,7 +204,8 @@ def make_plan(
         The plan, sealed with its hash, which has passed `planner.check.check_path`.
 
     Raises:
-        BadInput: Start, goal or a stop cannot be used, or settings do not fit the legs.
+        BadInput: Start, goal or a stop cannot be used, settings do not fit the legs, winches are
+            too slow, or the path passes too near a pulley's swivel axis.
         NoSolution: There is no path, or the search ended at its limit.
         Fault: The finished path failed its check, which is a fault of this program.
     """
@@ -219,7 +224,7 @@ def make_plan(
     poses = [space.pose(point) for point in route.path]
     report = check_path(rig, scene, poses, path.stops)
     if not report.passed:
-        _require_winch_speeds(rig, report)
+        require_limits_not_searched(rig, report)
         raise Fault(
             "the planned path failed its own check: "
             + "; ".join(v.sentence() for v in report.violations),
@@ -436,14 +441,3 @@ def _quality(report: CheckReport, raw: Array, mean_cost: float) -> dict[str, Any
         "min_tension_n": report.min_tension,
         "max_tension_n": report.max_tension,
     }
-
-
-def _require_winch_speeds(rig: Rig, report: CheckReport) -> None:
-    """Refuses a rig whose winches are slower than the path needs, which no other path mends."""
-    if all(violation.unit == "mm/s" for violation in report.violations):
-        raise BadInput(
-            report.violations[0].sentence(),
-            where=f"rig {rig.name}",
-            why="the platform moves along every path at motion.speed_mm_s",
-            next_step="reduce motion.speed_mm_s, or correct winches[].max_speed_mm_s",
-        )

@@ -128,6 +128,7 @@ def _typed(name: str, declared: Field[Any]) -> str:
 
 _ARGUMENT = re.compile(r"`([a-z_]+)=([^`]*)`")
 _UNIT = re.compile(r"_(mm|ms|n|mm_s)$")
+_THOUSANDTHS = ("_mm", "_ms", "_mm_s")
 _OTHER_NAMES = {"realtime": "fast", "start": "simulated_start", "length": "mm"}
 """Arguments of library functions, and the options named otherwise."""
 
@@ -135,22 +136,34 @@ _OTHER_NAMES = {"realtime": "fast", "start": "simulated_start", "length": "mm"}
 def name_options(error: CdprError, options: Mapping[str, str]) -> None:
     """Replaces arguments of library functions in a message, such as ```budget=```, by options.
 
+    Values of arguments, in SI, are converted to the unit of the option.
+
     Args:
         error: Modified.
         options: How the user types them, such as ``--budget-ms``, by parameter name.
     """
-    by_name = {_UNIT.sub("", name): typed for name, typed in options.items()}
+    by_name = {_UNIT.sub("", name): name for name in options}
 
     def as_typed(found: re.Match[str]) -> str:
         name, value = _UNIT.sub("", found.group(1)), found.group(2).strip("'")
         for known in (name, name.removesuffix("s"), _OTHER_NAMES.get(name)):
             if known in by_name:
-                shown = "" if value in ("True", "False") else value
-                return f"{by_name[known]} {shown}".rstrip()
+                option = by_name[known]
+                return f"{options[option]} {_in_unit(value, option)}".rstrip()
         return found.group()
 
     for part in ("what", "where", "why", "next_step"):
         setattr(error, part, _ARGUMENT.sub(as_typed, getattr(error, part)))
+
+
+def _in_unit(value: str, option: str) -> str:
+    """A value in SI as an option takes it; nothing for a flag."""
+    if value in ("True", "False"):
+        return ""
+    try:
+        return f"{float(value) * (1000.0 if option.endswith(_THOUSANDTHS) else 1.0):g}"
+    except ValueError:
+        return value
 
 
 def given_options(group: Any) -> dict[str, object]:

@@ -104,7 +104,8 @@ class JogLine:
         scene = self._scene.changed(start=self._at(begin), goal=self._at(begin + length), stops=())
         table = build_table(self._rig, scene, [(path, law)], self._cycle)
         checked = check_table(self._rig, scene, table)
-        require_stopping_room(self._rig, checked.report.proved_obstacle_clearance)
+        proved = checked.report.proved_obstacle_clearance
+        require_stopping_room(self._rig, proved, turns=table.turns)
         return checked
 
     def _path(self, begin: float, length: float) -> Path:

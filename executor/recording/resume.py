@@ -203,16 +203,18 @@ def _require_room(scene: Scene, rig: Rig) -> None:
     """
     model = ClearanceModel(rig, scene)
     near, own = model.smallest(scene.start), model.self_clearance(scene.start)
-    pairs = [(own, scene.self_clearance, "set clearance.self_mm in the scene to")]
+    pairs = [(own, scene.self_clearance, "set clearance.self_mm in the scene to {0:g}")]
     if near is not None:
-        pairs.insert(0, (near, scene.obstacle_clearance, "pass `clearance=`"))
+        ask = "pass `clearance={1:g}`"  # in metres, as all arguments
+        pairs.insert(0, (near, scene.obstacle_clearance, ask))
     for nearest, asked, ask in pairs:
         if nearest.distance >= asked + CLEARANCE_RESERVE:
             continue
         possible = math.floor((nearest.distance - CLEARANCE_RESERVE) * 1e5) / 100.0
         step = "move the platform away by hand and plan from its new pose with `start=`"
         if possible > 0.0:
-            step = f"{ask} {possible:g}, which then holds for the whole new plan; or {step}"
+            ask = ask.format(possible, possible / 1000.0)
+            step = f"{ask}, which then holds for the whole new plan; or {step}"
         raise BadInput(
             f"the platform stopped with {nearest.first} {nearest.distance * 1e3:.3f} mm from"
             f" {nearest.second}; a plan with a clearance of {asked * 1e3:g} mm and"

@@ -103,11 +103,11 @@ class RunFolder:
         Raises:
             BadInput: The path exists, or its parent is not a folder or is read-only.
         """
-        if path.exists() or path.is_symlink():
+        if os.path.lexists(path):
             why = "a run never writes into another run's folder"
             then = "choose another folder or remove this one"
             raise BadInput("exists already", where=str(path), why=why, next_step=then)
-        above = next(folder for folder in path.absolute().parents if folder.exists())
+        above = next(folder for folder in path.absolute().parents if os.path.exists(folder))
         if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
             raise _not_made(path, f"{above} is not a writable folder")
 
@@ -118,8 +118,8 @@ class RunFolder:
         Raises:
             BadInput: There is no such folder, or files of the run are missing or were changed.
         """
-        if not path.is_dir():
-            then = "give the folder that `cdpr run -o` created"
+        if not (os.path.isdir(path) and os.access(path, os.R_OK | os.X_OK)):
+            then = "give a folder that `cdpr run -o` created and that you may read"
             raise BadInput("no such run folder", where=str(path), next_step=then)
         require_unchanged(path)
         if missing := cls(path)._missing(NEEDED):
@@ -143,7 +143,7 @@ class RunFolder:
         return folder
 
     def _missing(self, names: Sequence[str]) -> list[str]:
-        return [name for name in names if not (self.path / name).is_file()]
+        return [name for name in names if not os.path.isfile(self.path / name)]
 
     def _lost(self) -> list[str]:
         """Missing files of a run that ended, which no other file can replace."""

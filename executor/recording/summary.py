@@ -15,6 +15,10 @@ obstacles, ``tension_n`` {``min``, ``max``, ``planned_min``, ``planned_max``, ``
 ``upper_limit``}, ``lateness_ms`` {``p50``, ``p99``, ``max``} or null in simulated time,
 ``final_state`` (``not_ended`` if the program was killed), ``events`` [{``time_s``, ``code``,
 ``text``}], ``versions``. An unknown number is null.
+
+``path_length_mm`` of the plan, with its corners, and ``travelled_mm`` of the run are lengths along
+the path: rotation counts as `executor.trajectory.path` says. A plan's own ``length_mm`` is the
+distance travelled by the platform's origin.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ import platform
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,9 +39,11 @@ from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunEvent
 from executor.recording.tables import CycleTable, PoseTable
 from executor.recording.verdict import judge
+from executor.trajectory.path import line
 from model.plan import Plan
 from model.pose import Array
 from model.rig import Rig
+from model.statics.wrench_sets import rms_anchor_radius
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +144,7 @@ def summarize(
         "lost_replies": int(cycles.missing.sum()),
         "rejected_frames": int(cycles.rejected.max(initial=0)),
         "error_frames": int(cycles.error_frames.max(initial=0)),
-        "path_length_mm": context.plan.document.quality.length_mm,
+        "path_length_mm": _path_length(context.plan, context.rig) * 1e3,
         "travelled_mm": _last(cycles.travelled * 1e3),
         "stops": [
             {"name": stop.name, "kind": stop.kind, **_times_at(cycles, number, stop.name)}
@@ -157,6 +164,12 @@ def summarize(
         "events": [asdict(event) for event in context.events],
         "versions": dict(context.versions),
     }
+
+
+def _path_length(plan: Plan, rig: Rig) -> float:
+    """Length of a plan, rotation counted as along the path, [m]."""
+    weight = rms_anchor_radius(rig.anchors)
+    return sum(line(start, end, weight).length for start, end in pairwise(plan.waypoints))
 
 
 def _times_at(cycles: CycleTable, number: int, name: str) -> dict[str, float | None]:

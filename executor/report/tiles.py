@@ -207,7 +207,10 @@ def _plan(run: RunData) -> list[tuple[str, str]]:
         ("Obstacles", ", ".join(o.name for o in scene.obstacles) or "none"),
         ("Required clearance", f"{scene.obstacle_clearance * 1e3:g} mm"),
         ("Required self clearance", f"{scene.self_clearance * 1e3:g} mm"),
-        ("Length", f"{quality.length_mm:.1f} mm (before smoothing {quality.raw_length_mm:.1f} mm)"),
+        (
+            "Length without rotation" if scene.rotation_limits else "Length",
+            f"{quality.length_mm:.1f} mm (before smoothing {quality.raw_length_mm:.1f} mm)",
+        ),
         ("Corners", str(len(document.waypoints))),
     ]
     if quality.obstacle_clearance is not None:

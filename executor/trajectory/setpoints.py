@@ -133,6 +133,11 @@ class Trajectory:
         return rounded
 
     @property
+    def turns(self) -> bool:
+        """Whether the platform rotates, beyond rounding errors."""
+        return bool(np.abs(self.rotations - self.rotations[0]).max() > 1e-9)
+
+    @property
     def hash(self) -> str:
         """SHA-256 over the set-points and their cycle, recomputed on each call."""
         return fingerprint(self.cycle, self.setpoints)
@@ -411,7 +416,7 @@ def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:
     cycle = rig.cycle
     table = build_table(rig, plan.scene, legs, cycle)
     checked = check_table(rig, plan.scene, table)
-    require_stopping_room(rig, checked.report.proved_obstacle_clearance)
+    require_stopping_room(rig, checked.report.proved_obstacle_clearance, turns=table.turns)
     return PreparedRun(verified, rig, checked)
 
 

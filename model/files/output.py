@@ -22,13 +22,14 @@ def require_new_file(path: Path, replace: bool = False) -> None:
     Raises:
         BadInput: The file exists, or its folder does not or is read-only.
     """
-    if path.is_dir():
+    if os.path.isdir(path):
         raise BadInput("this is a folder", where=str(path), next_step="name a file")
-    if path.exists() and not replace:
+    if os.path.exists(path) and not replace:
         raise AlreadyExists("the file exists already", str(path))
     folder, what = path.parent, "the file cannot be written"
-    if not folder.is_dir():
-        why = f"{folder} is not a folder" if folder.exists() else f"there is no folder {folder}"
+    if not os.path.isdir(folder):
+        is_there = os.path.exists(folder)
+        why = f"{folder} is not a folder" if is_there else f"there is no folder {folder}"
         raise BadInput(
             what, where=str(path), why=why, next_step="create the folder, or choose another file"
         )

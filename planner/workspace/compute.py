@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput
+from model.kinematics import axis_distances
 from model.pages.page import html_table
 from model.pose import Array
 from model.progress import SILENT, Listener
 from model.rig import Rig
+from planner.check import least_axis_distance
 from planner.kernels.jit import planner_compilation
 from planner.parallel import Count, worker_pool
 from planner.workspace.grid import Grid, frame_box, slice_through
@@ -27,6 +29,7 @@ VERDICTS = (
     "not wrench feasible",
     "self clearance too small",
     "obstacle clearance too small",
+    "too close to a pulley's axis",
 )
 Progress = Callable[[int], None]
 
@@ -88,11 +91,20 @@ class Maps:
         As for a plan, wrench closure is not required: suspended robots have none.
         """
         scene = self.question.scene
-        own = scene.self_clearance if scene else 0.0
-        tests = [self.feasible, self.values["self_clearance"] >= own]
-        if OBSTACLE_CLEARANCE in self.values:
-            tests.append(self.collision_free)
+        own = self.values["self_clearance"] >= (scene.self_clearance if scene else 0.0)
+        tests = [self.feasible, own, self.collision_free, self._off_pulley_axes()]
         return np.asarray(np.select([~test for test in tests], range(1, len(tests) + 1), 0))
+
+    def _off_pulley_axes(self) -> NDArray[np.bool_]:
+        """Where every anchor is as far from its pulley's swivel axis as a check requires."""
+        rig, grid = self.question.rig, self.grid
+        least = least_axis_distance(rig)
+        if least == 0.0:
+            return np.ones(grid.shape, dtype=np.bool_)
+        arms = rig.anchors @ self.question.rotation.T
+        parts = [grid.points(k, min(k + POINTS_IN_A_PART, grid.count)) for k in _starts(grid)]
+        reach = [axis_distances(rig, arms + part[:, None, :]).min(axis=1) for part in parts]
+        return np.asarray(np.concatenate(reach).reshape(grid.shape) >= least)
 
 
 def compute(

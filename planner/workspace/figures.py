@@ -36,7 +36,7 @@ FEASIBLE = "#2f7fb5"
 FREE = "#c98500"
 FRAME = "#c0392b"
 LIMIT = "#d0004f"
-VERDICT_COLOURS = ("#dcefe3", "#2f7fb5", "#e08a3c", "#c1465a")
+VERDICT_COLOURS = ("#dcefe3", "#2f7fb5", "#e08a3c", "#c1465a", "#7a5195")
 """In the order of `planner.workspace.compute.VERDICTS`."""
 MUTED = "#5c6675"
 DOTS_PER_INCH = 150

@@ -75,7 +75,7 @@ def slice_through(axis: int, value: float, lower: Array, upper: Array, step: flo
         raise BadInput(
             f"the slice {letter}={value * 1e3:g} is outside the region"
             f" ({letter} from {low:g} to {high:g} mm)",
-            next_step=f"choose a value between {low:g} and {high:g}",
+            next_step=f"choose a value between {low:g} and {high:g} mm, in Python in metres",
         )
     sides = [_axis(low, high, step) for low, high in zip(lower, upper, strict=True)]
     sides[axis] = read_only([value])

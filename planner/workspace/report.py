@@ -171,14 +171,13 @@ def csv_of(maps: Maps) -> str:
 
 def summary_of(maps: Maps) -> dict[str, Any]:
     """Extent of the grid, share of points that are allowed, and the range of every quantity."""
+    verdict = maps.verdict
     return {
         "points": maps.grid.count,
         "lower_mm": [round(float(a[0]) * 1e3, 6) for a in maps.grid.axes],
         "upper_mm": [round(float(a[-1]) * 1e3, 6) for a in maps.grid.axes],
         "share": {name: float(np.mean(answer)) for name, answer in _answers(maps).items()},
-        "verdict": {
-            text: float(np.mean(maps.verdict == k)) for k, text in enumerate(VERDICTS)
-        },
+        "verdict": {text: float(np.mean(verdict == k)) for k, text in enumerate(VERDICTS)},
         "range": {
             quantity.column: _range(maps.values[quantity.name] * quantity.scale)
             for quantity in shown_in(maps)

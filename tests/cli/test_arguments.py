@@ -144,10 +144,15 @@ def test_the_option_is_named_as_it_was_typed(
         ("`start=`: add `tags`", "--start-mm: add `tags`"),
         ("`tension=` is unknown to this verb", "`tension=` is unknown to this verb"),
         ("write front=0", "write front=0"),
+        ("pass `clearance=0.00987`", "pass --clearance-mm 9.87"),
+        ("pass `budget=0.5`", "pass --budget-ms 500"),
+        ("pass `rounds=60`", "pass --rounds 60"),
+        ("lower `tension_limit=12.5`", "lower --tension-limit-n 12.5"),
     ],
 )
 def test_arguments_of_the_library_are_shown_as_options(text: str, shown: str) -> None:
     names = ("budget_ms", "rounds", "weight", "planner", "free_rotation", "fast", "start_mm")
+    names += ("clearance_mm", "tension_limit_n")
     error = BadInput(text, where=text, why=text, next_step=text)
     options = {name: f"--{name.replace('_', '-')}" for name in names}
     arguments.name_options(error, options)

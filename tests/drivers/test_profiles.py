@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 
 from drivers.can_bus import BusSettings, open_bus
@@ -604,10 +605,33 @@ def test_without_sync_monitoring_the_platform_goes_further(
     assert lost_master(theirs).noticed_by == noticed_by
     distance = lost_master(theirs).distance
     assert distance == pytest.approx(millimetres / 1000.0)
-    require_stopping_room(theirs, distance)
-    require_stopping_room(theirs, math.inf)
-    with pytest.raises(Refused, match="without its master"):
-        require_stopping_room(theirs, 0.99 * distance)
+    for turns, room in ((False, distance), (True, lost_master(theirs).distance_turning)):
+        require_stopping_room(theirs, room, turns=turns)
+        require_stopping_room(theirs, math.inf, turns=turns)
+        for clearance in (0.99 * room, math.nan):
+            with pytest.raises(Refused, match="without its master"):
+                require_stopping_room(theirs, clearance, turns=turns)
+
+
+@pytest.mark.parametrize("name", ["rig", "pulley_rig"])
+def test_no_point_of_the_platform_travels_farther_than_the_stopping_distance(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    """Oracle: random twists at the speed along the path, of all corners and anchors."""
+    rig: Rig = request.getfixturevalue(name)
+    lost, rng = lost_master(rig), np.random.default_rng(5)
+    time = lost.distance / rig.motion.speed
+    weight = np.sqrt(np.mean(np.sum(rig.anchors**2, axis=1)))
+    points = np.concatenate([rig.platform_corners, rig.anchors])
+    travels = []
+    for _ in range(2000):
+        direction = rng.normal(size=6)
+        direction *= rig.motion.speed / np.linalg.norm(direction)
+        velocity, rotation = direction[:3], direction[3:] / weight
+        speeds = np.linalg.norm(velocity + np.cross(rotation, points), axis=1)
+        travels.append(time * speeds.max())
+    assert lost.distance < max(travels) <= lost.distance_turning
+    assert max(travels) > 0.9 * lost.distance_turning, "the bound is tight"
 
 
 def test_impatient_drives_are_said_to_stop_sooner(rig: Rig, tmp_path: Path) -> None:

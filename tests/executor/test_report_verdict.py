@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from executor.evaluation import _context_of
+from executor.evaluation import _context_of, _planned
 from executor.recording.clearance import ClearanceTable, no_clearance
 from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunEvent
@@ -17,7 +18,10 @@ from executor.recording.summary import _clearance, summarize
 from executor.recording.tables import CycleTable, no_poses
 from executor.recording.verdict import distances, following, replies, tensions
 from executor.report.tiles import chips
+from executor.trajectory.path import rounded
 from model.files.scene_file import StopDocument
+from model.pose import Pose, matrix_from_rotation_vector
+from model.statics.wrench_sets import rms_anchor_radius
 from tests.executor import fake_run
 
 
@@ -414,3 +418,40 @@ def test_the_smallest_clearance_is_the_encoders_where_no_camera_looked(
     assert found["source"] == source
     if source == "encoder":
         assert found["measured_min"] == pytest.approx(table.of("encoder").distance.min() * 1e3)
+
+
+def test_planned_and_travelled_length_of_a_turning_path_are_of_one_measure(
+    run: fake_run.FakeRun,
+) -> None:
+    plan, weight = run.context.plan, rms_anchor_radius(run.context.rig.anchors)
+    assert run.summary["path_length_mm"] == pytest.approx(plan.document.quality.length_mm)
+    turns = np.linspace(0.0, 0.3, len(plan.waypoints))[:, None] * [0.0, 0.6, 0.8]
+    poses = [
+        Pose(pose.position, matrix_from_rotation_vector(turn))
+        for pose, turn in zip(plan.waypoints, turns, strict=True)
+    ]
+    driven = rounded(poses, 0.0, weight, lambda _: True)
+    turning = summary(run, plan=replace(plan, waypoints=tuple(poses)))
+    assert turning["path_length_mm"] == pytest.approx(driven.length * 1e3)
+
+
+def test_the_planned_pose_at_an_image_is_between_those_of_two_cycles(
+    run: fake_run.FakeRun,
+) -> None:
+    """At a steady rotation and speed, each is known in closed form; also beyond both ends."""
+    times, speed, rate = run.cycles.time, np.array([0.02, 0.0, -0.01]), np.array([0.0, 0.03, 0.04])
+
+    def at(time: float) -> Pose:
+        return Pose(time * speed, matrix_from_rotation_vector(time * rate))
+
+    cycles = replace(
+        run.cycles,
+        planned=times[:, None] * speed,
+        planned_rotation=np.array([at(time).quaternion for time in times]),
+    )
+    wanted = [times[0] - 1.0, times[0], *(times[:5] + 0.7 * (times[1] - times[0])), times[-1] + 1.0]
+    samples = [SimpleNamespace(found=SimpleNamespace(time=time)) for time in wanted]
+    for time, pose in zip(wanted, _planned(samples, cycles), strict=True):  # type: ignore[arg-type]
+        expected = at(min(max(time, times[0]), times[-1]))
+        assert pose.distance_to(expected) < 1e-9
+        assert np.abs(pose.rotation - expected.rotation).max() < 1e-9

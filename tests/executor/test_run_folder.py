@@ -9,6 +9,7 @@ import json
 import math
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -33,6 +34,7 @@ from executor.recording.tables import (
 )
 from executor.run_result import RunResult
 from model.errors import BadInput
+from model.files.output import require_new_file
 from tests.executor import fake_run
 from tracking.pose_log import POSE_COLUMNS
 
@@ -124,6 +126,32 @@ def test_nothing_half_made_is_left_when_the_disk_is_full(
 def test_a_missing_folder_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="no such run folder"):
         RunFolder.open(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "locked/run"])
+def test_a_path_that_cannot_be_examined_is_bad_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """As with a name that is too long, or a folder of another user."""
+    stat, lstat = os.stat, os.lstat
+
+    def refusing(real: Callable[..., os.stat_result]) -> Callable[..., os.stat_result]:
+        def examine(path: Any, *args: Any, **options: Any) -> os.stat_result:
+            if "locked/" in str(path):
+                raise PermissionError(13, "Permission denied")
+            return real(path, *args, **options)
+
+        return examine
+
+    monkeypatch.setattr(os, "stat", refusing(stat))
+    monkeypatch.setattr(os, "lstat", refusing(lstat))
+    path = tmp_path / name
+    for opening in (RunFolder.open, RunFolder.open_cut_short):
+        with pytest.raises(BadInput, match="no such run folder"):
+            opening(path)
+    for making in (RunFolder.require_free, RunFolder.create, require_new_file):
+        with suppress(BadInput):
+            making(path)
 
 
 @pytest.mark.parametrize("name", NEEDED)

@@ -11,10 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 
 from executor.trajectory.dwell import Dwell
 from executor.trajectory.path import rounded
-from executor.trajectory.setpoints import CheckedTrajectory, Trajectory, build_table, check_table
+from executor.trajectory.setpoints import (
+    CheckedTrajectory,
+    Trajectory,
+    build_table,
+    check_table,
+    prepare_plan,
+)
 from executor.trajectory.time_scaling import time_law
 from model.errors import Refused
 from model.pose import Pose
@@ -23,6 +30,7 @@ from model.scene import Scene, load_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 from planner.check_report import CheckReport
+from planner.planning import plan_from_waypoints
 from tests.executor.routes import WEIGHT, always
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -413,3 +421,27 @@ def test_tensions_are_within_their_limits_but_for_the_accuracy_of_solving(
         tensions[4, 1] = bound
         what = _refused(name, replace(table, tensions=tensions))
         assert ("planned tensions range" in what) is wrong
+
+
+@pytest.mark.parametrize(("angle", "passes"), [(0.0, True), (1e-12, True), (0.1, False)])
+def test_room_to_stop_without_the_master_counts_the_rotation(angle: float, passes: bool) -> None:
+    """12 mm above a ball: enough for 10.5 mm of travel, less than a corner's 15.3 mm."""
+    document = load_rig(CONFIGS / "hall_10_6.yaml").as_dict()
+    document["drives"]["profile"] = "akd"
+    rig = Rig.from_dict(document)
+    start = rig.home
+    turned = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() @ start.rotation
+    aside, below = np.array([0.0, 0.02, 0.0]), rig.half_size[2] + 0.012 + 0.1
+    goal = Pose(start.position + (0.0 if angle > 1e-6 else aside), turned)
+    under = start.position - np.array([0.0, 0.0, below])
+    ball = {"name": "ball", "sphere": {"radius_mm": 100}, "position_mm": (under * 1e3).tolist()}
+    hall = load_scene(CONFIGS / "hall_pillar.yaml").as_dict()
+    hall |= {"obstacles": [ball], "clearance": {"obstacle_mm": 5, "self_mm": 15}}
+    scene = Scene.from_dict(hall).changed(start=start, goal=goal)
+    plan = plan_from_waypoints(rig, scene, [start, goal])
+    if passes:
+        prepare_plan(plan, rig)
+    else:
+        with pytest.raises(Refused, match=r"without its master .* 15[.]3 mm") as refused:
+            prepare_plan(plan, rig)
+        assert refused.value.why.endswith("mm/s along a path that rotates the platform")

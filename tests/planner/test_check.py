@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from model.clearance import ClearanceModel
 from model.errors import Refused
-from model.kinematics import structure_matrix
+from model.kinematics import axis_distances, structure_matrix
 from model.plan import plan_from_document, sealed
 from model.pose import Pose, interpolate
 from model.rig import Rig, rig_from_document
-from planner.check import _Check, axis_distances, check_path, verify
+from planner.check import _Check, check_path, verify
 from planner.check_report import VerifiedPlan, Violation
 from planner.costs import capacity_margins
 from planner.path import PosePath
@@ -249,7 +249,7 @@ def test_a_cable_near_its_pulleys_axis_is_reported_with_its_distance(gachon, sce
     below = Pose.level([x - np.sign(x) * 0.04, y, 0.3])
     report = check_path(rig, scene_with(), [below, gachon.home], ends=False)
     (violation,) = (v for v in report.violations if "pulley's axis" in v.what)
-    reach = axis_distances(rig, Pose.level(violation.position))
+    reach = axis_distances(rig, Pose.level(violation.position).apply(rig.anchors))
     cable = int(violation.what.split()[1]) - 1
     assert violation.measured == reach[cable] == reach.min()
     assert violation.limit == pytest.approx(4 * 0.013 + 0.005)

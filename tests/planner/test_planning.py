@@ -17,9 +17,11 @@ from model.plan import plan_from_document
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Rig, rig_from_document
 from model.scene import empty_scene
+from planner import planning
 from planner.check import verify
 from planner.costs import capacity_margins
 from planner.endpoints import require_usable_ends
+from planner.path import Route
 from planner.planning import make_plan, plan_from_waypoints
 from planner.settings import (
     CLEARANCE_RESERVE,
@@ -362,3 +364,18 @@ def test_plans_of_other_seeds_pass_their_check(gachon, ready_scene, number, clea
     scene = ready_scene(f"environment_{number}").changed(clearance=clearance_mm / 1000)
     document = proved(gachon, scene, PlannerSettings(seed=number + clearance_mm))
     assert document.quality.obstacle_clearance.distance_mm >= clearance_mm
+
+
+def test_a_path_near_a_pulleys_axis_is_refused_by_cable_and_pose(hall, monkeypatch) -> None:
+    """The search does not avoid the axis; its refusal is not a fault of this program."""
+    document = hall.as_dict()
+    document["outlets_mm"][4] = [0.0, 700.0, 2600.0]
+    rig = Rig.from_dict(document)
+    start, goal = (Pose.level([x, 0.45, 1.1]) for x in (0.5, -0.5))
+    scene = empty_scene(rig).changed(start=start, goal=goal)
+    line = np.array([start.position, goal.position])
+    route = Route(line, line, nodes=line, parents=np.array([-1, 0]), iterations=1, edge_checks=1)
+    found = planning.MultiSegmentPath(route, (), (1,), 0.0)
+    monkeypatch.setattr(planning, "plan_segments", lambda *_: found)
+    with pytest.raises(BadInput, match=r"^.*cable 5 .* pulley's axis.*at \[.*, 450.0, 1100.0\] mm"):
+        make_plan(rig, scene)

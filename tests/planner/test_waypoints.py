@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from model.errors import BadInput, Refused
+from model.files.documents import PoseDocument
+from model.files.scene_file import StopDocument
 from model.plan import load_plan
 from model.pose import Pose
-from model.rig import load_rig
+from model.rig import Rig, load_rig
 from model.scene import load_scene
 from planner.check import check_path, verify
 from planner.check_report import PlanRejected
@@ -103,3 +105,24 @@ def test_other_things_than_poses_stops_and_text_are_refused(arguments: dict[str,
 def test_one_waypoint_is_refused() -> None:
     with pytest.raises(BadInput, match="two waypoints"):
         plan_from_waypoints(RIG, FREE, [FREE.start])
+
+
+def test_a_plan_too_fast_for_the_winches_is_refused_with_the_speeds_to_change() -> None:
+    plan = plan_from_waypoints(RIG, FREE, [FREE.start, FREE.goal])
+    document = RIG.as_dict()
+    document["motion"] = {**document.get("motion", {}), "speed_mm_s": 5000.0}
+    with pytest.raises(PlanRejected) as rejected:
+        verify(plan, Rig.from_dict(document))
+    assert {v.unit for v in rejected.value.violations} == {"mm/s"}
+    assert "reduce motion.speed_mm_s" in (rejected.value.next_step or "")
+    assert "cdpr plan" not in (rejected.value.next_step or "")
+
+
+def test_the_report_of_a_path_with_one_leg_far_outside_has_finite_numbers_alone() -> None:
+    by = Pose.level(np.add(FREE.start.position, (0.0, 0.0, 0.01)))
+    scene = FREE.changed(stops=[StopDocument(name="by", **PoseDocument.of(by).model_dump())])
+    far = Pose.level(np.array([0.0, 0.0, 1000.0]))
+    report = check_path(RIG, scene, [FREE.start, by, far], [1])
+    assert report.obstacle_clearance is not None
+    facts = json.loads(json.dumps(report.as_dict(), allow_nan=False))
+    assert facts["exactness_mm"] is None

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
+import cdpr
 from executor.recording.resume import remaining_scene, run_end
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun, prepare
+from model.errors import BadInput
 from model.files.scene_file import Payload
 from model.kinematics import cable_lengths
 from model.plan import load_plan, plan_from_document
@@ -205,6 +207,9 @@ def test_a_clearance_that_is_not_there_is_reported_with_the_one_that_is(
     answer = call(*arguments, "300")
     one_message(answer, 2, "the platform stopped with", "block")
     possible = answer.said.split("pass --clearance-mm ")[1].split(",")[0]
+    with pytest.raises(BadInput) as refused:
+        cdpr.plan(RIG, scene_file, clearance=0.3, from_run=stopped.folder.path)
+    assert f"pass `clearance={float(possible) / 1000:g}`" in (refused.value.next_step or "")
     above = call(*arguments, str(float(possible) + 0.02))
     assert above.code == 2
     # With that clearance the plan may begin; the rest of the path is as close to the block.

@@ -59,8 +59,9 @@ def test_what_is_not_a_slice_is_refused(text):
 
 
 def test_a_slice_beside_the_region_names_the_region():
-    with pytest.raises(BadInput, match="z from 150 to 650 mm"):
+    with pytest.raises(BadInput, match="z from 150 to 650 mm") as refused:
         slice_through(2, 0.7, LOWER, UPPER, 0.01)
+    assert "150 and 650 mm, in Python in metres" in (refused.value.next_step or "")
 
 
 @pytest.mark.parametrize("step", [0.0, -0.01, np.nan, np.inf, 1e-4, 1e-300])

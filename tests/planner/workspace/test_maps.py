@@ -15,6 +15,9 @@ import pytest
 from model.clearance import ClearanceModel
 from model.kinematics import structure_matrix
 from model.pose import Pose, matrix_from_rotation_vector
+from model.rig import Rig
+from model.scene import empty_scene
+from planner.check import NEAR_AXIS, check_path
 from planner.costs import KinematicCost, capacity_margins, finite_range
 from planner.workspace import compute as computing
 from planner.workspace.compute import VERDICTS, compute
@@ -200,3 +203,23 @@ def test_work_without_a_caller_is_cancelled(gachon, extremes, monkeypatch):
     with ThreadPoolExecutor(1) as pool, pytest.raises(KeyboardInterrupt):
         compute(question, extremes, grid, pool=pool, progress=interrupt)
     assert len(evaluated) < grid.count / 8 / 2
+
+
+def test_a_pose_near_a_pulleys_axis_is_allowed_as_far_as_the_check_allows_it(hall) -> None:
+    """Each pose against a check of that pose alone; everything else is allowed here."""
+    document = hall.as_dict()
+    document["outlets_mm"][4] = [0.0, 700.0, 2600.0]
+    rig = Rig.from_dict(document)
+    question = Question.about(rig, rotation=matrix_from_rotation_vector([0.0, 0.05, 0.1]))
+    lower, upper = np.array([-0.4, 0.3, 1.1]), np.array([0.4, 0.6, 1.2])
+    grid = slice_through(2, 1.1, lower, upper, 0.05)
+    plenty = dict.fromkeys(("capacity_margin", "self_clearance"), np.ones(grid.shape))
+    verdict = computing.Maps(question, grid, plenty).verdict
+    scene = empty_scene(rig)
+    for position, found in zip(grid.points(0, grid.count), verdict.ravel(), strict=True):
+        report = check_path(rig, scene, [Pose(position, question.rotation)], ends=False)
+        near = any(v.what.endswith(NEAR_AXIS) for v in report.violations)
+        assert VERDICTS[found] == ("too close to a pulley's axis" if near else "allowed")
+    assert set(verdict.ravel()) == {0, VERDICTS.index("too close to a pulley's axis")}
+    point_exits = Question.about(Rig.from_dict({**document, "pulleys": None}))
+    assert not computing.Maps(point_exits, grid, plenty).verdict.any()
