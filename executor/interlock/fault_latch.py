@@ -61,8 +61,7 @@ class FaultLatch:
     def __init__(self, settings: BusSettings) -> None:
         """Reads nothing yet."""
         self._bus = str(settings)
-        self.path, *earlier = state_files("latched", settings)
-        self._earlier = [path for path in earlier if os.access(path.parent, os.R_OK | os.X_OK)]
+        self.path, *self._earlier = state_files("latched", settings)
         self._lock = self.path.with_suffix(".lock")
         self._held: weakref.finalize[[int], FaultLatch] | None = None
 
