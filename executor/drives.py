@@ -374,9 +374,9 @@ def faults_to_release_under(rig: Rig) -> tuple[LatchedFault | None, tuple[str, .
         Refused: A reset must clear the fault first, or winches without a brake cannot hold.
         CdprError: The drives cannot be read.
     """
-    latch = FaultLatch(BusSettings.of(rig))
+    latch = FaultLatch(BusSettings.of(rig), rig.drive_names)
     latched = latch.read()
-    if latched is None or latched.rig != rig.name:
+    if latched is None or not latch.is_of(latched, rig.name):
         latch.require_disengaged()
     latch.require_no_run()
     seen = read_snapshot(rig, rig.home, empty_scene(rig).load)

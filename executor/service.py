@@ -313,7 +313,7 @@ def reset(
     require_imported_script()
     require_other_process(rig)
     settings = BusSettings.of(rig)
-    latch = FaultLatch(settings)
+    latch = FaultLatch(settings, rig.drive_names)
     latched = latch.read()
     latch.require_no_run()
     require_confirmed(confirm, ResetProposal(str(settings), latched))
