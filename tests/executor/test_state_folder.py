@@ -222,7 +222,7 @@ def test_a_fault_is_not_reset_with_a_file_of_its_name_that_lacks_drives(
     shown, other = engaged_by(tuple(range(1, 9)), tmp_path), FaultLatch(BUS, others)
     assert not other.is_of(shown, "rig")
     with (
-        pytest.raises(Refused, match=r"(?m)drives that are not in the rig file: node .*\b8$") as caught,
+        pytest.raises(Refused, match=r"(?m)not in the rig file: node .*\b8$") as caught,
         other.held_for_reset("rig", shown),
     ):
         pytest.fail("it would be reset")
