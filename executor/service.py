@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from drivers.can_bus import BusSettings, open_bus
+from drivers.can_errors import BusFault, ForeignMaster, before_motion
 from drivers.drive_group import CycleStatus, how_to_reset
 from drivers.factory import (
     blocked_in_fault,
@@ -217,10 +218,12 @@ def status(rig: Rig) -> StatusResult:
     if in_motion:
         return known
     try:
-        with SetUpLock(settings).tried() as alone:
+        with SetUpLock(settings).tried() as alone, before_motion():
             return _read(rig, interlock, known) if alone else replace(known, being_set_up=True)
     except CdprError as error:  # the state on file is still reported
-        return replace(known, reference=known.reference.if_unread(error.what), missing=error)
+        failed = isinstance(error, BusFault) and not isinstance(error, ForeignMaster)
+        silent, unread = tuple(rig.drive_names if failed else ()), known.reference.if_unread
+        return replace(known, reference=unread(error.what), missing=error, silent=silent)
 
 
 def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusResult:
