@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from enum import IntFlag
 from typing import Any, ClassVar
 
@@ -12,7 +13,7 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 
-from model.errors import Fault, Refused
+from model.errors import Fault, HardwareMissing, Refused
 
 
 class BusFault(Fault):
@@ -90,6 +91,22 @@ class ForeignMaster(BusFault):
     code = "foreign_master"
     cause = "two masters must not command the same drives"
     remedy = "end the other program, or wait for its run to finish"
+
+
+@contextmanager
+def before_motion() -> Iterator[None]:
+    """While no drive is enabled: a failed bus counts as missing hardware, another master refuses.
+
+    Raises:
+        BusFault: Of the block, with the exit code of `HardwareMissing` or `Refused`.
+    """
+    try:
+        yield
+    except BusFault as fault:
+        kind = Refused if isinstance(fault, ForeignMaster) else HardwareMissing
+        fault.exit_code = kind.exit_code
+        fault.next_step = f"{fault.remedy}; no drive was enabled"
+        raise
 
 
 def bus_name(bus: can.BusABC) -> str:

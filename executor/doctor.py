@@ -348,10 +348,12 @@ def examine(rig: Rig) -> Examined:
         BadInput: They are not CANopen drives, or their profile is wrong.
         HardwareMissing: The bus cannot be opened.
         Refused: Another program configures the drives.
+        ForeignMaster: Another program commands them.
     """
     # Imported after the check of libraries: needs python-can and canopen.
     from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
-    from drivers.cia402.inspection import examine_drives
+    from drivers.can_errors import BusFault, ForeignMaster, before_motion
+    from drivers.cia402.inspection import Examined, examine_drives
     from executor.interlock.locks import SetUpLock
     from simulation.factory import make_rehearsal
 
@@ -371,7 +373,13 @@ def examine(rig: Rig) -> Examined:
             far_end = open_bus(settings)
             stack.callback(far_end.shutdown)
             pump = make_rehearsal(rig, far_end, rig.home).pump
-        return examine_drives(rig, bus, pump)
+        try:
+            with before_motion():
+                return examine_drives(rig, bus, pump)
+        except ForeignMaster:
+            raise
+        except BusFault as fault:
+            return Examined((), tuple(rig.drive_names), (), missing=fault)
 
 
 def stopping_text(rig: Rig) -> str:

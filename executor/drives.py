@@ -14,7 +14,7 @@ import numpy as np
 from can import BusABC
 
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
-from drivers.can_errors import TorqueLost
+from drivers.can_errors import TorqueLost, before_motion
 from drivers.drive_group import DriveSnapshot, how_to_reset
 from drivers.factory import (
     blocked_in_fault,
@@ -172,7 +172,7 @@ def _locked_bus(
 
 def read_snapshot(rig: Rig, simulated_start: Pose, load: Load) -> DriveSnapshot:
     """Reads the drives without changing them; arguments and errors as `open_drives`."""
-    with _locked_bus(rig, simulated_start, load) as drives:
+    with _locked_bus(rig, simulated_start, load) as drives, before_motion():
         return read_drives(rig, drives.bus, drives.pump)
 
 
@@ -228,6 +228,7 @@ def open_drives(
     Raises:
         BadInput: python-can has no such interface.
         HardwareMissing: The bus cannot be opened or a drive does not answer.
+        BusFault: The bus failed, or another program commands the drives; see `before_motion`.
         Refused: The bus is too slow, a drive rejects a setting, or another program configures it.
     """
     interlock, counted, max_tension = MotionInterlock(rig), rig, None
@@ -239,12 +240,14 @@ def open_drives(
 
     with _locked_bus(rig, simulated_start, load, lost_power, listener) as reached:
         if configure_as is not None:
-            snapshot = read_drives(rig, reached.bus, reached.pump, to_reset=to_reset)
+            with before_motion():
+                snapshot = read_drives(rig, reached.bus, reached.pump, to_reset=to_reset)
             counted, max_tension = configure_as(snapshot)
         group = make_drive_group(counted, reached.bus, reached.pump, max_tension=max_tension)
         try:
             try:
-                remarks = group.configure(to_reset=to_reset, on_restarted=note_restarted)
+                with before_motion():
+                    remarks = group.configure(to_reset=to_reset, on_restarted=note_restarted)
             except TorqueLost as error:
                 interlock.lost_torque(error.what)
                 raise
@@ -374,9 +377,9 @@ def faults_to_release_under(rig: Rig) -> tuple[LatchedFault | None, tuple[str, .
         Refused: A reset must clear the fault first, or winches without a brake cannot hold.
         CdprError: The drives cannot be read.
     """
-    latch = FaultLatch(BusSettings.of(rig))
+    latch = FaultLatch(BusSettings.of(rig), rig.drive_names)
     latched = latch.read()
-    if latched is None or latched.rig != rig.name:
+    if latched is None or not latch.is_of(latched, rig.name):
         latch.require_disengaged()
     latch.require_no_run()
     seen = read_snapshot(rig, rig.home, empty_scene(rig).load)

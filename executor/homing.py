@@ -36,6 +36,7 @@ from model.errors import (
     sequence_of,
     truth_value,
 )
+from model.pages.page import FactsDisplay
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
@@ -53,8 +54,8 @@ _SHARE_OF_LIMIT = 0.8
 FEWEST_IMAGES, MOST_IMAGES = 5, 1000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HomeResult:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class HomeResult(FactsDisplay):
     """Result of homing.
 
     Attributes:

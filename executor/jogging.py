@@ -15,7 +15,7 @@ from executor.control.preconditions import require_still_referenced
 from executor.control.winch_laws import CableStep
 from executor.drives import current_pose, is_simulated, read_snapshot, require_own_time
 from executor.interlock.interlock import MotionInterlock
-from executor.proposals import CableProposal, MotionProposal, require_confirmed
+from executor.proposals import CableProposal, Facts, MotionProposal, require_confirmed
 from executor.recording.record_files import free_folder
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.command_server import commands_from_start
@@ -35,6 +35,7 @@ from model.errors import (
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument
 from model.jit import KernelSet, compilation
+from model.pages.page import FactsDisplay
 from model.plan import plan_from_document
 from model.pose import Array, Pose, largest_rotations, point_of
 from model.progress import SILENT, Listener
@@ -258,8 +259,8 @@ def _require_cable(rig: Rig, cable: int, length: float) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CableJog:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class CableJog(FactsDisplay):
     """Result of a cable jog.
 
     Attributes:
@@ -271,6 +272,14 @@ class CableJog:
     cable: int
     moved: float
     tensions: Array
+
+    def facts(self) -> Facts:
+        """Human-readable travel and tensions."""
+        way = "paid out" if self.moved > 0.0 else "wound in"
+        return [
+            ("cable", f"{self.cable}, {way} by {abs(self.moved) * 1000.0:.3f} mm"),
+            ("tensions", f"{self.tensions.min():.1f} to {self.tensions.max():.1f} N"),
+        ]
 
 
 def jog_cable(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from drivers.can_bus import BusSettings, open_bus
+from drivers.can_errors import BusFault, ForeignMaster, before_motion
 from drivers.drive_group import CycleStatus, how_to_reset
 from drivers.factory import (
     blocked_in_fault,
@@ -55,14 +56,15 @@ from executor.state_machine import State
 from executor.supervision import Supervisor
 from model.errors import CdprError, truth_value
 from model.files.documents import PoseDocument
+from model.pages.page import FactsDisplay
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig
 from model.scene import empty_scene
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StatusResult:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class StatusResult(FactsDisplay):
     """Status of a rig; None for what was not read or is unknown.
 
     Attributes:
@@ -95,7 +97,7 @@ class StatusResult:
     silent: tuple[int, ...] = ()
     how_to_reset: str | None = None
 
-    def facts(self, rig_file: Path) -> Facts:
+    def facts(self, rig_file: Path = Path("RIG")) -> Facts:
         """Human-readable status, with the next step before a run.
 
         Args:
@@ -113,9 +115,12 @@ class StatusResult:
         if self.preparing:
             who = ", ".join(map(str, self.preparing))
             facts.append(("motion", f"process {who} is preparing one; `cdpr stop` cancels it"))
+        found = sorted({drive.state for drive in self.drives or ()})
+        found += [self.missing.what] if self.missing is not None else []
         if self.being_set_up:
-            unread = "not read: another program is preparing a motion or reading them"
-            facts.append(("drives", unread))
+            found = ["not read: another program is preparing a motion or reading them"]
+        if found:
+            facts.append(("drives", ", ".join(found)))
         if self.pose is not None:
             x, y, z = self.pose.position * 1000.0
             position = f"{x:z.2f}, {y:z.2f}, {z:z.2f} mm from the encoders, without a load"
@@ -157,11 +162,9 @@ class StatusResult:
 
     def as_dict(self) -> dict[str, Any]:
         """Values for `--json`, rounded, with units in the keys."""
-        pose: dict[str, Any] | None = None
+        pose = None if self.why_no_pose is None else {"why_not": self.why_no_pose}
         if self.pose is not None:
             pose = PoseDocument.of(self.pose).model_dump(mode="json")
-        elif self.why_no_pose is not None:
-            pose = {"why_not": self.why_no_pose}
         drives = [
             {
                 "node": drive.node,
@@ -215,10 +218,12 @@ def status(rig: Rig) -> StatusResult:
     if in_motion:
         return known
     try:
-        with SetUpLock(settings).tried() as alone:
+        with SetUpLock(settings).tried() as alone, before_motion():
             return _read(rig, interlock, known) if alone else replace(known, being_set_up=True)
     except CdprError as error:  # the state on file is still reported
-        return replace(known, reference=known.reference.if_unread(error.what), missing=error)
+        failed = isinstance(error, BusFault) and not isinstance(error, ForeignMaster)
+        silent, unread = tuple(rig.drive_names if failed else ()), known.reference.if_unread
+        return replace(known, reference=unread(error.what), missing=error, silent=silent)
 
 
 def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusResult:
@@ -259,8 +264,8 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
     return replace(read, pose=pose)
 
 
-@dataclass(frozen=True, slots=True)
-class ResetResult:
+@dataclass(frozen=True, slots=True, repr=False)
+class ResetResult(FactsDisplay):
     """State of a rig after a reset.
 
     Attributes:
@@ -276,6 +281,14 @@ class ResetResult:
     drives: tuple[str, ...]
     restarted: tuple[int, ...]
     reference: ReferenceStatus
+
+    def facts(self) -> Facts:
+        """Human-readable latch, drives and reference."""
+        latch = f"cleared: {self.cause}" if self.was_latched else "none was latched"
+        facts = [("latched fault", latch), ("drives", ", ".join(sorted({*self.drives})))]
+        if self.restarted:
+            facts.append(("power-cycled", f"drive {', '.join(map(str, self.restarted))}"))
+        return [*facts, ("reference", str(self.reference))]
 
 
 def reset(
@@ -303,7 +316,7 @@ def reset(
     require_imported_script()
     require_other_process(rig)
     settings = BusSettings.of(rig)
-    latch = FaultLatch(settings)
+    latch = FaultLatch(settings, rig.drive_names)
     latched = latch.read()
     latch.require_no_run()
     require_confirmed(confirm, ResetProposal(str(settings), latched))
@@ -333,8 +346,8 @@ def reset(
         )
 
 
-@dataclass(frozen=True, slots=True)
-class ReleaseResult:
+@dataclass(frozen=True, slots=True, repr=False)
+class ReleaseResult(FactsDisplay):
     """State of a rig after its drives were released.
 
     Attributes:
@@ -344,6 +357,11 @@ class ReleaseResult:
 
     drives: tuple[str, ...]
     reference: ReferenceStatus
+
+    def facts(self) -> Facts:
+        """Human-readable drives and reference."""
+        drives = ", ".join(sorted({*self.drives}))
+        return [("drives", drives), ("reference", str(self.reference))]
 
 
 def release(

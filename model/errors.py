@@ -44,7 +44,7 @@ class CdprError(Exception):
     """
 
     code: ClassVar[str] = "fault"
-    exit_code: ClassVar[int] = 1
+    exit_code: int = 1
 
     def __init__(
         self,

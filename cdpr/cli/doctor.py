@@ -12,7 +12,7 @@ from rich.table import Table
 
 from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import JSON
-from cdpr.cli.output import Terminal, out, show_json, show_line
+from cdpr.cli.output import Terminal, err, out, show_json, show_line
 from executor.doctor import MachineCheck, check_machine, check_rig, examine, stopping_text
 from model.errors import BadInput
 from model.rig import Rig, load_rig
@@ -61,7 +61,9 @@ def doctor(
     objects = examine(the_rig) if the_rig is not None and drives else None
     if as_json:
         plain = [asdict(check) for check in checks]
-        show_json(plain if objects is None else {"checks": plain, "drives": objects.as_dict()})
+        why = objects.missing.as_dict() if objects is not None and objects.missing else {}
+        read = None if objects is None else {"checks": plain, "drives": objects.as_dict(), **why}
+        show_json(plain if read is None else read)
     elif objects is not None and the_rig is not None:
         _show_table(objects, the_rig)
     if not all(check.good for check in checks) or (objects is not None and not objects.good):
@@ -104,4 +106,6 @@ def _show_table(found: Examined, rig: Rig) -> None:
         f"{len(found.rows)} objects of {len(found.nodes)} drives read, nothing written;"
         f" {wrong} to change"
     )
+    if found.missing is not None:
+        show_line(f"error: {found.missing}", err)
     show_line(stopping_text(rig))

@@ -27,7 +27,7 @@ BEFORE_MOTION = "Stopped during the preparation: nothing was moved."
 #: Verbs after which drives move, or let go.
 MOVING = frozenset({"home", "jog", "release", "run"})
 _REPORT = re.compile(r"(\S+/report\.html)")
-_HELP = re.compile(r"docs/faults/(\w+)\.md")
+_HELP = re.compile(r"details: cdpr explain (\w+)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +64,7 @@ class VerbOutcome:
         exit_code: Of the process.
         text: The end of its output.
         report: Path of the run's report, if one was written.
-        fault: Code of the fault whose help page the output names.
+        fault: Code of the first fault that the output explains.
     """
 
     verb: str
@@ -189,7 +189,7 @@ def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
         exit_code=code,
         text=_without_commands(text).strip()[-SHOWN:],
         report=Path(report[-1]) if report else None,
-        fault=fault[-1] if fault else None,
+        fault=fault[0] if fault else None,  # those that stop no run are last
     )
 
 

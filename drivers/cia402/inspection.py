@@ -108,12 +108,14 @@ class Examined:
         silent: The drives that did not answer.
         rows: One per object.
         stopped: The silent drives that are in NMT *stopped*, by their heartbeats.
+        missing: Why none could be read, where the bus failed.
     """
 
     nodes: tuple[int, ...]
     silent: tuple[int, ...]
     rows: tuple[ObjectRow, ...]
     stopped: tuple[int, ...] = ()
+    missing: CdprError | None = None
 
     @property
     def good(self) -> bool:

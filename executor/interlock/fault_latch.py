@@ -15,7 +15,7 @@ import fcntl
 import json
 import os
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -45,6 +45,7 @@ class LatchedFault:
         since: Time, ISO 8601, UTC.
         folder: Run folder.
         process: ID of the process that ran it.
+        nodes: Node IDs of the rig's drives; empty if unknown, as in files of earlier versions.
     """
 
     bus: str
@@ -53,16 +54,21 @@ class LatchedFault:
     since: str
     folder: str
     process: int
+    nodes: tuple[int, ...] = ()
 
 
 class FaultLatch:
     """Fault latch of one bus."""
 
-    def __init__(self, settings: BusSettings) -> None:
-        """Reads nothing yet."""
-        self._bus = str(settings)
-        self.path, *earlier = state_files("latched", settings)
-        self._earlier = [path for path in earlier if os.access(path.parent, os.R_OK | os.X_OK)]
+    def __init__(self, settings: BusSettings, nodes: Iterable[int] = ()) -> None:
+        """Reads nothing yet.
+
+        Args:
+            settings: Of the bus.
+            nodes: Node IDs of the rig's drives, to engage or reset it.
+        """
+        self._bus, self._nodes = str(settings), tuple(nodes)
+        self.path, *self._earlier = state_files("latched", settings)
         self._lock = self.path.with_suffix(".lock")
         self._held: weakref.finalize[[int], FaultLatch] | None = None
 
@@ -75,10 +81,12 @@ class FaultLatch:
 
     def _read(self, path: Path) -> LatchedFault:
         try:
-            return LatchedFault(**json.loads(read_state_file(path)))
+            content = json.loads(read_state_file(path))
+            nodes = tuple(map(int, content.pop("nodes", ())))
+            return LatchedFault(**content, nodes=nodes)
         except FileNotFoundError:
             raise
-        except (OSError, ValueError, TypeError, RecursionError, Refused) as error:
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError, Refused) as error:
             why = f"{error.where}: {error.what}" if isinstance(error, Refused) else error
             cause = f"the latch file cannot be read: {why}"
             return LatchedFault(self._bus, _UNKNOWN, cause, _UNKNOWN, _UNKNOWN, 0)
@@ -113,6 +121,13 @@ class FaultLatch:
         if latched is not None and self.held_by_another():
             raise self._refusal(latched)
 
+    def is_of(self, latched: LatchedFault, rig: str) -> bool:
+        """Whether a fault is of the rig of this name, and all its drives are known here."""
+        return latched.rig == rig and not self._unknown_nodes(latched)
+
+    def _unknown_nodes(self, latched: LatchedFault) -> list[int]:
+        return sorted({*latched.nodes} - {*self._nodes})
+
     @contextmanager
     def held_for_reset(self, rig: str, shown: LatchedFault | None) -> Iterator[None]:
         """Blocks runs while the block resets the drives, then disengages the latch.
@@ -124,7 +139,8 @@ class FaultLatch:
             shown: The fault that the operator confirmed.
 
         Raises:
-            Refused: Another fault is latched now, or one of another rig on this bus.
+            Refused: Another fault is latched now, or one of another rig on this bus, or with
+                drives that are not known here.
         """
         if shown is not None and shown.rig not in (rig, _UNKNOWN):
             raise Refused(
@@ -133,6 +149,15 @@ class FaultLatch:
                 why="its drives are not all known here, and would not be looked at",
                 next_step=f"run `cdpr reset` with the rig file of {shown.rig!r}; if it was"
                 " renamed, write its former name there for the reset",
+            )
+        if shown is not None and (unknown := self._unknown_nodes(shown)):
+            raise Refused(
+                f"the fault is also of drives that are not in the rig file: node"
+                f" {', '.join(map(str, unknown))}",
+                where=f"bus {self._bus}",
+                why="they would not be looked at",
+                next_step="run `cdpr reset` with the rig file it happened with; a drive that was"
+                " replaced needs its former node id for the reset",
             )
         if shown is None:
             self.engage(rig, self.path.parent, "a reset did not finish")
@@ -252,7 +277,9 @@ class FaultLatch:
 
     def _latched(self, rig: str, cause: str, folder: Path) -> LatchedFault:
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        return LatchedFault(self._bus, rig, cause, now, str(folder.resolve()), os.getpid())
+        return LatchedFault(
+            self._bus, rig, cause, now, str(folder.resolve()), os.getpid(), self._nodes
+        )
 
     def _write(self, latched: LatchedFault) -> None:
         try:

@@ -36,7 +36,8 @@ class MotionInterlock:
         self._rig = rig
         settings = BusSettings.of(rig)
         self._is_kept = settings.interface != IN_PROCESS
-        self._latch, self.file = FaultLatch(settings), ReferenceFile(settings)
+        self._latch = FaultLatch(settings, rig.drive_names)
+        self.file = ReferenceFile(settings)
         self._counted_from: HomingReference | None = None
         self._under: LatchedFault | None = None  # the fault of an earlier motion, which stays
 

@@ -56,9 +56,11 @@ def state_folders() -> tuple[Path, ...]:
 
 
 def state_files(kind: str, settings: BusSettings) -> tuple[Path, ...]:
-    """The file of a kind, such as ``latched``, for a bus; then where it was before."""
+    """The file of a kind, such as ``latched``, for a bus; then where it was before, if readable."""
     name = re.sub(r"[^A-Za-z0-9.]+", "-", settings.canonical)
-    return tuple(folder / f"{kind}-{name}.json" for folder in state_folders())
+    first, *earlier = state_folders()
+    readable = [folder for folder in earlier if os.access(folder, os.R_OK | os.X_OK)]
+    return tuple(folder / f"{kind}-{name}.json" for folder in (first, *readable))
 
 
 def state_file(kind: str, settings: BusSettings) -> Path:

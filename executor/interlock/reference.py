@@ -10,9 +10,11 @@ have one too, with the counts of the rig file.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -20,7 +22,7 @@ from pydantic import Field, ValidationError
 
 from drivers.can_bus import BusSettings
 from drivers.plausibility import HOME
-from executor.interlock.locks import read_state_file, state_file
+from executor.interlock.locks import read_state_file, state_files
 from model.errors import CdprError, Refused
 from model.files.documents import Document, PoseDocument, content_hash, document_hash, write_atomic
 from model.kinematics import cable_lengths
@@ -162,38 +164,56 @@ def released_since(
 
 
 class ReferenceFile:
-    """The reference file of one bus."""
+    """The reference file of one bus, also where it was before a folder for all users existed."""
 
     def __init__(self, settings: BusSettings) -> None:
         """Reads nothing yet."""
-        self.path = state_file("reference", settings)
+        self._paths = state_files("reference", settings)
+
+    @property
+    def path(self) -> Path:
+        """The file; where there is none, the one that would be written."""
+        return next(filter(os.path.lexists, self._paths), self._paths[0])
 
     def read(self) -> HomingReference | None:
         """The reference; None where there is none.
 
+        If there are two, a loss noted in either counts; two different ones are a loss.
+
         Raises:
-            Refused: The file cannot be read, so that its content is unknown.
+            Refused: A file cannot be read, so that its content is unknown.
         """
+        found = [one for one in map(self._read, self._paths) if one is not None]
+        if not found:
+            return None
+        first = next((one for one in found if one.lost), found[0])
+        if not first.lost and any(_origin(one) != _origin(first) for one in found):
+            differ = f"it differs between {' and '.join(map(str, self._paths))}"
+            return first.model_copy(update={"lost": differ})
+        return first
+
+    def _read(self, path: Path) -> HomingReference | None:
         try:
-            return HomingReference.model_validate_json(read_state_file(self.path))
+            return HomingReference.model_validate_json(read_state_file(path))
         except FileNotFoundError:
             return None
         except (OSError, ValidationError, ValueError) as error:
             raise Refused(
                 "the homing reference cannot be read",
-                where=str(self.path),
+                where=str(path),
                 why=str(error).splitlines()[0],
                 next_step=AGAIN,
             ) from None
 
     def remove(self) -> None:
-        """Removes the file.
+        """Removes the file, wherever it is.
 
         Raises:
             Refused: It cannot be removed.
         """
         try:
-            self.path.unlink(missing_ok=True)
+            for path in self._paths:
+                path.unlink(missing_ok=True)
         except OSError as error:
             raise Refused(
                 "the homing reference cannot be removed",
@@ -203,22 +223,30 @@ class ReferenceFile:
             ) from None
 
     def write(self, reference: HomingReference) -> None:
-        """Writes the reference.
+        """Writes the reference, and removes the one where it was before.
 
         Raises:
-            Refused: It cannot be written.
+            Refused: It cannot be written, or the other one not be removed.
         """
+        path, *earlier = self._paths
         try:
-            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             text = json.dumps(reference.model_dump(mode="json"), indent=1) + "\n"
-            write_atomic(self.path, text)
+            write_atomic(path, text)
+            for other in earlier:
+                other.unlink(missing_ok=True)
         except (OSError, CdprError) as error:
             raise Refused(
                 "the homing reference cannot be written",
-                where=str(self.path),
+                where=str(path),
                 why=error.why if isinstance(error, CdprError) else error.strerror or str(error),
                 next_step="make the folder writable for the rig's operators, then run `cdpr home`",
             ) from None
+
+
+def _origin(reference: HomingReference) -> tuple[str, str, list[int]]:
+    """What a reference is of: the same after each motion."""
+    return reference.rig_hash, reference.made, reference.home_counts
 
 
 # Status of a reference, for operators and scripts.

@@ -10,6 +10,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Protocol
 
+from drivers.can_errors import before_motion
 from drivers.drive_group import CycleStatus, DriveGroup
 from drivers.factory import without_torque
 from executor.control.sync_master import SyncMaster
@@ -307,14 +308,16 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
             loop = motion.loop(
                 drives, master, requests=supervised.read, on_cycle=on_cycle, on_event=on_event
             )
-            loop.arm(partial(motion.require, drives))
+            with before_motion():
+                loop.arm(partial(motion.require, drives))
             assert master.status is not None
             released = without_torque(drives.rig, master.status.status_words.tolist())
             if drives.group.capabilities.simulated and drives.true_pose is None:  # on a real bus
                 on_event(LoopEvent(0, 0.0, SIMULATED, "the drives report that they are simulated"))
             armed = Armed(denied, loop.positions, drives.restarted, released, drives.remarks)
             _send(link, armed)
-            message = master.cycle_until(lambda: _poll(link))
+            with before_motion():
+                message = master.cycle_until(lambda: _poll(link))
         except Exception:
             master.leave_disabled()
             raise

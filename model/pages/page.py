@@ -168,3 +168,22 @@ def html_table(title: str, rows: Iterable[tuple[str, str]]) -> str:
         for name, value in rows
     )
     return f"<table><caption><b>{escape(title)}</b></caption>{cells}</table>"
+
+
+class FactsDisplay:
+    """Base of results that show their facts: in one line as text, as a table in a notebook."""
+
+    __slots__ = ()
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Human-readable names and values."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        """The facts in one line."""
+        facts = "; ".join(f"{name}: {value}" for name, value in self.facts())
+        return f"<{type(self).__name__} {facts}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        return html_table(type(self).__name__, self.facts())

@@ -7,6 +7,7 @@ import hashlib
 import re
 import shutil
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 
 import matplotlib as mpl
@@ -17,10 +18,15 @@ from mcap.reader import make_reader
 
 import cdpr
 from cdpr.operation import set_speed
+from executor.drives import DriveStatus
+from executor.interlock.reference import ReferenceStatus
+from executor.jogging import CableJog
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.command_socket import find_runs
+from executor.service import ReleaseResult, ResetResult, StatusResult
 from model.files.documents import PoseDocument
 from model.files.scene_file import StopDocument
+from model.pages.page import FactsDisplay
 from model.pose import matrix_from_rotation_vector, quaternion_from_matrix
 from model.scene import empty_scene
 
@@ -337,3 +343,39 @@ def test_runs_of_one_process_need_a_simulated_channel_each(tmp_path: Path) -> No
     )
     assert (first.verdict, *beside) == ("PASSED", "refused", "PASSED", "1")
     assert not (tmp_path / "same").exists()
+
+
+REFERENCE = ReferenceStatus(True, None, "2026-01-01", "stated", "reference.json")
+LOST = replace(REFERENCE, counts=False, why_not="<cut>")
+STATUS = StatusResult("crane", "can0", None, (), None, False, LOST)
+SILENT = cdpr.HardwareMissing("drive 5 does not answer")
+
+
+@pytest.mark.parametrize(
+    ("result", "stated"),
+    [
+        (STATUS, ["crane", "can0", "not valid: <cut>", "cdpr home RIG"]),
+        (replace(STATUS, latched="cable 3 is slack"), ["cable 3 is slack", "cdpr reset RIG"]),
+        (replace(STATUS, missing=SILENT, silent=(5,)), ["drive 5 does not answer"]),
+        (replace(STATUS, drives=(DriveStatus(1, "fault", 0, 0.0, True),)), ["fault", "crane"]),
+        (ResetResult(True, "late", ("switched on",) * 8, (3,), LOST), ["late", "drive 3", "<cut>"]),
+        (ResetResult(False, None, ("fault", "fault"), (), REFERENCE), ["none was", "valid, made"]),
+        (ReleaseResult(("switch on disabled",) * 8, LOST), ["switch on disabled", "<cut>"]),
+        (CableJog(3, -0.005, np.array([9.0, 21.0])), ["3, wound in by 5.000 mm", "9.0 to 21.0 N"]),
+        (CableJog(2, 0.004, np.array([9.0, 21.0])), ["2, paid out by 4.000 mm"]),
+    ],
+)
+def test_results_about_drives_show_their_facts(result: FactsDisplay, stated: list[str]) -> None:
+    shown, table = repr(result), result._repr_html_()
+    assert shown.startswith(f"<{type(result).__name__} ")
+    assert len(shown) < 400
+    assert table.count("<tr>") == len(result.facts()) >= 2
+    for text in stated:
+        assert text in shown
+        assert escape(text) in table
+
+
+def test_homing_shows_its_facts() -> None:
+    home = cdpr.home(ready()[0], at_home=True, realtime=False)
+    assert repr(home).startswith("<HomeResult platform: ")
+    assert home._repr_html_().count("<tr>") == len(home.facts())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -13,8 +14,12 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import can
 import pytest
+import yaml
 
+from drivers.can_bus import BusSettings, open_bus
+from drivers.can_errors import ControllerState
 from drivers.cia402 import sdo
 from executor.cameras import process as camera_process
 from executor.cameras.process import CameraProcess
@@ -24,6 +29,7 @@ from model.scene import load_scene
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from tests.cli.plans import CONFIGS, GOAL_MM, RIG, START_MM, straight_plan
 from tests.cli.program import Answer, call, nothing_written, one_message
+from tests.drivers.drive_bench import free_udp_channel
 
 SCENE = CONFIGS / "environment_1.yaml"
 ROOT = Path(__file__).parents[2]
@@ -240,6 +246,54 @@ def test_a_bus_without_drives_is_reported_before_anything_is_enabled(
         no_camera=True,
         yes=True,
     )
+
+
+@pytest.fixture
+def unpowered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A rig on a bus where no node acknowledges: the controller becomes error-passive."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    settings = BusSettings("udp_multicast", free_udp_channel())
+    bus = open_bus(settings)
+
+    def fail(frame: can.Message) -> None:
+        if not frame.is_error_frame:
+            passive = bytes([0, ControllerState.TRANSMIT_PASSIVE, *bytes(6)])
+            bus.send(can.Message(arbitration_id=4, data=passive, is_error_frame=True))
+
+    notifier = can.Notifier(bus, [fail], timeout=0.05)
+    document = yaml.safe_load(RIG.read_text())
+    document["bus"] |= {"interface": settings.interface, "channel": settings.channel}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(document))
+    yield tmp_path / "rig.yaml"
+    notifier.stop()
+    bus.shutdown()
+
+
+def test_a_bus_that_fails_before_a_motion_counts_as_missing_hardware(unpowered: Path) -> None:
+    """As where no drive has power; the record and the message keep the fault's own code."""
+    answer = call("status", unpowered, "--json")
+    state = json.loads(answer.out)
+    assert (answer.code, state["error"], state["exit_code"]) == (4, "bus_passive", 4)
+    assert state["silent"] == list(range(1, 9))
+    assert (state["drives"], state["reference"]["known"]) == (None, False)
+    answer = call("doctor", unpowered, "--drives", "--json")
+    found = json.loads(answer.out)
+    assert (answer.code, found["error"], found["exit_code"]) == (4, "bus_passive", 4)
+    assert found["drives"]["silent"] == list(range(1, 9))
+    for verb in (("home", "--at-home", "--without-real-time"), ("reset",)):
+        answer = call(*verb, unpowered, "--yes", "--json")
+        failed = json.loads(answer.out)
+        assert (answer.code, failed["error"], failed["exit_code"]) == (4, "bus_passive", 4), verb
+        assert "no drive was enabled" in failed["next_step"]
+
+
+def test_a_failed_bus_is_named_beside_the_silent_drives(unpowered: Path) -> None:
+    for verb in (("status",), ("doctor", "--drives")):
+        answer = call(*verb, unpowered)
+        assert answer.code == 4
+        assert "error-passive" in answer.err
+        assert "check the drives' power" in answer.err
+        assert "answer" in answer.out
 
 
 @pytest.mark.parametrize("answers", ["", "n\n", "\n"])

@@ -30,12 +30,19 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from cdpr.cli.operate.run import show
 from cdpr.console import server
 from cdpr.console.commands import MOST_WAITING, Held, LetGo, Seen, parse_message
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
 from cdpr.console.session import Console
 from cdpr.console.state import MOST_IN_TRANSIT, StateFlow, StoredState
-from cdpr.console.verbs import ConsoleFiles, VerbOutcome, _outcome, _without_commands
+from cdpr.console.verbs import (
+    ConsoleFiles,
+    VerbOutcome,
+    _outcome,
+    _without_commands,
+    outcome_state,
+)
 from cdpr.console.watch import RobotWatch, RunReport, RunWatch
 from drivers.can_bus import BusSettings
 from executor.interlock.fault_latch import FaultLatch
@@ -44,6 +51,7 @@ from executor.remote.command_server import commands_from_start
 from executor.remote.command_server import serving as commands
 from executor.remote.command_socket import advertised
 from executor.remote.status import bus_name
+from executor.run_result import RunResult
 from executor.state_machine import State
 from executor.supervision import LocalRequests, Supervisor
 from model.errors import BadInput, Refused
@@ -323,6 +331,20 @@ def test_a_verb_that_fails_without_a_message_states_its_exit_code(code: int, tex
     )
     assert _outcome("home", 0, "").text == ""
     assert _outcome("home", 1, "why").text == "why"
+
+
+@pytest.mark.parametrize("cause", ["slack", "drive_fault", "late"])
+def test_a_failed_run_links_the_help_page_of_its_cause(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], cause: str
+) -> None:
+    """What the verb prints is what the console reads; a reply lost before stops no run."""
+    events = [{"code": code} for code in ("enabled", "reply_lost", cause, "not_held")]
+    ended = {"verdict": "FAILED", "sentence": "the run failed", "reasons": [], "events": events}
+    summary = {**ended, "passed": False, "final_state": "latched"}
+    show(RunResult(tmp_path, summary), as_json=False)
+    shown = outcome_state(_outcome("run", 1, capsys.readouterr().out))
+    assert shown is not None
+    assert shown["fault_page"] == f"/help/{cause}"
 
 
 @pytest.mark.parametrize("verb", ["home", "release", "run", "jog"])

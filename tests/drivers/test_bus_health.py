@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import pickle
 import socket
 from collections.abc import Callable
 
@@ -31,6 +32,7 @@ from drivers.can_errors import (
     ForeignMaster,
     ReceiveOverflow,
     TransmitQueueFull,
+    before_motion,
     bus_fault,
     error_frame_fault,
 )
@@ -183,6 +185,19 @@ def test_a_frame_that_the_kernel_threw_away_is_counted() -> None:
 def test_a_bus_without_a_socket_loses_nothing_that_could_be_counted() -> None:
     with open_bus(BusSettings("virtual", "no-socket")) as bus:
         assert lost_frames(bus) == 0
+
+
+@pytest.mark.parametrize("kind", [BusFault, *BusFault.__subclasses__()])
+def test_a_fault_of_the_bus_before_a_motion_is_no_fault_of_the_motion(kind: type[BusFault]) -> None:
+    """Also in the process of the command line, which gets it from the real-time process."""
+    with pytest.raises(kind) as caught, before_motion():
+        raise kind("it fails", "bus can0")
+    received = pickle.loads(pickle.dumps(caught.value))
+    code = Refused.exit_code if kind is ForeignMaster else HardwareMissing.exit_code
+    assert (received.exit_code, received.as_dict()["exit_code"]) == (code, code)
+    assert received.code == kind.code
+    assert "no drive was enabled" in received.next_step
+    assert kind("it fails", "bus can0").exit_code == Fault.exit_code
 
 
 def say(bench: Bench, can_id: int, data: bytes = b"", *, error: bool = False) -> None:

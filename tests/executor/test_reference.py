@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -16,6 +16,7 @@ from drivers.plausibility import require_within_limits
 from executor.control.preconditions import require_still_referenced
 from executor.drives import open_drives
 from executor.homing import use_rig_file_counts
+from executor.interlock import locks as state_folder
 from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.interlock.reference import HomingReference, reference_at
 from executor.proposals import ForgetProposal
@@ -481,3 +482,104 @@ def test_drives_that_were_never_homed_count_as_in_the_rig_file_whatever_it_was_b
     for ask in (relative.reference, relative.require_ready):
         with pytest.raises(Refused, match="never homed"):
             ask()
+
+
+@pytest.fixture
+def share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Path]:
+    """Creates the folder for all users, as `docs/commissioning.md` advises it."""
+    shared = tmp_path / "shared"
+    monkeypatch.setattr(state_folder, "SHARED", shared)
+
+    def create() -> Path:
+        shared.mkdir()
+        return shared
+
+    return create
+
+
+@pytest.mark.parametrize("encoder", ["absolute", "incremental"])
+@pytest.mark.parametrize("lost", ["", "a cable was released"])
+def test_it_outlives_the_change_to_a_folder_for_all_users(
+    share: Callable[[], Path], encoder: str, lost: str
+) -> None:
+    """Absolute encoders would count as in the rig file without a word, metres from the truth."""
+    rig = rig_with(encoder)
+    before = reference_of(rig).model_copy(update={"lost": lost})
+    MotionInterlock(rig).file.write(before)
+    own = MotionInterlock(rig).file.path
+    shared = share()
+    interlock = MotionInterlock(rig)
+    assert interlock.kept_reference() == before
+    status = reference_status(interlock)
+    assert (status.counts, status.file) == (not lost, str(own))
+    if lost:
+        with pytest.raises(Refused, match="reference is lost") as caught:
+            interlock.reference()
+        assert str(own) in caught.value.where
+    else:
+        assert [w.home_counts for w in interlock.referenced_rig().winches] == before.home_counts
+    interlock.lost_torque("drive 3 let go")
+    after = MotionInterlock(rig).kept_reference()
+    assert after is not None
+    assert after.lost == (lost or "drive 3 let go")
+    assert (own.exists(), interlock.file.path.parent) == (False, shared)
+    interlock.take(reference_of(rig))
+    assert MotionInterlock(rig).reference() is not None
+
+
+def test_a_loss_noted_in_either_folder_counts_until_the_drives_are_homed(
+    share: Callable[[], Path],
+) -> None:
+    rig = rig_with("absolute")
+    mine = reference_of(rig).model_copy(update={"lost": "a cable was released"})
+    MotionInterlock(rig).file.write(mine)
+    own, text = MotionInterlock(rig).file.path, mine.model_dump_json()
+    share()
+    MotionInterlock(rig).file.write(reference_of(rig))  # another user's, who does not see mine
+    own.write_text(text)
+    with pytest.raises(Refused, match="reference is lost") as caught:
+        MotionInterlock(rig).require_ready()
+    assert "a cable was released" in caught.value.why
+    MotionInterlock(rig).take(reference_of(rig))
+    assert MotionInterlock(rig).reference() is not None
+
+
+@pytest.mark.parametrize("change", [{"home_counts": [7] * 8}, {"made": ""}, {"rig_hash": "other"}])
+def test_two_different_references_are_none(
+    share: Callable[[], Path], change: Mapping[str, Any]
+) -> None:
+    rig = rig_with("absolute")
+    MotionInterlock(rig).file.write(reference_of(rig))
+    own = MotionInterlock(rig).file.path
+    shared = share()
+    old = own.read_text()
+    MotionInterlock(rig).file.write(reference_of(rig).model_copy(update=change))
+    own.write_text(old)
+    for ask in (MotionInterlock(rig).reference, MotionInterlock(rig).require_ready):
+        with pytest.raises(Refused, match="reference is lost") as caught:
+            ask()
+        assert str(own) in caught.value.why
+        assert str(shared) in caught.value.why
+    MotionInterlock(rig).confirm_held([0] * 8)
+    assert not reference_status(MotionInterlock(rig)).counts, "no reset makes it valid"
+    own.write_text("{")
+    with pytest.raises(Refused, match="cannot be read") as caught:
+        MotionInterlock(rig).reference()
+    assert caught.value.where == str(own)
+    use_rig_file_counts(rig)
+    assert MotionInterlock(rig).kept_reference() is None
+
+
+def test_positions_noted_in_the_folder_for_all_users_are_the_later_ones(
+    share: Callable[[], Path],
+) -> None:
+    """As after a crash between writing the one file and removing the other."""
+    rig = rig_with("incremental")
+    before = reference_of(rig)
+    MotionInterlock(rig).file.write(before)
+    own, text = MotionInterlock(rig).file.path, before.model_dump_json()
+    share()
+    MotionInterlock(rig).confirm_held([42] * 8)
+    own.write_text(text)
+    kept = MotionInterlock(rig).kept_reference()
+    assert kept == before.model_copy(update={"stands_at": [42] * 8})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import json
 import os
 import signal
 import socket
@@ -15,11 +16,14 @@ import pytest
 
 from drivers.can_bus import BusSettings
 from executor.interlock import locks as state_folder
-from executor.interlock.fault_latch import FaultLatch
+from executor.interlock.fault_latch import FaultLatch, LatchedFault
+from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import LARGEST_FILE, SetUpLock, read_state_file, state_file
 from executor.interlock.reference import ReferenceFile
+from executor.state_machine import State
 from model import jit as machine_code
 from model.errors import Refused
+from model.rig import load_rig
 from tests.cli.plans import RIG
 from tests.cli.program import call
 
@@ -198,6 +202,76 @@ def test_a_fault_is_not_reset_with_the_file_of_another_rig(tmp_path: Path) -> No
     ):
         pytest.fail("it would be reset")
     assert latch.read() is not None
+
+
+def engaged_by(nodes: tuple[int, ...], folder: Path) -> LatchedFault:
+    """A fault of a rig with drives of these node ids."""
+    latch = FaultLatch(BUS, nodes)
+    latch.engage("rig", folder)
+    latch.settle("rig", State.LATCHED, "drive 8 is in fault", folder)
+    latched = latch.read()
+    assert latched is not None
+    return latched
+
+
+@pytest.mark.parametrize("others", [(), (1, 2, 3, 4), (1, 2, 3, 4, 5, 6, 7, 9)])
+def test_a_fault_is_not_reset_with_a_file_of_its_name_that_lacks_drives(
+    tmp_path: Path, others: tuple[int, ...]
+) -> None:
+    """A copy for four of eight cables, say: drive 8, in fault, would not be looked at."""
+    shown, other = engaged_by(tuple(range(1, 9)), tmp_path), FaultLatch(BUS, others)
+    assert not other.is_of(shown, "rig")
+    with (
+        pytest.raises(Refused, match=r"(?m)not in the rig file: node .*\b8$") as caught,
+        other.held_for_reset("rig", shown),
+    ):
+        pytest.fail("it would be reset")
+    assert "rig file it happened with" in caught.value.next_step
+    assert not FaultLatch(BUS).held_by_another()
+    assert other.read() == shown
+
+
+@pytest.mark.parametrize("nodes", [(1, 2), (2, 1), (1, 2, 3)])
+def test_a_fault_is_reset_with_a_file_of_its_name_and_drives(
+    tmp_path: Path, nodes: tuple[int, ...]
+) -> None:
+    """Their order may be what was wrong."""
+    shown, latch = engaged_by((1, 2), tmp_path), FaultLatch(BUS, nodes)
+    assert latch.is_of(shown, "rig")
+    with latch.held_for_reset("rig", shown):
+        pass
+    latch.require_disengaged()
+
+
+def test_a_fault_of_an_earlier_version_which_noted_no_drives_is_reset(tmp_path: Path) -> None:
+    engaged_by((1, 2), tmp_path)
+    latch = FaultLatch(BUS, (1, 2))
+    content = json.loads(latch.path.read_text())
+    del content["nodes"]
+    latch.path.write_text(json.dumps(content))
+    shown = latch.read()
+    assert shown is not None
+    assert (shown.cause, shown.nodes) == ("drive 8 is in fault", ())
+    with latch.held_for_reset("rig", shown):
+        pass
+    latch.require_disengaged()
+
+
+@pytest.mark.parametrize("nodes", ["twelve", 3, [[]], None])
+def test_a_fault_with_unreadable_drives_counts_as_engaged(tmp_path: Path, nodes: object) -> None:
+    engaged_by((1, 2), tmp_path)
+    latch = FaultLatch(BUS)
+    latch.path.write_text(json.dumps({**json.loads(latch.path.read_text()), "nodes": nodes}))
+    with pytest.raises(Refused, match="cannot be read"):
+        latch.require_disengaged()
+
+
+def test_a_motion_latches_the_drives_of_its_rig(tmp_path: Path) -> None:
+    rig = load_rig(RIG).with_bus("udp_multicast", CHANNEL)
+    MotionInterlock(rig).begin(tmp_path, None)
+    latched = FaultLatch(BUS).read()
+    assert latched is not None
+    assert latched.nodes == tuple(winch.node_id for winch in rig.winches)
 
 
 def test_locks_may_be_used_by_every_operator_whatever_the_umask(tmp_path: Path) -> None:

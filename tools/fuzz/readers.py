@@ -65,7 +65,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
         "corners": read_corners,
         "camera": lambda path: imported_camera(path, rig.document.cameras[0]),
         "coordinates": read_coordinates,
-        "reference": lambda path: _at(ReferenceFile(bus), path).read(),
+        "reference": ReferenceFile(bus)._read,
         "latch": lambda path: _at(FaultLatch(bus), path).read(),
         "video": lambda path: sum(1 for _ in VideoFile(path, small)),
         "picture": read_picture,
