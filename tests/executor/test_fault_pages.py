@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from html import unescape
 from pathlib import Path
@@ -11,9 +12,11 @@ from typing import get_args
 import pytest
 
 from drivers.can_errors import BusFault
+from drivers.stopping_distance import lost_master
 from executor.recording.verdict import ORDINARY, fault_codes, faults_among, page_of, page_text
 from executor.report.run_data import markdown
 from model.files.scene_file import StopDocument
+from model.rig import load_rig
 from tests.cli.program import call, one_message
 
 ROOT = Path(__file__).parents[2]
@@ -77,6 +80,41 @@ def test_a_code_has_a_page_with_everything_in_it(code: str) -> None:
     assert f"faults/{code}.md" in (ROOT / "mkdocs.yml").read_text()
     assert f"[`{code}`]({code}.md)" in (PAGES / "index.md").read_text()
     assert page_of(code) == f"docs/faults/{code}.md"
+
+
+@pytest.mark.parametrize("code", PAGED)
+def test_a_page_is_true_of_drives_of_every_kind(code: str) -> None:
+    """ODrives hold by their brakes, and not every drive notices missing SYNC."""
+    state = " ".join(
+        page_text(code).split("## State of the machine")[1].split("## Next")[0].split()
+    )
+    if "under torque" in state or "torque on" in state:
+        assert "ODrives: disarmed, held by their brakes" in state
+    if "without SYNC" in state:
+        assert "100 ms without heartbeat" in state
+
+
+def test_drives_notice_the_loss_of_their_master_as_the_pages_say(tmp_path: Path) -> None:
+    noticed = {}
+    standard = (ROOT / "configs" / "gachon_8_6.yaml").read_text()
+    for name in ("cia402", "epos4", "nanotec-c5e", "akd", "elmo-gold"):
+        rig = tmp_path / f"{name}.yaml"
+        rig.write_text(f"{standard}drives: {{type: cia402, profile: {name}}}\n")
+        lost = lost_master(load_rig(rig))
+        noticed[name] = (lost.noticed_by, round(lost.notice * 1000.0))
+    assert noticed.pop("cia402") == ("SYNC", 30)
+    assert set(noticed.values()) == {("heartbeat", 100)}
+    odrives = lost_master(load_rig(ROOT / "configs" / "gachon_8_6_odrive.yaml"))
+    assert odrives.noticed_by == "set-points"
+
+
+@pytest.mark.parametrize("code", PAGED)
+def test_a_page_resets_the_latch_before_it_homes(code: str) -> None:
+    """Homing is refused while a fault is latched."""
+    steps = page_text(code).split("## Next step")[1]
+    homes = re.search(r"\bhome\b", steps)
+    if homes is not None:
+        assert 0 <= steps.find("`cdpr reset RIG`") < homes.start()
 
 
 def test_faults_are_named_once_and_what_stopped_no_run_comes_last() -> None:

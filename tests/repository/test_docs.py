@@ -16,6 +16,9 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
+from executor.control.winch_laws import CableStep
+from executor.jogging import SPEED
+from executor.winch_runs import limit_of
 from model.files.plan_file import PlanDocument
 from model.files.rig_file import RigDocument
 from model.files.scene_file import SceneDocument
@@ -146,6 +149,33 @@ def test_the_example_of_tags_and_cameras_completes_a_rig_without() -> None:
     assert abs(v - camera.height / 2.0) < 200.0
     assert camera_from_tag.rotation[2, 2] < -0.9, "it faces the camera"
     np.testing.assert_allclose(camera_from_tag.rotation[:, 1], [0, -1, 0], atol=1e-9)
+
+
+def test_a_jog_of_one_cable_takes_as_long_as_commissioning_says() -> None:
+    page = (ROOT / "docs" / "commissioning.md").read_text("utf-8")
+    rig = load_rig(ROOT / "configs" / "gachon_8_6.yaml")
+    rows = re.findall(
+        r"^\| ([\d.]+) N.* \| (\d+) \| ([\d.]+) s \| ([\d.]+) s \|$", page, re.MULTILINE
+    )
+    assert len(rows) >= 3
+    for pull, limit_n, *durations in rows:
+        limit = limit_of(rig, float(limit_n))
+        for length, said in zip((0.005, 0.05), durations, strict=True):
+            law = CableStep(
+                rig, [0] * rig.cable_count, cable=0, length=length, limit=limit, speed=SPEED
+            )
+            cycles = 0
+            while not law.done:
+                law.next(1.0, [float(pull)] + [0.0] * (rig.cable_count - 1))
+                cycles += 1
+            assert cycles * rig.cycle == pytest.approx(float(said), rel=0.03)
+
+
+def test_commissioning_writes_no_file_twice() -> None:
+    page = (ROOT / "docs" / "commissioning.md").read_text("utf-8")
+    written = re.findall(r"-o (\S+?)[`\s]", page)
+    assert len(written) > 5
+    assert len(set(written)) == len(written)
 
 
 OURS = re.compile(

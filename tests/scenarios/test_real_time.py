@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from shutil import which
 from typing import Any, TypeVar
 
 import pytest
@@ -20,9 +22,10 @@ from executor.interlock.fault_latch import FaultLatch
 from executor.recording.run_folder import RunFolder
 from executor.trajectory.setpoints import PreparedRun
 from model.rig import rig_from_document
+from simulation.drives.cia402 import SYNC_OVERDUE
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.ground_truth import PowerLoss
-from tests.scenarios.test_processes import finished, program, send, waited_for
+from tests.scenarios.test_processes import ROOT, finished, program, send, waited_for
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
@@ -128,6 +131,47 @@ def test_the_death_of_the_supervisor_ends_in_a_stop_by_the_real_time_process(
         process.wait()
         wait_until_gone(child)
         wait_until_all_hold(rehearsal)
+
+
+def codes_of_losses(rehearsal: SimulatedCia402Rig) -> set[int]:
+    """EMCY codes of the drives that miss their master from now on."""
+    codes: set[int] = set()
+    for drive in rehearsal.drives:
+        react = drive._connection_lost
+
+        def note(code: int, react: Callable[[int], None] = react) -> None:
+            codes.add(code)
+            react(code)
+
+        drive._connection_lost = note  # type: ignore[method-assign]
+    return codes
+
+
+@pytest.mark.skipif(which("pkill") is None, reason="there is no pkill here")
+@pytest.mark.parametrize(("verb", "takes_sync", "number"), [("pkill", True, 7), ("kill", False, 8)])
+def test_the_commands_of_commissioning_kill_what_the_page_says(
+    slow_run: PreparedRun,
+    slow_rig: Path,
+    short_plan: Path,
+    tmp_path: Path,
+    verb: str,
+    takes_sync: bool,
+    number: int,
+) -> None:
+    """Killing the supervisor alone ends in order, so it does not show what the drives do."""
+    page = (ROOT / "docs" / "commissioning.md").read_text("utf-8")
+    (command,) = re.findall(rf"`({verb} -9 [^`]+)`", page)
+    run = tmp_path / "run"
+    with moving_over_udp(slow_run, slow_rig, short_plan, run, number) as (process, rehearsal):
+        child = real_time_process(process.pid)
+        codes = codes_of_losses(rehearsal)
+        only_this = command.replace("cdpr jog", str(run))
+        subprocess.run(["sh"], input=only_this, text=True, check=True)
+        assert process.wait() == -signal.SIGKILL
+        wait_until_gone(child)
+        wait_until_all_hold(rehearsal)
+    assert (SYNC_OVERDUE in codes) == takes_sync
+    assert takes_sync or not codes
 
 
 def test_the_death_of_the_real_time_process_is_reported_and_the_drives_stop_on_their_own(
