@@ -10,7 +10,7 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, date, datetime
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 
@@ -363,7 +363,7 @@ class Destination:
 
     folder: Path | None = None
     replace: bool = False
-    on: date = field(default_factory=lambda: datetime.now(UTC).date())
+    on: date = field(default_factory=lambda: date.today())
 
     @classmethod
     def of(cls, output: Destination | str | Path | None) -> Destination:

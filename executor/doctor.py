@@ -131,8 +131,10 @@ def libraries(packages: Mapping[str, str] = LIBRARIES) -> list[MachineCheck]:
         try:
             import_module(module)
             checks.append(MachineCheck(package, True, version(package)))
-        except ImportError as error:
-            checks.append(MachineCheck(package, False, str(error), f"pip install {package}"))
+        except Exception as error:  # any: the module's own code runs, and may be damaged
+            absent = isinstance(error, ModuleNotFoundError)
+            fix = f"pip install {'' if absent else '--force-reinstall '}{package}"
+            checks.append(MachineCheck(package, False, str(error), fix))
     return checks
 
 

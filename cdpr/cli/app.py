@@ -248,6 +248,7 @@ def main() -> None:
     # Imports create some 10^5 permanent objects; garbage collection over them took a tenth of
     # the time of a plan.
     gc.set_threshold(100_000, 50, 50)
+    os.environ["MPLBACKEND"] = "agg"  # no verb opens a window; the user's may be invalid
     _replace_closed_streams()
     _escape_unprintable()
     try:

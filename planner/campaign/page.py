@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,7 @@ from planner.campaign.studies import (
     summary,
 )
 from planner.campaign.trial import OWN, SHARES, WIDE, Arm, Case
+from planner.workspace.figures import write_figures
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -214,19 +216,13 @@ _COST_LABEL = "mean kinematic cost along the path"
 
 def save_figures(results: Results, folder: Path) -> tuple[str, ...]:
     """Writes every image as SVG and PNG; returns the names without suffix."""
-    import matplotlib as mpl
-
     drawn = {
-        "figure_9": figure_9,
-        "figure_9_random_ends": lambda r: figure_9(r, "random"),
-        "readings": readings_figure,
-        "boxes": boxes_figure,
+        "figure_9": partial(figure_9, results),
+        "figure_9_random_ends": partial(figure_9, results, "random"),
+        "readings": partial(readings_figure, results),
+        "boxes": partial(boxes_figure, results),
     }
-    with mpl.rc_context(_SETTINGS):
-        for name, draw in drawn.items():
-            figure = draw(results)
-            figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
-            figure.savefig(folder / f"{name}.png")
+    write_figures(folder, drawn, _SETTINGS)
     return tuple(drawn)
 
 

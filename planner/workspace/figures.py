@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.files.documents import write_bytes_atomic
 from model.kinematics import cables_at
 from model.pages.scene import (
     Moment,
@@ -56,6 +60,11 @@ SETTINGS: dict[Any, Any] = {  # matplotlib types the keys as a union of every se
     "figure.dpi": DOTS_PER_INCH,
     "savefig.dpi": DOTS_PER_INCH,
 }
+_METADATA: dict[str, dict[str, Any]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None, "Creator": None},
+}
+"""By format: nothing that differs between days or versions of matplotlib."""
 
 
 def new_figure(
@@ -65,6 +74,32 @@ def new_figure(
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout=layout)
+
+
+def write_figures(
+    folder: Path, drawn: Mapping[str, Callable[[], Figure]], settings: Mapping[Any, Any] = SETTINGS
+) -> None:
+    """Writes each figure as PNG and SVG, the same whatever the user's ``matplotlibrc`` says.
+
+    Args:
+        folder: An existing folder.
+        drawn: Functions that draw a figure, by its name without suffix.
+        settings: Of matplotlib, where they differ from its defaults.
+
+    Raises:
+        BadInput: The folder cannot be written to or is full.
+    """
+    import matplotlib as mpl
+
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(settings)
+        for name, draw in drawn.items():
+            figure = draw()
+            for kind, metadata in _METADATA.items():
+                data = io.BytesIO()
+                figure.savefig(data, format=kind, metadata=metadata)
+                write_bytes_atomic(folder / f"{name}.{kind}", data.getvalue())
 
 
 _COLUMNS = 3

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from model.files.documents import write_atomic, write_bytes_atomic
 from model.scene import Scene
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 from planner.workspace.compute import Maps
 from planner.workspace.figures import (
-    SETTINGS,
     SPACE_LAYERS,
     cost_figure,
     level_figure,
@@ -23,6 +23,7 @@ from planner.workspace.figures import (
     space_figure,
     space_scene,
     title_of,
+    write_figures,
 )
 from planner.workspace.maps import Question
 from planner.workspace.report import Chapter, arrays_of, csv_of, page, shown_in, summary_of
@@ -57,9 +58,9 @@ def write_maps(
     where = f" in {scene.name}" if scene else ""
     title = f"Workspace of {question.rig.name}{where}"
     chapters = [_chapter(folder, maps) for maps in made]
-    (folder / PAGE).write_text(page(title, _lead(question), chapters), encoding="utf-8")
+    write_atomic(folder / PAGE, page(title, _lead(question), chapters))
     summary = {m.grid.name: c.summary for m, c in zip(made, chapters, strict=True)}
-    (folder / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    write_atomic(folder / SUMMARY, json.dumps(summary, indent=1) + "\n")
     return summary
 
 
@@ -80,26 +81,26 @@ def _chapter(folder: Path, maps: Maps) -> Chapter:
     tables = [f"{name}.npz"]
     packed = io.BytesIO()
     np.savez_compressed(packed, allow_pickle=False, **arrays_of(maps))
-    (folder / tables[0]).write_bytes(packed.getvalue())
+    write_bytes_atomic(folder / tables[0], packed.getvalue())
     if maps.grid.normal is not None:
         tables.append(f"{name}.csv")
-        (folder / tables[1]).write_text(csv_of(maps), encoding="utf-8")
+        write_atomic(folder / tables[1], csv_of(maps))
     title, text, figures = _content(maps)
-    pictures = [_picture(folder, file, draw) for file, draw in figures]
+    write_figures(folder, figures)
     alternative = f"{title}: colour maps; the numbers are in the table below and in the files"
     scene = space_scene(maps) if name == "frame" else None
-    shown = tuple((p, alternative) for p in pictures)
+    shown = tuple((f"{file}.png", alternative) for file in figures)
     return Chapter(title, text, shown, tuple(tables), summary_of(maps), scene, SPACE_LAYERS)
 
 
-def _content(maps: Maps) -> tuple[str, str, list[tuple[str, Draw]]]:
+def _content(maps: Maps) -> tuple[str, str, dict[str, Draw]]:
     """Heading, sentence and images of a grid."""
     name = maps.grid.name
     if maps.grid.normal is not None:
-        figures: list[tuple[str, Draw]] = [
-            (name, partial(slice_figure, maps)),
-            (f"{name}_costs", partial(cost_figure, maps)),
-        ]
+        figures: dict[str, Draw] = {
+            name: partial(slice_figure, maps),
+            f"{name}_costs": partial(cost_figure, maps),
+        }
         text = (
             "Red lines: where a limit is reached. Colours leave out the most extreme 1 %"
             " at each end. The two surfaces are the paper's Fig. 7."
@@ -110,20 +111,9 @@ def _content(maps: Maps) -> tuple[str, str, list[tuple[str, Draw]]]:
             "The paper's Fig. 6: where the cables can balance any wrench, and where the tension"
             " limits suffice; red: frame of the outlets, grey: workspace box."
         )
-        return "The whole frame", text, [(name, partial(space_figure, maps))]
+        return "The whole frame", text, {name: partial(space_figure, maps)}
     chosen = [quantity for quantity in shown_in(maps) if quantity.name in _LEVELS_OF]
-    levels: list[tuple[str, Draw]] = [
-        (f"{name}_{quantity.name}", partial(level_figure, maps, quantity)) for quantity in chosen
-    ]
+    levels: dict[str, Draw] = {
+        f"{name}_{quantity.name}": partial(level_figure, maps, quantity) for quantity in chosen
+    }
     return "The workspace, level by level", "Red lines: where a limit is reached.", levels
-
-
-def _picture(folder: Path, name: str, draw: Draw) -> str:
-    """Writes a figure as PNG and SVG; returns the name of the PNG."""
-    import matplotlib
-
-    with matplotlib.rc_context(SETTINGS):
-        figure = draw()
-        figure.savefig(folder / f"{name}.png", metadata={"Software": None})
-        figure.savefig(folder / f"{name}.svg", metadata={"Date": None, "Creator": None})
-    return f"{name}.png"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from datetime import date
 from pathlib import Path
 
@@ -60,6 +61,20 @@ def test_pictures_need_no_folder_and_nothing_is_written_unless_asked(folder: Pat
     made = calibrate_camera(ImageSet(images, len(images)), BOARD)
     assert made.files == ()
     assert np.isfinite(made.found.matrix).all()
+
+
+def test_a_result_has_the_date_of_the_laboratory_s_calendar(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As run folders: on a morning in Seoul, the date in UTC is still yesterday's."""
+    dates = {}
+    for zone in ("Etc/GMT-14", "Etc/GMT+12"):  # 14 h before UTC and 12 h after it
+        monkeypatch.setenv("TZ", zone)
+        time.tzset()
+        dates[zone] = Destination().on
+    monkeypatch.undo()
+    time.tzset()
+    assert dates["Etc/GMT-14"] > dates["Etc/GMT+12"]
 
 
 def test_a_result_that_exists_is_refused_before_any_picture_is_read(tmp_path: Path) -> None:

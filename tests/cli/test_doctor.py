@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import pwd
 import resource
+import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from importlib import import_module
 from importlib.metadata import packages_distributions
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -276,6 +280,42 @@ def test_every_required_library_is_checked_under_the_module_that_it_installs() -
     installed = packages_distributions()
     for module, package in doctor.LIBRARIES.items():
         assert package in [name.lower() for name in installed[module]]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("numpy.dtype size changed, may indicate binary incompatibility"),
+        OSError("libGL.so.1: cannot open shared object file"),
+        ImportError("DLL load failed"),
+    ],
+)
+def test_a_library_that_fails_in_any_way_is_one_check_that_failed(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def broken(module: str) -> ModuleType:
+        if module == "matplotlib":
+            raise error
+        return import_module(module)
+
+    monkeypatch.setattr(doctor, "import_module", broken)
+    answer = call("doctor")
+    assert answer.code == 4, answer
+    assert f"miss matplotlib: {error}" in answer.said
+    assert "matplotlib\n" in answer.out.partition("next: pip install ")[2]
+    assert "ok mcap" in answer.said
+
+
+def test_no_verb_depends_on_the_user_s_matplotlib_backend() -> None:
+    """A name that matplotlib does not know, as an old one, fails its import."""
+    done = subprocess.run(
+        [sys.executable, "-c", "from cdpr.cli import main; main()", "doctor"],
+        env=os.environ | {"MPLBACKEND": "Qt4Agg"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "ok   matplotlib" in done.stdout, done.stderr
 
 
 def test_the_detector_of_the_rig_is_checked_too(

@@ -7,15 +7,18 @@ import csv
 import io
 import json
 import pickle
+import resource
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from html.parser import HTMLParser
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 
+from model.errors import BadInput
 from planner.campaign.evaluation import findings_json, summary_csv, trials_csv, write_campaign
 from planner.campaign.page import page, save_figures
 from planner.campaign.studies import (
@@ -279,6 +282,27 @@ def test_the_page_has_every_claim_with_its_verdict_and_every_picture(results, tm
     assert "gachon <8 & 6>" in reader.text
     reported = json.loads(findings_json(results, about))
     assert len(reported["findings"]) == len(findings(results))
+
+
+def test_images_need_no_settings_of_the_user_and_are_whole(results, tmp_path) -> None:
+    for name in ("plain", "own", "full"):
+        (tmp_path / name).mkdir()
+    save_figures(results, tmp_path / "plain")
+    with mpl.rc_context({"text.usetex": True, "axes.facecolor": "red"}):
+        save_figures(results, tmp_path / "own")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+    try:
+        with pytest.raises(BadInput, match="cannot be written"):
+            save_figures(results, tmp_path / "full")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    plain, own, full = (
+        {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()}
+        for name in ("plain", "own", "full")
+    )
+    assert own == plain
+    assert full.items() < plain.items()
 
 
 @pytest.mark.parametrize("paths", [0, 1])

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import re
+import resource
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -15,10 +17,10 @@ from cdpr.cli.app import build_app
 from model.errors import BadInput
 from model.rig import load_rig
 from model.scene import load_scene
-from planner.workspace.compute import map_workspace
+from planner.workspace.compute import Maps, map_workspace, workspace_grids
 from planner.workspace.figures import space_scene
 from planner.workspace.files import write_maps
-from planner.workspace.grid import frame_box, volume
+from planner.workspace.grid import frame_box, parsed_slice, volume
 from planner.workspace.maps import Question
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -69,6 +71,42 @@ def test_the_whole_frame_can_be_turned_on_the_page(tmp_path):
     page = (tmp_path / "index.html").read_text()
     assert page.count('id="scene-canvas"') == page.count('id="scene-data"') == 1
     assert '<div class="still"><div class="scroll drawn"' in page
+
+
+@pytest.fixture(scope="module")
+def slice_maps() -> tuple[list[Maps], Question]:
+    rig = load_rig(Path(RIG))
+    question = Question.about(rig, None)
+    grids = workspace_grids(rig, [parsed_slice("z=445")], step=0.05)
+    return map_workspace(question, grids, workers=1), question
+
+
+def written(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_images_are_the_same_whatever_the_user_s_matplotlibrc_is(slice_maps, tmp_path):
+    for name, own in (("plain", {}), ("own", {"text.usetex": True, "axes.facecolor": "red"})):
+        (tmp_path / name).mkdir()
+        with mpl.rc_context(own):
+            write_maps(tmp_path / name, *slice_maps)
+            assert all(mpl.rcParams[key] == value for key, value in own.items())
+    assert written(tmp_path / "own") == written(tmp_path / "plain")
+
+
+@pytest.mark.parametrize("limit", [1000, 12_000, 40_000])
+def test_a_full_disk_leaves_whole_files_only(slice_maps, tmp_path, limit):
+    for name in ("whole", "full"):
+        (tmp_path / name).mkdir()
+    write_maps(tmp_path / "whole", *slice_maps)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    try:
+        with pytest.raises(BadInput, match="cannot be written"):
+            write_maps(tmp_path / "full", *slice_maps)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert written(tmp_path / "full").items() < written(tmp_path / "whole").items()
 
 
 def test_table_and_arrays_hold_the_same_numbers(folder):
