@@ -333,9 +333,8 @@ class Console:
             return "load a plan that passes its check first"
         if self.plan.preview["hash"] != shown:
             return "another plan is loaded now: look at it first"
-        if (here := self.robot.pose_at_rest()) is not None and self.plan.begins_elsewhere(here):
-            off = self.plan.off_mm(here)
-            return f"the platform is {off} mm from the plan's start: plan from its current pose"
+        if (here := self.robot.pose_at_rest()) is not None and (off := self.plan.off_start(here)):
+            return f"the platform is {off} from the plan's start: plan from its current pose"
         cameras = [text for source in self.files.cameras for text in ("--camera", source)]
         if not (cameras or is_simulated(self.rig)):
             cameras = ["--no-camera"]
@@ -381,8 +380,7 @@ class Console:
             return why_not
         relaxed = ["--without-real-time"] if real_time and self.files.without_real_time else []
         rig = (*self.files.bus_options, *self.files.calibration_options)
-        arguments = [*arguments, *rig, *relaxed, "--yes"]
-        self.verbs.start(verb, arguments, self._require_wanted)
+        self.verbs.start(verb, [*arguments, *rig, *relaxed, "--yes"], self._require_wanted)
         return ""
 
     def _plan(self, message: PlanCommand) -> None:
