@@ -186,6 +186,8 @@ class Console:
     def _read_stored(self) -> None:
         """Reads the bus's fault latch and reference from their files, at once when a verb ends."""
         now, verb = time.monotonic(), self.verbs.verb
+        if is_simulated(self.rig) and self._stored_for[1] == "home" != verb:
+            self.robot.simulate_at(self.rig.home)  # homing has found it there
         if verb == self._stored_for[1] and now - self._stored_for[0] < STORED_EVERY:
             return
         self._stored_for = now, verb

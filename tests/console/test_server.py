@@ -550,6 +550,22 @@ def test_a_platform_that_is_only_rotated_is_not_said_to_be_0_mm_from_the_start(
     console.close()
 
 
+def test_simulated_drives_are_at_home_after_homing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They lose power for it, so that their counts fit no pose meanwhile."""
+    console = Served().console
+    moving: Any = {"folder": "", "drives": [{"tension_n": 0.0, "torque": "none"}]}
+    console.verbs.verb = "home"
+    monkeypatch.setattr(console.verbs, "update", lambda: "")
+    assert console.update()["platform"] is not None
+    console.robot.update(moving, is_busy=True)
+    assert console.update()["platform"] is None
+    console.verbs.verb = None
+    console.update()
+    home = console.update()["platform"]
+    assert home["position_mm"] == pytest.approx(1e3 * console.rig.home.position, abs=0.01)
+    console.close()
+
+
 def test_simulated_drives_continue_where_the_platform_was_seen(served: Served) -> None:
     served.console.begin_with(Path("short.json"))
     start = load_plan(Path("short.json")).waypoints[0]
