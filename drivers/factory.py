@@ -6,6 +6,8 @@ A protocol and its libraries are loaded only when used.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import can
 
@@ -22,6 +24,42 @@ def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
     from drivers.cia402.state_machine import state_of
 
     return tuple(state_of(word).value for word in status_words)
+
+
+TorqueState = Literal["enabled", "holding", "none"]
+
+
+@dataclass(frozen=True, slots=True)
+class DriveFlags:
+    """What a status word means, for drives of any protocol.
+
+    Attributes:
+        torque: ``enabled`` to follow set-points, ``holding`` on its own, or ``none``: the torque
+            then measures no tension.
+        in_fault: Whether the drive is in fault.
+    """
+
+    torque: TorqueState
+    in_fault: bool
+
+
+def drive_flags(rig: Rig, status_words: Sequence[int]) -> tuple[DriveFlags, ...]:
+    """Meaning of the status words of a `CycleStatus`."""
+    if rig.document.drives.type == "odrive":
+        from drivers.odrive.messages import ERROR_FLAG, is_armed
+
+        return tuple(
+            DriveFlags("enabled" if is_armed(word) else "none", bool(word & ERROR_FLAG))
+            for word in status_words
+        )
+    from drivers.cia402.state_machine import FAULTED, TORQUE_ON, DriveState, state_of
+
+    def flags_of(state: DriveState) -> DriveFlags:
+        alone: TorqueState = "holding" if state in TORQUE_ON else "none"
+        torque = "enabled" if state is DriveState.OPERATION_ENABLED else alone
+        return DriveFlags(torque, state in FAULTED)
+
+    return tuple(flags_of(state_of(word)) for word in status_words)
 
 
 def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:

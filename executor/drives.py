@@ -18,6 +18,7 @@ from drivers.can_errors import TorqueLost, before_motion
 from drivers.drive_group import DriveSnapshot, how_to_reset
 from drivers.factory import (
     blocked_in_fault,
+    drive_flags,
     drive_states,
     make_drive_group,
     read_drives,
@@ -334,6 +335,7 @@ class DriveStatus:
         state: Of its state machine, as text.
         position: Of its encoder, [counts].
         tension: Of its cable, from the drive's torque, [N].
+        has_torque: Without torque the tension is not that of the cable, which a brake may hold.
         set_up: It has the configuration for this rig: no power cycle or other cycle time since.
         error: The error that a drive in fault stores, or why one at rest cannot be enabled; empty
             without one.
@@ -343,6 +345,7 @@ class DriveStatus:
     state: str
     position: int
     tension: float
+    has_torque: bool
     set_up: bool
     error: str = ""
 
@@ -352,6 +355,7 @@ def drive_statuses(rig: Rig, seen: DriveSnapshot) -> tuple[DriveStatus, ...]:
     columns = zip(
         [winch for winch in rig.winches if winch.node_id not in seen.silent],
         drive_states(rig, seen.status_words.tolist()),
+        drive_flags(rig, seen.status_words.tolist()),
         seen.positions.tolist(),
         seen.torques.tolist(),
         seen.errors,
@@ -363,10 +367,11 @@ def drive_statuses(rig: Rig, seen: DriveSnapshot) -> tuple[DriveStatus, ...]:
             state=state,
             position=position,
             tension=torque / 1000.0 * winch.torque_constant,
+            has_torque=flags.torque != "none",
             set_up=winch.node_id not in seen.restarted,
             error=error,
         )
-        for winch, state, position, torque, error in columns
+        for winch, state, flags, position, torque, error in columns
     )
 
 

@@ -186,6 +186,8 @@ class Console:
     def _read_stored(self) -> None:
         """Reads the bus's fault latch and reference from their files, at once when a verb ends."""
         now, verb = time.monotonic(), self.verbs.verb
+        if is_simulated(self.rig) and self._stored_for[1] == "home" != verb:
+            self.robot.simulate_at(self.rig.home)  # homing has found it there
         if verb == self._stored_for[1] and now - self._stored_for[0] < STORED_EVERY:
             return
         self._stored_for = now, verb
@@ -333,9 +335,8 @@ class Console:
             return "load a plan that passes its check first"
         if self.plan.preview["hash"] != shown:
             return "another plan is loaded now: look at it first"
-        if (here := self.robot.pose_at_rest()) is not None and self.plan.begins_elsewhere(here):
-            off = self.plan.off_mm(here)
-            return f"the platform is {off} mm from the plan's start: plan from its current pose"
+        if (here := self.robot.pose_at_rest()) is not None and (off := self.plan.off_start(here)):
+            return f"the platform is {off} from the plan's start: plan from its current pose"
         cameras = [text for source in self.files.cameras for text in ("--camera", source)]
         if not (cameras or is_simulated(self.rig)):
             cameras = ["--no-camera"]
@@ -381,8 +382,7 @@ class Console:
             return why_not
         relaxed = ["--without-real-time"] if real_time and self.files.without_real_time else []
         rig = (*self.files.bus_options, *self.files.calibration_options)
-        arguments = [*arguments, *rig, *relaxed, "--yes"]
-        self.verbs.start(verb, arguments, self._require_wanted)
+        self.verbs.start(verb, [*arguments, *rig, *relaxed, "--yes"], self._require_wanted)
         return ""
 
     def _plan(self, message: PlanCommand) -> None:

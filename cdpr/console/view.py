@@ -293,12 +293,14 @@ class LoadedPlan:
         start = self.start
         return None if start is None or pose is None else round(1e3 * pose.distance_to(start), 1)
 
-    def begins_elsewhere(self, pose: Pose) -> bool:
-        """Whether a cable has another length at a pose than at the plan's start."""
+    def off_start(self, pose: Pose) -> str:
+        """How far a pose is from the plan's start; empty if every cable has the same length."""
         if self.start is None:
-            return False
+            return ""
         off = cable_lengths(self._rig, pose) - cable_lengths(self._rig, self.start)
-        return bool(np.max(np.abs(off)) > self._rig.motion.start_tolerance)
+        if np.max(np.abs(off)) <= self._rig.motion.start_tolerance:
+            return ""
+        return f"{self.off_mm(pose)} mm and {math.degrees(pose.angle_to(self.start)):.1f}°"
 
 
 def plan_id(preview: dict[str, Any]) -> str:

@@ -215,13 +215,13 @@ class RobotSeen:
 
     Attributes:
         robot: None if no pose is known, or none fits the cables.
-        tensions: [N]; None if unknown.
+        tensions: [N]; None if unknown, as for a drive without torque.
         at: Local time of these values if nothing watches the drives; None while a run reports.
         why_not: Why some of it is unknown, or older than the last attempt to read it.
     """
 
     robot: RobotNow | None
-    tensions: list[float] | None
+    tensions: list[float | None] | None
     at: str | None = None
     why_not: str | None = None
 
@@ -313,7 +313,10 @@ class RobotWatch:
         if status is not None and status["drives"]:
             robot = self._view.take(status)
             why_not = None if robot else "the cables fit no pose; some may be slack"
-            tensions = [drive["tension_n"] for drive in status["drives"]]
+            tensions = [
+                None if drive["torque"] == "none" else drive["tension_n"]
+                for drive in status["drives"]
+            ]
             self.now = RobotSeen(robot, tensions, why_not=why_not)
         elif self._read is not None:
             with self._lock:
@@ -345,7 +348,9 @@ class RobotWatch:
                 seen = replace(self.now, why_not="another program uses the drives")
             else:
                 why_not = result.why_no_pose or result.reference.why_not
-                tensions = [round(drive.tension, 2) for drive in result.drives]
+                tensions = [
+                    round(drive.tension, 2) if drive.has_torque else None for drive in result.drives
+                ]
                 robot = self._view.at_rest(result)
                 seen = RobotSeen(robot, tensions, _local_time(), why_not)
         with self._lock:

@@ -12,7 +12,8 @@ it does not measure, or empty), ``live_image`` (descriptor of its newest image i
 {``time_s`` (of its images), ``position_mm``, ``quaternion``, ``covariance_mm2`` (of the position,
 row by row), ``stated`` (whether it includes the errors common to all images), ``clearance``
 {``distance_mm``, ``low_mm``, ``high_mm`` (its 95 % interval), ``pair``}, or null}, ``drives``
-[{``node``, ``state``, ``position_counts``, ``set_counts``, ``tension_n``}], ``events``
+[{``node``, ``state``, ``torque`` (``enabled``, ``holding`` or ``none``: then ``tension_n`` is not
+that of the cable), ``in_fault``, ``position_counts``, ``set_counts``, ``tension_n``}], ``events``
 [{``time_s``, ``code``, ``text``}], the newest last. An unknown number is null; before the first
 cycle ``state`` is ``preparing`` (``releasing`` during `cdpr release`) and ``drives`` is empty;
 before a motion opens its devices there is also ``verb``, the verb that is being prepared; at
@@ -37,7 +38,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drivers.factory import drive_states
+from drivers.factory import drive_flags, drive_states
 from executor.recording.run_folder import RunEvent
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import RequestBoard
@@ -117,6 +118,7 @@ class CyclesSoFar:
         columns = zip(
             self._rig.winches,
             drive_states(self._rig, record.words),
+            drive_flags(self._rig, record.words),
             record.actual,
             record.targets,
             self._rig.tensions_by(record.torques).tolist(),
@@ -126,11 +128,13 @@ class CyclesSoFar:
             {
                 "node": winch.node_id,
                 "state": state,
+                "torque": flags.torque,
+                "in_fault": flags.in_fault,
                 "position_counts": actual,
                 "set_counts": target,
                 "tension_n": round(tension, 2),
             }
-            for winch, state, actual, target, tension in columns
+            for winch, state, flags, actual, target, tension in columns
         ]
 
 

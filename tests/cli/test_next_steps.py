@@ -165,7 +165,8 @@ def test_status_names_who_prepares_a_motion(
 
 
 def test_a_drive_set_up_for_another_cycle_is_not_said_to_have_lost_power() -> None:
-    drive = DriveStatus(node=1, state="quick stop active", position=0, tension=5.0, set_up=False)
+    state = "quick stop active"
+    drive = DriveStatus(1, state, position=0, tension=5.0, has_torque=True, set_up=False)
     (line,) = replace(STANDING, drives=(drive,)).drive_lines({1: "cable 1 (drive 1)"})
     assert line.endswith("not set up, or for another cycle")
     (line,) = replace(STANDING, drives=(replace(drive, set_up=True),)).drive_lines({1: "cable 1"})
@@ -174,7 +175,8 @@ def test_a_drive_set_up_for_another_cycle_is_not_said_to_have_lost_power() -> No
 
 def test_status_states_the_error_of_a_drive_in_fault() -> None:
     over_voltage = "DC link over-voltage (error 3210h)"
-    drive = DriveStatus(1, "fault", position=0, tension=5.0, set_up=True, error=over_voltage)
+    flags = {"has_torque": False, "set_up": True}
+    drive = DriveStatus(1, "fault", position=0, tension=5.0, error=over_voltage, **flags)
     shown = replace(STANDING, drives=(drive,))
     (line,) = shown.drive_lines({1: "cable 1 (drive 1)"})
     assert line.endswith(over_voltage)

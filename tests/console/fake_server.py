@@ -366,6 +366,8 @@ class Fake:
             {
                 "node": k,
                 "state": "operation enabled",
+                "torque": "enabled",
+                "in_fault": False,
                 "position_counts": 1000 * k,
                 "set_counts": 1000 * k + 4,
                 "tension_n": round(float(t), 1),

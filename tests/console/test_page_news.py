@@ -198,6 +198,7 @@ def test_drives_that_are_on_are_the_normal_state_and_drives_that_hold_are_not_of
     ready = {"ready": False, "why_not": None, "moving": False, "limit": None, "speed_mm_s": 20}
     wished = {"stop": False, "hold": False, "speed_percent": 100}
     drive = {"node": 1, "state": "quick stop active", "position_counts": 0, "set_counts": 0}
+    drive |= {"torque": "holding", "in_fault": False}
     motion = {"process": 1, "state": "securing", "cause": None, "elapsed_s": 1.0, "age_s": 0.0}
     more = {"wished": wished, "events": [], "cameras": [], "path_mm": None, "feed_percent": 0}
     drives = [{**drive, "tension_n": 20.0}] * 8
@@ -205,6 +206,19 @@ def test_drives_that_are_on_are_the_normal_state_and_drives_that_hold_are_not_of
         state={"motion": {**motion, **more, "path_length_mm": None, "drives": drives}, "jog": ready}
     )
     expect(lamp).to_have_text("8 of 8 drives hold")
+    odrive = {**drive, "state": "closed loop control", "torque": "enabled", "tension_n": 20.0}
+    motion |= {**more, "path_length_mm": None}
+    desk.fake.ask(state={"motion": {**motion, "drives": [odrive] * 8}, "jog": ready})
+    expect(lamp).to_have_text("8 of 8 drives on")
+    expect(lamp).to_have_class("pass")
+    idle = {**odrive, "state": "idle, in error", "torque": "none", "in_fault": True}
+    known = {"motion": {**motion, "drives": [idle] * 8}, "jog": ready, "tensions_n": [None] * 8}
+    desk.fake.ask(state=known)
+    expect(lamp).to_have_text("0 of 8 drives on")
+    expect(lamp).to_have_class("fail")
+    trouble = desk.page.locator("#tension-trouble")
+    expect(trouble).to_have_text("Unknown: the drives have no torque.")
+    expect(trouble).to_have_class("quiet")
 
 
 def test_values_read_at_rest_are_not_shown_as_live(desk: Visit) -> None:

@@ -549,6 +549,45 @@ def test_a_scene_is_planned_in_a_folder_in_which_nothing_was_taught(
     console.close()
 
 
+def test_a_platform_that_is_only_rotated_is_not_said_to_be_0_mm_from_the_start(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    served = Served()
+    console = served.console
+    console.plan.load(Path("short.json"))
+    start, shown = console.plan.start, console.plan.preview
+    assert start is not None
+    assert shown is not None
+    page = console.control.join("here")
+    console.control.take(page, moving=False)
+    tilted = Pose.from_quaternion(start.position, [math.cos(0.05), math.sin(0.05), 0.0, 0.0])
+    monkeypatch.setattr(console.robot, "pose_at_rest", lambda: tilted)
+    text = json.dumps({"kind": "command", "command": "run", "plan": shown["hash"]})
+    message = parse_message(text)
+    assert not isinstance(message, Held | LetGo | Seen)
+    why_not = console.command(page, message, arrived_now())
+    assert f"0.0 mm and {math.degrees(start.angle_to(tilted)):.1f}° from" in why_not
+    assert served.started == []
+    console.close()
+
+
+def test_simulated_drives_are_at_home_after_homing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They lose power for it, so that their counts fit no pose meanwhile."""
+    console = Served().console
+    moving: Any = {"folder": "", "drives": [{"tension_n": 0.0, "torque": "none"}]}
+    console.verbs.verb = "home"
+    monkeypatch.setattr(console.verbs, "update", lambda: "")
+    assert console.update()["platform"] is not None
+    console.robot.update(moving, is_busy=True)
+    assert console.update()["platform"] is None
+    console.verbs.verb = None
+    console.update()
+    home = console.update()["platform"]
+    assert home["position_mm"] == pytest.approx(1e3 * console.rig.home.position, abs=0.01)
+    console.close()
+
+
 def test_simulated_drives_continue_where_the_platform_was_seen(served: Served) -> None:
     served.console.begin_with(Path("short.json"))
     start = load_plan(Path("short.json")).waypoints[0]

@@ -56,6 +56,7 @@ def status_at(pose: Pose) -> dict[str, Any]:
     counts = winches.counts(winches.unstrained(cable_lengths(THE_RIG, pose), tensions))
     drives = [
         {"position_counts": round(float(count)), "tension_n": round(float(tension), 3)}
+        | {"torque": "enabled"}
         for count, tension in zip(counts, tensions, strict=True)
     ]
     return {"folder": "", "drives": drives}
@@ -139,8 +140,9 @@ class Drives:
         self.watch = RobotWatch(RobotView(THE_RIG, SCENE), self.read, AtOnce(1))
 
     @staticmethod
-    def held_at(pose: Pose, tension: float = 20.0) -> StatusResult:
-        drives = tuple(DriveStatus(k, "operation enabled", 0, tension, True) for k in range(1, 9))
+    def held_at(pose: Pose, tension: float = 20.0, has_torque: bool = True) -> StatusResult:
+        flags = {"has_torque": has_torque, "set_up": True}
+        drives = tuple(DriveStatus(k, "any", 0, tension, **flags) for k in range(1, 9))
         counts = ReferenceStatus(counts=True, why_not=None, made="", how="jig", file="")
         return StatusResult("rig", "bus", None, (), None, False, counts, drives, pose)
 
@@ -165,7 +167,7 @@ def wound_in_at(pose: Pose) -> dict[str, Any]:
 
 
 RELEASED = replace(
-    Drives.held_at(THE_RIG.home, 0.0),
+    Drives.held_at(THE_RIG.home, 0.0, has_torque=False),
     pose=None,
     reference=ReferenceStatus(counts=False, why_not="released", made=None, how=None, file=None),
 )
@@ -175,15 +177,15 @@ SILENT = HardwareMissing("drive 3 does not answer", where="bus")
 @pytest.mark.parametrize(
     ("reading", "tensions", "why_not"),
     [
-        (RELEASED, [0.0] * 8, "released"),
-        (replace(RELEASED, why_no_pose="no pose fits"), [0.0] * 8, "no pose fits"),
+        (RELEASED, [None] * 8, "released"),
+        (replace(RELEASED, why_no_pose="no pose fits"), [None] * 8, "no pose fits"),
         (replace(RELEASED, drives=None, missing=SILENT), None, "drive 3 does not answer"),
         (OSError("unplugged"), None, "OSError: unplugged"),
         (SILENT, None, "drive 3 does not answer"),
     ],
 )
 def test_what_is_not_read_at_rest_is_not_shown_as_known(
-    reading: StatusResult | Exception, tensions: list[float] | None, why_not: str
+    reading: StatusResult | Exception, tensions: list[None] | None, why_not: str
 ) -> None:
     """After a release, a loss of power or of the reference: neither pose nor old tensions."""
     drives = Drives()
@@ -208,10 +210,12 @@ def test_a_run_whose_cables_fit_no_pose_keeps_no_old_one() -> None:
     drives = Drives()
     drives.move(THE_RIG.home)
     assert drives.watch.now.robot is not None
-    drives.watch.update(wound_in_at(THE_RIG.home), is_busy=True)
+    status = wound_in_at(THE_RIG.home)
+    status["drives"][2]["torque"] = "none"
+    drives.watch.update(status, is_busy=True)
     seen = drives.watch.now
     assert seen.robot is None
-    assert len(seen.tensions or []) == 8
+    assert [tension is None for tension in seen.tensions or []] == [k == 2 for k in range(8)]
     assert "fit no pose" in (seen.why_not or "")
     drives.watch.update({"folder": "", "drives": []}, is_busy=True)
     assert drives.watch.now.tensions == seen.tensions, "before its first cycle nothing is known"

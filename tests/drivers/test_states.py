@@ -19,8 +19,10 @@ from drivers.cia402.state_machine import (
     next_words,
     state_of,
 )
-from drivers.factory import unready_remarks
-from model.rig import Rig
+from drivers.factory import drive_flags, unready_remarks
+from drivers.odrive.messages import AxisState, status_word
+from model.rig import Rig, load_rig
+from tests.drivers.odrive_bench import ODRIVE_RIG, odrive_rig
 
 # Bits 6..0 as the standard prints them; x is any.
 STANDARD = {
@@ -171,3 +173,16 @@ def test_a_stop_commands_every_drive_to_stop_whatever_it_reported(
 ) -> None:
     states, commanded = zip(*drives, strict=True)
     assert next_words(Goal.STOP, states, commanded) == (ControlWord.QUICK_STOP,) * len(states)
+
+
+def test_the_flags_of_a_state_do_not_depend_on_the_protocol() -> None:
+    """Pages and programs need no protocol's names of states."""
+    cia402 = load_rig(ODRIVE_RIG.with_name("gachon_8_6.yaml"))
+    flags = drive_flags(cia402, [0x0237, 0x0217, 0x021F, 0x0218, 0x0250, 0x0231, 0x0233, 0x0200])
+    assert [one.torque for one in flags] == ["enabled", "holding", "holding"] + ["none"] * 5
+    assert [one.in_fault for one in flags] == [False, False, True, True] + [False] * 4
+    idle, armed = AxisState.IDLE, AxisState.CLOSED_LOOP_CONTROL
+    words = [status_word(armed, 0), status_word(idle, 0), status_word(idle, 1), status_word(3, 0)]
+    flags = drive_flags(odrive_rig(), words)
+    assert [one.torque for one in flags] == ["enabled", "none", "none", "none"]
+    assert [one.in_fault for one in flags] == [False, False, True, False]

@@ -53,7 +53,7 @@ function cameraCells(camera) {
 }
 
 function driveCells(drive, cable) {
-  return [`${cable} (drive ${drive.node})`, known(drive.tension_n, 1, "N"), drive.state, known(drive.position_counts, 0), known(drive.set_counts, 0)];
+  return [`${cable} (drive ${drive.node})`, known(drive.torque === "none" ? null : drive.tension_n, 1, "N"), drive.state, known(drive.position_counts, 0), known(drive.set_counts, 0)];
 }
 
 /** Updates the rows of a table in place; an empty table is hidden. */

@@ -8,13 +8,13 @@ const LAMPS = {
   control: ({ control, read_only: readOnly }) =>
     readOnly ? ["Read-only", "quiet"] : control.mode === "service" ? ["Service mode", "stop"] : control.yours ? ["You have control", "pass"] : [control.held_by ? `Control: ${control.held_by}` : "Control is free", "quiet"],
   drives: ({ motion, jog, cable, drives_read: read, tensions_n: tensions }) => {
-    const drives = motion?.drives ?? [], on = drives.filter((d) => d.state === "operation enabled").length;
-    const ready = jog.ready || cable.ready, holding = drives.filter((d) => d.state === "quick stop active").length;
+    const drives = motion?.drives ?? [], on = drives.filter((d) => d.torque === "enabled").length;
+    const ready = jog.ready || cable.ready, holding = drives.filter((d) => d.torque === "holding").length;
     if (!drives.length && read?.at) return tensions ? [`Read ${read.at}`, "quiet"] : ["Drives not read", "stop"];
     if (!drives.length) return [ready ? "Drives on" : "No drive data", ready ? "pass" : "quiet"];
     // After a quick stop drives hold by themselves, with torque.
     const text = !on && holding ? `${holding} of ${drives.length} drives hold` : `${on} of ${drives.length} drives on`;
-    return [text, drives.some((d) => d.state.includes("fault")) ? "fail" : on === drives.length ? "pass" : on ? "stop" : "quiet"];
+    return [text, drives.some((d) => d.in_fault) ? "fail" : on === drives.length ? "pass" : on ? "stop" : "quiet"];
   },
   homed: ({ reference }) => [reference.counts ? "Homed" : "Not homed", reference.counts ? "pass" : "stop"],
   latch: ({ latched }) => (latched === null ? ["No fault", "pass"] : ["Fault latched", "fail"]),
@@ -37,7 +37,7 @@ function readText({ drives_read: read, tensions_n: tensions }) {
 /** More than two cables in the same trouble are counted: a list would be longer than its space. */
 function troubleText(tensions, [low, high]) {
   const words = (name, limit, values) => {
-    const found = tensions.flatMap((t, k) => (values(t) ? [k] : []));
+    const found = tensions.flatMap((t, k) => (t !== null && values(t) ? [k] : []));
     if (found.length > 2) return [`${found.length} cables are ${name}: ${limit}`];
     return found.map((k) => `Cable ${k + 1} is ${name}: ${known(tensions[k], 1, "N")}, ${limit}`);
   };
@@ -136,9 +136,9 @@ export class Live {
       write(value, known(tension, 1, "N"));
       row.classList.toggle("bad", trouble !== null);
     });
-    const words = tensions ? troubleText(tensions, limits) : read?.at ? "Unknown." : "Unknown: tensions are measured while the drives are enabled.";
+    const words = tensions?.every((t) => t === null) ? "Unknown: the drives have no torque." : tensions ? troubleText(tensions, limits) : read?.at ? "Unknown." : "Unknown: tensions are measured while the drives are enabled.";
     write(at("tension-trouble"), words);
-    mark(at("tension-trouble"), "class", tensions && words ? "trouble" : "quiet");
+    mark(at("tension-trouble"), "class", tensions?.some((t) => t !== null) && words ? "trouble" : "quiet");
     at("tension-trouble").hidden = !words;
   }
 

@@ -227,7 +227,8 @@ export class Operate {
 
   async #release() {
     const { platform, tensions_n: tensions } = this.#page.situation().state;
-    const load = tensions ? ` The tightest cable carries ${known(Math.max(...tensions), 0, "N")}.` : "";
+    const measured = (tensions ?? []).filter((t) => t !== null);
+    const load = measured.length ? ` The tightest cable carries ${known(Math.max(...measured), 0, "N")}.` : "";
     const height = platform ? ` It is at z = ${known(platform.position_mm[2], 0, "mm")} now.` : " Its position is unknown.";
     const lines = [
       make("p", { class: "cause" }, "The platform drops unless it rests on a support or every winch has a brake."),
