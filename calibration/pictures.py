@@ -101,10 +101,10 @@ class CaptureGuide:
         if before is None or not _still(before, self._last, size):
             return self._advice(False, "hold it still")
         view = _view(self._last, size)
-        if not self._is_new(view, size):
-            return self._advice(False, self.missing() or "move it to another position and tilt it")
-        self.views.append(view)
-        return self._advice(True, self.missing() or "move it to another position and tilt it")
+        new = self._is_new(view, size)
+        if new:
+            self.views.append(view)
+        return self._advice(new, self.missing() or "move it to another position and tilt it")
 
     def coverage_map(self) -> str:
         """Coverage so far in ASCII, for any terminal.
@@ -115,7 +115,7 @@ class CaptureGuide:
         covered = {part for view in self.views for part in view.parts}
         rows = [" ".join("#" if (x, y) in covered else "." for x in range(3)) for y in range(3)]
         tilts = [name if self._is_tilted(k) else "-" for k, name in enumerate(_AWAY)]
-        upper, lower, left, right = tilts[1], tilts[0], tilts[3], tilts[2]
+        lower, upper, right, left = tilts
         beside = (f"edges away: {upper}", f"            {left} {right}", f"            {lower}")
         return "\n".join(f"  {row}   {text}" for row, text in zip(rows, beside, strict=True))
 
@@ -332,8 +332,7 @@ def same_images(sets: Sequence[ImageSet]) -> list[ImageSet]:
         raise BadInput(
             "the videos have different rates, so images of the same number are not simultaneous",
             where=", ".join(f"{rate:.6g} images/s" for rate in rates),
-            next_step="convert them to one rate, or save simultaneous images with the same name in"
-            " two folders",
+            next_step="convert them to one rate, or save images in pairs of equal names",
         )
     return [_sampled(video, most, total) for video in videos]
 
@@ -434,8 +433,7 @@ def _captured(folder: Path) -> list[Path]:
     if others:
         raise BadInput(
             "the folder has images that were not captured by --live",
-            where=str(folder),
-            why=", ".join(sorted(others)[:4]),
+            where=f"{folder}: {', '.join(sorted(others)[:4])}",
             next_step="choose another folder, so that they are not mixed with new images",
         )
     return images

@@ -385,8 +385,8 @@ def rig_from_document(document: RigDocument) -> Rig:
     feed = pulleys.feed_directions if pulleys else [[0.0, 0.0, 1.0]] * count
     return Rig(
         document=document,
-        outlets=_array(document.outlets_mm),
-        anchors=_array(document.anchors_mm),
+        outlets=read_only(millimetres(document.outlets_mm)),
+        anchors=read_only(millimetres(document.anchors_mm)),
         pulley_radius=pulleys.radius_mm / 1000.0 if pulleys else 0.0,
         feed_directions=read_only(np.asarray(feed) / np.linalg.norm(feed, axis=1)[:, None]),
         half_size=read_only(millimetres(document.platform.size_mm) / 2.0),
@@ -408,7 +408,7 @@ def rig_from_document(document: RigDocument) -> Rig:
         platform_tags=tuple(tag_from(t) for t in tags.platform) if tags else (),
         frame_tags=tuple(tag_from(t) for t in tags.frame) if tags else (),
         cameras=tuple(camera_from(c) for c in document.cameras),
-        tag_error=_metres(document.tags.error_mm if document.tags else None),
+        tag_error=_metres(tags.error_mm if tags else None),
         outlet_error=_metres(document.outlets_error_mm),
         anchor_error=_metres(document.anchors_error_mm),
     )
@@ -416,10 +416,6 @@ def rig_from_document(document: RigDocument) -> Rig:
 
 def _metres(millimetres: float | None) -> float | None:
     return None if millimetres is None else millimetres / 1e3
-
-
-def _array(points_mm: list[list[float]]) -> Array:
-    return read_only(np.asarray(points_mm) / 1000.0)
 
 
 def _winch(document: WinchDocument) -> Winch:

@@ -189,8 +189,8 @@ class PoseDocument(Document):
         )
 
 
-def millimetres(values: list[float]) -> Array:
-    """A list in mm as an array in m."""
+def millimetres(values: Sequence[float] | Sequence[Sequence[float]]) -> Array:
+    """Numbers in mm as an array of the same shape in m."""
     return np.asarray(values, dtype=np.float64) / 1000.0
 
 
