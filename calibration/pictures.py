@@ -101,10 +101,9 @@ class CaptureGuide:
         if before is None or not _still(before, self._last, size):
             return self._advice(False, "hold it still")
         view = _view(self._last, size)
-        new = self._is_new(view, size)
-        if new:
+        if is_new := self._is_new(view, size):
             self.views.append(view)
-        return self._advice(new, self.missing() or "move it to another position and tilt it")
+        return self._advice(is_new, self.missing() or "move it to another position and tilt it")
 
     def coverage_map(self) -> str:
         """Coverage so far in ASCII, for any terminal.
@@ -114,8 +113,8 @@ class CaptureGuide:
         """
         covered = {part for view in self.views for part in view.parts}
         rows = [" ".join("#" if (x, y) in covered else "." for x in range(3)) for y in range(3)]
-        tilts = [name if self._is_tilted(k) else "-" for k, name in enumerate(_AWAY)]
-        lower, upper, right, left = tilts
+        named = (name if self._is_tilted(k) else "-" for k, name in enumerate(_AWAY))
+        lower, upper, right, left = named
         beside = (f"edges away: {upper}", f"            {left} {right}", f"            {lower}")
         return "\n".join(f"  {row}   {text}" for row, text in zip(rows, beside, strict=True))
 
@@ -137,9 +136,7 @@ class CaptureGuide:
 
     def _is_new(self, view: View, size: tuple[int, int]) -> bool:
         covered = {part for other in self.views for part in other.parts}
-        if view.parts - covered:
-            return True
-        return all(
+        return bool(view.parts - covered) or all(
             np.linalg.norm(view.middle - other.middle) > _FAR * size[0]
             or np.abs(view.tilt - other.tilt).max() > _FAR_TILT
             for other in self.views
