@@ -18,6 +18,7 @@ from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests
 from model.rig import load_rig
 from tests.cli.plans import RIG
+from tests.cli.program import call, one_message
 
 
 def status(**changes: Any) -> dict[str, Any]:
@@ -178,3 +179,12 @@ def test_the_monitor_ends_as_the_run_did(
         _lines(iter([status(), status(**last)]), as_json=False)
     assert ended.value.exit_code == code
     assert text in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_a_layout_that_exists_is_kept_and_no_option_named_that_there_is_not(tmp_path: Path) -> None:
+    layout = tmp_path / "layout.json"
+    layout.write_text("mine")
+    answer = call("monitor", "--foxglove-layout", layout)
+    one_message(answer, 2, "exists already", "choose another name")
+    assert "--force" not in answer.err
+    assert layout.read_text() == "mine"
