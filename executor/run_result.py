@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
@@ -101,7 +102,7 @@ class RunResult:
             lines.append(f"  why: {', '.join(names)}: {why}")
         removed = "the folder was removed during the run, and its record with it"
         full = "free some disk space, then " if _FULL & {*self.missing.values()} else ""
-        again = f"{full}run `cdpr report {self.folder}` to write the missing files"
+        again = f"{full}run `cdpr report {quote(str(self.folder))}` to write the missing files"
         then = again if self.folder.is_dir() else removed
         lines.append(f"  next: the verdict and the exit code are valid; {then}")
         return "\n".join(lines)

@@ -24,7 +24,6 @@ from typer.core import TyperCommand, TyperGroup
 
 from cdpr.cli.arguments import as_command, flag
 from model.errors import (
-    AlreadyExists,
     BadInput,
     CdprError,
     Fault,
@@ -300,7 +299,7 @@ def _escape_unprintable() -> None:
 
 def _exit_with(error: CdprError) -> NoReturn:
     with suppress(OSError):  # the cause may be that nothing can be written
-        _print_error(error)
+        print(f"error: {error}", file=sys.stderr)
     with suppress(OSError):
         if "--json" in sys.argv:
             print(json.dumps(error.as_dict(), indent=1))
@@ -335,12 +334,6 @@ def _from_os_error(error: OSError) -> CdprError:
         )
     hint = "check the output's destination and its free space"
     return Fault("the command could not write all its output", why=why, next_step=hint)
-
-
-def _print_error(error: CdprError) -> None:
-    if isinstance(error, AlreadyExists):  # the library knows no options
-        error.next_step += ", or pass --force to replace it"
-    print(f"error: {error}", file=sys.stderr)
 
 
 def _print_defect(error: Exception) -> None:

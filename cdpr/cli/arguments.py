@@ -20,7 +20,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints, overload
 
 import typer
 
-from model.errors import BadInput, CdprError, StoppedByOperator
+from model.errors import AlreadyExists, BadInput, CdprError, StoppedByOperator
 from model.files.output import file_identity, refuse_overwriting
 from model.files.reading import shown
 
@@ -134,7 +134,10 @@ _OTHER_NAMES = {"realtime": "fast", "start": "simulated_start", "length": "mm"}
 
 
 def name_options(error: CdprError, options: Mapping[str, str]) -> None:
-    """Replaces arguments of library functions in a message, such as ```budget=```, by options.
+    """Names a verb's options in a message of the library, which knows none.
+
+    Arguments of its functions, such as ```budget=```, become options; where something exists
+    already, ``--force`` is offered by the verbs that have it.
 
     Values of arguments, in SI, are converted to the unit of the option.
 
@@ -154,6 +157,8 @@ def name_options(error: CdprError, options: Mapping[str, str]) -> None:
 
     for part in ("what", "where", "why", "next_step"):
         setattr(error, part, _ARGUMENT.sub(as_typed, getattr(error, part)))
+    if isinstance(error, AlreadyExists) and "force" in options:
+        error.next_step += ", or pass --force to replace it"
 
 
 def _in_unit(value: str, option: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import typer
+from rich.markup import escape
 
 from cdpr.cli.arguments import argument, option
 from cdpr.cli.options import JSON
@@ -42,7 +43,7 @@ def check(
         facts = [*the_plan.scene.stop_facts(), *report.facts()]
         show_facts(f"check of {plan}", facts)
         for violation in report.violations:
-            out.print(f"[red]violated[/red] {violation.sentence()}", soft_wrap=True)
+            out.print(f"[red]violated[/red] {escape(violation.sentence())}", soft_wrap=True)
         out.print("[green]passed[/green]" if report.passed else "[red]not passed[/red]")
     if not report.passed:
         raise typer.Exit(3)

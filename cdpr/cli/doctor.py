@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from cdpr.cli.arguments import argument, flag, option
@@ -74,7 +75,7 @@ def _show_checks(checks: Iterable[MachineCheck]) -> None:
     """One line per check, with the next step where it failed."""
     for check in checks:
         mark = "[green]ok  [/]" if check.good else "[red]miss[/]"
-        out.print(f"{mark} {check.name}: {check.text}", soft_wrap=True)
+        out.print(f"{mark} {escape(check.name)}: {escape(check.text)}", soft_wrap=True)
         if not check.good and check.fix:
             show_line(f"     next: {check.fix}")
 
@@ -90,7 +91,7 @@ def _show_table(found: Examined, rig: Rig) -> None:
             if row.verdict == verdict:
                 text = row.found_text(found.nodes)
                 cells = (row.object, row.needed, text, row.meaning, row.change)
-                table.add_row(marks[verdict], *cells)
+                table.add_row(marks[verdict], *map(escape, cells))
     if found.rows:
         out.print(table)
     unexplained = [node for node in found.silent if node not in found.stopped]

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from model.progress import Advance, Listener
 
-out = Console(highlight=False)
+out = Console(highlight=False, emoji=False)
 
 
 class _Remarks:
@@ -39,7 +39,7 @@ class _Remarks:
         return getattr(sys.stderr, name)
 
 
-err = Console(file=cast(IO[str], _Remarks()), highlight=False)
+err = Console(file=cast(IO[str], _Remarks()), highlight=False, emoji=False)
 
 
 def show_json(document: Any) -> None:

@@ -35,7 +35,9 @@ def sim(
     power_lost: int | None = option(
         "simulate a power loss (lost counts, slack cables) with this random seed", min=0
     ),
-    slack_mm: float = option("with --power-lost: largest slack", default=5.0, min=0.0, max=100.0),
+    slack_mm: float | None = option(
+        "with --power-lost: largest slack (default: 5)", min=0.0, max=100.0
+    ),
     on_a_stand: bool = flag("with --power-lost: platform supported until all cables are taut"),
     plan: Path | None = option("start the platform at the start of this plan, with its load"),
     eds: Path | None = option(
@@ -59,6 +61,12 @@ def sim(
           --channel 239.74.163.2 --no-camera -o runs/udp --yes
           --without-real-time
     """
+    if power_lost is None and (slack_mm is not None or on_a_stand):
+        raise BadInput(
+            "--slack-mm and --on-a-stand describe the state after a power loss",
+            where="command line",
+            next_step="pass --power-lost SEED as well, or leave them out",
+        )
     behaviour = _behaviour(drive_behaviour or [])
     the_rig = rig_on_bus(rig, interface, channel, calibration)
     if the_rig.document.bus.interface == IN_PROCESS:
@@ -76,7 +84,8 @@ def sim(
     try:
         rehearsal = make_rehearsal(the_rig, bus, pose, load, behaviour=behaviour, eds=eds)
         if power_lost is not None:
-            loss = PowerLoss.drawn(the_rig, power_lost, slack_mm / 1000.0, on_a_stand=on_a_stand)
+            slack = 0.005 if slack_mm is None else slack_mm / 1000.0
+            loss = PowerLoss.drawn(the_rig, power_lost, slack, on_a_stand=on_a_stand)
             loss.apply_to(the_rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
         x, y, z = rehearsal.pose.position * 1000.0
         show_line(

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from cdpr.cli.arguments import flag, option, required
 from cdpr.cli.options import RIG, Quaternion, Triple, rotation_of
-from cdpr.cli.output import Terminal, out, present, show_json
+from cdpr.cli.output import Terminal, out, present, show_json, show_line
 from model.files.documents import millimetres
 from model.files.examples import PAPER_RIG, ready_folder
 from model.files.output import make_folder
@@ -135,7 +135,7 @@ def paper(
                 out.print(f"{name}: {described[name]}")
         else:
             out.print("paths were not checked; pass --check to check them")
-        out.print(f"for larger boxes, every reading and figures, open {output / 'index.html'}")
+        show_line(f"for larger boxes, every reading and figures, open {output / 'index.html'}")
     if described["paths that failed their check"]:
         raise typer.Exit(1)
 

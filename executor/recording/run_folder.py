@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -151,7 +152,7 @@ class RunFolder:
 
     def _incomplete(self, missing: Sequence[str]) -> BadInput:
         what = f"incomplete run folder: {', '.join(missing)} missing"
-        why, then = "the run was interrupted", f"`cdpr report {self.path}` makes the missing files"
+        why, then = "the run was interrupted", f"`cdpr report {quote(str(self.path))}` adds them"
         if self.is_active():
             what, why, then = "the run is still in progress", "", "wait, or see `cdpr monitor`"
         elif self._missing(BEGUN):

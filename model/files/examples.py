@@ -16,7 +16,8 @@ from pydantic import ValidationError
 from model.errors import AlreadyExists, BadInput
 from model.files.documents import write_bytes_atomic
 from model.files.new_rig import Answers, shown_value
-from model.files.reading import read_bytes, read_text, shown, unreadable
+from model.files.output import make_missing_folder
+from model.files.reading import read_bytes, read_text, shown
 from model.files.rig_file import RigDocument
 from model.files.validation import key_path, parse_yaml, problems_of
 
@@ -143,10 +144,7 @@ def _copy(source: Path, target: Path) -> None:
     files = [source] if source.is_file() else [path for path in source.rglob("*") if path.is_file()]
     for path in files:
         copy = target / path.relative_to(source)
-        try:
-            copy.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise unreadable(copy.parent, error) from None
+        make_missing_folder(copy.parent)
         write_bytes_atomic(copy, read_bytes(path))
 
 

@@ -400,3 +400,10 @@ def test_without_standard_input_a_question_has_no_answer(tmp_path: Path) -> None
     assert done.returncode == 2, done
     assert "no answer to the question" in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("option", [("--slack-mm", "3"), ("--on-a-stand",)])
+def test_a_power_loss_is_not_described_without_one(option: tuple[str, ...]) -> None:
+    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.9")
+    answer = call("sim", RIG, *bus, "--eds", "missing.eds", *option)
+    one_message(answer, 2, option[0], "--power-lost SEED")

@@ -306,6 +306,17 @@ def test_a_library_that_fails_in_any_way_is_one_check_that_failed(
     assert "ok mcap" in answer.said
 
 
+@pytest.mark.parametrize(
+    "text", ["rtsp://[fe80::1]/live", "could not read [/dev/video0]", "[red]", ":x: :warning:"]
+)
+def test_findings_are_shown_letter_for_letter(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    found = MachineCheck(text, False, text, text)
+    monkeypatch.setattr("cdpr.cli.doctor.check_machine", lambda: [found])
+    answer = call("doctor")
+    assert answer.code == 4, answer
+    assert answer.out == f"miss {text}: {text}\n     next: {text}\n"
+
+
 def test_no_verb_depends_on_the_user_s_matplotlib_backend() -> None:
     """A name that matplotlib does not know, as an old one, fails its import."""
     done = subprocess.run(

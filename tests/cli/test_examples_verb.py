@@ -55,6 +55,17 @@ def test_a_copy_replaces_nothing_unless_asked(tmp_path: Path) -> None:
     assert mine.read_bytes() == (CONFIGS / mine.name).read_bytes()
 
 
+@pytest.mark.parametrize("names", [("--all",), ("gachon_8_6",), ("rig_session",)])
+def test_a_folder_that_cannot_be_created_is_named_as_such(
+    tmp_path: Path, names: tuple[str, ...]
+) -> None:
+    (tmp_path / "file").touch()
+    with nothing_written(tmp_path):
+        answer = call("examples", *names, "-o", tmp_path / "file")
+    one_message(answer, 2, "the folder cannot be created", "write permission")
+    assert "read" not in answer.err.replace("already", "")
+
+
 def test_a_name_that_is_unknown_lists_those_there_are(tmp_path: Path) -> None:
     answer = call("examples", "gachon", "-o", tmp_path)
     one_message(answer, 2, "no example 'gachon'", "gachon_8_6, ")

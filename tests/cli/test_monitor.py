@@ -22,6 +22,7 @@ from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests
 from model.rig import load_rig
 from tests.cli.plans import RIG
+from tests.cli.program import call, one_message
 
 
 def status(**changes: Any) -> dict[str, Any]:
@@ -209,3 +210,12 @@ def test_the_next_stop_is_ahead_whatever_its_name(stops: dict[int, str], row: fl
     assert shown["name"] == name
     assert shown["distance_mm"] == pytest.approx(at - row, abs=0.051)
     assert shown["seconds"] == pytest.approx(at - row, abs=0.051)
+
+
+def test_a_layout_that_exists_is_kept_and_no_option_named_that_there_is_not(tmp_path: Path) -> None:
+    layout = tmp_path / "layout.json"
+    layout.write_text("mine")
+    answer = call("monitor", "--foxglove-layout", layout)
+    one_message(answer, 2, "exists already", "choose another name")
+    assert "--force" not in answer.err
+    assert layout.read_text() == "mine"

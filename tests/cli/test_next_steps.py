@@ -20,13 +20,14 @@ from executor import service
 from executor.drives import DriveStatus
 from executor.interlock.locks import SetUpLock
 from executor.interlock.reference import ReferenceStatus
+from executor.recording.run_folder import BEGUN, RunFolder
 from executor.recording.verdict import page_text
 from executor.remote.client import request_run as request
 from executor.remote.command_server import commands_from_start
 from executor.run_result import RunResult
 from executor.service import StatusResult
 from executor.supervision import Supervisor
-from model.errors import Fault
+from model.errors import BadInput, Fault
 from model.rig import load_rig
 from model.scene import load_scene
 from planner.planning import plan_path
@@ -253,3 +254,29 @@ def test_the_bar_says_what_the_run_does(monkeypatch: pytest.MonkeyPatch) -> None
         advance(4.0)
     assert told_of[0]["description"] == "holding, row"
     assert told_of[1]["description"] is None
+
+
+SPACED = Path("my runs; first")
+
+
+def test_paths_in_printed_commands_are_quoted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    SPACED.mkdir()
+    result = RunResult(SPACED, {}, missing={"report.html": "No space left on device"})
+    with pytest.raises(BadInput) as caught:
+        RunFolder.open(folder_begun(SPACED))
+    (SPACED / "rig.yaml").touch()
+    calibrated = SPACED / "calibrated.yaml"
+    camera = write_result(SPACED, camera_result_of())
+    applied = call("calibrate", "apply", RIG, camera, "-o", calibrated)
+    for said in (result.missing_text(), caught.value.next_step, applied.out):
+        assert shlex.quote(str(SPACED)) in said or shlex.quote(str(calibrated)) in said, said
+
+
+def folder_begun(path: Path) -> Path:
+    """A run folder with the files that are written before anything moves."""
+    for name in BEGUN:
+        (path / name).write_text("{}\n")
+    return path

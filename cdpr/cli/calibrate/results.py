@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import typer
@@ -111,7 +112,10 @@ def apply(
             what = f"calibration {result.kind} {result.name}, {result.date}"
             show_line(f"remark {what}: {result.verdict}", err)
     facts = [(f"{one.kind} {one.name}", f"{one.date}: {one.verdict}") for one in loaded]
-    facts += [("rig file", str(output)), ("next", f"`cdpr home {output}`, then plan with it")]
+    facts += [
+        ("rig file", str(output)),
+        ("next", f"`cdpr home {quote(str(output))}`, then plan with it"),
+    ]
     document = {"rig": str(output), "results": [str(path) for path in results]}
     present(as_json, document, f"{new.name} with its calibration", facts)
 

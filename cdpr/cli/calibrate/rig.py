@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from math import degrees, radians
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from calibration.geometry.pose_selection import measurement_poses
@@ -76,7 +77,8 @@ def poses(
     angles = [degrees(pose.angle_to(the_rig.home)) for pose in made.poses]
     sentences = [s for s in plan_facts(made.document) if s[0] not in ("via", "search")]
     text = f"{len(made.poses)}, rotated by up to {max(angles):.1f}°"
-    next_step = f"cdpr run {output} --rig {rig} -o RUNDIR, then cdpr calibrate rig {rig} RUNDIR"
+    plan, file = quote(str(output)), quote(str(rig))
+    next_step = f"cdpr run {plan} --rig {file} -o RUNDIR, then cdpr calibrate rig {file} RUNDIR"
     document = {"plan": str(output), "turned_deg": angles, **plan_as_dict(made.document)}
     facts = [("poses", text), *sentences, ("next", next_step)]
     present(as_json, document, f"plan {output}", facts)
