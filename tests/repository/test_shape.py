@@ -32,7 +32,6 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "model/rig.py",
         "model/statics/tension_distribution.py",
         "planner/campaign/page.py",
-        "planner/workspace/files.py",
         "planner/workspace/figures.py",
     },
     "of several protocols, back ends or planners one is loaded": {
