@@ -208,7 +208,9 @@ def test_a_clearance_that_is_not_there_is_reported_with_the_one_that_is(
     one_message(answer, 2, "the platform stopped with", "block")
     possible = answer.said.split("pass --clearance-mm ")[1].split(",")[0]
     with pytest.raises(BadInput) as refused:
-        cdpr.plan(RIG, scene_file, clearance=0.3, from_run=stopped.folder.path)
+        cdpr.plan(
+            load_rig(RIG), load_scene(scene_file), clearance=0.3, from_run=stopped.folder.path
+        )
     assert f"pass `clearance={float(possible) / 1000:g}`" in (refused.value.next_step or "")
     above = call(*arguments, str(float(possible) + 0.02))
     assert above.code == 2
