@@ -357,7 +357,12 @@ SILENT = cdpr.HardwareMissing("drive 5 does not answer")
         (STATUS, ["crane", "can0", "not valid: <cut>", "cdpr home RIG"]),
         (replace(STATUS, latched="cable 3 is slack"), ["cable 3 is slack", "cdpr reset RIG"]),
         (replace(STATUS, missing=SILENT, silent=(5,)), ["drive 5 does not answer"]),
-        (replace(STATUS, drives=(DriveStatus(1, "fault", 0, 0.0, True),)), ["fault", "crane"]),
+        (
+            replace(
+                STATUS, drives=(DriveStatus(1, "fault", 0, 0.0, has_torque=False, set_up=True),)
+            ),
+            ["fault", "crane"],
+        ),
         (ResetResult(True, "late", ("switched on",) * 8, (3,), LOST), ["late", "drive 3", "<cut>"]),
         (ResetResult(False, None, ("fault", "fault"), (), REFERENCE), ["none was", "valid, made"]),
         (ReleaseResult(("switch on disabled",) * 8, LOST), ["switch on disabled", "<cut>"]),
