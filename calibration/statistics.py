@@ -213,7 +213,7 @@ def duplicate_views(views: Mapping[str, Mapping[T, Array]]) -> dict[str, str]:
     kept: dict[str, Mapping[T, Array]] = {}
     reasons = {}
     for name, own in sorted(views.items(), key=lambda view: -len(view[1])):
-        first = next((n for n, before in kept.items() if _has_not_moved(own, before)), None)
+        first = next((n for n, before in kept.items() if has_not_moved(own, before)), None)
         if first is None:
             kept[name] = own
         else:
@@ -221,7 +221,8 @@ def duplicate_views(views: Mapping[str, Mapping[T, Array]]) -> dict[str, str]:
     return reasons
 
 
-def _has_not_moved(own: Mapping[T, Array], before: Mapping[T, Array]) -> bool:
+def has_not_moved(own: Mapping[T, Array], before: Mapping[T, Array]) -> bool:
+    """Whether the points or tags that two views both show did not move; False without any."""
     both = own.keys() & before.keys()
     if not both:
         return False

@@ -125,7 +125,8 @@ def left_out_errors(before: Sequence[CameraDocument], after: Sequence[CameraDocu
     """
     return [
         f"error_mm of camera {own.name!r}, {own.error_mm:g}, was stated for another lens and is"
-        " left out; state it again in a rig file with the new lens before clearance is measured"
+        " left out; unless calibrations state all errors, state it again in a rig file with the new"
+        " lens"
         for own, new in zip(before, after, strict=True)
         if own.error_mm is not None and new.error_mm is None
     ]

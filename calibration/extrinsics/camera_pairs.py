@@ -36,7 +36,7 @@ from calibration.pictures import (
 )
 from calibration.procedures import ExtrinsicsOutcome
 from calibration.results import Calibration, Destination, Issue, data_hash
-from calibration.statistics import duplicate_reason, is_duplicate_view
+from calibration.statistics import duplicate_reason, has_not_moved
 from calibration.tag_map.bundle_adjustment import require_tags
 from calibration.tag_map.observations import (
     TagObservations,
@@ -90,11 +90,7 @@ class BodyObservation:
 
     def duplicates(self, before: BodyObservation) -> bool:
         """Whether what is seen of the body in both images did not move."""
-        both = self.corners.keys() & before.corners.keys()
-        if not both:
-            return False
-        now, earlier = (np.array([one.corners[k] for k in both]) for one in (self, before))
-        return is_duplicate_view(now, earlier)
+        return has_not_moved(self.corners, before.corners)
 
 
 def observe_platform(

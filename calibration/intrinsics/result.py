@@ -291,12 +291,11 @@ class CameraResult(ResultDocument):
                 next_step="calibrate the camera at the image size in use",
             )
         keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens", "lens_covariance")
-        changes = {k: getattr(self, k) for k in keys} | {
-            "pose_by_lens": None,
-            "pose_covariance": None,
-            "error_mm": None,
-        }
-        return with_camera(rig, camera.model_copy(update=changes))
+        lens = {k: getattr(self, k) for k in keys}
+        left_out: dict[str, None] = {"pose_by_lens": None, "pose_covariance": None}
+        if any(getattr(camera, key) != value for key, value in lens.items()):
+            left_out["error_mm"] = None
+        return with_camera(rig, camera.model_copy(update=lens | left_out))
 
 
 def camera_result(

@@ -122,7 +122,7 @@ def _parameter(name: str, kind: Any, declared: Field[Any]) -> inspect.Parameter:
 def _typed(name: str, declared: Field[Any]) -> str:
     """How an argument or option is typed, in full."""
     if declared.metadata["kind"] is typer.Argument:
-        return name
+        return str(declared.metadata["more"].get("metavar") or name)
     return max(declared.metadata["names"], key=len, default=f"--{name.replace('_', '-')}")
 
 

@@ -136,7 +136,7 @@ class Console:
         if self._planned is None or self.verbs.verb is not None:
             return
         path, self._planned = self._planned, None
-        if self.verbs.outcome is not None and self.verbs.outcome.exit_code == 0:
+        if self.verbs.has_succeeded:
             self._asks.submit(self._load_at_rest, path)
 
     def _load_at_rest(self, path: Path) -> None:
@@ -186,8 +186,9 @@ class Console:
     def _read_stored(self) -> None:
         """Reads the bus's fault latch and reference from their files, at once when a verb ends."""
         now, verb = time.monotonic(), self.verbs.verb
-        if is_simulated(self.rig) and self._stored_for[1] == "home" != verb:
-            self.robot.simulate_at(self.rig.home)  # homing has found it there
+        homed = self._stored_for[1] == "home" != verb and self.verbs.has_succeeded
+        if homed and is_simulated(self.rig):
+            self.robot.simulate_at(self.rig.home)
         if verb == self._stored_for[1] and now - self._stored_for[0] < STORED_EVERY:
             return
         self._stored_for = now, verb
@@ -374,8 +375,7 @@ class Console:
         with self._control_lock:
             press = None if page is None else self.control.set_service(page, on)
         self.end_press(press)
-        is_prepared = self.verbs.verb == "jog" and not self.verbs.is_under_way
-        return self._jog_end() if not on and (jogs_cables or is_prepared) else ""
+        return self._jog_end() if not on and (jogs_cables or self.verbs.prepares_cable_jog) else ""
 
     def _start_verb(self, verb: str, arguments: Sequence[str], *, real_time: bool = True) -> str:
         if why_not := self.watch.why_busy():

@@ -162,12 +162,15 @@ def read_stored(rig: Rig, *, is_moving: bool) -> StoredState:
 def _read_latch(rig: Rig) -> tuple[LatchedFault | None, int | None]:
     """The latched fault, or the process of another user that moves or resets the drives."""
     fault, in_motion = FaultLatch(BusSettings.of(rig)).read_in_motion()
-    if fault is None or not in_motion:
+    if fault is None or not in_motion or not fault.process:
         return fault, None
-    with suppress(OSError):  # processes of other users may be hidden
-        if os.stat(f"/proc/{fault.process}").st_uid == os.getuid():
-            return None, None
-    return None, fault.process
+    try:
+        os.kill(fault.process, 0)  # only asks whether it may be signalled
+    except ProcessLookupError:  # its motion is over; a reset or release of the fault is in progress
+        return fault, None
+    except PermissionError:
+        return None, fault.process
+    return None, None
 
 
 def not_stopped(rig: Rig) -> str:

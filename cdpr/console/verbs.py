@@ -91,6 +91,7 @@ class StartedVerb:
         """Result of the last verb."""
         self.is_under_way = False
         """Whether the running verb's drives may move."""
+        self._jogs_cables = False
 
     def start(self, verb: str, arguments: Sequence[str], require: Callable[[], None]) -> None:
         """Starts a verb without a terminal.
@@ -120,6 +121,16 @@ class StartedVerb:
         with self._lock:
             if self.outcome is not None:
                 self.outcome = replace(self.outcome, exit_code=error.exit_code, text=str(error))
+
+    @property
+    def has_succeeded(self) -> bool:
+        """Whether the last verb ended without an error."""
+        return self.outcome is not None and self.outcome.exit_code == 0
+
+    @property
+    def prepares_cable_jog(self) -> bool:
+        """Whether a session of single cables is being prepared."""
+        return self._jogs_cables and self.verb is not None and not self.is_under_way
 
     def follow(self, status: dict[str, Any]) -> None:
         """Notes from a run's status whether the running verb's drives may move."""
@@ -162,7 +173,7 @@ class StartedVerb:
             os.close(output)
             raise
         self._output, self.verb, self.outcome = output, verb, None
-        self.is_under_way = False
+        self.is_under_way, self._jogs_cables = False, "--one-cable" in arguments
 
     def _update(self) -> str:
         if self._process is None or self.verb is None:

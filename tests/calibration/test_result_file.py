@@ -97,7 +97,12 @@ def test_an_error_stated_for_another_lens_is_left_out(rig: Rig) -> None:
     (remark,) = remarks.texts
     assert remark.startswith("error_mm of camera 'front', 0.5, was stated for another lens")
     remarks.texts.clear()
-    better.with_calibration(camera_result_of(), listener=remarks)
+    (camera,) = better.document.cameras
+    again = camera.model_copy(update={"error_mm": 0.25})  # stated for this lens
+    restated = rig_from_document(better.document.model_copy(update={"cameras": [again]}))
+    for known in (better, restated):
+        same = known.with_calibration(camera_result_of(), listener=remarks)
+        assert same.document.cameras[0].error_mm == known.document.cameras[0].error_mm
     assert remarks.texts == []
 
 

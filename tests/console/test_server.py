@@ -397,7 +397,8 @@ def test_a_session_that_is_being_prepared_ends_when_its_end_is_asked_for(name: s
     message = parse_message(json.dumps({"kind": "command", "command": name}))
     assert not isinstance(message, Held | LetGo | Seen)
     for is_under_way in (False, True):
-        console.verbs.start("jog", ["--help"], wanted)
+        how = ["--one-cable"] if name == "service_end" else []
+        console.verbs.start("jog", [*how, "--help"], wanted)
         process = console.verbs._process
         assert process is not None
         os.kill(process.pid, signal.SIGSTOP)
@@ -411,6 +412,16 @@ def test_a_session_that_is_being_prepared_ends_when_its_end_is_asked_for(name: s
         assert process.wait() == (0 if is_under_way else -signal.SIGTERM)
         console.verbs.update()
     console.close()
+
+
+def test_leaving_service_mode_ends_no_session_of_the_platform(served: Served) -> None:
+    console = served.console
+    del console.verbs.start
+    console.verbs.start("jog", ["--help"], wanted)
+    assert console.verbs._process is not None
+    assert console._service(on=False) == ""
+    assert console.verbs._process.wait() == 0
+    console.verbs.update()
 
 
 def test_stop_leaves_what_moves_nothing_and_what_writes_its_report_alone() -> None:
@@ -572,7 +583,10 @@ def test_a_platform_that_is_only_rotated_is_not_said_to_be_0_mm_from_the_start(
     console.close()
 
 
-def test_simulated_drives_are_at_home_after_homing(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("code", [0, 130])
+def test_simulated_drives_are_at_home_after_homing(
+    monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
     """They lose power for it, so that their counts fit no pose meanwhile."""
     console = Served().console
     moving: Any = {"folder": "", "drives": [{"tension_n": 0.0, "torque": "none"}]}
@@ -582,9 +596,13 @@ def test_simulated_drives_are_at_home_after_homing(monkeypatch: pytest.MonkeyPat
     console.robot.update(moving, is_busy=True)
     assert console.update()["platform"] is None
     console.verbs.verb = None
+    console.verbs.outcome = _outcome("home", code, "text")
     console.update()
     home = console.update()["platform"]
-    assert home["position_mm"] == pytest.approx(1e3 * console.rig.home.position, abs=0.01)
+    if code:
+        assert home is None, "one that was stopped in its preparation found nothing"
+    else:
+        assert home["position_mm"] == pytest.approx(1e3 * console.rig.home.position, abs=0.01)
     console.close()
 
 
@@ -870,6 +888,13 @@ def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
     monkeypatch.setattr(RobotWatch, "update", lambda *_, **__: None)
     console = Console(replace(Served().console.files, rig=rig))
     latch = FaultLatch(BusSettings.of(rig))
+
+    def kill(process: int, number: int) -> None:
+        assert number == 0
+        if process == HIDDEN:
+            raise PermissionError
+
+    monkeypatch.setattr(os, "kill", kill)
     for process, moved_by in ((HIDDEN, HIDDEN), (os.getpid(), None)):
         with monkeypatch.context() as patch:
             patch.setattr(os, "getpid", lambda process=process: process)
@@ -893,8 +918,28 @@ def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
     console.close()
 
 
-#: Of no process that is visible here.
+#: Of another user.
 HIDDEN = 2**30
+
+
+def test_a_reset_of_this_user_is_no_motion_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It holds the latch of a run whose process has ended."""
+    monkeypatch.setattr("cdpr.console.session.read_status", lambda _: pytest.fail("read"))
+    rig = load_rig(RIG).with_bus("udp_multicast", "239.74.9.15")
+    monkeypatch.setattr(RobotWatch, "update", lambda *_, **__: None)
+    console = Console(replace(Served().console.files, rig=rig))
+    latch = FaultLatch(BusSettings.of(rig))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "getpid", lambda: 2**30)  # of no process
+        latch.engage(rig.name, Path("runs/mine"))
+    console._stored_for = float("-inf"), None
+    state = console.update()
+    assert "did not finish" in state["latched"]
+    assert state["moved_by"] is None
+    assert console.stop() == "nothing moves"
+    latch.let_go()
+    latch.disengage()
+    console.close()
 
 
 @pytest.mark.parametrize("path", ["/", "/scene", "/api/files", "/runs/one/report.html"])
