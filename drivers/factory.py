@@ -46,12 +46,13 @@ class DriveFlags:
 def drive_flags(rig: Rig, status_words: Sequence[int]) -> tuple[DriveFlags, ...]:
     """Meaning of the status words of a `CycleStatus`."""
     if rig.document.drives.type == "odrive":
-        from drivers.odrive.messages import ERROR_FLAG, is_armed
+        from drivers.odrive.messages import ERROR_FLAG, AxisState, state_in
 
-        return tuple(
-            DriveFlags("enabled" if is_armed(word) else "none", bool(word & ERROR_FLAG))
-            for word in status_words
-        )
+        def flags_in(word: int) -> DriveFlags:
+            is_armed = state_in(word) == AxisState.CLOSED_LOOP_CONTROL
+            return DriveFlags("enabled" if is_armed else "none", bool(word & ERROR_FLAG))
+
+        return tuple(map(flags_in, status_words))
     from drivers.cia402.state_machine import FAULTED, TORQUE_ON, DriveState, state_of
 
     def flags_of(state: DriveState) -> DriveFlags:
@@ -76,22 +77,6 @@ def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
     from drivers.cia402.state_machine import DriveState, state_of
 
     return tuple(state_of(word) is DriveState.QUICK_STOP_ACTIVE for word in status_words)
-
-
-def enabled_drives(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
-    """Whether drives are enabled, so that they follow set-points.
-
-    Args:
-        rig: The robot.
-        status_words: Reported status word of each drive.
-    """
-    if rig.document.drives.type == "odrive":
-        from drivers.odrive.messages import AxisState, state_in
-
-        return tuple(state_in(word) == AxisState.CLOSED_LOOP_CONTROL for word in status_words)
-    from drivers.cia402.state_machine import DriveState, state_of
-
-    return tuple(state_of(word) is DriveState.OPERATION_ENABLED for word in status_words)
 
 
 def without_torque(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:

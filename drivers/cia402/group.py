@@ -349,7 +349,7 @@ class Cia402Group(CyclicGroup):
             if self._cycles_to_goal > self._reset_cycles or DriveState.FAULT not in states:
                 self._goal = Goal.IDLE
         elif self._state is GroupState.ENABLED:
-            self._ask(self._poll, self._requests)  # late in the cycle: drives stop after SYNC
+            self._ask(self._poll, 1)  # late: drives stop after SYNC; few: a stop may follow
         elif self._state is GroupState.ENABLING:
             names, words = self._rig.drive_names, self._watch.status_words
             seconds, needs_bit = self._enable_s, self._profile.follows_bit

@@ -163,7 +163,8 @@ class OdriveGroup(CyclicGroup):
     def read_positions(self, pace: Pace | None = None) -> CycleStatus:
         """Waits until every drive has reported position and state; see `DriveGroup`.
 
-        ODrives report on their own, so nothing is sent and ``pace`` is not used.
+        ODrives report on their own, so nothing is sent; ``pace`` only shows the supervisor that
+        this process is alive.
         """
         self._online()
         self._cyclic.forget_waiting()
@@ -171,6 +172,8 @@ class OdriveGroup(CyclicGroup):
         self._watch.forget_heartbeats()
         agreed = 0
         for _ in range(first_attempts(self._rig, self._document, self._pump)):
+            if pace is not None and self._pump is None:
+                pace()
             self._watch.begin_cycle()
             status = self.receive(FIRST_READING_TIMEOUT)
             agreed = 0 if status.missing.any() else agreed + 1

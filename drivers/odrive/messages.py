@@ -338,11 +338,6 @@ def state_text(word: int) -> str:
     return f"{text}, in error" if error else f"{text}"
 
 
-def is_armed(word: int) -> bool:
-    """Whether an axis is under torque, by its `status_word`."""
-    return word & 0xFF == AxisState.CLOSED_LOOP_CONTROL
-
-
 ERROR_FLAG = 0x100
 
 

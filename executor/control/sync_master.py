@@ -17,7 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
-from drivers.factory import drive_states, enabled_drives
+from drivers.factory import drive_flags, drive_states
 from executor.realtime.scheduling import Clock
 from executor.safety.fault_messages import name_drives
 from executor.safety.monitor import MISSING_CYCLES
@@ -279,12 +279,12 @@ def changed_states(
         drive_states(rig, before.status_words.tolist()),
         drive_states(rig, after.status_words.tolist()),
         after.missing.tolist(),
-        enabled_drives(rig, after.status_words.tolist()),
+        drive_flags(rig, after.status_words.tolist()),
         strict=True,
     )
     changed, still = [], []
-    for drive, (name, old, new, silent, enabled) in enumerate(rows):
-        if enabled and not silent and (old == new or drive in excluded):
+    for drive, (name, old, new, silent, flags) in enumerate(rows):
+        if flags.torque == "enabled" and not silent and (old == new or drive in excluded):
             still.append(name)
         elif (silent or old != new) and drive not in excluded:
             what = "does not answer" if silent else f"went from {old} to {new}"

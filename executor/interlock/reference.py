@@ -187,6 +187,8 @@ class ReferenceFile:
         if not found:
             return None
         first = next((one for one in found if one.lost), found[0])
+        if not any(one.made or one.lost for one in found):  # none was homed: the rig file counts
+            return first
         if not first.lost and any(_origin(one) != _origin(first) for one in found):
             differ = f"it differs between {' and '.join(map(str, self._paths))}"
             return first.model_copy(update={"lost": differ})
@@ -212,7 +214,7 @@ class ReferenceFile:
             Refused: It cannot be removed.
         """
         try:
-            for path in self._paths:
+            for path in reversed(self._paths):  # an interruption leaves the one that counts
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise Refused(

@@ -305,10 +305,10 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
             drives.rig, drives.group, RealClock(motion.cycle, supervised.note_cycle)
         )
         try:
-            loop = motion.loop(
-                drives, master, requests=supervised.read, on_cycle=on_cycle, on_event=on_event
-            )
             with before_motion():
+                loop = motion.loop(
+                    drives, master, requests=supervised.read, on_cycle=on_cycle, on_event=on_event
+                )
                 loop.arm(partial(motion.require, drives))
             assert master.status is not None
             released = without_torque(drives.rig, master.status.status_words.tolist())

@@ -134,8 +134,8 @@ class Trajectory:
 
     @property
     def turns(self) -> bool:
-        """Whether the platform rotates, beyond rounding errors."""
-        return bool(np.abs(self.rotations - self.rotations[0]).max() > 1e-9)
+        """Whether the platform rotates, beyond rounding errors of files."""
+        return bool(np.abs(self.rotations - self.rotations[0]).max() > 1e-6)
 
     @property
     def hash(self) -> str:

@@ -14,7 +14,7 @@ import pytest
 
 from drivers import cyclic_group
 from drivers.drive_group import GroupCommand, GroupState
-from drivers.factory import drive_states, enabled_drives, read_drives
+from drivers.factory import drive_flags, drive_states, read_drives
 from drivers.odrive import configure
 from drivers.odrive.configure import check_resolution
 from drivers.odrive.endpoints import read_endpoints, wanted_settings
@@ -64,10 +64,8 @@ def test_all_drives_are_enabled_at_their_positions_and_follow(bench: OdriveBench
     words = status.status_words.tolist()
     assert drive_states(bench.rig, words) == ("closed loop control",) * 8
     in_error = status_word(AxisState.CLOSED_LOOP_CONTROL, 1)
-    assert enabled_drives(bench.rig, [in_error, AxisState.IDLE, *words[2:]]) == (
-        *(True, False),
-        *(True,) * 6,
-    )
+    flags = drive_flags(bench.rig, [in_error, AxisState.IDLE, *words[2:]])
+    assert [one.torque for one in flags] == ["enabled", "none", *["enabled"] * 6]
 
 
 def test_torques_are_tensions_in_per_mille_of_rated_torque(bench: OdriveBench) -> None:

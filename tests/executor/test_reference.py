@@ -18,7 +18,7 @@ from executor.drives import open_drives
 from executor.homing import use_rig_file_counts
 from executor.interlock import locks as state_folder
 from executor.interlock.interlock import MotionInterlock, reference_status
-from executor.interlock.reference import HomingReference, reference_at
+from executor.interlock.reference import HomingReference, as_in_the_file, reference_at
 from executor.proposals import ForgetProposal
 from executor.state_machine import State
 from model.errors import BadInput, Refused, StoppedByOperator
@@ -568,6 +568,41 @@ def test_two_different_references_are_none(
     assert caught.value.where == str(own)
     use_rig_file_counts(rig)
     assert MotionInterlock(rig).kept_reference() is None
+
+
+def test_drives_that_were_never_homed_have_no_two_references(share: Callable[[], Path]) -> None:
+    """Files of motions by the rig file's own counts, one before the rig file was corrected."""
+    rig = rig_with("absolute")
+    MotionInterlock(rig).file.write(as_in_the_file(rig).model_copy(update={"rig_hash": "former"}))
+    own = MotionInterlock(rig).file.path
+    old = own.read_text()
+    share()
+    MotionInterlock(rig).file.write(as_in_the_file(rig))
+    own.write_text(old)
+    MotionInterlock(rig).require_ready()
+
+
+def test_an_interrupted_removal_leaves_the_reference_that_counts(
+    share: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rig_with("absolute")
+    MotionInterlock(rig).file.write(reference_of(rig))
+    own = MotionInterlock(rig).file.path
+    old = own.read_text()
+    share()
+    later = reference_of(rig).model_copy(update={"home_counts": [7] * 8})
+    MotionInterlock(rig).file.write(later)
+    own.write_text(old)
+    unlink = Path.unlink
+
+    def once(path: Path, missing_ok: bool = False) -> None:
+        unlink(path, missing_ok=missing_ok)
+        raise OSError("interrupted")
+
+    monkeypatch.setattr(Path, "unlink", once)
+    with pytest.raises(Refused, match="cannot be removed"):
+        MotionInterlock(rig).file.remove()
+    assert MotionInterlock(rig).file.read() == later
 
 
 def test_positions_noted_in_the_folder_for_all_users_are_the_later_ones(
