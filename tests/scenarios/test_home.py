@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from drivers.can_bus import BusSettings, open_bus
 from drivers.can_errors import BusDown
 from drivers.cia402.state_machine import DriveState
-from drivers.drive_group import DriveGroup
+from drivers.drive_group import DriveGroup, GroupState
 from drivers.factory import make_drive_group, read_drives
 from executor.cameras.client import static_pose
 from executor.control.preconditions import counted_here, require_below, with_reduced_limits
@@ -334,7 +334,12 @@ def test_a_bus_that_dies_at_once_is_reported(monkeypatch: pytest.MonkeyPatch) ->
         def broken(*_: object) -> None:
             raise BusDown("the interface is down", "can0")
 
-        there = SimpleNamespace(positions=np.array(bench.counts), holding=False)
+        there = SimpleNamespace(
+            positions=np.array(bench.counts),
+            holding=False,
+            state=GroupState.CONFIGURED,
+            status_words=np.zeros(8, dtype=np.int64),
+        )
         monkeypatch.setattr(bench.group, "read_positions", lambda _pace: there)
         monkeypatch.setattr(bench.group, "send_cycle", broken)
         result = bench.take_up()

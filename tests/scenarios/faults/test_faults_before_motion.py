@@ -118,7 +118,11 @@ def test_f16_a_drive_in_fault_keeps_all_others_without_power(
 ) -> None:
     with simulated(prepared, tmp_path / "run", nothing) as bench:
         bench.drives[4].fail(0x3210)
-        assert bench.run() is State.LATCHED
+        with pytest.raises(Refused) as caught:
+            bench.run()
+        assert (
+            caught.value.what == "cable 5 (drive 5) is in fault: DC link over-voltage (error 3210h)"
+        )
         assert all(ENABLED not in sample.states for sample in bench.rehearsal.samples)
         assert bench.violations() == []
 
