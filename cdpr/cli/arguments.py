@@ -127,8 +127,9 @@ def _typed(name: str, declared: Field[Any]) -> str:
 
 
 _ARGUMENT = re.compile(r"`([a-z_]+)=([^`]*)`")
-_UNIT = re.compile(r"_(mm|ms|n|mm_s)$")
-_THOUSANDTHS = ("_mm", "_ms", "_mm_s")
+_UNITS = {"mm": 1e3, "ms": 1e3, "n": 1.0, "mm_s": 1e3}
+"""Units in names of options, and how many make the SI unit."""
+_UNIT = re.compile(rf"_({'|'.join(_UNITS)})$")
 _OTHER_NAMES = {"realtime": "fast", "start": "simulated_start", "length": "mm"}
 """Arguments of library functions, and the options named otherwise."""
 
@@ -165,8 +166,9 @@ def _in_unit(value: str, option: str) -> str:
     """A value in SI as an option takes it; nothing for a flag."""
     if value in ("True", "False"):
         return ""
+    unit = _UNIT.search(option)
     try:
-        return f"{float(value) * (1000.0 if option.endswith(_THOUSANDTHS) else 1.0):g}"
+        return f"{float(value) * (_UNITS[unit[1]] if unit else 1.0):g}"
     except ValueError:
         return value
 

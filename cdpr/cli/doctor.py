@@ -62,9 +62,11 @@ def doctor(
     objects = examine(the_rig) if the_rig is not None and drives else None
     if as_json:
         plain = [asdict(check) for check in checks]
-        why = objects.missing.as_dict() if objects is not None and objects.missing else {}
-        read = None if objects is None else {"checks": plain, "drives": objects.as_dict(), **why}
-        show_json(plain if read is None else read)
+        if objects is None:
+            show_json(plain)
+        else:
+            why = objects.missing.as_dict() if objects.missing else {}
+            show_json({"checks": plain, "drives": objects.as_dict(), **why})
     elif objects is not None and the_rig is not None:
         _show_table(objects, the_rig)
     if not all(check.good for check in checks) or (objects is not None and not objects.good):

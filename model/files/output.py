@@ -22,6 +22,7 @@ def require_new_file(path: Path, replace: bool = False) -> None:
     Raises:
         BadInput: The file exists, or its folder does not or is read-only.
     """
+    # `os.path` answers False where `Path` raises, as for a name that is too long.
     if os.path.isdir(path):
         raise BadInput("this is a folder", where=str(path), next_step="name a file")
     if os.path.exists(path) and not replace:

@@ -880,14 +880,19 @@ def test_one_page_of_all_consoles_of_a_robot_has_control(monkeypatch: pytest.Mon
         console.close()
 
 
+def latching_console(monkeypatch: pytest.MonkeyPatch, channel: str) -> tuple[Console, FaultLatch]:
+    """A console on a bus between programs whose drives it must not read, and that bus's latch."""
+    monkeypatch.setattr("cdpr.console.session.read_status", lambda _: pytest.fail("read"))
+    monkeypatch.setattr(RobotWatch, "update", lambda *_, **__: None)
+    rig = load_rig(RIG).with_bus("udp_multicast", channel)
+    console = Console(replace(Served().console.files, rig=rig))
+    return console, FaultLatch(BusSettings.of(rig))
+
+
 def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("cdpr.console.session.read_status", lambda _: pytest.fail("read"))
-    rig = load_rig(RIG).with_bus("udp_multicast", "239.74.9.14")
-    monkeypatch.setattr(RobotWatch, "update", lambda *_, **__: None)
-    console = Console(replace(Served().console.files, rig=rig))
-    latch = FaultLatch(BusSettings.of(rig))
+    console, latch = latching_console(monkeypatch, "239.74.9.14")
 
     def kill(process: int, number: int) -> None:
         assert number == 0
@@ -898,7 +903,7 @@ def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
     for process, moved_by in ((HIDDEN, HIDDEN), (os.getpid(), None)):
         with monkeypatch.context() as patch:
             patch.setattr(os, "getpid", lambda process=process: process)
-            latch.engage(rig.name, Path("runs/theirs"))
+            latch.engage(console.rig.name, Path("runs/theirs"))
         console._stored_for = float("-inf"), None
         state = console.update()
         assert (state["latched"], state["moved_by"]) == (None, moved_by)
@@ -924,14 +929,10 @@ HIDDEN = 2**30
 
 def test_a_reset_of_this_user_is_no_motion_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
     """It holds the latch of a run whose process has ended."""
-    monkeypatch.setattr("cdpr.console.session.read_status", lambda _: pytest.fail("read"))
-    rig = load_rig(RIG).with_bus("udp_multicast", "239.74.9.15")
-    monkeypatch.setattr(RobotWatch, "update", lambda *_, **__: None)
-    console = Console(replace(Served().console.files, rig=rig))
-    latch = FaultLatch(BusSettings.of(rig))
+    console, latch = latching_console(monkeypatch, "239.74.9.15")
     with monkeypatch.context() as patch:
         patch.setattr(os, "getpid", lambda: 2**30)  # of no process
-        latch.engage(rig.name, Path("runs/mine"))
+        latch.engage(console.rig.name, Path("runs/mine"))
     console._stored_for = float("-inf"), None
     state = console.update()
     assert "did not finish" in state["latched"]

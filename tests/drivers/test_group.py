@@ -169,16 +169,22 @@ def test_set_points_wait_until_all_drives_say_that_they_follow(bench: Bench) -> 
     bench.until(GroupState.ENABLED)
 
 
+def fault_of_enabling(bench: Bench, limit: int) -> tuple[int, str]:
+    """Node and text of the only fault when the drives are enabled, after at most so many cycles."""
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    bench.until(GroupState.FAULT, limit=limit)
+    assert bench.status is not None
+    (fault,) = bench.status.faults
+    return fault
+
+
 def test_a_drive_that_never_follows_is_named(bench: Bench) -> None:
     without_following(bench.drives[3], [True])
     profile = bench.group._profile.model_copy(update={"follows_bit": True})  # type: ignore[attr-defined]
     bench.group._profile = profile  # type: ignore[attr-defined]
-    bench.group.configure()
-    bench.group.read_positions()
-    bench.group.command(GroupCommand.ENABLE)
-    bench.until(GroupState.FAULT, limit=150)
-    assert bench.status is not None
-    ((node, text),) = bench.status.faults
+    node, text = fault_of_enabling(bench, limit=150)
     assert node == 4
     assert "ignores its target" in text
     assert "follows_bit" in text
@@ -1225,12 +1231,7 @@ def test_a_drive_that_exceeds_its_time_to_enable_is_named_with_this_time(
 ) -> None:
     bench = short_of_time
     bench.drives[2].behaviour = replace(bench.drives[2].behaviour, enable_delay=60.0)
-    bench.group.configure()
-    bench.group.read_positions()
-    bench.group.command(GroupCommand.ENABLE)
-    bench.until(GroupState.FAULT, limit=10)
-    assert bench.status is not None
-    ((node, text),) = bench.status.faults
+    node, text = fault_of_enabling(bench, limit=10)
     assert node == 3
     assert "after 0.1 s (enable_timeout_ms" in text
 
