@@ -889,6 +889,15 @@ def latching_console(monkeypatch: pytest.MonkeyPatch, channel: str) -> tuple[Con
     return console, FaultLatch(BusSettings.of(rig))
 
 
+def require_only_latched(console: Console, words: str) -> None:
+    """Requires that a fault with these words is shown, no motion, and that STOP finds none."""
+    console._stored_for = float("-inf"), None
+    state = console.update()
+    assert words in state["latched"]
+    assert state["moved_by"] is None
+    assert console.stop() == "nothing moves"
+
+
 def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -914,11 +923,7 @@ def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
             assert f"process {HIDDEN}, is not stopped from here" in answer
             assert "press the emergency stop" in answer
         latch.let_go()  # as if it was killed
-        console._stored_for = float("-inf"), None
-        state = console.update()
-        assert "was killed" in state["latched"]
-        assert state["moved_by"] is None
-        assert console.stop() == "nothing moves"
+        require_only_latched(console, "was killed")
         latch.disengage()
     console.close()
 
@@ -933,11 +938,7 @@ def test_a_reset_of_this_user_is_no_motion_of_another(monkeypatch: pytest.Monkey
     with monkeypatch.context() as patch:
         patch.setattr(os, "getpid", lambda: 2**30)  # of no process
         latch.engage(console.rig.name, Path("runs/mine"))
-    console._stored_for = float("-inf"), None
-    state = console.update()
-    assert "did not finish" in state["latched"]
-    assert state["moved_by"] is None
-    assert console.stop() == "nothing moves"
+    require_only_latched(console, "did not finish")
     latch.let_go()
     latch.disengage()
     console.close()
