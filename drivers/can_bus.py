@@ -72,7 +72,8 @@ class InProcessBus(VirtualBus):
             super().send(msg, timeout)
             return
         self._check_if_open()
-        arrived = copy.copy(msg) if isinstance(msg, SentFrame) else copy.deepcopy(msg)
+        ours = isinstance(msg, SentFrame)
+        arrived = SentFrame(msg.arbitration_id, msg.data) if ours else copy.deepcopy(msg)
         arrived.timestamp, arrived.channel, arrived.is_rx = time.time(), self.channel_id, True
         for inbox in self.channel:
             if inbox is not self.queue:
