@@ -41,9 +41,9 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "$(PYTHON) has no venv module. Next, on Debian or Ubuntu: sudo apt-get install python3-venv" >&2; exit 1; }; \
 	echo "Installing into $(VENV) (once; needs the network) ..."; \
-	case "$$stamp" in "" | "$$place, "*) ;; *) rm -rf "$(VENV)" ;; esac; \
-	rm -f "$(STAMP)"; \
+	case "$$stamp" in "$$place, "*) ;; *) rm -rf "$(VENV)" ;; esac; \
 	"$(PYTHON)" -m venv "$(VENV)" && \
+	echo "$$place, unfinished" > "$(STAMP)" && \
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: -c constraints.txt hatchling && \
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: --no-build-isolation -c constraints.txt -e ".[dev]" && \
 	"$(BIN)/python" -m pip check --disable-pip-version-check && \
