@@ -97,9 +97,9 @@ test-python:  ## Run the quick tests in .venv-python, with another Python (PYTHO
 	.venv-python/bin/python -m pytest $(QUICK) $(TESTS)
 
 # Nothing is downloaded but what tells the versions apart. Left out: the extra `apriltag`, which has no wheel there.
-check-arm64:  ## Check that every pinned package has a wheel for 64-bit ARM (Raspberry Pi, Jetson)
+check-arm64: install  ## Check that every pinned package has a wheel for 64-bit ARM (Raspberry Pi, Jetson)
 	@sed -e '/^# The extra .apriltag/,$$d' -e '/^#/d' -e '/^$$/d' constraints.txt > "$${TMPDIR:-/tmp}/cdpr-pins-$$$$" && \
-	"$(PYTHON)" -m pip $(PIP) --dry-run --ignore-installed --no-deps --only-binary :all: --python-version 3.11 \
+	"$(BIN)/python" -m pip $(PIP) --dry-run --ignore-installed --no-deps --only-binary :all: --python-version 3.11 \
 	  --platform manylinux_2_28_aarch64 --platform manylinux_2_17_aarch64 --platform manylinux2014_aarch64 \
 	  --target "$${TMPDIR:-/tmp}/cdpr-arm64" -r "$${TMPDIR:-/tmp}/cdpr-pins-$$$$"; \
 	status=$$?; rm -f "$${TMPDIR:-/tmp}/cdpr-pins-$$$$"; exit $$status

@@ -85,3 +85,7 @@ def test_pins_that_return_after_an_interrupted_installation_are_installed_again(
     assert not make("install", interpreter)
     pins.write_text(before)
     assert not make("install", interpreter)
+
+
+def test_wheels_are_checked_where_the_python_has_no_pip(folder: Path) -> None:
+    assert make("check-arm64", python(folder, "3.12.1"))
