@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 from benchmarks import realtime
@@ -15,9 +17,10 @@ from benchmarks import realtime
         (("--rates", "0"), "0 Hz is outside"),
         (("--seconds", "0"), "the measuring time is 0 s"),
         (("--seconds", "inf"), "the measuring time is inf s"),
+        (("--seconds", "120"), "the measuring time is 120 s, the path takes 43.4 s"),
     ],
 )
-def test_a_rate_that_arming_refuses_is_refused_in_one_message(
+def test_a_case_that_cannot_be_measured_is_refused_in_one_message(
     options: tuple[str, ...],
     said: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -27,6 +30,8 @@ def test_a_rate_that_arming_refuses_is_refused_in_one_message(
         pytest.fail("it began to measure")
 
     monkeypatch.setattr(realtime, "measured", measured)
+    monkeypatch.setattr(realtime, "verified_plan", str)
+    monkeypatch.setattr(realtime, "prepare", lambda *_: SimpleNamespace(duration=43.42))
     assert realtime.main(options) == 2
     told = capsys.readouterr()
     assert said in told.err
