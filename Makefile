@@ -41,9 +41,9 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "$(PYTHON) has no venv module. Next, on Debian or Ubuntu: sudo apt-get install python3-venv" >&2; exit 1; }; \
 	echo "Installing into $(VENV) (once; needs the network) ..."; \
-	case "$$stamp" in "" | "$$place, "*) ;; *) rm -rf "$(VENV)" ;; esac; \
-	rm -f "$(STAMP)"; \
+	case "$$stamp" in "$$place, "*) ;; *) rm -rf "$(VENV)" ;; esac; \
 	"$(PYTHON)" -m venv "$(VENV)" && \
+	echo "$$place, unfinished" > "$(STAMP)" && \
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: -c constraints.txt hatchling && \
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: --no-build-isolation -c constraints.txt -e ".[dev]" && \
 	"$(BIN)/python" -m pip check --disable-pip-version-check && \
@@ -97,9 +97,9 @@ test-python:  ## Run the quick tests in .venv-python, with another Python (PYTHO
 	.venv-python/bin/python -m pytest $(QUICK) $(TESTS)
 
 # Nothing is downloaded but what tells the versions apart. Left out: the extra `apriltag`, which has no wheel there.
-check-arm64:  ## Check that every pinned package has a wheel for 64-bit ARM (Raspberry Pi, Jetson)
+check-arm64: install  ## Check that every pinned package has a wheel for 64-bit ARM (Raspberry Pi, Jetson)
 	@sed -e '/^# The extra .apriltag/,$$d' -e '/^#/d' -e '/^$$/d' constraints.txt > "$${TMPDIR:-/tmp}/cdpr-pins-$$$$" && \
-	"$(PYTHON)" -m pip $(PIP) --dry-run --ignore-installed --no-deps --only-binary :all: --python-version 3.11 \
+	"$(BIN)/python" -m pip $(PIP) --dry-run --ignore-installed --no-deps --only-binary :all: --python-version 3.11 \
 	  --platform manylinux_2_28_aarch64 --platform manylinux_2_17_aarch64 --platform manylinux2014_aarch64 \
 	  --target "$${TMPDIR:-/tmp}/cdpr-arm64" -r "$${TMPDIR:-/tmp}/cdpr-pins-$$$$"; \
 	status=$$?; rm -f "$${TMPDIR:-/tmp}/cdpr-pins-$$$$"; exit $$status

@@ -116,6 +116,7 @@ def main() -> int:
     parser.add_argument("--one-cable", action="store_true", help="one cable, not the platform")
     options = parser.parse_args()
     rig: Rig = load_rig(RIG).with_bus("udp_multicast", CHANNEL)
+    scene = load_scene(options.scene)
     operator = Operator(options.presses, options.one_cable)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_STATE_HOME"] = folder
@@ -124,12 +125,7 @@ def main() -> int:
             if options.one_cable:
                 cable_session(rig, need_real_time_rights=False, on_cycle=operator.on_cycle)
             else:
-                jog_session(
-                    rig,
-                    load_scene(options.scene),
-                    need_real_time_rights=False,
-                    on_cycle=operator.on_cycle,
-                )
+                jog_session(rig, scene, need_real_time_rights=False, on_cycle=operator.on_cycle)
     moved = np.array(operator.moved)
     first, rest, lost = [], [], 0
     for began, ended in operator.spans:

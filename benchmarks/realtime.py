@@ -1,10 +1,11 @@
 """Lateness of the real-time process and of a plain `time.sleep` loop, idle and with busy cores.
 
     python benchmarks/realtime.py                       # 4 cases of 15 s: under 2 minutes
-    python benchmarks/realtime.py --seconds 120 --rates 100 250
+    python benchmarks/realtime.py --seconds 40 --rates 100 250
 
 The real-time process is that of `cdpr run`, with all work of a cycle: requests, gate, set-points,
-simulated drives and platform in the same process, replies, monitor, status ring. The plain loop
+simulated drives and platform in the same process, replies, monitor, status ring. It follows a path
+of the paper's third environment, which takes about 43 s; a longer time is refused. The plain loop
 runs at the same time in its own process: a thread sleeps with `time.sleep` until its next cycle,
 beside another that writes JSON fifty times a second, as a logging server does. Lateness is the
 delay of a cycle's start after its deadline.
@@ -44,18 +45,36 @@ from model.pose import Array
 from model.rig import Rig, load_rig, rig_from_document
 from model.scene import load_scene
 from planner.check import verify
+from planner.check_report import VerifiedPlan
 from planner.planning import make_plan
 from planner.settings import OptimalSettings
 
 ENVIRONMENT = "environment_3.yaml"
 
 
-def prepared_at(rate: float, folder: Path) -> PreparedRun:
-    """A run in the paper's third environment, half a minute long, at a cycle rate [Hz]."""
+def prepared_runs(rates: Sequence[float], seconds: float, folder: Path) -> list[PreparedRun]:
+    """Runs in the paper's third environment, one for each cycle rate [Hz].
+
+    Raises:
+        BadInput: They end before the measuring time.
+    """
+    rig, plan = load_rig(ready_folder() / PAPER_RIG), verified_plan(folder / "plan.json")
+    runs = [prepare(plan, with_cycle(rig, 1000.0 / rate)) for rate in rates]
+    shortest = min(run.duration for run in runs)
+    if seconds > shortest:
+        raise BadInput(
+            f"the measuring time is {seconds:g} s, the path takes {shortest:.1f} s",
+            where="--seconds",
+            next_step=f"give at most {math.floor(shortest)} s",
+        )
+    return runs
+
+
+def verified_plan(path: Path) -> VerifiedPlan:
+    """A plan of the paper's rig for its third environment, saved and checked."""
     rig, scene = load_rig(ready_folder() / PAPER_RIG), load_scene(ready_folder() / ENVIRONMENT)
-    plan = folder / f"plan-{rate:g}.json"
-    save_plan(make_plan(rig, scene, OptimalSettings(seed=0)), plan)
-    return prepare(verify(load_plan(plan)), with_cycle(rig, 1000.0 / rate))
+    save_plan(make_plan(rig, scene, OptimalSettings(seed=0)), path)
+    return verify(load_plan(path))
 
 
 def with_cycle(rig: Rig, cycle_ms: float) -> Rig:
@@ -155,14 +174,15 @@ def row(rate: float, load: str, loop: str, late: Array) -> str:
     )
 
 
-def measured(rate: float, busy: bool, seconds: float, folder: Path) -> list[str]:
+def measured(prepared: PreparedRun, busy: bool, seconds: float, folder: Path) -> list[str]:
     """Table rows of both loops, measured at the same time."""
+    cycle = prepared.checked.table.cycle
+    rate = 1.0 / cycle
     load = "all cores busy" if busy else "idle"
     print(f"  {rate:g} Hz, {load} ...", flush=True)
     context = multiprocessing.get_context("spawn")
     link, far_end = context.Pipe()
-    plain = context.Process(target=plain_loop, args=(1.0 / rate, far_end), daemon=True)
-    prepared = prepared_at(rate, folder)
+    plain = context.Process(target=plain_loop, args=(cycle, far_end), daemon=True)
     with all_cores_busy(busy):
         plain.start()
         try:
@@ -224,9 +244,9 @@ def show_measured(rates: Sequence[float], seconds: float) -> None:
     began = os.getloadavg()[0]
     rows: list[str] = []
     with TemporaryDirectory(prefix="cdpr-realtime-") as folder:
-        for rate in rates:
+        for prepared in prepared_runs(rates, seconds, Path(folder)):
             for busy in (False, True):
-                rows += measured(rate, busy, seconds, Path(folder))
+                rows += measured(prepared, busy, seconds, Path(folder))
     print(f"\n{os.cpu_count()} cores, load average {began:.1f} before; lateness in ms\n")
     print("| Hz | load | loop | cycles | p50 | p99 | p99.9 | max |")
     print("|---|---|---|---|---|---|---|---|")

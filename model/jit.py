@@ -2,9 +2,10 @@
 
 Numba recompiles a cached function when its own file changes, not when a function it calls does. So
 the cache folder is named after the content of all files beside the function and in the folders of
-kernels that it calls: any change starts a new one. It is in the user's cache (``NUMBA_CACHE_DIR``,
-else ``XDG_CACHE_HOME`` or ``~/.cache``), so a read-only installation works. Where no folder can be
-written, kernels last as long as the process.
+kernels that it calls, and after the Python and the processor, whose code Numba keeps apart: any
+change starts a new one. It is in the user's cache (``NUMBA_CACHE_DIR``, else ``XDG_CACHE_HOME`` or
+``~/.cache``), so a read-only installation works. Where no folder can be written, kernels last as
+long as the process.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
-import platform
 import re
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.registry import cpu_target
 
 from model.progress import Listener
 
@@ -159,8 +161,10 @@ def cache_folder(sources: Path, *called: Path) -> Path | None:
 
 @cache
 def _version(folders: frozenset[Path]) -> str:
-    """Name of this state of the kernels in ``folders``, on this processor."""
-    digest = hashlib.sha256(f"{numba.__version__} {platform.machine()}".encode())
+    """Name of this state of the kernels in ``folders``, for this Python and processor."""
+    processor = cpu_target.target_context.codegen().magic_tuple()  # as Numba distinguishes them
+    python = sys.implementation.cache_tag
+    digest = hashlib.sha256(f"{numba.__version__} {python} {processor}".encode())
     digest.update(Path(__file__).read_bytes())
     for source in sorted(source for folder in folders for source in folder.glob("*.py")):
         digest.update(source.name.encode() + b"\0" + source.read_bytes() + b"\0")
@@ -169,9 +173,9 @@ def _version(folders: frozenset[Path]) -> str:
 
 # Whether the machine code of a task is in the user's cache, or must be compiled first.
 #
-# Numba finds machine code by the path and date of a kernel's file, in a folder named after the
-# content of all kernels. Another copy of the program, or a file that was only touched, compiles
-# again; hence the stamp of a task is named after path, date and size of every kernel's file.
+# Numba finds machine code by the path and date of a kernel's file, in a folder named as above.
+# Another copy of the program, or a file that was only touched, compiles again; hence the stamp of a
+# task is named after path, date and size of every kernel's file.
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,14 +14,14 @@ from typing import Any
 from pydantic import ValidationError
 
 from model.errors import AlreadyExists, BadInput
-from model.files.documents import write_bytes_atomic
+from model.files.documents import write_atomic, write_bytes_atomic
 from model.files.new_rig import Answers, shown_value
 from model.files.output import make_missing_folder
 from model.files.reading import read_bytes, read_text, shown
 from model.files.rig_file import RigDocument
 from model.files.validation import key_path, parse_yaml, problems_of
 
-_KIND = re.compile(r"\$schema=.*/(rig|scene)\.schema\.json")
+_SCHEMA = re.compile(r"(?<=\$schema=).*/(rig|scene)\.schema\.json")
 _DESCRIPTION = re.compile(r"^description: *(.+)$", re.MULTILINE)
 _ABOUT = "README.md"
 PAPER_RIG = "gachon_8_6.yaml"
@@ -56,7 +56,7 @@ def ready_folder(name: str = "configs") -> Path:
     """The folder of the example rigs and scenes: in the package `cdpr`, or in the repository.
 
     Args:
-        name: ``examples`` for the recorded sessions instead.
+        name: ``examples`` for the recorded sessions instead, ``docs/schema`` for the schemas.
     """
     root = Path(__file__).resolve().parents[2]
     inside = root / "cdpr" / name
@@ -79,7 +79,7 @@ def find_examples(configs: Path, sessions: Path) -> list[Example]:
 def _ready_file(path: Path) -> Example:
     text = read_text(path)
     lines = text.splitlines()
-    kind = _KIND.search(lines[0])
+    kind = _SCHEMA.search(lines[0])
     if kind is None:
         raise BadInput(f"{path.name} names no schema in its first line", where=str(path))
     described = _DESCRIPTION.search(text)
@@ -141,11 +141,20 @@ def copy_examples(
 
 
 def _copy(source: Path, target: Path) -> None:
-    files = [source] if source.is_file() else [path for path in source.rglob("*") if path.is_file()]
-    for path in files:
-        copy = target / path.relative_to(source)
-        make_missing_folder(copy.parent)
-        write_bytes_atomic(copy, read_bytes(path))
+    if source.is_file():
+        make_missing_folder(target.parent)
+        write_atomic(target, _SCHEMA.sub(lambda found: _schema(found[1]), read_text(source), 1))
+        return
+    for path in source.rglob("*"):
+        if path.is_file():
+            copy = target / path.relative_to(source)
+            make_missing_folder(copy.parent)
+            write_bytes_atomic(copy, read_bytes(path))
+
+
+def _schema(kind: str) -> str:
+    """The address of the installed schema, which editors find from any folder."""
+    return (ready_folder("docs/schema") / f"{kind}.schema.json").as_uri()
 
 
 # The commented text of a new rig file, from the answers of `model.files.new_rig`.
@@ -159,6 +168,7 @@ def rig_text(answers: Answers) -> str:
     """
     text = _TEMPLATE.format(
         **{key: _yaml(value) for key, value in answers.items()},
+        schema=_schema("rig"),
         outlets=_lines(answers["outlets_mm"]),
         anchors=_lines(answers["anchors_mm"]),
         winches="\n".join(_winch(number, answers) for number in range(1, answers["cables"] + 1)),
@@ -209,6 +219,7 @@ def _winch(number: int, answers: Answers) -> str:
 
 
 _TEMPLATE = """\
+# yaml-language-server: $schema={schema}
 # The rig {name}, written by `cdpr new`. What every key means, and the keys left out here:
 # docs/rig-file.md. Lengths in mm, forces in N, masses in kg; the world frame has z up.
 schema_version: 1

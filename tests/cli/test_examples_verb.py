@@ -23,7 +23,7 @@ def test_every_ready_file_and_session_is_listed_with_what_it_is() -> None:
     assert all(len(words) > 4 for words in listed.values())
 
 
-def test_copies_are_the_files_themselves(tmp_path: Path) -> None:
+def test_copies_are_the_files_but_for_the_address_of_the_schema(tmp_path: Path) -> None:
     folder = tmp_path / "my" / "robot"
     assert call("examples", "gachon_8_6", "environment_1.yaml", "-o", folder).code == 0
     assert sorted(path.name for path in folder.iterdir()) == [
@@ -31,7 +31,7 @@ def test_copies_are_the_files_themselves(tmp_path: Path) -> None:
         "gachon_8_6.yaml",
     ]
     for path in folder.iterdir():
-        assert path.read_bytes() == (CONFIGS / path.name).read_bytes()
+        assert path.read_text().splitlines()[1:] == original(path.name)[1:]
 
 
 def test_all_of_them_are_copied_as_a_clone_has_them(
@@ -52,7 +52,11 @@ def test_a_copy_replaces_nothing_unless_asked(tmp_path: Path) -> None:
         answer = call("examples", "environment_1", "gachon_8_6", "-o", tmp_path)
     one_message(answer, 2, "exists already", "1 of the 2 copies", "--force")
     assert call("examples", "gachon_8_6", "-o", tmp_path, "--force").code == 0
-    assert mine.read_bytes() == (CONFIGS / mine.name).read_bytes()
+    assert mine.read_text().splitlines()[1:] == original(mine.name)[1:]
+
+
+def original(name: str) -> list[str]:
+    return (CONFIGS / name).read_text().splitlines()
 
 
 @pytest.mark.parametrize("names", [("--all",), ("gachon_8_6",), ("rig_session",)])

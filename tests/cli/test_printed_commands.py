@@ -58,7 +58,7 @@ STEPS = (
     (0, "calibrate export configs/gachon_8_6.yaml -o front.yaml --to ros"),
     (0, "calibrate print tags.pdf --rig configs/gachon_8_6.yaml"),
     (0, "calibrate poses REHEARSAL SCENE -o measure.json --count 10 --candidates 100"),
-    (0, "calibrate rig REHEARSAL examples/rig_session/places.csv -o calibration"),
+    (0, "calibrate rig REHEARSAL examples/rig_session/places.csv -o results"),
     (3, "calibrate rig REHEARSAL LENGTHS --without-poses --known drum_scale"),
     (0, f"workspace configs/gachon_8_6.yaml -o maps {FEW}"),
     (0, f"workspace configs/gachon_8_6.yaml --scene SCENE -o more {FEW}"),

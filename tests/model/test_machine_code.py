@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from model import jit as machine_code
 from model.jit import KernelSet
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -64,3 +68,33 @@ def test_a_stamp_that_cannot_be_written_is_ignored(
     monkeypatch.setattr(machine_code, "cache_folder", lambda _: cache / "gone")
     machine_code.note_compiled(task(Path("kernels"), "maps"))
     assert not machine_code.is_compiled(task(Path("kernels"), "maps"))
+
+
+@pytest.mark.parametrize("setting", ["NUMBA_CPU_NAME=generic", "NUMBA_CPU_FEATURES="])
+def test_code_for_another_processor_does_not_count(tmp_path: Path, setting: str) -> None:
+    """A home on a file server, or a container, moves between computers."""
+    run = (
+        "from pathlib import Path; from model.jit import *;"
+        f" task = KernelSet('maps', (Path({str(tmp_path)!r}),));"
+        " print(is_compiled(task)); note_compiled(task)"
+    )
+    here = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_CPU_")}
+    here |= {"NUMBA_CACHE_DIR": str(tmp_path)}
+    there = here | dict([setting.split("=")])
+    found = [
+        subprocess.check_output([sys.executable, "-c", run], cwd=ROOT, env=where, text=True).strip()
+        for where in (here, there, here, there)
+    ]
+    assert found == ["False", "False", "True", "True"]
+
+
+def test_code_for_another_python_does_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    find, version = machine_code.cache_folder.__wrapped__, machine_code._version.__wrapped__
+    monkeypatch.setattr(machine_code, "_version", version)
+    here = find(tmp_path)
+    assert find(tmp_path) == here
+    monkeypatch.setattr(sys.implementation, "cache_tag", "cpython-399")
+    assert find(tmp_path) != here

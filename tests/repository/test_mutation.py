@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import sys
 import tomllib
+from itertools import count
+from math import inf
+from multiprocessing import active_children
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,6 +23,8 @@ def tool(monkeypatch: pytest.MonkeyPatch) -> Any:
     import run
 
     yield run
+    for process in active_children():
+        process.join()
     for name in ("run", "mutants"):
         sys.modules.pop(name, None)
 
@@ -97,3 +103,51 @@ def test_the_same_few_changes_are_tried_every_time(tool: Any) -> None:
     assert [trial.target for trial in chosen] == [safe] * 20 + [other] * 20
     assert tool.sample(found[:7]) != []
     assert {trial.number for trial in tool.sample(found[:7])} == set(range(7))
+
+
+@pytest.mark.parametrize("sent", [[], [(0, True)], [(-1, False)]])
+def test_a_process_that_does_not_try_all_its_changes_fails_the_run(
+    tool: Any, sent: list[tuple[int, bool]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One is killed for its memory, one finds a test that fails without any change."""
+    share = trials(tool)
+    send_and_end(tool, monkeypatch, sent)
+    with pytest.raises(SystemExit) as failed:
+        tool.tried(share, 1, inf)
+    assert failed.value.code == 2
+
+
+def test_a_process_may_end_early_once_the_time_is_up(
+    tool: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, *_ = share = trials(tool)
+    send_and_end(tool, monkeypatch, [(0, True)])
+    monkeypatch.setattr(tool, "time", SimpleNamespace(monotonic=count().__next__))
+    assert tool.tried(share, 1, 0.5) == {first: True}
+
+
+def trials(tool: Any) -> list[Any]:
+    target = tool.Target("executor/safety/gate.py", (), ())
+    made = tool.mutants("x = [1, 2]", "source.py")
+    return [tool.Trial(target, number, mutant) for number, mutant in enumerate(made)]
+
+
+def send_and_end(
+    tool: Any, monkeypatch: pytest.MonkeyPatch, results: list[tuple[int, bool]]
+) -> None:
+    """Replaces the processes by ones that send these results."""
+
+    def serve(_target: Any, _share: Any, _until: float, link: Any) -> None:
+        for result in results:
+            link.send(result)
+
+    monkeypatch.setattr(tool, "serve", serve)
+
+
+def test_lines_changed_since_an_unknown_commit_fail_the_run(
+    tool: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["run.py", "--changed", "no-such-commit"])
+    with pytest.raises(SystemExit) as failed:
+        tool.main()
+    assert failed.value.code == 2

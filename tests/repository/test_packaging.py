@@ -111,7 +111,9 @@ def test_the_citation_names_the_software_and_the_paper() -> None:
 
 
 @pytest.mark.slow
-def test_a_wheel_holds_every_package_its_type_marker_and_the_ready_rigs(tmp_path: Path) -> None:
+def test_a_wheel_holds_every_package_its_type_marker_the_ready_rigs_and_schemas(
+    tmp_path: Path,
+) -> None:
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
     build = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert build.returncode == 0, build.stderr
@@ -132,5 +134,8 @@ def test_a_wheel_holds_every_package_its_type_marker_and_the_ready_rigs(tmp_path
     faults = {f"executor/faults/{path.name}" for path in (ROOT / "docs/faults").glob("*.md")}
     assert faults
     assert faults <= names
+    schemas = {f"cdpr/{p.relative_to(ROOT)}" for p in (ROOT / "docs/schema").glob("*.json")}
+    assert schemas
+    assert schemas <= names
     tops = {name.split("/")[0] for name in names}
     assert tops == {*packages, f"cdpr-{PROJECT['project']['version']}.dist-info"}

@@ -22,8 +22,8 @@ NAMES = {"utils", "util", "common", "helpers", "core", "misc"}
 
 
 def files() -> list[Path]:
-    """The files of the repository: tracked, or new and not ignored."""
-    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    """The tracked files of the repository: others may be a user's own."""
+    command = ["git", "ls-files", "-z"]
     listing = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if listing.returncode != 0:
         pytest.skip(f"not a git work tree: {listing.stderr.strip()}")
@@ -69,6 +69,20 @@ def test_no_generated_output_is_tracked() -> None:
     written = {ROOT / "cdpr/console/static/index.html"}
     found = [p for p in files() if p.suffix in suffixes or "__pycache__" in p.parts]
     found = [path for path in found if path not in written]
+    assert not found
+
+
+def test_documented_commands_do_not_write_into_the_repository() -> None:
+    """A user tries them in a clone: what they write there would be packed into the wheel."""
+    tops = {path.relative_to(ROOT).parts[0] for path in files()}
+    helps = [path for path in files() if ROOT / "cdpr/cli" in path.parents]
+    found = [
+        f"{path.relative_to(ROOT)}: {target}"
+        for path in [*helps, *(path for path in files() if path.suffix == ".md")]
+        for target in re.findall(r" -o ([\w.-]+)", path.read_text())
+        if target in tops
+    ]
+    assert helps
     assert not found
 
 

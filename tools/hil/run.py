@@ -1,6 +1,6 @@
 """Runs the tests marked `hil` on a virtual CAN bus of this or of a virtual machine.
 
-    python tools/hil/run.py [--part runs|table|epos4|nanotec-c5e|akd] [--artefacts DIR]
+    python tools/hil/run.py [--part all|runs|table|epos4|nanotec-c5e|akd] [--artefacts DIR]
         [--limit-s S] [pytest's arguments]
     python tools/hil/run.py --missing
 
@@ -34,12 +34,12 @@ TABLE = "tests/hil/test_fault_table_on_vcan.py"
 MAKERS = "tests/hil/test_makers_on_vcan.py"
 MAKES = ("epos4", "nanotec-c5e", "akd")
 PARTS = {
-    "": ("tests/hil",),
+    "all": ("tests/hil",),
     "runs": ("tests/hil", f"--ignore={TABLE}", f"--ignore={MAKERS}"),
     "table": (TABLE,),
     **{make: (MAKERS, "-k", make) for make in MAKES},
 }
-"""Arguments of each part; the empty name runs all."""
+"""Arguments of each part."""
 NEEDED = {"ip": "iproute2", "candump": "can-utils"}
 NEEDED_BY_VM = {QEMU: "qemu-system-x86", str(BUSYBOX): "busybox-static"}
 KERNELS = "from executor.kernels import ready_to_simulate; ready_to_simulate()"
@@ -60,7 +60,7 @@ COMPILED = (
 def main() -> int:
     """Selects a bus, and runs the tests on it."""
     parser = argparse.ArgumentParser(description="run the hardware-in-the-loop tests on vcan")
-    parser.add_argument("--part", choices=[name for name in PARTS if name], default="")
+    parser.add_argument("--part", choices=list(PARTS), default="all")
     parser.add_argument("--artefacts", type=Path)
     parser.add_argument("--limit-s", type=float, default=1800.0)
     parser.add_argument("--missing", action="store_true")

@@ -1,14 +1,15 @@
 """Mutation tests of the safety code: makes every small change and counts what the tests notice.
 
     python tools/mutation/run.py                       # everything: takes a while
-        python tools/mutation/run.py executor/safety       # files below a path
+    python tools/mutation/run.py executor/safety       # files below a path
     python tools/mutation/run.py --changed [BASE]      # lines changed since BASE (HEAD~1), < 60 s
 
 Each survivor is printed with file, line and change. The exit code is 1 if less than 99 % of the
 changes below `executor/safety` were noticed, or none could be tried; 2 if tests fail without any
-change. `targets.toml` assigns tests to files; `equivalent.toml` lists changes without effect, with
-the reason. Every change runs in a separate process, forked from one that has loaded all modules
-except the changed one and those that import it.
+change, if a process ends before it has tried its changes in time, or if git does not know BASE.
+`targets.toml` assigns tests to files; `equivalent.toml` lists changes without effect, with the
+reason. Every change runs in a separate process, forked from one that has loaded all modules except
+the changed one and those that import it.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from types import CodeType
+from typing import NoReturn
 
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
@@ -258,16 +260,22 @@ def tried(asked: Sequence[Trial], jobs: int, until: float) -> dict[Trial, bool]:
                 number, result = ready.recv()
             except EOFError:
                 del running[ready]
+                if time.monotonic() < until and not noticed.keys() >= set(share):
+                    fail(f"{target.path}: a process ended before it had tried all its changes")
                 continue
             if number < 0:
-                raise SystemExit(
-                    f"{target.path}: {', '.join(target.tests)} fail without any change"
-                )
+                fail(f"{target.path}: {', '.join(target.tests)} fail without any change")
             (trial,) = (t for t in share if t.number == number)
             noticed[trial] = result
             if not result:
                 show(trial)
     return noticed
+
+
+def fail(why: str) -> NoReturn:
+    """Ends the program without a result."""
+    print(why, file=sys.stderr)
+    sys.exit(2)
 
 
 def show(trial: Trial) -> None:
@@ -331,8 +339,7 @@ def main() -> int:
     try:
         asked = asked_for(options.paths, options.changed)
     except subprocess.CalledProcessError:
-        print(f"git does not know {options.changed}: cannot determine the changed lines")
-        return 0
+        fail(f"git does not know {options.changed}: cannot determine the changed lines")
     if not asked:
         print("no file listed in `tools/mutation/targets.toml` was changed")
         return 0

@@ -64,11 +64,11 @@ def camera(
     Exit code 3 where the result is not good enough. Files that cannot be used are listed.
 
     Examples:
-      cdpr calibrate camera pictures/ --columns 9 --rows 6 --square-mm 25 -o calibration
+      cdpr calibrate camera pictures/ --columns 9 --rows 6 --square-mm 25 -o results
       cdpr calibrate camera pictures/ --board charuco --columns 7 --rows 5 --square-mm 30
           --marker-mm 22 --dictionary 4X4_50
-      cdpr calibrate camera corners.csv --size-px 1280 720 -o calibration
-      cdpr calibrate camera pictures/ --live 0 --columns 9 --rows 6 --square-mm 25 -o calibration
+      cdpr calibrate camera corners.csv --size-px 1280 720 -o results
+      cdpr calibrate camera pictures/ --live 0 --columns 9 --rows 6 --square-mm 25 -o results
     """
     require_file_name(name, "--name")
     if live is None and folder.suffix.lower() == ".csv":
@@ -156,7 +156,7 @@ def readout(
     result is not good enough.
 
     Examples:
-      cdpr calibrate readout rig.yaml moving.mp4 -o calibration
+      cdpr calibrate readout rig.yaml moving.mp4 -o results
       cdpr calibrate readout rig.yaml moving/ --rate-hz 30
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)
@@ -207,7 +207,7 @@ def extrinsics(
     The camera must not move between images. Exit code 3 where the result is not good enough.
 
     Examples:
-      cdpr calibrate extrinsics rig.yaml pictures/ -o calibration
+      cdpr calibrate extrinsics rig.yaml pictures/ -o results
       cdpr calibrate extrinsics rig.yaml 0 --calibration calibration_camera_front_2026-03-01.yaml
       cdpr calibrate extrinsics rig.yaml runs/first/pictures --poses runs/first
       cdpr calibrate extrinsics rig.yaml side/ --camera side --beside front=front/
@@ -281,7 +281,7 @@ def tags(
     result is not good enough.
 
     Examples:
-      cdpr calibrate tags rig.yaml pictures/ -o calibration
+      cdpr calibrate tags rig.yaml pictures/ -o results
       cdpr calibrate tags rig.yaml pictures/ --calibration calibration_camera_front_2026-03-01.yaml
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)

@@ -186,7 +186,7 @@ def rig(
     and is reported. Exit code 3 where the result is not good enough.
 
     Examples:
-      cdpr calibrate rig rig.yaml runs/measuring -o calibration
+      cdpr calibrate rig rig.yaml runs/measuring -o results
       cdpr calibrate rig rig.yaml lengths.csv --without-poses --known drum_scale
     """
     made = calibrate_rig(

@@ -1,0 +1,91 @@
+"""The `Makefile` installs on the Python it is given, and continues what was interrupted."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+PYTHON = """\
+#!/bin/sh
+case "$*" in
+  -V) echo "Python {version}" ;;
+  "-m venv "*)
+    mkdir -p "$3/bin" && cd "$3/bin" || exit 1
+    echo "#!/bin/sh" > cdpr
+    [ -e python ] || cp "{path}" python
+    chmod +x cdpr ;;
+  "-m pip "*) [ -e "${{0%python}}cdpr" ] && [ ! -e broken ] ;;
+esac
+"""
+"""Stands for a distribution's Python: with venv, which keeps a Python that exists; pip only in an
+environment, where it fails while a file `broken` exists."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with the files that an installation reads."""
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(ROOT / name, tmp_path)
+    return tmp_path
+
+
+def python(folder: Path, version: str) -> Path:
+    path = folder / f"python{version}"
+    path.write_text(PYTHON.format(version=version, path=path))
+    path.chmod(0o755)
+    return path
+
+
+def make(target: str, python: Path) -> bool:
+    command = ["make", f"PYTHON={python}", target]
+    return subprocess.run(command, cwd=python.parent, capture_output=True).returncode == 0
+
+
+def installed(folder: Path) -> tuple[str, str]:
+    """The version of the environment's Python, and the one it is said to be."""
+    shown = subprocess.run([folder / ".venv/bin/python", "-V"], capture_output=True, text=True)
+    return shown.stdout.split()[1], (folder / ".venv/installed").read_text().split()[1]
+
+
+def test_an_environment_of_another_python_is_replaced(folder: Path) -> None:
+    """`venv` itself keeps the Python of an environment that exists."""
+    subprocess.run([python(folder, "3.11.2"), "-m", "venv", ".venv"], cwd=folder, check=True)
+    assert make("install", python(folder, "3.12.1"))
+    assert installed(folder) == ("3.12.1", "3.12.1")
+
+
+def test_an_interrupted_installation_continues_on_its_own_python_only(folder: Path) -> None:
+    broken = folder / "broken"
+    old, new = python(folder, "3.11.2"), python(folder, "3.12.1")
+    broken.touch()
+    assert not make("install", old)
+    download = folder / ".venv/download"
+    download.touch()
+    assert not make("install", old)
+    assert download.exists()
+    broken.unlink()
+    assert make("install", new)
+    assert not download.exists()
+    assert installed(folder) == ("3.12.1", "3.12.1")
+
+
+def test_pins_that_return_after_an_interrupted_installation_are_installed_again(
+    folder: Path,
+) -> None:
+    pins, interpreter = folder / "constraints.txt", python(folder, "3.12.1")
+    assert make("install", interpreter)
+    before = pins.read_text()
+    pins.write_text(f"{before}another==1\n")
+    (folder / "broken").touch()
+    assert not make("install", interpreter)
+    pins.write_text(before)
+    assert not make("install", interpreter)
+
+
+def test_wheels_are_checked_where_the_python_has_no_pip(folder: Path) -> None:
+    assert make("check-arm64", python(folder, "3.12.1"))
