@@ -20,6 +20,9 @@ from executor.trajectory.time_scaling import speed_change
 from model.pose import Array
 from model.rig import Motion
 
+#: Cycles at rest before and after the motion.
+SETTLING = 10
+
 
 class Feed:
     """Index into the set-point table; advances with every cycle sent, never by a clock.
@@ -193,9 +196,11 @@ class Cycle:
         """From now on the gate allows the range of these set-points, shape (n, m)."""
         self._limits = gate_limits(self._rig, setpoints, self._rig.cycle)
 
-    def largest_travel(self, first: Array, second: Array) -> float:
-        """Largest cable travel between two sets of drive positions, [m]."""
-        return float(np.max(np.abs((second - first) / self._per_metre)))
+    def approach_cycles(self, first: Array, second: Array) -> int:
+        """Cycles for a `smooth_step` between two sets of drive positions, shape (m,), [counts]."""
+        travel = float(np.max(np.abs((second - first) / self._per_metre)))
+        speed = min(self._rig.motion.speed, *(winch.max_speed for winch in self._rig.winches))
+        return SETTLING + math.ceil(4.0 * travel / (speed * self._rig.cycle))
 
     def allows(self, purpose: Purpose, targets: tuple[int, ...]) -> GateDecision:
         """Decision of the gate on targets now."""

@@ -15,7 +15,7 @@ import numpy as np
 from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.factory import stop_alone, without_torque
-from executor.control.cycle import Cycle, CycleResult, Feed, targets_at
+from executor.control.cycle import SETTLING, Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
 from executor.control.sync_master import SyncMaster, changed_states
 from executor.safety.fault_messages import Alarm, StopReaction, shared_causes
@@ -28,8 +28,6 @@ from model.errors import CdprError, Refused
 
 #: All drives must hold within this time after the command, [s].
 HOLD_TIMEOUT = 3.0
-#: Cycles at rest before and after the motion.
-SETTLING = 10
 #: Failures of the bus in a row after which it is given up while drives stop.
 GONE = 10
 
@@ -167,8 +165,7 @@ class Loop:
         """Moves smoothly to the first row, by at most the start tolerance."""
         begin = np.array(self._sender.targets, dtype=np.float64)
         end = self._checked.setpoints[0].astype(np.float64)
-        travel, speed = self._sender.largest_travel(begin, end), self._checked.rig.motion.speed
-        steps = SETTLING + int(np.ceil(4.0 * travel / (speed * self._checked.cycle)))
+        steps = self._sender.approach_cycles(begin, end)
         for step in range(1, steps + 1):
             share = smooth_step(step / steps)
             targets = tuple(int(v) for v in np.rint(begin + share * (end - begin)))

@@ -17,7 +17,7 @@ import numpy as np
 
 from drivers.drive_group import CycleStatus
 from drivers.factory import without_torque
-from executor.control.loop import SETTLING
+from executor.control.cycle import SETTLING
 from executor.control.winch_loop import WinchMover
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
