@@ -92,7 +92,7 @@ class Loop:
         seen = self._master.read_positions()
         self._master.require_no_fault()
         require(seen)
-        self._held_before = {*self._checked.rig.drive_names} - self._released(seen)
+        self._held_before = self._nodes_holding(seen)
         self._require_at_start()
         self._sender.armed = True
 
@@ -263,13 +263,15 @@ class Loop:
 
     def _is_held(self, status: CycleStatus) -> bool:
         """Whether no drive has let go of a cable that it held, before or in this motion."""
-        let_go = self._held_before & self._released(status)
-        return status.holding or not (self._taken_over or let_go)
+        holding = self._nodes_holding(status)
+        self._held_before |= holding
+        return holding == self._held_before
 
-    def _released(self, status: CycleStatus) -> set[int]:
-        """Nodes that do not hold by torque; those of ODrives hold by brakes, all or none."""
+    def _nodes_holding(self, status: CycleStatus) -> set[int]:
+        """Nodes that hold by torque; those of ODrives hold by brakes, all or none."""
         released = without_torque(self._checked.rig, status.status_words.tolist())
-        return {*released} if status.holding or released else {*self._checked.rig.drive_names}
+        nodes = {*self._checked.rig.drive_names} if status.holding or released else set[int]()
+        return nodes.difference(released)
 
     def _index(self) -> float:
         """Progress of the motion, for the record."""
