@@ -16,7 +16,7 @@ from executor.safety.limits import gate_limits, stuck_limits, watch_limits
 from executor.safety.monitor import Monitor, Observation
 from executor.safety.stall import StuckWatch
 from executor.trajectory.setpoints import CheckedSetpoints
-from executor.trajectory.time_scaling import speed_change
+from executor.trajectory.time_scaling import smooth_step_duration, speed_change
 from model.pose import Array
 from model.rig import Motion
 
@@ -198,9 +198,12 @@ class Cycle:
 
     def approach_cycles(self, first: Array, second: Array) -> int:
         """Cycles for a `smooth_step` between two sets of drive positions, shape (m,), [counts]."""
-        travel = float(np.max(np.abs((second - first) / self._per_metre)))
-        speed = min(self._rig.motion.speed, *(winch.max_speed for winch in self._rig.winches))
-        return SETTLING + math.ceil(4.0 * travel / (speed * self._rig.cycle))
+        motion, cycle = self._rig.motion, self._rig.cycle
+        # The platform may move farther than its cables; so its limits are kept for twice as far.
+        travel = 2.0 * float(np.max(np.abs((second - first) / self._per_metre)))
+        speed = min(motion.speed, *(winch.max_speed for winch in self._rig.winches))
+        cycles = SETTLING + math.ceil(2.0 * travel / (speed * cycle))
+        return max(cycles, math.ceil(smooth_step_duration(travel, motion) / cycle))
 
     def allows(self, purpose: Purpose, targets: tuple[int, ...]) -> GateDecision:
         """Decision of the gate on targets now."""

@@ -303,35 +303,34 @@ class Loop:
         state = self.machine.state
         if self._apply_stop(requests):
             return
+        speed = f"{requests.speed:.0%} of the planned speed"
         if requests.hold and state is State.MOVING:
-            self._feed.stop()
+            self._report("hold", f"feed hold; {self._slow_down()}")
             self.machine.on(Event.HOLD)
-            self._report("hold", f"feed hold; slowing down {self.motion_phrase}")
         elif state is State.HOLDING and not requests.hold:
             self._feed.go_to(requests.speed)
             self.machine.on(Event.RESUME)
-            self._report(
-                "resume",
-                f"continuing {self.motion_phrase} at {requests.speed:.0%} of the planned speed",
-            )
+            self._report("resume", f"continuing {self.motion_phrase} at {speed}")
         elif state is State.MOVING and self._feed.wanted != requests.speed:
             self._feed.go_to(requests.speed)
-            self._report(
-                "speed", f"speed {self.motion_phrase}: {requests.speed:.0%} of the planned speed"
-            )
+            self._report("speed", f"speed {self.motion_phrase}: {speed}")
 
     def _apply_stop(self, requests: OperatorRequests) -> bool:
         """Begins a path stop if one is requested and possible; returns whether it did."""
         if not (requests.stop and self.machine.state in _STOPPABLE):
             return False
-        on_hold = self.machine.state is State.HOLDING and self._feed.at_rest
-        what_follows = "at rest on hold" if on_hold else f"slowing down {self.motion_phrase}"
         why = requests.for_what or StopReason("stop", "stop requested")
-        self._requested = f"{why.text}; {what_follows}"
+        self._requested = f"{why.text}; {self._slow_down()}"
         self._report_cause(why.code, self._requested)
-        self._feed.stop()
         self.machine.on(Event.STOP)
         return True
+
+    def _slow_down(self) -> str:
+        """Stops the feed; returns what follows."""
+        self._feed.stop()
+        if self.machine.state not in ON_PATH:
+            return "stopping at once"
+        return "at rest" if self._feed.at_rest else f"slowing down {self.motion_phrase}"
 
     def _report_once(self, alarm: Alarm) -> None:
         """A condition that persists is reported in its first cycle."""
