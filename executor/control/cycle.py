@@ -46,6 +46,10 @@ class Feed:
         self._last = rows - 1
         self._acceleration = motion.acceleration / motion.speed * cycle  # [rows a cycle²]
         self._jerk = motion.jerk / motion.speed * cycle**2  # [rows a cycle³]
+        self._begin(rate)
+
+    def _begin(self, rate: float) -> None:
+        """Takes a rate without a ramp."""
         self._change = speed_change((rate, 0.0), rate, self._acceleration, self._jerk)
         self._passed = 0.0  # of the change, [cycles]
         self._wanted = rate
@@ -105,8 +109,11 @@ class Feed:
         self._passed, self._wanted, self._steady = 0.0, rate, False
 
     def stop(self) -> None:
-        """Begins to slow down to rest."""
-        self.go_to(0.0)
+        """Begins to slow down to rest; before the first step it is at rest at once."""
+        if self.index > 0.0:
+            self.go_to(0.0)
+        else:
+            self._begin(0.0)
 
     def advance(self) -> float:
         """Table index of the next cycle."""

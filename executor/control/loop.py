@@ -174,6 +174,7 @@ class Loop:
                 return
         self.machine.on(Event.AT_START)
         self._report("moving", f"at the start; moving {self.motion_phrase}")
+        self._apply_requests(self._requests())
 
     def _follow(self) -> None:
         """One cycle along the table, or at rest in it."""

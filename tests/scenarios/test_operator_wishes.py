@@ -15,7 +15,7 @@ from executor.recording import recorder
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
 from model.pose import moved
-from tests.scenarios.stage import Stage, path_indices, staged
+from tests.scenarios.stage import Stage, at, path_indices, staged
 
 Does = Callable[[Stage], object]
 HELD_AT = 150
@@ -222,3 +222,20 @@ def test_the_approach_keeps_the_paths_acceleration_and_jerk(
         for _ in range(order):
             differences = differences[window:] - differences[:-window]
         assert np.abs(differences).max() <= limit * (window * rig.cycle) ** order
+
+
+def test_a_hold_requested_before_the_motion_waits_at_the_start_of_the_path(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with staged(prepared, tmp_path / "run", at(150, lambda s: s.board.ask_hold(False))) as stage:
+        stage.board.ask_hold(True)
+        outcome = stage.run()
+        events = stage.events()
+    assert outcome.state is State.FINISHED, outcome.cause
+    table = outcome.log.table()
+    assert states(outcome) == ["enabling", "approaching", "holding", "moving", "securing"]
+    first, resumed = table.state.index("holding"), table.state.index("moving")
+    assert resumed > 140
+    assert (table.set_counts[first:resumed] == prepared.checked.table.counts[0]).all()
+    assert [event.code for event in events] == ["enabled", "moving", "hold", "resume", "held"]
+    assert events[2].text == "feed hold; at rest"
