@@ -12,6 +12,7 @@ from drivers.can_bus import BusSettings, open_bus
 from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import DriveGroup, DriveSnapshot, GroupState
 from drivers.factory import make_drive_group, read_drives
+from drivers.odrive.messages import AxisError
 from executor.control.preconditions import set_up_here
 from executor.control.standstill import FaultReset, Release, Standstill
 from executor.control.sync_master import SyncMaster
@@ -24,6 +25,7 @@ from simulation.drives.cia402 import SimulatedDrive
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.ground_truth import PowerLoss
 from tests.cli.plans import RIG
+from tests.drivers.odrive_bench import OdriveBench, odrive_bench
 
 _CHANNELS = itertools.count()
 FOLLOWING, HOLDING = DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE
@@ -307,3 +309,27 @@ def _fails_unwatched(drive: SimulatedDrive) -> Callable[[tuple[int, int], int], 
             drive.state = DriveState.FAULT
 
     return fails
+
+
+def reset_odrives(bench: OdriveBench, clock: SimulatedClock) -> FaultReset:
+    """Resets those drives, one of them in error."""
+    bench.drives[2].fail(AxisError.ESTOP_REQUESTED)
+    bench.group.configure(to_reset=True)
+    master, records = SyncMaster(bench.rig, bench.group, clock), list[CycleRecord]()
+    procedure = FaultReset(bench.rig, master, OperatorRequests, records.append)
+    procedure.arm()
+    procedure.run()
+    return procedure
+
+
+def test_a_late_cycle_while_odrives_are_reset_is_no_fault_as_none_is_enabled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with odrive_bench() as bench:
+        clock = SimulatedClock(bench.rig.cycle)
+        late = {100: 1.6}
+        cycles = itertools.count()
+        monkeypatch.setattr(clock, "next_cycle", lambda: late.get(next(cycles), 0.0))
+        assert reset_odrives(bench, clock).error is None
+        assert next(cycles) > max(late)
+        assert {drive.errors for drive in bench.drives} == {0}
