@@ -9,10 +9,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
-from drivers.factory import without_torque
 from executor.control.preconditions import require_capabilities
 from executor.control.sync_master import ReplyTimeout, SyncMaster, changed_states, late_fault
 from executor.interlock.fault_latch import LatchedFault
@@ -345,28 +344,28 @@ def release_drives(
     on_armed(armed.denied)
     interlock.found_released(armed.restarted, armed.released)
     interlock.begin(record, interlock.still_counts(armed.positions), under=under)
-    ended = _CUT_SHORT
+    ended, left, released = _CUT_SHORT, None, False
     try:
         ended = process.run()
-        left = process.read_status() if ended.state is State.FINISHED else None
+        released = ended.state is State.FINISHED
+        left = process.read_status() if released else None
+    except CdprError as error:
+        ended = replace(ended, state=State.LATCHED, cause=error.what, error=error)
     except BaseException:
         ended = _CUT_SHORT
         raise
     finally:
-        if ended.state is not State.FINISHED:
-            cause = f"while releasing the drives: {ended.cause}"
-            interlock.end(State.LATCHED, cause, record, holding=False, positions=None)
+        interlock.end(
+            ended.state,
+            ended.cause and f"while releasing the drives: {ended.cause}",
+            record,
+            holding=released and is_braked(rig),
+            positions=armed.positions if left is None else left.positions.tolist(),
+            released=[winch.node_id for winch in rig.winches],
+            release_reason=_RELEASED if released else "",
+        )
     if left is None:
         raise ended.error or Fault(ended.cause, where="release")
-    interlock.end(
-        State.FINISHED,
-        "",
-        record,
-        holding=is_braked(rig),
-        positions=left.positions.tolist(),
-        released=without_torque(rig, left.status_words.tolist()),
-        release_reason=_RELEASED,
-    )
     return left
 
 

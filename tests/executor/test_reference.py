@@ -9,17 +9,20 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 
-from drivers.can_errors import TorqueLost
+from drivers.can_errors import BusDown, TorqueLost
 from drivers.cia402.group import Cia402Group
 from drivers.drive_group import DriveSnapshot
 from drivers.plausibility import require_within_limits
 from executor.control.preconditions import require_still_referenced
+from executor.control.standstill import release_drives
 from executor.drives import open_drives
 from executor.homing import use_rig_file_counts
 from executor.interlock import locks as state_folder
 from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.interlock.reference import HomingReference, as_in_the_file, reference_at
 from executor.proposals import ForgetProposal
+from executor.realtime.child import Armed, Ended, Records
+from executor.realtime.process import RealTimeProcess
 from executor.state_machine import State
 from model.errors import BadInput, Refused, StoppedByOperator
 from model.rig import Rig, load_rig, rig_from_document
@@ -443,6 +446,39 @@ def test_drives_released_behind_their_brakes_need_not_hold_until_they_are_enable
     with pytest.raises(Refused, match=r"reference is lost") as caught:
         MotionInterlock(rig).reference()
     assert "without torque" in caught.value.why
+
+
+@pytest.mark.parametrize(("brake", "lost"), [(True, ""), (False, "released by the operator")])
+def test_a_release_whose_end_cannot_be_read_is_latched_with_its_cause_and_braked_drives_count(
+    brake: bool, lost: str
+) -> None:
+    """As where the adapter is unplugged just after all drives were released."""
+    rig = rig_with("incremental", brake=brake)
+    reference = reference_of(rig)
+    interlock = MotionInterlock(rig)
+    interlock.file.write(reference)
+
+    class Unplugged(RealTimeProcess):
+        def __init__(self) -> None:
+            pass
+
+        def arm(self, records: Records) -> Armed:
+            return Armed("", tuple(reference.stands_at))
+
+        def run(self) -> Ended:
+            return Ended(State.FINISHED, "", holding=False, true_pose=None)
+
+        def read_status(self) -> NoReturn:
+            raise BusDown("the interface is down", "can0")
+
+    with pytest.raises(BusDown, match="interface is down"):
+        release_drives(rig, interlock, Unplugged(), lambda _denied: None)
+    with pytest.raises(Refused, match=r"while releasing the drives: .*interface is down"):
+        interlock.require_free()
+    MotionInterlock(rig).found_released((), ALL)  # as a reset finds them
+    why = MotionInterlock(rig).why_unreferenced(reference.stands_at)
+    assert lost in why
+    assert bool(lost) is bool(why)
 
 
 def test_a_motion_from_released_drives_does_not_make_the_reference_good_again() -> None:
