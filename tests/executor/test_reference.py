@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -13,8 +15,11 @@ from drivers.can_errors import BusDown, TorqueLost
 from drivers.cia402.group import Cia402Group
 from drivers.drive_group import DriveSnapshot
 from drivers.plausibility import require_within_limits
+from executor import drives
+from executor.control import path_runs
 from executor.control.preconditions import require_still_referenced
 from executor.control.standstill import release_drives
+from executor.control.winch_motion import move_winches
 from executor.drives import open_drives
 from executor.homing import use_rig_file_counts
 from executor.interlock import locks as state_folder
@@ -479,6 +484,82 @@ def test_a_release_whose_end_cannot_be_read_is_latched_with_its_cause_and_braked
     why = MotionInterlock(rig).why_unreferenced(reference.stands_at)
     assert lost in why
     assert bool(lost) is bool(why)
+
+
+class Unmoved:
+    """Drives of which one falls silent before the first cycle."""
+
+    def __init__(self, armed: Armed) -> None:
+        self.armed = armed
+
+    def arm(self, _records: object) -> Armed:
+        return self.armed
+
+    def run(self) -> Ended:
+        return Ended(State.LATCHED, "drive 3 stopped answering", holding=True, true_pose=None)
+
+    def read_status(self) -> NoReturn:
+        raise AssertionError("it did not finish")
+
+
+@pytest.mark.parametrize("path", [True, False])
+def test_braked_drives_that_were_not_enabled_after_all_need_not_have_held(
+    path: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rig_with("incremental", brake=True)
+    reference = reference_of(rig)
+    MotionInterlock(rig).file.write(reference.model_copy(update={"released": [*ALL]}))
+    mover: Any = Unmoved(Armed("", tuple(reference.stands_at), released=ALL))
+    records: Any = SimpleNamespace(folder=SimpleNamespace(path=tmp_path), take_event=print)
+    if path:
+        records.log = SimpleNamespace(last=None)
+        motion = SimpleNamespace(of=lambda *_args, **_more: None)
+        monkeypatch.setattr(path_runs, "PathMotion", motion)
+        monkeypatch.setattr(path_runs, "real_time_process", lambda *_, **__: nullcontext(mover))
+        monkeypatch.setattr(path_runs, "checked_setpoints_of", id)
+        monkeypatch.setattr(path_runs, "load_changes", lambda *_: None)
+        table = SimpleNamespace(table=SimpleNamespace(dwells=()))
+        prepared: Any = SimpleNamespace(
+            rig=MotionInterlock(rig).referenced_rig(), scene=None, checked=table
+        )
+        path_runs.run_in_real_time(
+            prepared,
+            records,
+            records,
+            records,
+            pose_every=0,
+            need_real_time=False,
+            check_drives=lambda _released: "",
+            before_motion=lambda _denied: None,
+        )
+    else:
+        move_winches(
+            mover,
+            rig,
+            MotionInterlock(rig),
+            records,
+            record=tmp_path,
+            rehome=False,
+            at_rest=lambda _result, _pose: None,
+        )
+    with pytest.raises(Refused, match="drive 3 stopped answering"):
+        MotionInterlock(rig).require_free()
+    MotionInterlock(rig).found_released((), ALL)  # as a reset finds them
+    assert MotionInterlock(rig).why_unreferenced(reference.stands_at) == ""
+
+
+@pytest.mark.parametrize("word", [0x0231, 0x0218])
+def test_abandoned_drives_must_hold_unless_they_were_never_enabled(
+    monkeypatch: pytest.MonkeyPatch, word: int
+) -> None:
+    rig = rig_with("incremental", brake=True)
+    seen = seen_at(rig, words={2: word, 4: word})
+    monkeypatch.setattr(drives, "read_snapshot", lambda *_: seen)
+    monkeypatch.setattr(drives, "ALONE", 0.0)
+    assert drives.abandoned_drives_fault(rig.document, (2, 4)) == ""
+    found = drives.abandoned_drives_fault(rig.document, (2,))
+    assert "cable 4 (drive 4) is in" in found
+    assert "drive 2" not in found
 
 
 def test_a_motion_from_released_drives_does_not_make_the_reference_good_again() -> None:
