@@ -562,6 +562,35 @@ def test_abandoned_drives_must_hold_unless_they_were_never_enabled(
     assert "drive 2" not in found
 
 
+def _notices_power_cycle(interlock: MotionInterlock) -> None:
+    interlock.found_restarted((3,))
+
+
+def _homes_in_part(interlock: MotionInterlock) -> None:
+    interlock.begin(Path("home"), None, rehome=True)
+    interlock.end(State.STOPPED, "", Path("home"), holding=True, positions=[0] * 8)
+
+
+@pytest.mark.parametrize("does", [_notices_power_cycle, _homes_in_part])
+def test_what_another_user_notes_of_drives_that_only_this_one_homed_counts(
+    share: Callable[[], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    does: Callable[[MotionInterlock], None],
+) -> None:
+    """The other one's set-up leaves no other trace; drives power-cycled at home count from 0."""
+    rig = rig_with("incremental")
+    MotionInterlock(rig).file.write(reference_of(rig))
+    share()
+    with monkeypatch.context() as other:
+        other.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+        does(MotionInterlock(rig))
+    with pytest.raises(Refused, match="reference is lost"):
+        MotionInterlock(rig).reference()
+    MotionInterlock(rig).file.write(reference_of(rig))  # homed
+    assert MotionInterlock(rig).reference() is not None
+
+
 def test_a_motion_from_released_drives_does_not_make_the_reference_good_again() -> None:
     rig = rig_with("incremental")
     interlock, left = MotionInterlock(rig), reference_of(rig)
