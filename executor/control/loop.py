@@ -26,8 +26,6 @@ from executor.trajectory.setpoints import CheckedSetpoints
 from executor.trajectory.time_scaling import smooth_step
 from model.errors import CdprError, Refused
 
-#: All drives must hold within this time after the command, [s].
-HOLD_TIMEOUT = 3.0
 #: Failures of the bus in a row after which it is given up while drives stop.
 GONE = 10
 
@@ -195,14 +193,15 @@ class Loop:
             if self.machine.state is not State.SECURING:
                 return
         self._group.command(GroupCommand.QUICK_STOP)
-        for _ in range(round(HOLD_TIMEOUT / self._checked.cycle)):
+        within = self._master.hold_timeout
+        for _ in range(round(within / self._checked.cycle)):
             status = self._send(Purpose.HOLD, self._sender.resting_targets)
             if self.machine.state is not State.SECURING:
                 return
             if status is not None and status.stopped and (status.holding or not was_enabled):
                 self._leave(status)
                 return
-        self._fault("hold_timeout", f"the drives did not hold within {HOLD_TIMEOUT:g} s")
+        self._fault("hold_timeout", f"the drives did not hold within {within:.3g} s")
 
     def _leave(self, held: CycleStatus) -> None:
         """Ends monitoring of drives that hold on their own, and reads their state once more."""
@@ -373,7 +372,7 @@ class Loop:
     def _drain(self) -> None:
         """Continues cycles for drives still stopping and for the record, then ends."""
         try:
-            for cycle in range(round(HOLD_TIMEOUT / self._checked.cycle)):
+            for cycle in range(round(self._master.hold_timeout / self._checked.cycle)):
                 if cycle >= SETTLING and not self._group.stopping:
                     break
                 if not self._one_more_latched():

@@ -24,8 +24,6 @@ from model.errors import CdprError, Fault, StoppedByOperator
 from model.pose import Pose
 from model.rig import Rig
 
-#: All drives must have stopped within this time, [s].
-WITHIN_S = 3.0
 #: Time for a drive to leave its fault, and for the others to be confirmed holding, [s].
 SETTLING_S = 1.5
 
@@ -53,7 +51,6 @@ class Standstill(ABC):
         self._requests, self._on_cycle = requests, on_cycle
         self._silence = ReplyTimeout(rig)
         self._cycles = 0
-        self._longest = round(WITHIN_S / rig.cycle)
         self.cause, self.error = "", None
         self.holding = True
 
@@ -167,7 +164,7 @@ class Standstill(ABC):
         """
         with suppress(CdprError):
             self._master.stop_now()
-        for _ in range(self._longest):
+        for _ in range(round(self._master.hold_timeout / self._rig.cycle)):
             self._master.begin()
             with suppress(CdprError):
                 status = self._master.exchange(self._group.targets.tolist())
