@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -177,13 +177,14 @@ def read_snapshot(rig: Rig, simulated_start: Pose, load: Load) -> DriveSnapshot:
         return read_drives(rig, drives.bus, drives.pump)
 
 
-def abandoned_drives_fault(document: RigDocument) -> str:
+def abandoned_drives_fault(document: RigDocument, released: Collection[int]) -> str:
     """Why drives without a master do not hold; empty if all hold.
 
     Drives simulated in the process that ended are gone as well.
 
     Args:
         document: The rig file.
+        released: Nodes that need not hold, as they were never enabled.
     """
     rig = rig_from_document(document)
     if is_simulated(rig):
@@ -195,9 +196,13 @@ def abandoned_drives_fault(document: RigDocument) -> str:
         return f"state of the drives unknown: {error.what}"
     words = snapshot.status_words.tolist()
     rows = zip(
-        rig.drive_names.values(), drive_states(rig, words), stop_alone(rig, words), strict=True
+        rig.drive_names.items(), drive_states(rig, words), stop_alone(rig, words), strict=True
     )
-    wrong = [f"{name} is in {state}" for name, state, good in rows if not good]
+    wrong = [
+        f"{name} is in {state}"
+        for (node, name), state, good in rows
+        if not (good or node in released)
+    ]
     return f"drives do not hold on their own: {', '.join(wrong)}" if wrong else ""
 
 

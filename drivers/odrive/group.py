@@ -347,6 +347,7 @@ class OdriveGroup(CyclicGroup):
         for array in (positions, demands, torques, words, missing):
             array.setflags(write=False)
         braked = self.capabilities.has_brake and self._all_disarmed()
+        following = self._state in (GroupState.ENABLING, GroupState.ENABLED) or self.stopping
         return CycleStatus(
             positions=positions,
             demands=demands,
@@ -356,7 +357,7 @@ class OdriveGroup(CyclicGroup):
             faults=tuple(self._faults),
             state=self._state,
             holding=braked or watch.in_state(AxisState.CLOSED_LOOP_CONTROL),
-            stopped=self._stop is _Stop.OVER and self._all_disarmed() and not missing.any(),
+            stopped=not following and self._all_disarmed() and not missing.any(),
             rejected=watch.rejected,
             error_frames=self._cyclic.error_frames,
         )

@@ -342,8 +342,12 @@ ERROR_FLAG = 0x100
 
 
 def status_word(state: int, errors: int) -> int:
-    """State of an axis as one number, with a flag for errors."""
-    return state | (ERROR_FLAG if errors else 0)
+    """State of an axis as one number, with a flag for errors.
+
+    An expired watchdog of an idle axis is none: its brake holds, and enabling clears it.
+    """
+    excused = AxisError.WATCHDOG_TIMER_EXPIRED if state == AxisState.IDLE else 0
+    return state | (ERROR_FLAG if errors & ~excused else 0)
 
 
 def state_in(word: int) -> int:

@@ -16,9 +16,12 @@ from executor.safety.limits import gate_limits, stuck_limits, watch_limits
 from executor.safety.monitor import Monitor, Observation
 from executor.safety.stall import StuckWatch
 from executor.trajectory.setpoints import CheckedSetpoints
-from executor.trajectory.time_scaling import speed_change
+from executor.trajectory.time_scaling import smooth_step_duration, speed_change
 from model.pose import Array
 from model.rig import Motion
+
+#: Cycles at rest before and after the motion.
+SETTLING = 10
 
 
 class Feed:
@@ -43,6 +46,10 @@ class Feed:
         self._last = rows - 1
         self._acceleration = motion.acceleration / motion.speed * cycle  # [rows a cycle²]
         self._jerk = motion.jerk / motion.speed * cycle**2  # [rows a cycle³]
+        self._begin(rate)
+
+    def _begin(self, rate: float) -> None:
+        """Takes a rate without a ramp."""
         self._change = speed_change((rate, 0.0), rate, self._acceleration, self._jerk)
         self._passed = 0.0  # of the change, [cycles]
         self._wanted = rate
@@ -102,8 +109,11 @@ class Feed:
         self._passed, self._wanted, self._steady = 0.0, rate, False
 
     def stop(self) -> None:
-        """Begins to slow down to rest."""
-        self.go_to(0.0)
+        """Begins to slow down to rest; before the first step it is at rest at once."""
+        if self.index > 0.0:
+            self.go_to(0.0)
+        else:
+            self._begin(0.0)
 
     def advance(self) -> float:
         """Table index of the next cycle."""
@@ -193,9 +203,14 @@ class Cycle:
         """From now on the gate allows the range of these set-points, shape (n, m)."""
         self._limits = gate_limits(self._rig, setpoints, self._rig.cycle)
 
-    def largest_travel(self, first: Array, second: Array) -> float:
-        """Largest cable travel between two sets of drive positions, [m]."""
-        return float(np.max(np.abs((second - first) / self._per_metre)))
+    def approach_cycles(self, first: Array, second: Array) -> int:
+        """Cycles for a `smooth_step` between two sets of drive positions, shape (m,), [counts]."""
+        motion, cycle = self._rig.motion, self._rig.cycle
+        # The platform may move farther than its cables; so its limits are kept for twice as far.
+        travel = 2.0 * float(np.max(np.abs((second - first) / self._per_metre)))
+        speed = min(motion.speed, *(winch.max_speed for winch in self._rig.winches))
+        cycles = SETTLING + math.ceil(2.0 * travel / (speed * cycle))
+        return max(cycles, math.ceil(smooth_step_duration(travel, motion) / cycle))
 
     def allows(self, purpose: Purpose, targets: tuple[int, ...]) -> GateDecision:
         """Decision of the gate on targets now."""

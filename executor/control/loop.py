@@ -15,7 +15,7 @@ import numpy as np
 from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.factory import stop_alone, without_torque
-from executor.control.cycle import Cycle, CycleResult, Feed, targets_at
+from executor.control.cycle import SETTLING, Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
 from executor.control.sync_master import SyncMaster, changed_states
 from executor.safety.fault_messages import Alarm, StopReaction, shared_causes
@@ -26,10 +26,6 @@ from executor.trajectory.setpoints import CheckedSetpoints
 from executor.trajectory.time_scaling import smooth_step
 from model.errors import CdprError, Refused
 
-#: All drives must hold within this time after the command, [s].
-HOLD_TIMEOUT = 3.0
-#: Cycles at rest before and after the motion.
-SETTLING = 10
 #: Failures of the bus in a row after which it is given up while drives stop.
 GONE = 10
 
@@ -94,7 +90,7 @@ class Loop:
         seen = self._master.read_positions()
         self._master.require_no_fault()
         require(seen)
-        self._held_before = {*self._checked.rig.drive_names} - self._released(seen)
+        self._held_before = self._nodes_holding(seen)
         self._require_at_start()
         self._sender.armed = True
 
@@ -167,8 +163,7 @@ class Loop:
         """Moves smoothly to the first row, by at most the start tolerance."""
         begin = np.array(self._sender.targets, dtype=np.float64)
         end = self._checked.setpoints[0].astype(np.float64)
-        travel, speed = self._sender.largest_travel(begin, end), self._checked.rig.motion.speed
-        steps = SETTLING + int(np.ceil(4.0 * travel / (speed * self._checked.cycle)))
+        steps = self._sender.approach_cycles(begin, end)
         for step in range(1, steps + 1):
             share = smooth_step(step / steps)
             targets = tuple(int(v) for v in np.rint(begin + share * (end - begin)))
@@ -177,6 +172,7 @@ class Loop:
                 return
         self.machine.on(Event.AT_START)
         self._report("moving", f"at the start; moving {self.motion_phrase}")
+        self._apply_requests(self._requests())
 
     def _follow(self) -> None:
         """One cycle along the table, or at rest in it."""
@@ -197,14 +193,15 @@ class Loop:
             if self.machine.state is not State.SECURING:
                 return
         self._group.command(GroupCommand.QUICK_STOP)
-        for _ in range(round(HOLD_TIMEOUT / self._checked.cycle)):
+        within = self._master.hold_timeout
+        for _ in range(round(within / self._checked.cycle)):
             status = self._send(Purpose.HOLD, self._sender.resting_targets)
             if self.machine.state is not State.SECURING:
                 return
             if status is not None and status.stopped and (status.holding or not was_enabled):
                 self._leave(status)
                 return
-        self._fault("hold_timeout", f"the drives did not hold within {HOLD_TIMEOUT:g} s")
+        self._fault("hold_timeout", f"the drives did not hold within {within:.3g} s")
 
     def _leave(self, held: CycleStatus) -> None:
         """Ends monitoring of drives that hold on their own, and reads their state once more."""
@@ -266,13 +263,15 @@ class Loop:
 
     def _is_held(self, status: CycleStatus) -> bool:
         """Whether no drive has let go of a cable that it held, before or in this motion."""
-        let_go = self._held_before & self._released(status)
-        return status.holding or not (self._taken_over or let_go)
+        holding = self._nodes_holding(status)
+        self._held_before |= holding
+        return holding == self._held_before
 
-    def _released(self, status: CycleStatus) -> set[int]:
-        """Nodes that do not hold by torque; those of ODrives hold by brakes, all or none."""
+    def _nodes_holding(self, status: CycleStatus) -> set[int]:
+        """Nodes that hold by torque; those of ODrives hold by brakes, all or none."""
         released = without_torque(self._checked.rig, status.status_words.tolist())
-        return {*released} if status.holding or released else {*self._checked.rig.drive_names}
+        nodes = {*self._checked.rig.drive_names} if status.holding or released else set[int]()
+        return nodes.difference(released)
 
     def _index(self) -> float:
         """Progress of the motion, for the record."""
@@ -304,35 +303,34 @@ class Loop:
         state = self.machine.state
         if self._apply_stop(requests):
             return
+        speed = f"{requests.speed:.0%} of the planned speed"
         if requests.hold and state is State.MOVING:
-            self._feed.stop()
+            self._report("hold", f"feed hold; {self._slow_down()}")
             self.machine.on(Event.HOLD)
-            self._report("hold", f"feed hold; slowing down {self.motion_phrase}")
         elif state is State.HOLDING and not requests.hold:
             self._feed.go_to(requests.speed)
             self.machine.on(Event.RESUME)
-            self._report(
-                "resume",
-                f"continuing {self.motion_phrase} at {requests.speed:.0%} of the planned speed",
-            )
+            self._report("resume", f"continuing {self.motion_phrase} at {speed}")
         elif state is State.MOVING and self._feed.wanted != requests.speed:
             self._feed.go_to(requests.speed)
-            self._report(
-                "speed", f"speed {self.motion_phrase}: {requests.speed:.0%} of the planned speed"
-            )
+            self._report("speed", f"speed {self.motion_phrase}: {speed}")
 
     def _apply_stop(self, requests: OperatorRequests) -> bool:
         """Begins a path stop if one is requested and possible; returns whether it did."""
         if not (requests.stop and self.machine.state in _STOPPABLE):
             return False
-        on_hold = self.machine.state is State.HOLDING and self._feed.at_rest
-        what_follows = "at rest on hold" if on_hold else f"slowing down {self.motion_phrase}"
         why = requests.for_what or StopReason("stop", "stop requested")
-        self._requested = f"{why.text}; {what_follows}"
+        self._requested = f"{why.text}; {self._slow_down()}"
         self._report_cause(why.code, self._requested)
-        self._feed.stop()
         self.machine.on(Event.STOP)
         return True
+
+    def _slow_down(self) -> str:
+        """Stops the feed; returns what follows."""
+        self._feed.stop()
+        if self.machine.state not in ON_PATH:
+            return "stopping at once"
+        return "at rest" if self._feed.at_rest else f"slowing down {self.motion_phrase}"
 
     def _report_once(self, alarm: Alarm) -> None:
         """A condition that persists is reported in its first cycle."""
@@ -374,7 +372,7 @@ class Loop:
     def _drain(self) -> None:
         """Continues cycles for drives still stopping and for the record, then ends."""
         try:
-            for cycle in range(round(HOLD_TIMEOUT / self._checked.cycle)):
+            for cycle in range(round(self._master.hold_timeout / self._checked.cycle)):
                 if cycle >= SETTLING and not self._group.stopping:
                     break
                 if not self._one_more_latched():

@@ -16,7 +16,7 @@ from executor.control.sync_master import SyncMaster
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.realtime.child import MakeDrives, ReadyDrives
-from executor.realtime.process import real_time_process
+from executor.realtime.process import CheckDrives, real_time_process
 from executor.realtime.scheduling import Clock
 from executor.realtime.shared_memory import SharedMemory, SharedRequests
 from executor.recording.recorder import Recorder, RunLog
@@ -201,7 +201,7 @@ def run_in_real_time(
     *,
     pose_every: int,
     need_real_time: bool,
-    check_drives: Callable[[], str],
+    check_drives: CheckDrives,
     before_motion: Callable[[str], None],
     listener: Listener = SILENT,
 ) -> Outcome:
@@ -240,10 +240,10 @@ def run_in_real_time(
         check_drives=check_drives,
         listener=listener,
     ) as process:
-        denied = process.arm(recorder).denied
+        armed = process.arm(recorder)
         interlock.begin(recorder.folder.path, reference)
         try:
-            before_motion(denied)
+            before_motion(armed.denied)
         except BaseException:
             interlock.cancel()
             raise
@@ -256,8 +256,8 @@ def run_in_real_time(
                 ended.cause,
                 recorder.folder.path,
                 holding=ended.holding,
-                positions=last.actual if last else None,
-                released=without_torque(prepared.rig, last.words) if last else (),
+                positions=last.actual if last else armed.positions,
+                released=without_torque(prepared.rig, last.words) if last else armed.released,
             )
         except CdprError as error:  # the motion is over: its record is still completed
             text = f"{error.what} ({error.where}: {error.why})"

@@ -9,10 +9,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
-from drivers.factory import without_torque
 from executor.control.preconditions import require_capabilities
 from executor.control.sync_master import ReplyTimeout, SyncMaster, changed_states, late_fault
 from executor.interlock.fault_latch import LatchedFault
@@ -25,8 +24,6 @@ from model.errors import CdprError, Fault, StoppedByOperator
 from model.pose import Pose
 from model.rig import Rig
 
-#: All drives must have stopped within this time, [s].
-WITHIN_S = 3.0
 #: Time for a drive to leave its fault, and for the others to be confirmed holding, [s].
 SETTLING_S = 1.5
 
@@ -54,7 +51,6 @@ class Standstill(ABC):
         self._requests, self._on_cycle = requests, on_cycle
         self._silence = ReplyTimeout(rig)
         self._cycles = 0
-        self._longest = round(WITHIN_S / rig.cycle)
         self.cause, self.error = "", None
         self.holding = True
 
@@ -168,7 +164,7 @@ class Standstill(ABC):
         """
         with suppress(CdprError):
             self._master.stop_now()
-        for _ in range(self._longest):
+        for _ in range(round(self._master.hold_timeout / self._rig.cycle)):
             self._master.begin()
             with suppress(CdprError):
                 status = self._master.exchange(self._group.targets.tolist())
@@ -345,28 +341,28 @@ def release_drives(
     on_armed(armed.denied)
     interlock.found_released(armed.restarted, armed.released)
     interlock.begin(record, interlock.still_counts(armed.positions), under=under)
-    ended = _CUT_SHORT
+    ended, left, released = _CUT_SHORT, None, False
     try:
         ended = process.run()
-        left = process.read_status() if ended.state is State.FINISHED else None
+        released = ended.state is State.FINISHED
+        left = process.read_status() if released else None
+    except CdprError as error:
+        ended = replace(ended, state=State.LATCHED, cause=error.what, error=error)
     except BaseException:
         ended = _CUT_SHORT
         raise
     finally:
-        if ended.state is not State.FINISHED:
-            cause = f"while releasing the drives: {ended.cause}"
-            interlock.end(State.LATCHED, cause, record, holding=False, positions=None)
+        interlock.end(
+            ended.state,
+            ended.cause and f"while releasing the drives: {ended.cause}",
+            record,
+            holding=released and is_braked(rig),
+            positions=armed.positions if left is None else left.positions.tolist(),
+            released=[winch.node_id for winch in rig.winches],
+            release_reason=_RELEASED if released else "",
+        )
     if left is None:
         raise ended.error or Fault(ended.cause, where="release")
-    interlock.end(
-        State.FINISHED,
-        "",
-        record,
-        holding=is_braked(rig),
-        positions=left.positions.tolist(),
-        released=without_torque(rig, left.status_words.tolist()),
-        release_reason=_RELEASED,
-    )
     return left
 
 

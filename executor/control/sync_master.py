@@ -64,6 +64,8 @@ class ReplyTimeout:
             raise HardwareMissing(what, where=where, why=why, next_step=next_step)
 
 
+#: Drives hold within this time after a stop, [s]; those without a quick stop may take longer.
+HOLD_TIMEOUT = 3.0
 #: A drive that has not answered SYNC for this long is not waited for at the end, [s].
 GIVEN_UP_AFTER = 0.5
 
@@ -90,6 +92,12 @@ class SyncMaster:
         self._synced: float | None = None
         self._overdue = 0.0
         self._enabled_after: float | None = None  # time of the SYNC before one that enables, [s]
+
+    @property
+    def hold_timeout(self) -> float:
+        """Longest time until all drives hold after a stop, [s]."""
+        drives = self.group.capabilities
+        return max(HOLD_TIMEOUT, 0.0 if drives.holds_on_quick_stop else drives.released_within)
 
     @property
     def age(self) -> float:

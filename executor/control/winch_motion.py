@@ -17,11 +17,11 @@ import numpy as np
 
 from drivers.drive_group import CycleStatus
 from drivers.factory import without_torque
-from executor.control.loop import SETTLING
+from executor.control.cycle import SETTLING
 from executor.control.winch_loop import WinchMover
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
-from executor.realtime.child import Ended, Records
+from executor.realtime.child import Armed, Ended, Records
 from executor.recording.run_folder import EVENTS
 from executor.state_machine import CycleRecord, LoopEvent, State
 from model.errors import BadInput, CdprError, Fault
@@ -162,8 +162,8 @@ def move_winches(
             if reference is not None:
                 interlock.take(reference)
     finally:
-        left = _last_state(last.cycles, found)
-        not_recorded = _record_end(rig, interlock, ended, record, left)
+        left = _last_state(rig, armed, ended, last.cycles, found)
+        not_recorded = _record_end(interlock, ended, record, *left)
     if not_recorded:
         last.report_event("recorder", not_recorded)
         result = replace(result, state=State.LATCHED, cause=result.cause or not_recorded)
@@ -189,20 +189,26 @@ def _not_held(ended: Ended, found: CycleStatus | None, cause: str) -> Ended:
 
 
 def _last_state(
-    last: Sequence[CycleRecord], found: CycleStatus | None
-) -> tuple[Sequence[int], Sequence[int]] | None:
-    """Last known positions [counts] and status words of the drives; None if unknown."""
+    rig: Rig,
+    armed: Armed,
+    ended: Ended,
+    last: Sequence[CycleRecord],
+    found: CycleStatus | None,
+) -> tuple[Sequence[int] | None, Sequence[int]]:
+    """Last known positions [counts] of the drives, None if unknown; and nodes without torque."""
     if found is not None:
-        return found.positions.tolist(), found.status_words.tolist()
-    return (last[-1].actual, last[-1].words) if last else None
+        return found.positions.tolist(), without_torque(rig, found.status_words.tolist())
+    if last:
+        return last[-1].actual, without_torque(rig, last[-1].words)
+    return (None, ()) if ended is _CUT_SHORT else (armed.positions, armed.released)
 
 
 def _record_end(
-    rig: Rig,
     interlock: MotionInterlock,
     ended: Ended,
     record: Path,
-    left: tuple[Sequence[int], Sequence[int]] | None,
+    positions: Sequence[int] | None,
+    released: Sequence[int],
 ) -> str:
     """Records the end in the interlock; returns why that failed, else nothing."""
     try:
@@ -211,8 +217,8 @@ def _record_end(
             ended.cause,
             record,
             holding=ended.holding,
-            positions=left[0] if left else None,
-            released=without_torque(rig, left[1]) if left else (),
+            positions=positions,
+            released=released,
         )
     except CdprError as error:
         return f"{error.what} ({error.where}: {error.why})"

@@ -13,8 +13,8 @@ import numpy as np
 
 from drivers.drive_group import CycleStatus
 from drivers.plausibility import position_limits
-from executor.control.cycle import Feed
-from executor.control.loop import SETTLING, Loop
+from executor.control.cycle import SETTLING, Feed
+from executor.control.loop import Loop
 from executor.control.preconditions import with_reduced_limits
 from executor.control.sync_master import SyncMaster
 from executor.control.winch_laws import (

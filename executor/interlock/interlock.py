@@ -345,9 +345,12 @@ class MotionInterlock:
         return reference.model_copy(update={"released": kept.released})
 
     def _lose(self, why: str) -> None:
-        """Marks any reference on file as lost; the first reason is kept."""
-        reference = self._readable()
-        if reference is not None and not reference.lost:
+        """Marks the reference as lost, also one only another user has; keeps the first reason."""
+        try:
+            reference = self.kept_reference() or as_in_the_file(self._rig)
+        except Refused:  # it is refused anyway, and says why
+            return
+        if self._is_kept and not reference.lost:
             self.file.write(reference.model_copy(update={"lost": why}))
 
     def _readable(self) -> HomingReference | None:

@@ -33,7 +33,7 @@ from model.winches import WinchMap
 AGAIN = f"home the drives: {HOME}; nothing was moved"
 
 #: Why a drive lost its configuration, and with it the reference of an incremental encoder.
-RESTARTED = "power-cycled, or `bus.cycle_ms` was changed, after homing"
+RESTARTED = "power-cycled, or `bus.cycle_ms` was changed"
 
 #: Why drives at rest lost their reference, though they kept their power and position.
 RELEASED = "left holding by the last motion, but without torque now, as after an emergency stop"

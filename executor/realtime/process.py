@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import wait
@@ -40,6 +40,8 @@ SILENT_POLLS = 300
 #: A process without a command to move ends within this time, [s]; it may still read the drives.
 END_TIMEOUT = 10.0
 
+CheckDrives = Callable[[Collection[int]], str]
+
 
 @contextmanager
 def real_time_process(
@@ -48,7 +50,7 @@ def real_time_process(
     board: SharedRequests,
     *,
     need_real_time: bool,
-    check_drives: Callable[[], str],
+    check_drives: CheckDrives,
     listener: Listener = SILENT,
 ) -> Iterator[RealTimeProcess]:
     """A process for one motion; ends when the block is left.
@@ -59,7 +61,7 @@ def real_time_process(
         board: Operator requests.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
         check_drives: Reads the state of drives whose process is gone; returns what is wrong, empty
-            if they hold.
+            if all hold but the nodes given, which were never enabled.
         listener: Receives remarks on missing capabilities of the drives.
     """
     job = Job.of(motion, board.memory, make_drives, need_real_time=need_real_time)
@@ -84,7 +86,7 @@ class RealTimeProcess:
     """One motion in a process of its own; a `WinchMover`."""
 
     def __init__(
-        self, job: Job, board: SharedRequests, check_drives: Callable[[], str], listener: Listener
+        self, job: Job, board: SharedRequests, check_drives: CheckDrives, listener: Listener
     ) -> None:
         """Starts the process, which opens the drives."""
         self._board, self._look_again, self._listener = board, check_drives, listener
@@ -92,6 +94,7 @@ class RealTimeProcess:
         self._cycles, self._events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)
         self._records: Records | None = None
         self._last: CycleRecord | None = None
+        self._released: tuple[int, ...] = ()
         self._ended = False
         context = multiprocessing.get_context("spawn")
         self._link, far_end = context.Pipe()
@@ -119,6 +122,7 @@ class RealTimeProcess:
             if wait([self._link, self._process.sentinel], POLL_INTERVAL):
                 message = self._receive()
                 if isinstance(message, Armed):
+                    self._released = message.released
                     for remark in message.remarks:
                         self._listener.remark(remark)
                         records.take_event(LoopEvent(0, 0.0, REMARK, remark))
@@ -157,7 +161,8 @@ class RealTimeProcess:
             self.report_event(_event_code(error), error.what)
         else:
             self.report_event("real_time_lost", error.what)
-        doubt = self._look_again()  # they should hold on their own without SYNC
+        never_enabled = () if self._last else self._released
+        doubt = self._look_again(never_enabled)  # the others should hold on their own without SYNC
         if doubt:
             self.report_event("not_held", doubt)
         cause = f"{error.what}; {doubt}" if doubt else error.what

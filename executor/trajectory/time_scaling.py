@@ -297,3 +297,13 @@ PEAK = 1.875
 def smooth_step(share: float) -> float:
     """0 to 1 with zero speed and acceleration at both ends."""
     return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+
+
+def smooth_step_duration(length: float, motion: Motion) -> float:
+    """Shortest duration [s] of a `smooth_step` over a length [m] within the motion limits."""
+    acceleration, jerk = 10.0 / math.sqrt(3.0), 60.0  # its peaks, of unit length and duration
+    return max(
+        PEAK * length / motion.speed,
+        math.sqrt(acceleration * length / motion.acceleration),
+        math.cbrt(jerk * length / motion.jerk),
+    )

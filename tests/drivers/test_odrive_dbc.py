@@ -140,3 +140,7 @@ def test_errors_and_states_are_shown_as_text() -> None:
     assert state_text(status_word(8, 0)) == "closed loop control"
     assert state_text(status_word(1, 0x20)) == "idle, in error"
     assert state_text(status_word(4, 0)) == "axis state 4"
+    watchdog = AxisError.WATCHDOG_TIMER_EXPIRED
+    assert state_text(status_word(1, watchdog)) == "idle"
+    assert state_text(status_word(1, watchdog | 0x20)) == "idle, in error"
+    assert state_text(status_word(8, watchdog)) == "closed loop control, in error"

@@ -59,7 +59,7 @@ def test_a_stop_anywhere_comes_to_rest_ahead_and_never_beyond_the_end(rows, befo
     assert (np.diff(steps) <= 1e-9).all(), "it slows down only"
 
 
-@given(before=st.integers(0, 50), motion=motions, cycle=st.sampled_from([0.004, 0.01, 0.02]))
+@given(before=st.integers(1, 50), motion=motions, cycle=st.sampled_from([0.004, 0.01, 0.02]))
 @settings(max_examples=40)
 def test_at_full_speed_a_stop_keeps_the_paths_acceleration_and_jerk(before, motion, cycle):
     indices = _stopped(5000, before, motion, cycle)
@@ -72,7 +72,7 @@ def test_at_full_speed_a_stop_keeps_the_paths_acceleration_and_jerk(before, moti
     assert jerk.max() <= motion.jerk * (1 + 1e-6)
 
 
-@given(before=st.integers(0, 50), motion=motions)
+@given(before=st.integers(1, 50), motion=motions)
 @settings(max_examples=20)
 def test_a_stop_takes_the_textbook_distance(before, motion):
     """From v to rest, acceleration a, jerk j: v/2 (v/a + a/j), or v √(v/j) if a is not reached."""
@@ -81,6 +81,15 @@ def test_a_stop_takes_the_textbook_distance(before, motion):
     indices = _stopped(5000, before, motion)
     assert (indices[-1] - before) * CYCLE == pytest.approx(time / 2.0, rel=1e-6)
     assert len(indices) - 1 == pytest.approx(np.ceil(time / CYCLE), abs=1)
+
+
+def test_a_stop_before_the_first_step_is_at_rest_at_once_and_can_be_ended_by_a_ramp():
+    feed = Feed(500, CYCLE, GACHON)
+    feed.stop()
+    assert feed.at_rest
+    assert (feed.advance(), feed.rate, feed.wanted, feed.rows_to_rest) == (0.0, 0.0, 0.0, 0.0)
+    feed.go_to(1.0)
+    assert 0.0 < feed.advance() < 0.1
 
 
 def test_a_second_stop_changes_nothing():

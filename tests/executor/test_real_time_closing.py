@@ -72,7 +72,7 @@ def test_a_process_killed_before_it_was_ready_moved_nothing(
         with (
             pytest.raises(Fault, match=r"killed by signal 9\); nothing moved") as caught,
             real_time_process.real_time_process(
-                *motion_on_board, need_real_time=False, check_drives=str
+                *motion_on_board, need_real_time=False, check_drives=lambda _released: ""
             ) as process,
         ):
             process.arm(SimpleNamespace())
@@ -100,7 +100,9 @@ def test_a_motion_that_did_not_begin_is_recorded_with_its_own_cause(
     motion_on_board: Any = (Still(), print, board)
     try:
         with real_time_process.real_time_process(
-            *motion_on_board, need_real_time=False, check_drives=lambda: "drive 3 is in fault"
+            *motion_on_board,
+            need_real_time=False,
+            check_drives=lambda _released: "drive 3 is in fault",
         ) as process:
             process.arm(records)
             ended = process.run()
@@ -109,6 +111,31 @@ def test_a_motion_that_did_not_begin_is_recorded_with_its_own_cause(
     assert [event.code for event in events] == [code, "not_held"]
     assert (ended.state, ended.holding) == (State.LATCHED, False)
     assert events[0].text in ended.cause
+
+
+def falls_silent_behind_its_brakes(_job: Any, link: Connection, _supervisor: int) -> None:
+    link.send(Armed("", (0,) * 8, released=(1, 2, 3)))
+    link.send(Failed(HardwareMissing(SILENT)))
+
+
+@pytest.mark.parametrize(("lets_go", "holding"), [(2, True), (4, False)])
+def test_a_drive_that_never_held_is_no_doubt_about_a_motion_that_did_not_begin(
+    monkeypatch: pytest.MonkeyPatch, lets_go: int, holding: bool
+) -> None:
+    monkeypatch.setattr(real_time_process, "serve", falls_silent_behind_its_brakes)
+    board = SharedRequests()
+    motion_on_board: Any = (Still(), print, board)
+    try:
+        with real_time_process.real_time_process(
+            *motion_on_board,
+            need_real_time=False,
+            check_drives=lambda released: "" if lets_go in released else f"drive {lets_go} let go",
+        ) as process:
+            process.arm(SimpleNamespace(take_event=lambda _event: None))  # type: ignore[arg-type]
+            ended = process.run()
+    finally:
+        board.close()
+    assert (ended.state, ended.holding) == (State.LATCHED, holding)
 
 
 @pytest.mark.parametrize("goes", [True, False])
@@ -121,7 +148,7 @@ def test_a_motion_that_is_over_leaves_no_stop_behind_on_the_board(
     motion_on_board: Any = (Still(), print, board)
     try:
         with real_time_process.real_time_process(
-            *motion_on_board, need_real_time=False, check_drives=str
+            *motion_on_board, need_real_time=False, check_drives=lambda _released: ""
         ) as process:
             process.arm(nobody_listens)  # type: ignore[arg-type]
             if goes:

@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 
-from drivers.can_errors import TorqueLost
+from drivers.can_errors import BusDown, TorqueLost
 from drivers.cia402.group import Cia402Group
 from drivers.drive_group import DriveSnapshot
 from drivers.plausibility import require_within_limits
+from executor import drives
+from executor.control import path_runs
 from executor.control.preconditions import require_still_referenced
+from executor.control.standstill import release_drives
+from executor.control.winch_motion import move_winches
 from executor.drives import open_drives
 from executor.homing import use_rig_file_counts
 from executor.interlock import locks as state_folder
 from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.interlock.reference import HomingReference, as_in_the_file, reference_at
 from executor.proposals import ForgetProposal
+from executor.realtime.child import Armed, Ended, Records
+from executor.realtime.process import RealTimeProcess
 from executor.state_machine import State
 from model.errors import BadInput, Refused, StoppedByOperator
 from model.rig import Rig, load_rig, rig_from_document
@@ -443,6 +451,144 @@ def test_drives_released_behind_their_brakes_need_not_hold_until_they_are_enable
     with pytest.raises(Refused, match=r"reference is lost") as caught:
         MotionInterlock(rig).reference()
     assert "without torque" in caught.value.why
+
+
+@pytest.mark.parametrize(("brake", "lost"), [(True, ""), (False, "released by the operator")])
+def test_a_release_whose_end_cannot_be_read_is_latched_with_its_cause_and_braked_drives_count(
+    brake: bool, lost: str
+) -> None:
+    """As where the adapter is unplugged just after all drives were released."""
+    rig = rig_with("incremental", brake=brake)
+    reference = reference_of(rig)
+    interlock = MotionInterlock(rig)
+    interlock.file.write(reference)
+
+    class Unplugged(RealTimeProcess):
+        def __init__(self) -> None:
+            pass
+
+        def arm(self, records: Records) -> Armed:
+            return Armed("", tuple(reference.stands_at))
+
+        def run(self) -> Ended:
+            return Ended(State.FINISHED, "", holding=False, true_pose=None)
+
+        def read_status(self) -> NoReturn:
+            raise BusDown("the interface is down", "can0")
+
+    with pytest.raises(BusDown, match="interface is down"):
+        release_drives(rig, interlock, Unplugged(), lambda _denied: None)
+    with pytest.raises(Refused, match=r"while releasing the drives: .*interface is down"):
+        interlock.require_free()
+    MotionInterlock(rig).found_released((), ALL)  # as a reset finds them
+    why = MotionInterlock(rig).why_unreferenced(reference.stands_at)
+    assert lost in why
+    assert bool(lost) is bool(why)
+
+
+class Unmoved:
+    """Drives of which one falls silent before the first cycle."""
+
+    def __init__(self, armed: Armed) -> None:
+        self.armed = armed
+
+    def arm(self, _records: object) -> Armed:
+        return self.armed
+
+    def run(self) -> Ended:
+        return Ended(State.LATCHED, "drive 3 stopped answering", holding=True, true_pose=None)
+
+    def read_status(self) -> NoReturn:
+        raise AssertionError("it did not finish")
+
+
+@pytest.mark.parametrize("path", [True, False])
+def test_braked_drives_that_were_not_enabled_after_all_need_not_have_held(
+    path: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rig_with("incremental", brake=True)
+    reference = reference_of(rig)
+    MotionInterlock(rig).file.write(reference.model_copy(update={"released": [*ALL]}))
+    mover: Any = Unmoved(Armed("", tuple(reference.stands_at), released=ALL))
+    records: Any = SimpleNamespace(folder=SimpleNamespace(path=tmp_path), take_event=print)
+    if path:
+        records.log = SimpleNamespace(last=None)
+        motion = SimpleNamespace(of=lambda *_args, **_more: None)
+        monkeypatch.setattr(path_runs, "PathMotion", motion)
+        monkeypatch.setattr(path_runs, "real_time_process", lambda *_, **__: nullcontext(mover))
+        monkeypatch.setattr(path_runs, "checked_setpoints_of", id)
+        monkeypatch.setattr(path_runs, "load_changes", lambda *_: None)
+        table = SimpleNamespace(table=SimpleNamespace(dwells=()))
+        prepared: Any = SimpleNamespace(
+            rig=MotionInterlock(rig).referenced_rig(), scene=None, checked=table
+        )
+        path_runs.run_in_real_time(
+            prepared,
+            records,
+            records,
+            records,
+            pose_every=0,
+            need_real_time=False,
+            check_drives=lambda _released: "",
+            before_motion=lambda _denied: None,
+        )
+    else:
+        move_winches(
+            mover,
+            rig,
+            MotionInterlock(rig),
+            records,
+            record=tmp_path,
+            rehome=False,
+            at_rest=lambda _result, _pose: None,
+        )
+    with pytest.raises(Refused, match="drive 3 stopped answering"):
+        MotionInterlock(rig).require_free()
+    MotionInterlock(rig).found_released((), ALL)  # as a reset finds them
+    assert MotionInterlock(rig).why_unreferenced(reference.stands_at) == ""
+
+
+@pytest.mark.parametrize("word", [0x0231, 0x0218])
+def test_abandoned_drives_must_hold_unless_they_were_never_enabled(
+    monkeypatch: pytest.MonkeyPatch, word: int
+) -> None:
+    rig = rig_with("incremental", brake=True)
+    seen = seen_at(rig, words={2: word, 4: word})
+    monkeypatch.setattr(drives, "read_snapshot", lambda *_: seen)
+    monkeypatch.setattr(drives, "ALONE", 0.0)
+    assert drives.abandoned_drives_fault(rig.document, (2, 4)) == ""
+    found = drives.abandoned_drives_fault(rig.document, (2,))
+    assert "cable 4 (drive 4) is in" in found
+    assert "drive 2" not in found
+
+
+def _notices_power_cycle(interlock: MotionInterlock) -> None:
+    interlock.found_restarted((3,))
+
+
+def _homes_in_part(interlock: MotionInterlock) -> None:
+    interlock.begin(Path("home"), None, rehome=True)
+    interlock.end(State.STOPPED, "", Path("home"), holding=True, positions=[0] * 8)
+
+
+@pytest.mark.parametrize("does", [_notices_power_cycle, _homes_in_part])
+def test_what_another_user_notes_of_drives_that_only_this_one_homed_counts(
+    share: Callable[[], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    does: Callable[[MotionInterlock], None],
+) -> None:
+    """The other one's set-up leaves no other trace; drives power-cycled at home count from 0."""
+    rig = rig_with("incremental")
+    MotionInterlock(rig).file.write(reference_of(rig))
+    share()
+    with monkeypatch.context() as other:
+        other.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+        does(MotionInterlock(rig))
+    with pytest.raises(Refused, match="reference is lost"):
+        MotionInterlock(rig).reference()
+    MotionInterlock(rig).file.write(reference_of(rig))  # homed
+    assert MotionInterlock(rig).reference() is not None
 
 
 def test_a_motion_from_released_drives_does_not_make_the_reference_good_again() -> None:

@@ -10,7 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from executor.trajectory.path import Path, rounded
-from executor.trajectory.time_scaling import TimeLaw, length_to_change, s_curve, time_law
+from executor.trajectory.time_scaling import (
+    TimeLaw,
+    length_to_change,
+    s_curve,
+    smooth_step,
+    smooth_step_duration,
+    time_law,
+)
 from model.errors import Fault
 from model.pose import Pose
 from model.rig import Motion
@@ -62,6 +69,17 @@ def test_it_goes_forward_from_rest_to_rest_and_tells_its_speed(seed, motion):
     assert np.abs(acceleration).max() <= motion.acceleration * (1.0 + 1e-9)
     middle = np.diff(travelled) / np.diff(times)
     assert middle == pytest.approx((speed[:-1] + speed[1:]) / 2, abs=0.01 * motion.speed)
+
+
+@given(length=st.floats(1e-6, 0.1), motion=motions)
+@settings(max_examples=30)
+def test_a_smooth_step_keeps_all_limits_and_reaches_one_of_them(length, motion):
+    count = 4000
+    step = smooth_step_duration(length, motion) / count
+    travelled = length * np.array([[smooth_step(n / count)] for n in range(count + 1)])
+    limits = (motion.speed, motion.acceleration, motion.jerk)
+    used = [_largest(travelled, n, step) / limit for n, limit in enumerate(limits, start=1)]
+    assert 0.995 <= max(used) <= 1.0 + 1e-6, "differences average the peaks"
 
 
 def test_it_is_at_rest_outside_its_time():

@@ -275,6 +275,20 @@ def test_a_platform_that_hangs_free_is_referenced_by_its_tags_and_goes_home(
         group.close()
 
 
+def test_a_drum_that_moved_before_it_was_enabled_returns_no_faster_than_the_winches_may() -> None:
+    """Enabling may let a drum sag; winches are then slower than the platform on a path."""
+    speed, sagged = 0.002, 0.0006
+    with after_power_loss(lost(1, on_a_stand=True), speed=speed) as bench:
+        winch, drive = bench.rig.winches[2], bench.rehearsal.drives[2]
+        drive.motor.position += sagged * winch.counts_per_metre
+        result = bench.take_up()
+        assert (result.state, result.cause) == (State.FINISHED, "")
+        approach = [r.targets[2] for r in bench.records if r.state is State.APPROACHING]
+        travelled = (approach[0] - approach[-1]) / winch.counts_per_metre
+        assert travelled == pytest.approx(sagged, rel=0.05), "the first of them hardly moves"
+        assert np.abs(bench.steps()[: len(approach)]).max() <= speed * bench.rig.cycle
+
+
 @pytest.mark.parametrize("phase", [3, 60, 200])
 def test_stop_ends_it_in_every_phase_and_a_hold_waits(phase: int) -> None:
     with after_power_loss(lost(1, on_a_stand=False)) as bench:

@@ -147,6 +147,30 @@ def test_a_drive_that_held_and_lets_go_while_all_are_enabled_is_no_longer_held(
     assert outcome.holding is not lets_go
 
 
+def test_a_drive_that_opened_its_brake_and_lets_go_while_others_still_enable_is_no_longer_held(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """After power-up the brakes held all cables; nothing held by torque before this motion."""
+    failed: list[int] = []
+
+    def fault(stage: Stage) -> None:
+        sixth = stage.drives[SIXTH]
+        enabled = [states[SIXTH] for states in stage.drive_states]
+        if not failed and enabled.count(DriveState.OPERATION_ENABLED) == 2:  # has replied so
+            failed.append(stage.cycle)
+            sixth.fail(0x2310)
+
+    with staged(prepared, tmp_path / "run", fault) as stage:
+        last = stage.drives[-1]
+        last.behaviour = replace(last.behaviour, enable_delay=0.4)
+        outcome = stage.run()
+        codes = [event.code for event in stage.events()]
+    assert failed
+    assert "drive 6" in outcome.cause
+    assert "enabled" not in codes
+    assert not outcome.holding
+
+
 def test_a_second_drive_that_releases_after_a_fault_is_reported_although_the_first_does_not_hold(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:

@@ -22,7 +22,7 @@ from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import Refused
 from model.plan import load_plan, save_plan
-from model.rig import load_rig
+from model.rig import load_rig, rig_from_document
 from planner.check import verify
 from simulation.drives.odrive import SimulatedOdriveRig
 from tests.cli.plans import CONFIGS, GOAL_MM, START_MM, free_scene, straight_plan
@@ -93,6 +93,26 @@ def test_a_plan_is_run_on_odrives_from_the_rig_file_alone(plan: Path, tmp_path: 
     assert [event["code"] for event in events] == ["enabled", "moving", "held"]
     assert events[-1]["text"] == "at rest; the brakes of the winches hold"
     assert "odrive, 1000 kbit/s" in (run / "report.html").read_text()
+
+
+def test_rare_heartbeats_of_which_some_are_lost_are_waited_for_at_the_end(
+    plan: Path, tmp_path: Path
+) -> None:
+    """The brakes have closed; only the heartbeat says so."""
+    document = load_rig(ODRIVE).document
+    drives = document.drives.model_copy(update={"heartbeat_ms": 1000})
+    rig = rig_from_document(document.model_copy(update={"drives": drives}))
+    disarmed: list[int] = []
+
+    def lost(stage: Any) -> None:
+        if stage.cycle > 300 and not stage.drives[4].torque_on:
+            disarmed.append(stage.cycle)
+        stage.drives[4].silent = {"heartbeat"} if 0 < len(disarmed) < 310 else set()
+
+    with staged(prepare(verify(load_plan(plan), rig), rig), tmp_path / "run", lost) as (stage, _):
+        outcome = stage.run()
+    assert outcome.state is State.FINISHED, outcome.cause
+    assert len(disarmed) >= 310
 
 
 def test_measurements_are_compared_with_the_plan_of_the_same_moment(

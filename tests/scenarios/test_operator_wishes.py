@@ -14,7 +14,8 @@ from executor.control.path_runs import Outcome
 from executor.recording import recorder
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
-from tests.scenarios.stage import Stage, path_indices, staged
+from model.pose import moved
+from tests.scenarios.stage import Stage, at, path_indices, staged
 
 Does = Callable[[Stage], object]
 HELD_AT = 150
@@ -79,7 +80,7 @@ def test_a_hold_rests_on_the_path_under_power_and_a_resume_continues_to_the_goal
     assert (table.set_counts[-1] == plain.log.table().set_counts[-1]).all(), "the same goal"
 
 
-@pytest.mark.parametrize(("cycle", "said"), [(160, "slowing down"), (300, "at rest on hold")])
+@pytest.mark.parametrize(("cycle", "said"), [(160, "slowing down"), (300, "at rest")])
 def test_a_stop_says_whether_the_platform_was_at_rest(
     prepared: PreparedRun, tmp_path: Path, cycle: int, said: str
 ) -> None:
@@ -200,3 +201,41 @@ def test_parts_of_a_record_are_those_of_the_whole_and_an_hour_is_small(
         for end in {min(first + count, len(log)) for count in (0, 1, 7, 20)}:
             assert log.table(first, end).csv_rows(first).splitlines() == whole[first:end]
     assert sum(chunk.nbytes for chunk in log._chunks) / len(log) < 300.0
+
+
+def test_the_approach_keeps_the_paths_acceleration_and_jerk(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """From nearly as far as the start tolerance allows."""
+    rig, start = prepared.rig, prepared.scene.start
+    beside = moved(start, np.array([0.0, 0.0, -0.9 * rig.motion.start_tolerance, 0.0, 0.0, 0.0]))
+    with staged(prepared, tmp_path / "run", lambda _stage: None, beside) as stage:
+        outcome = stage.run()
+    assert outcome.state is State.FINISHED, outcome.cause
+    table = outcome.log.table()
+    per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
+    cables = table.set_counts[: table.state.index("moving")] / per_metre
+    assert np.abs(cables[-1] - cables[0]).max() > 0.5 * rig.motion.start_tolerance
+    window = 5  # cycles, as single ones show only whole counts
+    for order, limit in ((2, rig.motion.acceleration), (3, rig.motion.jerk)):
+        differences = cables
+        for _ in range(order):
+            differences = differences[window:] - differences[:-window]
+        assert np.abs(differences).max() <= limit * (window * rig.cycle) ** order
+
+
+def test_a_hold_requested_before_the_motion_waits_at_the_start_of_the_path(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with staged(prepared, tmp_path / "run", at(150, lambda s: s.board.ask_hold(False))) as stage:
+        stage.board.ask_hold(True)
+        outcome = stage.run()
+        events = stage.events()
+    assert outcome.state is State.FINISHED, outcome.cause
+    table = outcome.log.table()
+    assert states(outcome) == ["enabling", "approaching", "holding", "moving", "securing"]
+    first, resumed = table.state.index("holding"), table.state.index("moving")
+    assert resumed > 140
+    assert (table.set_counts[first:resumed] == prepared.checked.table.counts[0]).all()
+    assert [event.code for event in events] == ["enabled", "moving", "hold", "resume", "held"]
+    assert events[2].text == "feed hold; at rest"

@@ -10,8 +10,9 @@ import pytest
 
 from drivers.can_bus import BusSettings, open_bus
 from drivers.cia402.state_machine import DriveState
-from drivers.drive_group import DriveGroup, DriveSnapshot, GroupState
+from drivers.drive_group import CycleStatus, DriveGroup, DriveSnapshot, GroupState, Pace
 from drivers.factory import make_drive_group, read_drives
+from drivers.odrive.messages import AxisError
 from executor.control.preconditions import set_up_here
 from executor.control.standstill import FaultReset, Release, Standstill
 from executor.control.sync_master import SyncMaster
@@ -24,6 +25,7 @@ from simulation.drives.cia402 import SimulatedDrive
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.ground_truth import PowerLoss
 from tests.cli.plans import RIG
+from tests.drivers.odrive_bench import OdriveBench, odrive_bench
 
 _CHANNELS = itertools.count()
 FOLLOWING, HOLDING = DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE
@@ -307,3 +309,52 @@ def _fails_unwatched(drive: SimulatedDrive) -> Callable[[tuple[int, int], int], 
             drive.state = DriveState.FAULT
 
     return fails
+
+
+def reset_odrives(bench: OdriveBench, clock: SimulatedClock) -> FaultReset:
+    """Resets those drives, one of them in error."""
+    bench.drives[2].fail(AxisError.ESTOP_REQUESTED)
+    bench.group.configure(to_reset=True)
+    master, records = SyncMaster(bench.rig, bench.group, clock), list[CycleRecord]()
+    procedure = FaultReset(bench.rig, master, OperatorRequests, records.append)
+    procedure.arm()
+    procedure.run()
+    return procedure
+
+
+def test_a_late_cycle_while_odrives_are_reset_is_no_fault_as_none_is_enabled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with odrive_bench() as bench:
+        clock = SimulatedClock(bench.rig.cycle)
+        late = {100: 1.6}
+        cycles = itertools.count()
+        monkeypatch.setattr(clock, "next_cycle", lambda: late.get(next(cycles), 0.0))
+        assert reset_odrives(bench, clock).error is None
+        assert next(cycles) > max(late)
+        assert {drive.errors for drive in bench.drives} == {0}
+
+
+@pytest.mark.parametrize(
+    ("also", "found"),
+    [(0, ""), (AxisError.ESTOP_REQUESTED, "cable 5 (drive 5) went from idle to idle, in error")],
+)
+def test_a_watchdog_that_expires_at_rest_is_no_change_of_state_but_another_error_is(
+    also: int, found: str
+) -> None:
+    """As in firmware 0.5; no set-point feeds it once the cycles have ended."""
+    with odrive_bench() as bench:
+        for drive in bench.drives:
+            drive.settings.watchdog_at_rest = True
+        read = bench.group.read_state
+
+        def late(pace: Pace) -> CycleStatus:
+            bench.rehearsal.advance(0.3)
+            if also:
+                bench.drives[4].fail(also)
+            return read(pace)
+
+        bench.group.read_state = late  # type: ignore[method-assign]
+        error = reset_odrives(bench, SimulatedClock(bench.rig.cycle)).error
+        assert all(drive.errors & AxisError.WATCHDOG_TIMER_EXPIRED for drive in bench.drives)
+        assert (error.what.split(": ")[1] if error else "") == found
