@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.live import Frame, Image, eight_bits, is_too_large
+from drivers.cameras.live import Frame, Image, eight_bits
 from model.errors import AlreadyExists, BadInput, Fault
 from model.files.documents import write_bytes_atomic
-from model.files.reading import PICTURE_LIMIT, read_bytes
+from model.files.reading import PICTURE_LIMIT, is_too_large, read_bytes
 from model.rig import Camera
 
 #: Suffixes of image files, in lower case.

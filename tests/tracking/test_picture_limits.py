@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from drivers.cameras.files import PictureOutput, read_picture
-from drivers.cameras.live import MOST_PIXELS, is_too_large, stated_size
 from model.errors import Fault
+from model.files.reading import MOST_PIXELS, is_too_large, stated_size
 
 IMAGE = np.full((48, 64, 3), 90, np.uint8)
 
