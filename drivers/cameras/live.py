@@ -29,6 +29,9 @@ from model.rig import Camera
 
 #: Consecutive failed reads after which a camera counts as lost.
 LOST_PICTURES = 5
+#: The same after copies of one image for this long, [s]. A video codec may repeat an image of a
+#: platform at rest up to its next complete one.
+FROZEN = 10.0
 #: Longest wait for the reading thread when closing, [s].
 END_TIMEOUT = 2.0
 
@@ -61,7 +64,14 @@ class Arrived:
 
 
 class PictureReader:
-    """Reads all images of a camera in a thread."""
+    """Reads all images of a camera in a thread.
+
+    A copy of the image before is not a new one: noise makes images of a camera differ, but a
+    decoder or driver that hangs may repeat its last one.
+
+    Attributes:
+        lost: Why the camera delivers no more, as a predicate of it.
+    """
 
     def __init__(self, capture: Capture, clock: Callable[[], float]) -> None:
         """Starts the thread.
@@ -73,6 +83,7 @@ class PictureReader:
         self._capture, self._clock = capture, clock
         self._changed = threading.Condition()
         self._newest: Arrived | None = None
+        self.lost = ""
         self._ended = self._is_closing = False
         self._thread = threading.Thread(target=self._read, name="cdpr-pictures", daemon=True)
         self._thread.start()
@@ -96,14 +107,23 @@ class PictureReader:
 
     def _read(self) -> None:
         number = failed = 0
+        last: Arrived | None = None
         try:
-            while failed < LOST_PICTURES and not self._is_closing:
+            while not (self.lost or self._is_closing):
                 good, picture = self._capture.read()
                 now = self._clock()
                 failed = 0 if good else failed + 1
-                if good:
-                    self._put(Arrived(number, now, np.asarray(picture)))
-                    number += 1
+                if failed == LOST_PICTURES:
+                    self.lost = f"failed to deliver an image {LOST_PICTURES} times in a row"
+                if not good:
+                    continue
+                arrived = Arrived(number, now, np.asarray(picture))
+                number += 1
+                if last is None or not _is_copy(arrived.picture, last.picture):
+                    last = arrived
+                    self._put(arrived)
+                elif now - last.time > FROZEN:
+                    self.lost = f"delivered the same image for {FROZEN:g} s"
         finally:
             self._capture.release()
             with self._changed:
@@ -114,6 +134,11 @@ class PictureReader:
         with self._changed:
             self._newest = arrived
             self._changed.notify_all()
+
+
+def _is_copy(picture: NDArray[np.generic], last: NDArray[np.generic]) -> bool:
+    """Whether two images are equal; a few of their rows suffice for most that are not."""
+    return np.array_equal(picture[::64], last[::64]) and np.array_equal(picture, last)
 
 
 Image = NDArray[np.uint8]
@@ -295,9 +320,9 @@ class LiveCamera:
             return Frame(arrived.time, _grey(arrived.picture), f"image {number}", number)
         kind = Fault if self._seen else HardwareMissing
         raise kind(
-            f"the camera failed to deliver an image {LOST_PICTURES} times in a row",
+            f"the camera {self._reader.lost or 'delivers no more images'}",
             where=self.name,
-            why="it was unplugged, or its USB bus is too slow",
+            why="it was unplugged or hangs, its USB bus is too slow, or its lens is covered",
             next_step="check the cable, then start again",
         )
 

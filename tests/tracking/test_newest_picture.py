@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import drivers.cameras.live
-from drivers.cameras.live import LOST_PICTURES, LiveCamera
+from drivers.cameras.live import FROZEN, LOST_PICTURES, LiveCamera
 from model.errors import BadInput, Fault, HardwareMissing
 from model.rig import Camera
 
@@ -18,9 +18,11 @@ from model.rig import Camera
 class Queue:
     """Queue of camera images.
 
-    An image's brightness is its number. Reading one takes no time; when none waits, reading waits,
-    as with a camera, for the next.
+    An image's brightness is its number, or with ``repeats`` that of the first of so many equal
+    ones. Reading one takes no time; when none waits, reading waits, as with a camera, for the next.
     """
+
+    repeats = 1
 
     def __init__(self, camera: Camera) -> None:
         self._shape = (camera.height, camera.width, 3)
@@ -61,7 +63,8 @@ class Queue:
             if self._taken == self._come:
                 return False, None
             self._taken += 1
-            return True, np.full(self._shape, self._taken - 1, np.uint8)
+            number = self._taken - 1
+            return True, np.full(self._shape, number - number % self.repeats, np.uint8)
 
     def release(self) -> None:
         self.released = True
@@ -102,6 +105,33 @@ def test_no_picture_is_answered_twice(queue: Queue, camera: Camera) -> None:
         assert live.read().name == "image 1"
         later.join()
         queue.unplug()
+
+
+def test_a_copy_of_the_last_picture_is_not_a_new_one(queue: Queue, camera: Camera) -> None:
+    """A hanging decoder repeats its last image; its platform would be measured as at rest."""
+    queue.repeats = 4
+    queue.take(1)
+    with LiveCamera("0", camera, queue.clock) as live:
+        queue.take(6)
+        queue.wait_until_read()
+        frame = live.read()
+        assert (int(frame.image[0, 0]), frame.name) == (4, "image 4")
+        assert frame.time == pytest.approx(0.04)
+        queue.take(2)
+        queue.wait_until_read()
+        assert live.read().name == "image 8"
+        queue.unplug()
+
+
+def test_a_camera_that_repeats_one_picture_for_long_is_lost(queue: Queue, camera: Camera) -> None:
+    queue.repeats = 100_000
+    queue.take(1)
+    with LiveCamera("7", camera, queue.clock) as live:
+        queue.take(round(100 * FROZEN) + 2)
+        with pytest.raises(Fault, match=f"the same image for {FROZEN:g} s") as caught:
+            live.read()
+    assert caught.value.where == f"camera {camera.name} (7)"
+    assert queue.released
 
 
 def test_a_lost_camera_is_reported_by_its_name_and_source(queue: Queue, camera: Camera) -> None:
