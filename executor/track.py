@@ -16,6 +16,7 @@ from drivers.cameras.files import ImageFolder, PictureOutput, natural_order
 from drivers.cameras.live import Frame, LiveCamera, VideoFile
 from executor.cameras.sources import (
     SYNTHETIC,
+    cycles_per_image,
     require_camera_source,
     require_one_kind,
 )
@@ -425,7 +426,7 @@ def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Po
     require_same_rig(plan, rig, f"plan for {plan.rig.name}")
     table = prepare(verify(plan, rig), rig).checked.table
     poses = table.poses()
-    every = max(1, round(1.0 / (camera.rate * table.cycle)))
+    every = cycles_per_image(camera.rate, table.cycle)
     return [(row * table.cycle, poses[row]) for row in range(0, len(table), every)]
 
 

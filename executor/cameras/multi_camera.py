@@ -428,7 +428,8 @@ class CameraWatch:
         for camera in seen.cameras:
             if camera.dropped:
                 what = f"{camera.dropped} of {camera.dropped + camera.pictures} images skipped"
-                text = f"camera {camera.name}: {what}; the previous one was still being processed"
+                why = "the previous one had not arrived yet, or was still being measured"
+                text = f"camera {camera.name}: {what}; {why}"
                 self._report("pictures_dropped", text, at)
         return seen
 
