@@ -24,7 +24,7 @@ from executor.kernels import ready_to_measure
 from executor.recording.mcap import write_track_mcap
 from executor.trajectory.setpoints import prepare
 from model.clearance import ClearanceModel
-from model.errors import BadInput, CdprError, path_of
+from model.errors import BadInput, CdprError, StoppedByOperator, path_of
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -183,7 +183,8 @@ def track_sources(
         pictures: Largest number of images per camera.
         overlay: Folder or video for the images with measurements drawn in.
         replace_overlay: Whether it may exist.
-        stopped: Called before each image; True ends tracking.
+        stopped: Called before each image, and while a live camera delivers none; True ends
+            tracking.
         keep: Called with what was measured before an error that ends tracking, unless no image gave
             a pose; the error is then raised.
         listener: Receives progress, and files that are not used.
@@ -193,6 +194,7 @@ def track_sources(
         BadInput: A source cannot be used, or an image is of another size.
         HardwareMissing: A camera does not open.
         CameraMoved: Frame tags differ from their positions in the rig file.
+        StoppedByOperator: Stopped before the first image.
     """
     require_plan_used(sources.values(), plan)
     require_one_kind({camera.name: source for camera, source in sources.items()})
@@ -207,7 +209,7 @@ def track_sources(
         with_clearance=model is not None,
     )
     opened = [
-        _opened(rig, the_scene, camera, source, plan, result.unused[camera.name], listener)
+        _opened(rig, the_scene, camera, source, plan, result.unused[camera.name], stopped, listener)
         for camera, source in sources.items()
     ]
     opened, within = _simultaneous(list(sources), opened, listener)
@@ -234,6 +236,8 @@ def track_sources(
         except (CdprError, KeyboardInterrupt):
             if result.count.poses:
                 keep(result)
+            if not result.count.pictures and stopped():
+                raise StoppedByOperator("stopped before the first image") from None
             raise
     for text in result.together.clocks if result.together is not None else ():
         listener.remark(text)
@@ -388,6 +392,7 @@ def _opened(
     source: str,
     plan: Plan | None,
     unused: dict[str, str],
+    stopped: Callable[[], bool],
     listener: Listener,
 ) -> tuple[Iterable[Picture], int | None]:
     """The images of a source, and their number if known."""
@@ -413,7 +418,7 @@ def _opened(
         video = VideoFile(path, camera)
         return video, len(video)
     require_camera_source(source)
-    return _exposed(LiveCamera(source, camera), camera.latency), None
+    return _exposed(LiveCamera(source, camera, stopped=stopped), camera.latency), None
 
 
 def _exposed(frames: Iterable[Frame], latency: float) -> Iterator[Frame]:

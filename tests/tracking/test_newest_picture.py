@@ -11,7 +11,7 @@ import pytest
 
 import drivers.cameras.live
 from drivers.cameras.live import FROZEN, LOST_PICTURES, LiveCamera
-from model.errors import BadInput, Fault, HardwareMissing
+from model.errors import BadInput, Fault, HardwareMissing, StoppedByOperator
 from model.rig import Camera
 
 
@@ -156,6 +156,41 @@ def test_a_camera_without_images_or_of_another_size_is_released(
     with pytest.raises(BadInput, match="5 x 4 px"):
         LiveCamera("0", camera, queue.clock)
     assert queue.released
+
+
+def test_a_camera_without_images_can_be_stopped(
+    queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before its first image, and afterwards; it hangs in neither case for the operator."""
+    monkeypatch.setattr(drivers.cameras.live, "ROUND", 1e-3)
+    monkeypatch.setattr(drivers.cameras.live, "END_TIMEOUT", 0.0)  # it hangs
+    with pytest.raises(StoppedByOperator, match="stopped before"):
+        LiveCamera("0", camera, queue.clock, stopped=lambda: True)
+    queue.take(1)
+    request = threading.Event()
+    with LiveCamera("0", camera, queue.clock, stopped=request.is_set) as live:
+        request.set()
+        assert list(live) == []
+
+
+def test_a_camera_that_does_not_open_can_be_stopped(
+    camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Opening an address waits half a minute for its server."""
+    answered, made = threading.Event(), Queue(camera)
+
+    def opened(_source: int | str) -> Queue:
+        answered.wait()
+        return made
+
+    monkeypatch.setattr(drivers.cameras.live, "_opened", opened)
+    monkeypatch.setattr(drivers.cameras.live, "END_TIMEOUT", 0.0)
+    with pytest.raises(StoppedByOperator):
+        LiveCamera("http://[::1]/x", camera, made.clock, stopped=lambda: True)
+    (reader,) = [one for one in threading.enumerate() if one.name == "cdpr-pictures"]
+    answered.set()
+    reader.join()
+    assert made.released
 
 
 def test_no_thread_is_left_without_a_close(queue: Queue, camera: Camera) -> None:

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 
 from drivers.cameras.live import Frame
 from executor.track import track_sources
-from model.errors import BadInput
+from model.errors import BadInput, StoppedByOperator
 from model.pose import Pose
 from model.progress import Listener
 from model.rig import Camera, Rig
@@ -101,6 +101,13 @@ def test_it_stops_before_the_next_picture_when_it_is_asked_to(folder: Path, rig:
     assert len(result.pictures) == 1
 
 
+def test_one_that_is_stopped_before_the_first_picture_is_no_bad_input(
+    folder: Path, rig: Rig
+) -> None:
+    with pytest.raises(StoppedByOperator, match="before the first image"):
+        track_sources(rig, {rig.cameras[0]: str(folder)}, stopped=lambda: True)
+
+
 def test_a_source_that_is_none_and_a_camera_without_a_path_are_refused(rig: Rig) -> None:
     camera = rig.cameras[0]
     with pytest.raises(BadInput, match="not a folder of images"):
@@ -118,7 +125,7 @@ def test_live_cameras_with_different_latencies_measure_the_platform_where_it_was
         return Pose.level([0.3 * (time - 5.2), 0.05, 0.4])
 
     class Live:
-        def __init__(self, _source: str, camera: Camera) -> None:
+        def __init__(self, _source: str, camera: Camera, **_: object) -> None:
             self._eye = SyntheticCamera(rig, replace(scene, obstacles=()), camera, seed=4)
             self._delay = camera.latency
 
