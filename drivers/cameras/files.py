@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.live import Frame, Image, eight_bits
-from model.errors import AlreadyExists, BadInput, Fault
+from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.documents import write_bytes_atomic
 from model.files.reading import PICTURE_LIMIT, is_too_large, read_bytes
 from model.rig import Camera
@@ -300,6 +300,8 @@ VIDEO_CODES = {".mp4": "mp4v", ".avi": "MJPG"}
 class PictureOutput:
     """Context manager that writes colour images to a folder or a video.
 
+    What was written before a user-visible error or Ctrl-C is kept, as are the poses until then.
+
     Args:
         path: A folder to create, or a video file, by its suffix.
         rate: Images per second of a video.
@@ -342,9 +344,10 @@ class PictureOutput:
     ) -> None:
         if self._video is None:
             return
+        is_writable = self._video.isOpened()
         self._video.release()
         try:
-            if error is None or isinstance(error, KeyboardInterrupt):
+            if is_writable and isinstance(error, CdprError | KeyboardInterrupt | None):
                 self._keep_video()
         finally:
             self._unfinished.unlink(missing_ok=True)
