@@ -171,7 +171,7 @@ class CameraRecords:
     """Samples of the cameras of a run.
 
     Attributes:
-        together: Fused samples, one per frame.
+        together: Fused samples, one per frame, in order of time.
         alone: Samples of each camera by its name, if there are several.
         cameras: Statistics of each camera.
     """
@@ -284,7 +284,7 @@ class RunCameras:
         self._report_trouble()
         several = len(self._clients) > 1
         return CameraRecords(
-            tuple(sorted(self._together, key=lambda sample: sample.frame)),
+            tuple(sorted(self._together, key=lambda sample: sample.found.time)),
             {client.name: tuple(client.samples) for client in self._clients} if several else {},
             tuple(client.record() for client in self._clients),
         )

@@ -157,6 +157,28 @@ def test_for_any_delay_of_cameras_every_frame_is_reported_once_and_nothing_is_lo
         assert camera.pictures + camera.dropped == moments
 
 
+class Awaited(Scripted):
+    """A camera whose images are taken when they are answered, as if it had none before."""
+
+    def answer_within(self, patience: float) -> CameraSample | None:
+        asked = self.unanswered
+        self._off["late"] = 0.0 if asked is None else self._delays[asked.frame % 4] % BLIND / RATE
+        return super().answer_within(patience)
+
+
+@given(
+    front=st.lists(st.sampled_from([0, BLIND]), min_size=4, max_size=4),
+    side=st.lists(st.integers(0, 12), min_size=4, max_size=4),
+)
+@example(front=[BLIND, 0, 0, 0], side=[10, 0, 0, 0])
+def test_measurements_are_in_order_of_time_whichever_camera_blocks(
+    front: list[int], side: list[int]
+) -> None:
+    run, _ = run_of(25, Awaited("front", front), Awaited("side", side))
+    times = [look.found.time for look in run.finish(never).together]
+    assert times == sorted(times)
+
+
 @given(late=st.integers(2, 5))
 def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
     """The fast camera measures too small a clearance: the stop must not wait for the slow one."""
