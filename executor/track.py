@@ -418,12 +418,7 @@ def _opened(
         video = VideoFile(path, camera)
         return video, len(video)
     require_camera_source(source)
-    return _exposed(LiveCamera(source, camera, stopped=stopped), camera.latency), None
-
-
-def _exposed(frames: Iterable[Frame], latency: float) -> Iterator[Frame]:
-    """Images of a live camera with the times of their exposure instead of their arrival, [s]."""
-    return (replace(frame, time=frame.time - latency) for frame in frames)
+    return LiveCamera(source, camera, stopped=stopped), None
 
 
 def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Pose]]:

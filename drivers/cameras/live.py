@@ -159,7 +159,8 @@ class Frame:
     """One image.
 
     Attributes:
-        time: Time of capture, [s]; for files, since the first image.
+        time: Middle of the exposure, [s]; of a live camera on its clock, of files since the first
+            image.
         image: Grey, shape (height, width).
         name: File name, or number in the video or of the camera.
         number: In the source, from 0, counting also images that are skipped or cannot be read.
@@ -276,7 +277,7 @@ class LiveCamera:
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         self.name = f"camera {live_name(camera.name, str(source))}"
-        self._stopped, self._seen = stopped, False
+        self._stopped, self._seen, self._latency = stopped, False, camera.latency
         numbered = isinstance(source, int) or source.isdecimal()
         if numbered and (len(str(source)) > 9 or int(source) > LAST_CAMERA):
             raise BadInput(
@@ -317,7 +318,7 @@ class LiveCamera:
                 yield self.read()
 
     def read(self) -> Frame:
-        """The newest unread image with its time of arrival, which may precede the call.
+        """The newest unread image with its time, the camera's latency before it arrived.
 
         Raises:
             HardwareMissing: The camera never delivered an image.
@@ -327,8 +328,8 @@ class LiveCamera:
         arrived = self._reader.newest(self._stopped)
         if arrived is not None:
             self._seen = True
-            number = arrived.number
-            return Frame(arrived.time, _grey(arrived.picture), f"image {number}", number)
+            number, image = arrived.number, _grey(arrived.picture)
+            return Frame(arrived.time - self._latency, image, f"image {number}", number)
         if self._stopped():
             what = "stopped before the camera delivered an image"
             raise StoppedByOperator(what, where=self.name)

@@ -148,7 +148,7 @@ def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> ImageSource:
         synthetic = make_synthetic_camera(rig, scene, camera)
         true = synthetic.camera.latency
         return RenderedImages(ImageSequence(synthetic), camera.latency, true)
-    return LiveImages(LiveCamera(name, camera), camera.latency)
+    return LiveImages(LiveCamera(name, camera))
 
 
 class RenderedImages:
@@ -188,20 +188,16 @@ class RenderedImages:
 
 
 class LiveImages:
-    """A real camera as a source of images.
+    """A real camera as a source of images."""
 
-    Args:
-        camera: The camera.
-        latency: Of its images, [s].
-    """
-
-    def __init__(self, camera: LiveCamera, latency: float) -> None:
-        self._camera, self._latency = camera, latency
+    def __init__(self, camera: LiveCamera) -> None:
+        """Uses an open camera."""
+        self._camera = camera
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """The next image, and the middle of its exposure after the request, [s]."""
         frame = self._camera.read()
-        return frame.image, frame.time - self._latency - trigger.asked
+        return frame.image, frame.time - trigger.asked
 
     def close(self) -> None:
         """Closes the camera."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,15 @@ def test_the_newest_picture_is_answered_with_the_time_at_which_it_came(
             assert frame.time == pytest.approx(number / 100.0)
         queue.unplug()
     assert queue.released
+
+
+def test_a_picture_was_exposed_its_latency_before_it_came(queue: Queue, camera: Camera) -> None:
+    queue.take(1)
+    with LiveCamera("0", replace(camera, latency=0.08), queue.clock) as live:
+        queue.take(5)
+        queue.wait_until_read()
+        assert live.read().time == pytest.approx(0.05 - 0.08)
+        queue.unplug()
 
 
 def test_no_picture_is_answered_twice(queue: Queue, camera: Camera) -> None:
