@@ -100,6 +100,10 @@ class TrackResult:
             facts["pictures_without_partner"] = self.together.without_partner
             facts["moments_apart"] = self.together.apart
             facts["moments_without_speed"] = self.together.without_speed
+        common = [np.sqrt(np.diag(p.shared)[:3]) for p in poses if not p.unstated]
+        if common:
+            deviation = float(np.median(np.linalg.norm(common, axis=1)))
+            facts["common_deviation_mm"] = round(deviation * 1000, 4)
         clearances = [p.clearance for p in logged if p.clearance is not None]
         if clearances:
             nearest = min(clearances, key=lambda c: c.distance)

@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 
 from drivers.cameras.live import Frame
 from executor.track import track_sources
+from model.cameras import Z_95
 from model.errors import BadInput, StoppedByOperator
 from model.pose import Pose
 from model.progress import Listener
@@ -54,6 +55,17 @@ def test_a_folder_is_measured_and_saved(folder: Path, rig: Rig, tmp_path: Path) 
     head, *rows = (tmp_path / "poses.csv").read_text().splitlines()
     assert head == ",".join(POSE_COLUMNS)
     assert len(rows) == 3
+
+
+def test_errors_common_to_all_images_are_stated_beside_their_scatter(
+    folder: Path, rig: Rig
+) -> None:
+    """4 mm with 95 %, of each coordinate; nothing if it is unknown."""
+    for error, expected in ((4e-3, 4.0 / Z_95 * np.sqrt(3.0)), (None, None)):
+        camera = replace(rig.cameras[0], error=error, lens_covariance=None)
+        facts = track_sources(replace(rig, cameras=(camera,)), {camera: str(folder)}).summary()
+        assert facts["position_deviation_mm"] < 0.2
+        assert facts.get("common_deviation_mm") == pytest.approx(expected, abs=1e-3)
 
 
 def column(path: Path, name: str) -> list[str]:
