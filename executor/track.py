@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.cameras.files import ImageFolder, PictureOutput, natural_order
+from drivers.cameras.files import ImageFolder, PictureOutput, first_gap, natural_order
 from drivers.cameras.live import Frame, LiveCamera, VideoFile
 from executor.cameras.sources import (
     SYNTHETIC,
@@ -262,8 +262,15 @@ def _simultaneous(
     named = {camera.name: frames for camera, (frames, _) in zip(cameras, opened, strict=True)}
     folders = {name: one for name, one in named.items() if isinstance(one, ImageFolder)}
     videos = {name: one for name, one in named.items() if isinstance(one, VideoFile)}
-    if len(folders) > 1:
-        times = _times_by_name(folders, listener)
+    times = _times_by_name(folders, listener) if len(folders) > 1 else {}
+    names = list(times) or [path.name for folder in folders.values() for path in folder.files]
+    if gap := first_gap(names):
+        listener.remark(
+            f"images seem to be missing between {' and '.join(gap)}: times are those of consecutive"
+            " images, so later ones are too early, and the next poses of a camera with readout_ms"
+            " are wrong"
+        )
+    if times:
         return [(_dated(one, times), len(one)) for one in folders.values()], 0.0
     _report_different_videos(videos, listener)
     # The fastest camera defines the time window of simultaneous images.

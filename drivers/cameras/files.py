@@ -7,6 +7,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 
@@ -288,6 +289,23 @@ def natural_order(name: str) -> tuple[list[tuple[int, int, str]], str]:
     """Sort key that puts ``frame_10`` after ``frame_9``; different for different names."""
     parts = re.split(r"(\d+)", name.lower())
     return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts], name
+
+
+def first_gap(names: Sequence[str]) -> tuple[str, str] | None:
+    """The first names between which images seem to be missing, by the last number of each.
+
+    The numbers increase, and most by about the same step, which is 1, 10 or that of time stamps.
+
+    Args:
+        names: In natural order.
+    """
+    found = [re.findall(r"\d+", Path(name).stem) for name in names]
+    if len(found) < 3 or not all(found):
+        return None
+    steps = [int(after[-1]) - int(before[-1]) for before, after in pairwise(found)]
+    usual = sorted(steps)[(len(steps) - 1) // 2]
+    gaps = (k for k, step in enumerate(steps) if step > 1.5 * usual and min(steps) > 0)
+    return next(((names[k], names[k + 1]) for k in gaps), None)
 
 
 # Images written to a folder or into a video.

@@ -184,18 +184,35 @@ def test_an_image_that_a_camera_lost_shifts_none_of_its_others(
         assert found.pose.distance_to(pose) < 1e-3
 
 
+class Remarks(Listener):
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def remark(self, text: str) -> None:
+        self.texts.append(text)
+
+
+def test_images_missing_in_all_folders_are_remarked_on(
+    rig: Rig, scene: Scene, tmp_path: Path
+) -> None:
+    """Later times are too early; an image that only one camera lost shifts none."""
+    front, side = rig.cameras[0], other_side(rig.cameras[0])
+    names = {"front": ["f0.png", "f1.png", "f3.png"], "side": ["f0.png", "f1.png", "f3.png"]}
+    both, sources = two_folders(rig, scene, tmp_path, names)
+    for robot, given in ((rig, {front: sources[front]}), (both, sources)):
+        track_sources(robot, given, listener=(remarks := Remarks()))
+        (text,) = remarks.texts
+        assert "missing between f1.png and f3.png" in text
+    cv2.imwrite(str(tmp_path / side.name / "f2.png"), np.zeros((720, 1280), np.uint8))
+    track_sources(both, sources, listener=(remarks := Remarks()))
+    assert not any("missing" in text for text in remarks.texts)
+
+
 @pytest.mark.parametrize("behind", [0.0, 0.05])
 def test_images_of_the_same_name_that_are_not_simultaneous_are_remarked_on(
     rig: Rig, scene: Scene, tmp_path: Path, behind: float
 ) -> None:
     """The platform accelerates to 0.1 m/s and back to rest."""
-
-    class Remarks(Listener):
-        def __init__(self) -> None:
-            self.texts: list[str] = []
-
-        def remark(self, text: str) -> None:
-            self.texts.append(text)
 
     front, remarks = rig.cameras[0], Remarks()
     cameras = (front, other_side(front))
