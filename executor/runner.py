@@ -308,11 +308,8 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
     rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
     rate = asked_rate(job.cameras) if job.cameras else PROGRESS_RATE
     every = cycles_per_image(rate, cycle)
-    pictures = rows // every
     status = RunStatus(prepared, job.folder.path, board, simulated_time=fast)
-    opening = partial(
-        open_cameras, prepared.rig, prepared.scene, job.cameras, job.folder.path, pictures, board
-    )
+    opening = partial(open_cameras, prepared, job.cameras, job.folder.path, board)
     guarded = (callbacks := Callbacks(board.ask_stop)).guarded
     moved.callbacks = callbacks
     with ExitStack() as stack:
