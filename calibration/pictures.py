@@ -381,7 +381,7 @@ def capture_images(
         wanted: Minimum number of images.
         size: Width and height of the camera's images, [px]; a video has its own.
         on_advice: Receives the next instruction for the operator whenever it changes.
-        stopped: Ends the capture when true; called after each image.
+        stopped: Ends the capture when true; called after each image, and while there is none.
 
     Returns:
         Number of images captured.
@@ -393,7 +393,7 @@ def capture_images(
     """
     guide, last = CaptureGuide(board, wanted), ""
     earlier = _captured(folder)
-    with _frames(source, size) as frames:
+    with _frames(source, size, stopped) as frames:
         for image in frames:
             if stopped():
                 break
@@ -437,11 +437,13 @@ def _captured(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def _frames(source: str, size: tuple[int, int]) -> Iterator[Iterator[Image]]:
-    """Grey images from a camera or a video."""
+def _frames(
+    source: str, size: tuple[int, int], stopped: Callable[[], bool]
+) -> Iterator[Iterator[Image]]:
+    """Grey images from a camera, until stopped, or a video."""
     path = Path(source)
     if path.is_file():
         yield (frame.image for frame in VideoFile(path, generic_camera(video_size(path), source)))
         return
-    with LiveCamera(source, generic_camera(size, source)) as live:
+    with LiveCamera(source, generic_camera(size, source), stopped=stopped) as live:
         yield (frame.image for frame in live)

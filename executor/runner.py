@@ -16,7 +16,12 @@ from typing import Any
 
 from executor.cameras.multi_camera import CameraRecords, CameraWatch
 from executor.cameras.open import asked_rate, open_cameras, require_no_stop
-from executor.cameras.sources import CameraChoice, require_synthetic_images, resolve_cameras
+from executor.cameras.sources import (
+    CameraChoice,
+    cycles_per_image,
+    require_synthetic_images,
+    resolve_cameras,
+)
 from executor.control.path_runs import Outcome, run_in_process, run_in_real_time
 from executor.drives import (
     abandoned_drives_fault,
@@ -302,11 +307,9 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
     listener, fast = options.listener, not options.realtime
     rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
     rate = asked_rate(job.cameras) if job.cameras else PROGRESS_RATE
-    pictures = int(prepared.duration * rate)
+    every = cycles_per_image(rate, cycle)
     status = RunStatus(prepared, job.folder.path, board, simulated_time=fast)
-    opening = partial(
-        open_cameras, prepared.rig, prepared.scene, job.cameras, job.folder.path, pictures, board
-    )
+    opening = partial(open_cameras, prepared, job.cameras, job.folder.path, board)
     guarded = (callbacks := Callbacks(board.ask_stop)).guarded
     moved.callbacks = callbacks
     with ExitStack() as stack:
@@ -328,7 +331,7 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
                 job.folder,
                 status,
                 trigger=watch.trigger if watch else None,
-                every=max(1, round(1.0 / (rate * cycle))),
+                every=every,
                 progress=lambda row: show(
                     row, watch.rates if watch else "", f"{recorder.state.value}, row"
                 ),

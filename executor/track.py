@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.cameras.files import ImageFolder, PictureOutput, natural_order
+from drivers.cameras.files import ImageFolder, PictureOutput, first_gap, natural_order
 from drivers.cameras.live import Frame, LiveCamera, VideoFile
 from executor.cameras.sources import (
     SYNTHETIC,
+    cycles_per_image,
     require_camera_source,
     require_one_kind,
 )
@@ -23,7 +24,7 @@ from executor.kernels import ready_to_measure
 from executor.recording.mcap import write_track_mcap
 from executor.trajectory.setpoints import prepare
 from model.clearance import ClearanceModel
-from model.errors import BadInput, CdprError, path_of
+from model.errors import BadInput, CdprError, StoppedByOperator, path_of
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -99,6 +100,10 @@ class TrackResult:
             facts["pictures_without_partner"] = self.together.without_partner
             facts["moments_apart"] = self.together.apart
             facts["moments_without_speed"] = self.together.without_speed
+        common = [np.sqrt(np.diag(p.shared)[:3]) for p in poses if not p.unstated]
+        if common:
+            deviation = float(np.median(np.linalg.norm(common, axis=1)))
+            facts["common_deviation_mm"] = round(deviation * 1000, 4)
         clearances = [p.clearance for p in logged if p.clearance is not None]
         if clearances:
             nearest = min(clearances, key=lambda c: c.distance)
@@ -182,7 +187,8 @@ def track_sources(
         pictures: Largest number of images per camera.
         overlay: Folder or video for the images with measurements drawn in.
         replace_overlay: Whether it may exist.
-        stopped: Called before each image; True ends tracking.
+        stopped: Called before each image, and while a live camera delivers none; True ends
+            tracking.
         keep: Called with what was measured before an error that ends tracking, unless no image gave
             a pose; the error is then raised.
         listener: Receives progress, and files that are not used.
@@ -192,6 +198,7 @@ def track_sources(
         BadInput: A source cannot be used, or an image is of another size.
         HardwareMissing: A camera does not open.
         CameraMoved: Frame tags differ from their positions in the rig file.
+        StoppedByOperator: Stopped before the first image.
     """
     require_plan_used(sources.values(), plan)
     require_one_kind({camera.name: source for camera, source in sources.items()})
@@ -206,7 +213,7 @@ def track_sources(
         with_clearance=model is not None,
     )
     opened = [
-        _opened(rig, the_scene, camera, source, plan, result.unused[camera.name], listener)
+        _opened(rig, the_scene, camera, source, plan, result.unused[camera.name], stopped, listener)
         for camera, source in sources.items()
     ]
     opened, within = _simultaneous(list(sources), opened, listener)
@@ -233,6 +240,8 @@ def track_sources(
         except (CdprError, KeyboardInterrupt):
             if result.count.poses:
                 keep(result)
+            if not result.count.pictures and stopped():
+                raise StoppedByOperator("stopped before the first image") from None
             raise
     for text in result.together.clocks if result.together is not None else ():
         listener.remark(text)
@@ -253,8 +262,15 @@ def _simultaneous(
     named = {camera.name: frames for camera, (frames, _) in zip(cameras, opened, strict=True)}
     folders = {name: one for name, one in named.items() if isinstance(one, ImageFolder)}
     videos = {name: one for name, one in named.items() if isinstance(one, VideoFile)}
-    if len(folders) > 1:
-        times = _times_by_name(folders, listener)
+    times = _times_by_name(folders, listener) if len(folders) > 1 else {}
+    names = list(times) or [path.name for folder in folders.values() for path in folder.files]
+    if gap := first_gap(names):
+        listener.remark(
+            f"images seem to be missing between {' and '.join(gap)}: times are those of consecutive"
+            " images, so later ones are too early, and the next poses of a camera with readout_ms"
+            " are wrong"
+        )
+    if times:
         return [(_dated(one, times), len(one)) for one in folders.values()], 0.0
     _report_different_videos(videos, listener)
     # The fastest camera defines the time window of simultaneous images.
@@ -387,6 +403,7 @@ def _opened(
     source: str,
     plan: Plan | None,
     unused: dict[str, str],
+    stopped: Callable[[], bool],
     listener: Listener,
 ) -> tuple[Iterable[Picture], int | None]:
     """The images of a source, and their number if known."""
@@ -412,12 +429,7 @@ def _opened(
         video = VideoFile(path, camera)
         return video, len(video)
     require_camera_source(source)
-    return _exposed(LiveCamera(source, camera), camera.latency), None
-
-
-def _exposed(frames: Iterable[Frame], latency: float) -> Iterator[Frame]:
-    """Images of a live camera with the times of their exposure instead of their arrival, [s]."""
-    return (replace(frame, time=frame.time - latency) for frame in frames)
+    return LiveCamera(source, camera, stopped=stopped), None
 
 
 def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Pose]]:
@@ -425,7 +437,7 @@ def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Po
     require_same_rig(plan, rig, f"plan for {plan.rig.name}")
     table = prepare(verify(plan, rig), rig).checked.table
     poses = table.poses()
-    every = max(1, round(1.0 / (camera.rate * table.cycle)))
+    every = cycles_per_image(camera.rate, table.cycle)
     return [(row * table.cycle, poses[row]) for row in range(0, len(table), every)]
 
 

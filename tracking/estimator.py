@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.cameras import Z_95
-from model.pose import Array, Pose, read_only
+from model.pose import Pose, read_only
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, distort_pixels, pixels_of, project_undistorted
 from tracking.detection.detector import Detection
@@ -39,7 +39,7 @@ class TrackerSettings:
         jump: Largest distance from the last pose beyond what `speed` allows, [m].
         jump_angle: Largest rotation from the last pose, [rad].
         speed: Largest expected speed of the platform, [m/s].
-        turn: Largest rotation from the home pose, [rad]; no cable robot rotates by a right angle.
+        turn: Largest rotation from the home pose, [rad]; wrong poses are mostly beyond it.
         single_tag_margin: Required cost difference of a single tag's pose to its mirror pose, in
             variances.
         contradiction: Largest misfit of the edges: their mean squared error, in variances of edges
@@ -196,10 +196,9 @@ def rejection_reason(
             f"the reprojection error is {bundle.reprojection:.2f} px,"
             f" the limit is {limits.reprojection_px:g} px"
         )
-    if len(views) == 1 and bundle.second_best_cost - bundle.cost < limits.single_tag_margin:
-        near = prior is not None and prior.angle_to(bundle.camera_from_body) < 0.1
-        if not near:
-            return f"only tag {used} is detected, and it allows two poses"
+    is_single = len(views) == 1 and bundle.second_best_cost - bundle.cost < limits.single_tag_margin
+    if is_single and (prior is None or not prior.angle_to(bundle.camera_from_body) < 0.1):
+        return f"only tag {used} is detected, and it allows two poses"
     largest, _ = largest_deviations(bundle.covariance)
     if not largest <= limits.position_deviation:
         return (
@@ -286,7 +285,6 @@ class PlatformEstimator:
     ) -> Observation:
         detected = views
         agreed = find_consensus(self._camera, views, lambda pose: not self._impossible(views, pose))
-        measured = len(views) > 0
         if agreed.ambiguous:
             twice = ", ".join(map(str, agreed.ambiguous))
             return NoPose(time, f"tags {twice} are detected at inconsistent positions", seen)
@@ -295,7 +293,7 @@ class PlatformEstimator:
         first = solve_pnp(self._camera, views, prior) if views else None
         start = prior if first is None else first.camera_from_body
         if start is None:
-            return NoPose(time, self._no_pose_reason(seen, measured), seen)
+            return NoPose(time, self._no_pose_reason(seen, detected), seen)
         views = views + self._find_predicted(image, start, {v.tag.id for v in views})
         by_rows: FitByRows | None = None
         if self._camera.readout == 0.0:
@@ -314,6 +312,7 @@ class PlatformEstimator:
         elsewhere = self._elsewhere(detected, views, bundle)
         likely = self._expected_error(bundle)
         reason = rejection_reason(limits, views, bundle, prior, edges, likely, elsewhere)
+        # A fit can end at the mirror pose of the one it began at.
         reason = reason or self._impossible(views, bundle.camera_from_body)
         faults = edge_faults(image, self._camera, [view.seen for view in views], self._modules)
         if reason or faults.unusable:
@@ -325,19 +324,21 @@ class PlatformEstimator:
         return replace(found, covariance=covariance, at_rest=by_rows.at_rest)
 
     def _impossible(self, views: Sequence[TagView], camera_from_platform: Pose) -> str:
-        """Why the platform cannot have the pose that fits tags; empty if it can.
-
-        A fit can end at the mirror pose of the one it began at, so its result is tested as well.
-        """
+        """Why the platform cannot have the pose that fits tags; empty if it can."""
         pose = self._camera.world_from_camera.compose(camera_from_platform)
         fits = f"the pose that fits tags {', '.join(str(view.tag.id) for view in views)} is"
         turn, limit = np.degrees([pose.angle_to(self._rig.home), self._settings.turn])
         if not turn < limit:
             return f"{fits} {turn:.0f}° from the home pose, the limit is {limit:g}°"
-        if np.all((pose.position >= self._lower) & (pose.position <= self._upper)):
+        if self._is_reached(camera_from_platform):
             return ""
         x, y, z = pose.position * 1e3
         return f"{fits} at ({x:.0f}, {y:.0f}, {z:.0f}) mm, where the platform cannot be"
+
+    def _is_reached(self, camera_from_platform: Pose) -> bool:
+        """Whether the platform can be at the position of a pose."""
+        position = self._camera.world_from_camera.apply(camera_from_platform.position)
+        return bool(np.all((position >= self._lower) & (position <= self._upper)))
 
     def _no_fit_reason(self, views: Sequence[TagView], start: Pose) -> str:
         """Why no view gives a pose near ``start``, in the camera frame."""
@@ -351,12 +352,15 @@ class PlatformEstimator:
             f" {np.degrees(seen):.0f}° from their normal, the limit is {np.degrees(limit):.0f}°"
         )
 
-    def _no_pose_reason(self, seen: tuple[int, ...], measured: bool) -> str:
+    def _no_pose_reason(self, seen: tuple[int, ...], views: Sequence[TagView]) -> str:
         if mine := [str(number) for number in seen if number in self._platform]:
             tags = ", ".join(mine)
-            if measured:
-                return f"no pose within the workspace fits tags {tags}"
-            return f"the edges of tags {tags} {UNSHARP}"
+            if not views:
+                return f"the edges of tags {tags} {UNSHARP}"
+            rotated = find_consensus(self._camera, views, self._is_reached).views
+            fitted = solve_pnp(self._camera, rotated) if rotated else None
+            why = "" if fitted is None else self._impossible(rotated, fitted.camera_from_body)
+            return why or f"no pose within the workspace fits tags {tags}"
         wanted = ", ".join(map(str, self._platform))
         others = [number for number in seen if number not in self._frame]
         also = f"; detected instead: {', '.join(map(str, others))}" if others else ""
@@ -428,19 +432,15 @@ class PlatformEstimator:
             displaced += (worst.tag.id,)
         return None
 
-    def _covariance(self, bundle: BundlePose, views: Sequence[TagView]) -> Array:
-        """Covariance of a pose from edge scatter, world axes, shape (6, 6), [m, rad]."""
-        turn = np.kron(np.eye(2), self._camera.world_from_camera.rotation)
-        return read_only(turn @ self._shared.scatter(bundle, views) @ turn.T)
-
     def _measurement(
         self, time: float, views: list[TagView], bundle: BundlePose, status: str
     ) -> PoseMeasurement:
         pose = self._camera.world_from_camera.compose(bundle.camera_from_body)
+        turn = np.kron(np.eye(2), self._camera.world_from_camera.rotation)
         return PoseMeasurement(
             time,
             pose,
-            self._covariance(bundle, views),
+            read_only(turn @ self._shared.scatter(bundle, views) @ turn.T),
             tuple(sorted(view.tag.id for view in views)),
             bundle.reprojection,
             status,

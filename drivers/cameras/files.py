@@ -7,6 +7,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 
@@ -14,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.live import Frame, Image, eight_bits, is_too_large
-from model.errors import AlreadyExists, BadInput, Fault
+from drivers.cameras.live import Frame, Image, eight_bits
+from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.documents import write_bytes_atomic
-from model.files.reading import PICTURE_LIMIT, read_bytes
+from model.files.reading import PICTURE_LIMIT, is_too_large, read_bytes
 from model.rig import Camera
 
 #: Suffixes of image files, in lower case.
@@ -290,6 +291,23 @@ def natural_order(name: str) -> tuple[list[tuple[int, int, str]], str]:
     return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts], name
 
 
+def first_gap(names: Sequence[str]) -> tuple[str, str] | None:
+    """The first names between which images seem to be missing, by the last number of each.
+
+    The numbers increase, and most by about the same step, which is 1, 10 or that of time stamps.
+
+    Args:
+        names: In natural order.
+    """
+    found = [re.findall(r"\d+", Path(name).stem) for name in names]
+    if len(found) < 3 or not all(found):
+        return None
+    steps = [int(after[-1]) - int(before[-1]) for before, after in pairwise(found)]
+    usual = sorted(steps)[(len(steps) - 1) // 2]
+    gaps = (k for k, step in enumerate(steps) if step > 1.5 * usual and min(steps) > 0)
+    return next(((names[k], names[k + 1]) for k in gaps), None)
+
+
 # Images written to a folder or into a video.
 
 
@@ -299,6 +317,8 @@ VIDEO_CODES = {".mp4": "mp4v", ".avi": "MJPG"}
 
 class PictureOutput:
     """Context manager that writes colour images to a folder or a video.
+
+    What was written before a user-visible error or Ctrl-C is kept, as are the poses until then.
 
     Args:
         path: A folder to create, or a video file, by its suffix.
@@ -342,9 +362,10 @@ class PictureOutput:
     ) -> None:
         if self._video is None:
             return
+        is_writable = self._video.isOpened()
         self._video.release()
         try:
-            if error is None or isinstance(error, KeyboardInterrupt):
+            if is_writable and isinstance(error, CdprError | KeyboardInterrupt | None):
                 self._keep_video()
         finally:
             self._unfinished.unlink(missing_ok=True)

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import os
-import struct
 import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from model.errors import BadInput, Fault, HardwareMissing, without_passwords
+from model.errors import (
+    BadInput,
+    Fault,
+    HardwareMissing,
+    StoppedByOperator,
+    without_passwords,
+)
+from model.files.reading import MOST_PIXELS
 from model.rig import Camera
 
 # The newest image of a camera that delivers them faster than they are used.
@@ -29,20 +34,13 @@ from model.rig import Camera
 
 #: Consecutive failed reads after which a camera counts as lost.
 LOST_PICTURES = 5
-#: Longest wait for the reading thread when closing, [s].
-END_TIMEOUT = 2.0
-
-
-class Capture(Protocol):
-    """A source of images, such as `cv2.VideoCapture`."""
-
-    def read(self) -> tuple[bool, Any]:
-        """Waits for the next image in the queue; False and None if it fails."""
-        ...
-
-    def release(self) -> None:
-        """Releases the camera."""
-        ...
+#: The same after copies of one image for this long, [s]. A video codec may repeat an image of a
+#: platform at rest up to its next complete one.
+FROZEN = 10.0
+#: Longest wait for the reading thread when closing, and interval of checks for a stop, [s].
+END_TIMEOUT, ROUND = 2.0, 0.1
+NOT_OPENED = "cannot be opened"
+"""Why a camera delivers no images, as a predicate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,30 +59,43 @@ class Arrived:
 
 
 class PictureReader:
-    """Reads all images of a camera in a thread."""
+    """Opens a camera and reads all its images in a thread.
 
-    def __init__(self, capture: Capture, clock: Callable[[], float]) -> None:
+    A copy of the image before is not a new one: noise makes images of a camera differ, but a
+    decoder or driver that hangs may repeat its last one.
+
+    Attributes:
+        lost: Why the camera delivers no more, as a predicate of it.
+    """
+
+    def __init__(self, opened: Callable[[], cv2.VideoCapture], clock: Callable[[], float]) -> None:
         """Starts the thread.
 
         Args:
-            capture: Read and released only by the thread.
+            opened: Opens the camera, called by the thread: it may take half a minute.
             clock: Monotonic time, [s].
         """
-        self._capture, self._clock = capture, clock
+        self._opened, self._clock = opened, clock
         self._changed = threading.Condition()
         self._newest: Arrived | None = None
+        self.lost = ""
         self._ended = self._is_closing = False
         self._thread = threading.Thread(target=self._read, name="cdpr-pictures", daemon=True)
         self._thread.start()
 
-    def newest(self) -> Arrived | None:
+    def newest(self, stopped: Callable[[], bool]) -> Arrived | None:
         """Waits for the newest image not returned before.
 
+        Args:
+            stopped: Called repeatedly; True ends the wait.
+
         Returns:
-            None once the camera delivers no more.
+            None once the camera delivers no more, or the wait was ended.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._newest is not None or self._ended)
+            while not self._changed.wait_for(lambda: self._newest or self._ended, ROUND):
+                if stopped():
+                    break
             newest, self._newest = self._newest, None
             return newest
 
@@ -95,20 +106,37 @@ class PictureReader:
             self._thread.join(END_TIMEOUT)
 
     def _read(self) -> None:
-        number = failed = 0
         try:
-            while failed < LOST_PICTURES and not self._is_closing:
-                good, picture = self._capture.read()
-                now = self._clock()
-                failed = 0 if good else failed + 1
-                if good:
-                    self._put(Arrived(number, now, np.asarray(picture)))
-                    number += 1
+            capture = self._opened()
+            try:
+                self._read_all(capture)
+            finally:
+                capture.release()
         finally:
-            self._capture.release()
             with self._changed:
                 self._ended = True
                 self._changed.notify_all()
+
+    def _read_all(self, capture: cv2.VideoCapture) -> None:
+        """Puts each image of a camera until that is lost, or this closed."""
+        number = failed = 0
+        last: Arrived | None = None
+        self.lost = "" if capture.isOpened() else NOT_OPENED
+        while not (self.lost or self._is_closing):
+            good, picture = capture.read()
+            now = self._clock()
+            failed = 0 if good else failed + 1
+            if failed == LOST_PICTURES:
+                self.lost = f"failed to deliver an image {LOST_PICTURES} times in a row"
+            if not good:
+                continue
+            arrived = Arrived(number, now, np.asarray(picture))
+            number += 1
+            if last is None or not _is_copy(arrived.picture, last.picture):
+                last = arrived
+                self._put(arrived)
+            elif now - last.time > FROZEN:
+                self.lost = f"delivered the same image for {FROZEN:g} s"
 
     def _put(self, arrived: Arrived) -> None:
         with self._changed:
@@ -116,56 +144,9 @@ class PictureReader:
             self._changed.notify_all()
 
 
-# Size stated in the header of an image file, read before decoding.
-#
-# Source: PNG specification (W3C), 11.2.1; JPEG, ITU-T T.81, annex B; BMP,
-# Microsoft's BITMAPINFOHEADER.
-
-
-MOST_PIXELS = 2**28
-"""Largest number of pixels of an image, above any camera in use; 256 MB in grey."""
-
-_NO_SIZE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
-_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-
-
-def stated_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of a PNG, JPEG or BMP file, [px]; None for other or damaged files."""
-    try:
-        if data.startswith(b"\x89PNG\r\n\x1a\n"):
-            width, height = struct.unpack_from(">II", data, 16)
-        elif data.startswith(b"\xff\xd8"):
-            return _jpeg(data)
-        elif data.startswith(b"BM"):
-            width, height = struct.unpack_from("<ii", data, 18)
-        else:
-            return None
-    except struct.error:
-        return None
-    return abs(width), abs(height)
-
-
-def is_too_large(data: bytes) -> bool:
-    """Whether an image states more than `MOST_PIXELS`; OpenCV limits other formats itself."""
-    size = stated_size(data)
-    return size is not None and size[0] * size[1] > MOST_PIXELS
-
-
-def _jpeg(data: bytes) -> tuple[int, int] | None:
-    """Size from the first frame header, found by following the markers."""
-    at = 2
-    while True:
-        sign, marker = struct.unpack_from(">BB", data, at)
-        if sign != 0xFF:
-            return None
-        at += 2 if marker != 0xFF else 1
-        if marker == 0xFF or marker in _NO_SIZE:
-            continue
-        if marker in _FRAMES:
-            height, width = struct.unpack_from(">HH", data, at + 3)
-            return int(width), int(height)
-        (length,) = struct.unpack_from(">H", data, at)
-        at += max(2, length)
+def _is_copy(picture: NDArray[np.generic], last: NDArray[np.generic]) -> bool:
+    """Whether two images are equal; a few of their rows suffice for most that are not."""
+    return np.array_equal(picture[::64], last[::64]) and np.array_equal(picture, last)
 
 
 Image = NDArray[np.uint8]
@@ -178,7 +159,8 @@ class Frame:
     """One image.
 
     Attributes:
-        time: Time of capture, [s]; for files, since the first image.
+        time: Middle of the exposure, [s]; of a live camera on its clock, of files since the first
+            image.
         image: Grey, shape (height, width).
         name: File name, or number in the video or of the camera.
         number: In the source, from 0, counting also images that are skipped or cannot be read.
@@ -279,17 +261,23 @@ class LiveCamera:
         source: Index, such as ``0``, device file or address.
         camera: Its description in the rig file.
         clock: Monotonic time, [s].
+        stopped: Ends the images when true; called repeatedly while there is none.
 
     Raises:
         HardwareMissing: It does not open or delivers no image.
         BadInput: It delivers images of another size.
+        StoppedByOperator: Stopped before the first image.
     """
 
     def __init__(
-        self, source: int | str, camera: Camera, clock: Callable[[], float] = time.monotonic
+        self,
+        source: int | str,
+        camera: Camera,
+        clock: Callable[[], float] = time.monotonic,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         self.name = f"camera {live_name(camera.name, str(source))}"
-        self._seen = False
+        self._stopped, self._seen, self._latency = stopped, False, camera.latency
         numbered = isinstance(source, int) or source.isdecimal()
         if numbered and (len(str(source)) > 9 or int(source) > LAST_CAMERA):
             raise BadInput(
@@ -297,19 +285,14 @@ class LiveCamera:
                 where=self.name[:100],
                 next_step=f"give an index from 0 to {LAST_CAMERA}; `ls /dev/video*` lists them",
             )
-        capture = _opened(int(source) if numbered else str(source))
-        if not capture.isOpened():
-            capture.release()
-            raise HardwareMissing(
-                "the camera cannot be opened",
-                where=self.name,
-                why="it is not connected, another program uses it, or you may not read it",
-                next_step="check the cable and `ls -l /dev/video*`, close other programs, or name"
-                " another camera",
-            )
-        capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
-        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
-        self._reader = PictureReader(capture, clock)
+
+        def opened() -> cv2.VideoCapture:
+            capture = _opened(int(source) if numbered else str(source))
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
+            return capture
+
+        self._reader = PictureReader(opened, clock)
         # A caller that only iterates does not close it, and the thread must not outlive it.
         self._finalizer = weakref.finalize(self, self._reader.close)
         try:
@@ -325,33 +308,43 @@ class LiveCamera:
         self.close()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields images endlessly; those that arrive during processing are skipped.
+        """Yields images until stopped; those that arrive during processing are skipped.
 
         Raises:
             Fault: The camera stopped delivering images.
         """
-        while True:
-            yield self.read()
+        with suppress(StoppedByOperator):
+            while True:
+                yield self.read()
 
     def read(self) -> Frame:
-        """The newest unread image with its time of arrival, which may precede the call.
+        """The newest unread image with its time, the camera's latency before it arrived.
 
         Raises:
             HardwareMissing: The camera never delivered an image.
             Fault: It stopped delivering images.
+            StoppedByOperator: Stopped before the next image.
         """
-        arrived = self._reader.newest()
+        arrived = self._reader.newest(self._stopped)
         if arrived is not None:
             self._seen = True
-            number = arrived.number
-            return Frame(arrived.time, _grey(arrived.picture), f"image {number}", number)
+            number, image = arrived.number, _grey(arrived.picture)
+            return Frame(arrived.time - self._latency, image, f"image {number}", number)
+        if self._stopped():
+            what = "stopped before the camera delivered an image"
+            raise StoppedByOperator(what, where=self.name)
+        if self._reader.lost == NOT_OPENED:
+            why = "it is not connected, another program uses it, or you may not read it"
+            next_step = (
+                "check the cable and `ls -l /dev/video*`, close other programs, or name another"
+                " camera"
+            )
+        else:
+            why = "it was unplugged or hangs, its USB bus is too slow, or its lens is covered"
+            next_step = "check the cable, then start again"
         kind = Fault if self._seen else HardwareMissing
-        raise kind(
-            f"the camera failed to deliver an image {LOST_PICTURES} times in a row",
-            where=self.name,
-            why="it was unplugged, or its USB bus is too slow",
-            next_step="check the cable, then start again",
-        )
+        what = f"the camera {self._reader.lost or 'delivers no more images'}"
+        raise kind(what, where=self.name, why=why, next_step=next_step)
 
     def close(self) -> None:
         """Releases the camera."""

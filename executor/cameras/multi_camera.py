@@ -171,7 +171,7 @@ class CameraRecords:
     """Samples of the cameras of a run.
 
     Attributes:
-        together: Fused samples, one per frame.
+        together: Fused samples, one per frame, in order of time.
         alone: Samples of each camera by its name, if there are several.
         cameras: Statistics of each camera.
     """
@@ -284,7 +284,7 @@ class RunCameras:
         self._report_trouble()
         several = len(self._clients) > 1
         return CameraRecords(
-            tuple(sorted(self._together, key=lambda sample: sample.frame)),
+            tuple(sorted(self._together, key=lambda sample: sample.found.time)),
             {client.name: tuple(client.samples) for client in self._clients} if several else {},
             tuple(client.record() for client in self._clients),
         )
@@ -428,7 +428,8 @@ class CameraWatch:
         for camera in seen.cameras:
             if camera.dropped:
                 what = f"{camera.dropped} of {camera.dropped + camera.pictures} images skipped"
-                text = f"camera {camera.name}: {what}; the previous one was still being processed"
+                why = "the previous one had not arrived yet, or was still being measured"
+                text = f"camera {camera.name}: {what}; {why}"
                 self._report("pictures_dropped", text, at)
         return seen
 

@@ -16,7 +16,7 @@ from executor.cameras.client import CameraClient, samples_at_rest, wait_until_re
 from executor.cameras.live_image import ImageBoard, memory_for
 from executor.cameras.multi_camera import RunCameras
 from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, ImageSource
-from executor.cameras.sources import SYNTHETIC
+from executor.cameras.sources import SYNTHETIC, cycles_per_image
 from executor.kernels import ready_for_camera_processes, ready_to_measure
 from executor.realtime.shared_memory import SharedMemory
 from executor.recording.run_folder import RunFolder
@@ -25,13 +25,15 @@ from model.clearance import ClearanceModel
 from model.errors import Fault, StoppedByOperator
 from model.files.rig_file import RigDocument
 from model.files.scene_file import SceneDocument
-from model.pose import Pose, interpolate
+from model.pose import Array, Pose, interpolate
 from model.progress import Listener
 from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene, empty_scene, scene_from_document
+from tracking.estimator import TrackerSettings
 from tracking.measurement import Observation
 
-if TYPE_CHECKING:  # a real camera loads no simulator
+if TYPE_CHECKING:  # a real camera loads no simulator, and its process no planner
+    from executor.trajectory.setpoints import PreparedRun
     from simulation.camera.camera import ImageSequence
 
 #: Approximate number of a run's images kept for its report.
@@ -40,11 +42,9 @@ KEPT_IMAGES = 12
 
 @contextmanager
 def open_cameras(
-    rig: Rig,
-    scene: Scene,
+    prepared: PreparedRun,
     sources: Mapping[Camera, str],
     folder: Path,
-    pictures: int,
     board: RequestBoard,
     *,
     simulated_time: bool,
@@ -53,14 +53,12 @@ def open_cameras(
     """Starts a process for each camera; None without one.
 
     Args:
-        rig: The robot.
-        scene: What the cameras see besides it.
+        prepared: The run.
         sources: From `resolve_cameras`.
-        folder: The run folder.
-        pictures: Expected number of images per camera; some of them are kept.
+        folder: The run folder, which keeps some of the images.
         board: A stop request ends the opening.
         simulated_time: The run waits for late images instead of dropping them.
-        listener: Receives the wait.
+        listener: Receives the wait, and a remark on what cannot be measured.
 
     Raises:
         StoppedByOperator: A stop was requested before all were open.
@@ -69,6 +67,9 @@ def open_cameras(
     if not sources:
         yield None
         return
+    rig, scene, table = prepared.rig, prepared.scene, prepared.checked.table
+    report_unmeasured_rotation(rig, table.rotations, listener)
+    pictures = len(table) // cycles_per_image(asked_rate(sources), table.cycle)
     keep_every = max(1, pictures // KEPT_IMAGES)
     ready_for_camera_processes(listener)
     with ExitStack() as stack:
@@ -99,6 +100,23 @@ def open_cameras(
             ClearanceModel(rig, scene),
             scene.obstacle_clearance,
             asked_rate(sources),
+        )
+
+
+def report_unmeasured_rotation(rig: Rig, rotations: Array, listener: Listener) -> None:
+    """Remarks on a plan that rotates the platform farther than cameras measure it.
+
+    Args:
+        rig: The robot.
+        rotations: ``world_from_platform`` along the plan, shape (n, 3, 3).
+        listener: Receives the remark.
+    """
+    cosine = (np.einsum("nij,ij->n", rotations, rig.home.rotation).min() - 1.0) / 2.0
+    angle, limit = np.degrees([np.arccos(np.clip(cosine, -1.0, 1.0)), TrackerSettings().turn])
+    if angle >= limit:
+        listener.remark(
+            f"the plan rotates the platform by up to {angle:.4g}° from its home pose; cameras"
+            f" measure it below {limit:g}° only, and no clearance beyond"
         )
 
 
@@ -148,7 +166,7 @@ def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> ImageSource:
         synthetic = make_synthetic_camera(rig, scene, camera)
         true = synthetic.camera.latency
         return RenderedImages(ImageSequence(synthetic), camera.latency, true)
-    return LiveImages(LiveCamera(name, camera), camera.latency)
+    return LiveImages(LiveCamera(name, camera))
 
 
 class RenderedImages:
@@ -188,20 +206,16 @@ class RenderedImages:
 
 
 class LiveImages:
-    """A real camera as a source of images.
+    """A real camera as a source of images."""
 
-    Args:
-        camera: The camera.
-        latency: Of its images, [s].
-    """
-
-    def __init__(self, camera: LiveCamera, latency: float) -> None:
-        self._camera, self._latency = camera, latency
+    def __init__(self, camera: LiveCamera) -> None:
+        """Uses an open camera."""
+        self._camera = camera
 
     def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """The next image, and the middle of its exposure after the request, [s]."""
         frame = self._camera.read()
-        return frame.image, frame.time - self._latency - trigger.asked
+        return frame.image, frame.time - trigger.asked
 
     def close(self) -> None:
         """Closes the camera."""

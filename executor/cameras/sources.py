@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -271,7 +272,17 @@ def require_synthetic_images(sources: Iterable[str], fast: bool) -> None:
         )
 
 
-# Which images of several cameras are simultaneous.
+# Which images are requested, and which of several cameras are simultaneous.
+
+
+def cycles_per_image(rate: float, cycle: float) -> int:
+    """Cycles between requested images: the fewest in which a camera always takes another one.
+
+    Args:
+        rate: Of the camera's images, [Hz].
+        cycle: [s].
+    """
+    return max(1, math.ceil(1.0 / (rate * cycle) - 1e-9))
 
 
 def require_one_kind(sources: Mapping[str, str]) -> None:

@@ -88,7 +88,8 @@ TAG_STATUS = _object(
     reprojection_px=_NUMBER,
     covariance={
         **_list(_NUMBER),
-        "description": "6 x 6, row by row: position [m] and rotation vector [rad], world axes",
+        "description": "6 x 6, row by row: position [m] and rotation vector [rad], world axes;"
+        " without errors common to all images",
     },
 )
 CLEARANCE = _object(

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.cameras.live import is_too_large
 from executor.recording.tables import PoseTable
 from executor.recording.verdict import faults_among, page_of, page_text
 from executor.report.run_data import RunData, markdown, missing_images
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
+from model.files.reading import is_too_large
 from model.pages.page import known, list_table, paragraph, prose, table, tile, tiles
 from model.scene import legs_of
 from tracking.clearance import INTERVAL

@@ -11,6 +11,7 @@ import errno
 import json
 import os
 import stat
+import struct
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -211,6 +212,61 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         (twice, _), *_ = Counter(key for key, _ in pairs).most_common(1)
         raise ValueError(f"the key {twice[:60]!r} appears twice")
     return data
+
+
+# Size stated in the header of an image file, read before decoding.
+#
+# Source: PNG specification (W3C), 11.2.1; JPEG, ITU-T T.81, annex B; BMP,
+# Microsoft's BITMAPINFOHEADER.
+
+
+MOST_PIXELS = 2**28
+"""Largest number of pixels of an image, above any camera in use; 256 MB in grey."""
+
+_NO_SIZE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def stated_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of a PNG, JPEG or BMP file, [px]; None for other or damaged files."""
+    try:
+        if data.startswith(b"\x89PNG\r\n\x1a\n"):
+            width, height = struct.unpack_from(">II", data, 16)
+        elif data.startswith(b"\xff\xd8"):
+            return _jpeg(data)
+        elif data.startswith(b"BM"):
+            width, height = struct.unpack_from("<ii", data, 18)
+        else:
+            return None
+    except struct.error:
+        return None
+    return abs(width), abs(height)
+
+
+def is_too_large(data: bytes) -> bool:
+    """Whether an image states more than `MOST_PIXELS`; OpenCV limits other formats itself."""
+    size = stated_size(data)
+    return size is not None and size[0] * size[1] > MOST_PIXELS
+
+
+def _jpeg(data: bytes) -> tuple[int, int] | None:
+    """Size from the first frame header, found by following the markers."""
+    at = 2
+    while True:
+        sign, marker = struct.unpack_from(">BB", data, at)
+        if sign != 0xFF:
+            return None
+        at += 2 if marker != 0xFF else 1
+        if marker == 0xFF or marker in _NO_SIZE:
+            continue
+        if marker in _FRAMES:
+            height, width = struct.unpack_from(">HH", data, at + 3)
+            return int(width), int(height)
+        (length,) = struct.unpack_from(">H", data, at)
+        at += max(2, length)
+
+
+# Tables.
 
 
 class CsvFile:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import cast
 
+import numpy as np
 import pytest
+from hypothesis import assume, example, given
+from hypothesis import strategies as st
 
 from executor.cameras import client as camera_start
 from executor.cameras.client import HEARING, wait_until_ready
+from executor.cameras.open import report_unmeasured_rotation
 from executor.cameras.process import CameraProcess
 from model.errors import Fault, HardwareMissing, StoppedByOperator
+from model.pose import Pose, matrix_from_rotation_vector
+from model.progress import Listener
+from model.rig import load_rig
+from tests.cli.plans import RIG
 
 
 class Opening:
@@ -67,3 +76,25 @@ def test_all_cameras_together_have_one_time_to_open(monkeypatch: pytest.MonkeyPa
     with pytest.raises(Fault, match="camera front, side did not open"):
         wait(*cameras)
     assert [camera.asked for camera in cameras] == [1, 1, 1]
+
+
+@given(
+    home=st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3),
+    axis=st.sampled_from(list(np.eye(3))),
+    farthest=st.floats(-180.0, 180.0),
+)
+@example(home=[0.0] * 3, axis=np.eye(3)[2], farthest=180.0)
+@example(home=[0.0] * 3, axis=np.eye(3)[2], farthest=0.0)
+def test_a_plan_that_rotates_beyond_what_cameras_measure_is_remarked_on(
+    home: list[float], axis: np.ndarray, farthest: float
+) -> None:
+    assume(abs(abs(farthest) - 80.0) > 1e-3)
+    start = Pose(np.zeros(3), matrix_from_rotation_vector(np.array(home)))
+    rig, remarks = replace(load_rig(RIG), home=start), []
+    listener = Listener()
+    listener.remark = remarks.append  # type: ignore[method-assign]
+    angles = np.radians(np.linspace(0.0, farthest, 5))
+    rotations = np.array([matrix_from_rotation_vector(a * axis) @ start.rotation for a in angles])
+    report_unmeasured_rotation(rig, rotations, listener)
+    assert len(remarks) == (abs(farthest) > 80.0)
+    assert all(f"up to {abs(farthest):.4g}° from its home pose" in text for text in remarks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
@@ -32,6 +33,7 @@ from executor.cameras.process import (
     FrameRequest,
     sample_without_pose,
 )
+from executor.cameras.sources import cycles_per_image
 from executor.proposals import HomingProposal
 from executor.remote.client import camera_line
 from model.clearance import ClearanceModel
@@ -48,6 +50,27 @@ HERE = Pose.level([0.0, 0.0, 0.445])
 _RIG = load_rig(RIG)
 _SCENE = free_scene([0.0, 0.0, 445.0], [0.0, 30.0, 495.0])
 MODEL = ClearanceModel(_RIG, _SCENE)
+
+
+@given(
+    rate=st.floats(0.5, 200.0),
+    milliseconds=st.integers(1, 100),
+    phase=st.floats(0.0, 1.0, exclude_max=True),
+)
+@example(rate=30.0, milliseconds=10, phase=0.9)  # 33.3 requests per second before
+@example(rate=10.0, milliseconds=10, phase=0.0)
+def test_a_camera_with_its_stated_rate_has_an_image_for_every_request(
+    rate: float, milliseconds: int, phase: float
+) -> None:
+    """It takes images all the time; a request is answered by the next one, or one not yet used."""
+    every = cycles_per_image(rate, milliseconds / 1e3)
+    period = every * milliseconds / 1e3
+    assert every == 1 or (every - 1) * milliseconds / 1e3 < 1.0 / rate
+    used = -1
+    for request in range(50):
+        come = math.floor(request * period * rate - phase + 1e-6)  # the newest image
+        used = max(come, used + 1)
+        assert (used + phase) / rate <= (request + 1) * period + 1e-6
 
 
 BLIND = 100
@@ -132,6 +155,28 @@ def test_for_any_delay_of_cameras_every_frame_is_reported_once_and_nothing_is_lo
     for camera in seen.cameras:
         assert len(alone[camera.name]) == camera.pictures == camera.poses
         assert camera.pictures + camera.dropped == moments
+
+
+class Awaited(Scripted):
+    """A camera whose images are taken when they are answered, as if it had none before."""
+
+    def answer_within(self, patience: float) -> CameraSample | None:
+        asked = self.unanswered
+        self._off["late"] = 0.0 if asked is None else self._delays[asked.frame % 4] % BLIND / RATE
+        return super().answer_within(patience)
+
+
+@given(
+    front=st.lists(st.sampled_from([0, BLIND]), min_size=4, max_size=4),
+    side=st.lists(st.integers(0, 12), min_size=4, max_size=4),
+)
+@example(front=[BLIND, 0, 0, 0], side=[10, 0, 0, 0])
+def test_measurements_are_in_order_of_time_whichever_camera_blocks(
+    front: list[int], side: list[int]
+) -> None:
+    run, _ = run_of(25, Awaited("front", front), Awaited("side", side))
+    times = [look.found.time for look in run.finish(never).together]
+    assert times == sorted(times)
 
 
 @given(late=st.integers(2, 5))

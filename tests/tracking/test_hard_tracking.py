@@ -83,6 +83,18 @@ def test_a_loose_print_on_the_floor_gives_no_pose(
         assert str(number) in found.reason
 
 
+@pytest.mark.parametrize(("axis", "degrees"), [(0, 85), (1, 120), (2, 120), (2, 180)])
+def test_a_platform_rotated_too_far_is_named_with_its_angle_and_the_limit(
+    rig: Rig, camera: Camera, empty: Scene, axis: int, degrees: int
+) -> None:
+    """Its tags are as the rig file has them; to check those would lead nowhere."""
+    turn = matrix_from_rotation_vector(np.radians(degrees) * np.eye(3)[axis])
+    pose = Pose(np.array([0.05, 0.1, 0.4]), turn @ rig.home.rotation)
+    found = Tracker(rig, camera).observe(SyntheticCamera(rig, empty, camera).render(pose, 1), 0.0)
+    assert isinstance(found, NoPose)
+    assert f"{degrees}° from the home pose, the limit is 80°" in found.reason
+
+
 @pytest.mark.parametrize("height", [0.30, 0.34, 0.37])
 def test_a_tag_seen_too_obliquely_is_named_with_its_angle_and_the_limit(
     rig: Rig, camera: Camera, empty: Scene, height: float

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import drivers.cameras.live
-from drivers.cameras.live import LOST_PICTURES, LiveCamera
-from model.errors import BadInput, Fault, HardwareMissing
+from drivers.cameras.live import FROZEN, LOST_PICTURES, LiveCamera
+from model.errors import BadInput, Fault, HardwareMissing, StoppedByOperator
 from model.rig import Camera
 
 
 class Queue:
     """Queue of camera images.
 
-    An image's brightness is its number. Reading one takes no time; when none waits, reading waits,
-    as with a camera, for the next.
+    An image's brightness is its number, or with ``repeats`` that of the first of so many equal
+    ones. Reading one takes no time; when none waits, reading waits, as with a camera, for the next.
     """
+
+    repeats = 1
 
     def __init__(self, camera: Camera) -> None:
         self._shape = (camera.height, camera.width, 3)
@@ -61,7 +64,8 @@ class Queue:
             if self._taken == self._come:
                 return False, None
             self._taken += 1
-            return True, np.full(self._shape, self._taken - 1, np.uint8)
+            number = self._taken - 1
+            return True, np.full(self._shape, number - number % self.repeats, np.uint8)
 
     def release(self) -> None:
         self.released = True
@@ -94,6 +98,15 @@ def test_the_newest_picture_is_answered_with_the_time_at_which_it_came(
     assert queue.released
 
 
+def test_a_picture_was_exposed_its_latency_before_it_came(queue: Queue, camera: Camera) -> None:
+    queue.take(1)
+    with LiveCamera("0", replace(camera, latency=0.08), queue.clock) as live:
+        queue.take(5)
+        queue.wait_until_read()
+        assert live.read().time == pytest.approx(0.05 - 0.08)
+        queue.unplug()
+
+
 def test_no_picture_is_answered_twice(queue: Queue, camera: Camera) -> None:
     queue.take(1)
     with LiveCamera("0", camera, queue.clock) as live:
@@ -102,6 +115,33 @@ def test_no_picture_is_answered_twice(queue: Queue, camera: Camera) -> None:
         assert live.read().name == "image 1"
         later.join()
         queue.unplug()
+
+
+def test_a_copy_of_the_last_picture_is_not_a_new_one(queue: Queue, camera: Camera) -> None:
+    """A hanging decoder repeats its last image; its platform would be measured as at rest."""
+    queue.repeats = 4
+    queue.take(1)
+    with LiveCamera("0", camera, queue.clock) as live:
+        queue.take(6)
+        queue.wait_until_read()
+        frame = live.read()
+        assert (int(frame.image[0, 0]), frame.name) == (4, "image 4")
+        assert frame.time == pytest.approx(0.04)
+        queue.take(2)
+        queue.wait_until_read()
+        assert live.read().name == "image 8"
+        queue.unplug()
+
+
+def test_a_camera_that_repeats_one_picture_for_long_is_lost(queue: Queue, camera: Camera) -> None:
+    queue.repeats = 100_000
+    queue.take(1)
+    with LiveCamera("7", camera, queue.clock) as live:
+        queue.take(round(100 * FROZEN) + 2)
+        with pytest.raises(Fault, match=f"the same image for {FROZEN:g} s") as caught:
+            live.read()
+    assert caught.value.where == f"camera {camera.name} (7)"
+    assert queue.released
 
 
 def test_a_lost_camera_is_reported_by_its_name_and_source(queue: Queue, camera: Camera) -> None:
@@ -126,6 +166,41 @@ def test_a_camera_without_images_or_of_another_size_is_released(
     with pytest.raises(BadInput, match="5 x 4 px"):
         LiveCamera("0", camera, queue.clock)
     assert queue.released
+
+
+def test_a_camera_without_images_can_be_stopped(
+    queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before its first image, and afterwards; it hangs in neither case for the operator."""
+    monkeypatch.setattr(drivers.cameras.live, "ROUND", 1e-3)
+    monkeypatch.setattr(drivers.cameras.live, "END_TIMEOUT", 0.0)  # it hangs
+    with pytest.raises(StoppedByOperator, match="stopped before"):
+        LiveCamera("0", camera, queue.clock, stopped=lambda: True)
+    queue.take(1)
+    request = threading.Event()
+    with LiveCamera("0", camera, queue.clock, stopped=request.is_set) as live:
+        request.set()
+        assert list(live) == []
+
+
+def test_a_camera_that_does_not_open_can_be_stopped(
+    camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Opening an address waits half a minute for its server."""
+    answered, made = threading.Event(), Queue(camera)
+
+    def opened(_source: int | str) -> Queue:
+        answered.wait()
+        return made
+
+    monkeypatch.setattr(drivers.cameras.live, "_opened", opened)
+    monkeypatch.setattr(drivers.cameras.live, "END_TIMEOUT", 0.0)
+    with pytest.raises(StoppedByOperator):
+        LiveCamera("http://[::1]/x", camera, made.clock, stopped=lambda: True)
+    (reader,) = [one for one in threading.enumerate() if one.name == "cdpr-pictures"]
+    answered.set()
+    reader.join()
+    assert made.released
 
 
 def test_no_thread_is_left_without_a_close(queue: Queue, camera: Camera) -> None:

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from drivers.cameras.files import PictureOutput, read_picture
-from drivers.cameras.live import MOST_PIXELS, is_too_large, stated_size
 from model.errors import Fault
+from model.files.reading import MOST_PIXELS, is_too_large, stated_size
 
 IMAGE = np.full((48, 64, 3), 90, np.uint8)
 
@@ -109,6 +109,30 @@ def test_a_video_has_its_name_once_it_is_whole(tmp_path: Path, name: str) -> Non
             out.write(IMAGE, "")
         assert not (tmp_path / name).exists()
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("error", [Fault("the camera was unplugged"), KeyboardInterrupt()])
+def test_a_video_ended_by_an_error_has_the_images_until_then(
+    tmp_path: Path, error: BaseException
+) -> None:
+    out = PictureOutput(tmp_path / "a.mp4", 10.0)
+    out.write(IMAGE, "")
+    out.__exit__(type(error), error, None)
+    capture = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 1
+    capture.release()
+
+
+def test_a_video_without_an_encoder_is_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.cameras.files.VIDEO_CODES", {".mp4": "none"})
+    out = PictureOutput(tmp_path / "a.mp4", 10.0)
+    with pytest.raises(Fault, match="cannot be written") as caught:
+        out.write(IMAGE, "")
+    assert "no encoder" in caught.value.why
+    out.__exit__(Fault, caught.value, None)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_video_that_a_full_disk_cut_short_is_not_kept(tmp_path: Path) -> None:

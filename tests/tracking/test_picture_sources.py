@@ -9,8 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
-from drivers.cameras.files import ImageFolder, OneCamerasPictures
+from drivers.cameras.files import ImageFolder, OneCamerasPictures, first_gap
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from model.errors import BadInput, HardwareMissing
 from model.pose import Pose
@@ -42,6 +44,38 @@ def test_a_folder_is_read_in_the_order_of_its_numbers(folder: Path, camera: Came
     frames = list(ImageFolder(folder, camera))
     assert [frame.name for frame in frames] == [f"frame_{8 + k}.png" for k in range(4)]
     np.testing.assert_allclose([frame.time for frame in frames], [0.0, 0.1, 0.2, 0.3])
+
+
+@given(
+    count=st.integers(3, 40),
+    step=st.sampled_from([1, 10, 33_333_333]),
+    first=st.integers(0, 10**18),
+    lost=st.integers(1, 38),
+)
+def test_a_gap_in_the_numbers_of_names_is_found(
+    count: int, step: int, first: int, lost: int
+) -> None:
+    """The first and the last image are there; the clock of time stamps is not exact."""
+    names = [f"cam2_{first + k * step + k * k % 7 * (step // 100)}.png" for k in range(count)]
+    assert first_gap(names) is None
+    assume(lost < count - 1 and count > 3)
+    del names[lost]
+    assert first_gap(names) == (names[lost - 1], names[lost])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [],
+        ["1.png", "9.png"],
+        ["a.png", "b.png", "d.png"],
+        ["start.png", "1.png", "2.png", "5.png"],
+        ["12-00-58.png", "12-00-59.png", "12-01-00.png", "12-01-01.png"],
+        ["left_1.png", "left_2.png", "right_1.png", "right_2.png"],
+    ],
+)
+def test_names_without_consecutive_numbers_have_no_gap(names: list[str]) -> None:
+    assert first_gap(names) is None
 
 
 def test_a_broken_file_among_good_ones_is_named_and_skipped(
