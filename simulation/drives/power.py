@@ -15,7 +15,12 @@ from dataclasses import dataclass
 
 from drivers.cia402.state_machine import FAULTED, TORQUE_ON, DriveState
 from simulation.drives.behaviour import DriveBehaviour
-from simulation.drives.object_dictionary import ACCELERATION_UNIT, DriveObjects, counts_in
+from simulation.drives.object_dictionary import (
+    ACCELERATION_UNIT,
+    VELOCITY_UNIT,
+    DriveObjects,
+    counts_in,
+)
 from simulation.drives.pdo import Deadlines
 
 # Motion of the motor: following set-points, ramping down, holding. Pure.
@@ -183,7 +188,7 @@ class PowerStage(ABC):
     def _read_motion_settings(self) -> None:
         """Caches settings of the motion, so that `_move` reads no objects."""
         get = self.objects.get
-        unit = get((ACCELERATION_UNIT, 0), 0)
+        unit = get((ACCELERATION_UNIT, 0), get((VELOCITY_UNIT, 0), 0))  # of speed, per second
         acceleration = counts_in(unit, self._counts_per_turn) or 1.0
         self._deceleration = max(1e-3, get((0x6085, 0), 1_000_000) * acceleration)
         self._max_torque = get((0x6072, 0), 0xFFFF)

@@ -9,7 +9,12 @@ from pathlib import Path
 import canopen
 import pytest
 
+from drivers.cia402.object_dictionary import settings_for
+from drivers.cia402.profile import profile_names
 from model.errors import BadInput
+from model.files.rig_file import RigDocument
+from model.rig import Rig, rig_from_document
+from model.winches import WinchMap
 from simulation.drives.eds_file import EDS_FOLDER, profile_path, read_eds
 from simulation.drives.object_dictionary import READ_ONLY, Abort, DriveObjects, counts_in
 from tests.simulation.drive_line import Line
@@ -111,6 +116,29 @@ def test_a_drive_of_every_profile_answers(path: Path) -> None:
     line.drive.on_nmt(1, 5)
     line.drive.advance(0.01)
     line.drive.on_sync()
+
+
+@pytest.mark.parametrize("profile", profile_names())
+def test_the_quick_stop_that_is_set_up_takes_one_cycle_on_drives_of_every_make(
+    rig: Rig, profile: str
+) -> None:
+    """The distance from top speed is half of that in a cycle, in whatever unit 6085h is."""
+    document = rig.document.model_dump()
+    document["drives"]["profile"] = profile
+    theirs = rig_from_document(RigDocument.model_validate(document))
+    winch, cycle = theirs.winches[0], theirs.cycle
+    line = Line(eds=read_eds(profile_path(profile)), counts_per_turn=winch.counts_per_turn)
+    values = {s.index: s.value for s in settings_for(theirs, 0, WinchMap(theirs))}
+    for index, form in ((0x6085, "<I"), (0x605A, "<h"), (0x6060, "<b")):
+        assert line.abort(index, 0, form, values[index]) == 0
+    for word in (0x06, 0x07, 0x0F):
+        line.write(0x6040, 0, "<H", word)
+    line.drive.motor.speed = top = winch.max_speed * abs(winch.counts_per_metre)
+    line.write(0x6040, 0, "<H", 0x02)
+    for _ in range(100):
+        line.drive.advance(cycle / 20.0)
+    assert line.drive.motor.speed == 0.0
+    assert line.drive.motor.demand - 1000.0 == pytest.approx(0.5 * top * cycle, rel=1e-3)
 
 
 def test_an_epos4_runs_csp_without_listing_it() -> None:
