@@ -28,7 +28,7 @@ from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.eds_file import Eds, Key, profile_path, read_eds
 from simulation.drives.object_dictionary import (
     ACCELERATION_UNIT,
-    NO_DUPLICATE_CONSUMER,
+    HEARTBEAT_CONSUMERS,
     OUT_OF_RANGE,
     POSITION_UNIT,
     VELOCITY_UNIT,
@@ -281,24 +281,17 @@ class SimulatedDrive(PowerStage):
 
     def _judge(self, key: Key, value: int) -> int:
         """Abort code of an SDO write in the present state; 0 to accept it."""
-        index, sub = key
+        index = key[0]
         if index in RPDO or index in TPDO or index in RPDO_MAP or index in TPDO_MAP:
             pre_operational = self.nmt is NmtState.PRE_OPERATIONAL
             may_map = pre_operational or self.behaviour.maps_when_operational
             return self._pdos.refused(key, value, may_map=may_map)
-        if index == 0x1016 and self._is_consumed_already(sub, value):
-            return NO_DUPLICATE_CONSUMER
         if key == MODE and not self.objects.has_mode(value):
             return OUT_OF_RANGE
         if index in (POSITION_UNIT, VELOCITY_UNIT, ACCELERATION_UNIT):
             known = counts_in(value, self._counts_per_turn)
             return 0 if known and (index != POSITION_UNIT or known == 1.0) else OUT_OF_RANGE
         return 0
-
-    def _is_consumed_already(self, sub: int, value: int) -> bool:
-        node = value >> 16 & 0x7F
-        others = (self.objects[0x1016, s] for s in self.objects.subs(0x1016) if s not in (0, sub))
-        return bool(value & 0xFFFF) and any(e >> 16 & 0x7F == node and e & 0xFFFF for e in others)
 
     def _on_changed(self, key: Key, value: int) -> None:
         """Reacts to a changed object."""
@@ -311,7 +304,7 @@ class SimulatedDrive(PowerStage):
             for what in self._deadlines.kept():
                 if isinstance(what, int) and what not in watched:
                     self._deadlines.forget(what)
-        elif index == 0x1016:
+        elif index == HEARTBEAT_CONSUMERS:
             self._watched = self._heartbeat_consumers()
             for what in self._deadlines.kept():
                 if isinstance(what, tuple) and what[1] not in self._watched:
@@ -342,8 +335,9 @@ class SimulatedDrive(PowerStage):
 
     def _heartbeat_consumers(self) -> dict[int, float]:
         """Nodes and times [s] of the heartbeat consumer, 1016h."""
-        entries = (self.objects[0x1016, sub] for sub in self.objects.subs(0x1016) if sub)
-        room = self.objects.get((0x1016, 0), 0)
+        subs = self.objects.subs(HEARTBEAT_CONSUMERS)
+        entries = (self.objects[HEARTBEAT_CONSUMERS, sub] for sub in subs if sub)
+        room = self.objects.get((HEARTBEAT_CONSUMERS, 0), 0)
         taken = [e for e, _ in zip(entries, range(room), strict=False)]
         return {e >> 16 & 0x7F: (e & 0xFFFF) / 1000.0 for e in taken if e & 0xFFFF}
 

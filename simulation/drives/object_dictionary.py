@@ -21,7 +21,10 @@ NOT_THERE = 0x06020000
 WRONG_LENGTH = 0x06070010
 NO_SUB_INDEX = 0x06090011
 OUT_OF_RANGE = 0x06090030
+MAXIMUM_BELOW_MINIMUM = 0x06090036
 NOT_IN_THIS_STATE = 0x08000022
+
+HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS = 0x1016, 0x607D
 
 DEVICE_NAME = b"cdpr simulated drive"
 
@@ -171,8 +174,11 @@ class DriveObjects:
         if len(data) != described.length:
             raise Abort(WRONG_LENGTH)
         value = int.from_bytes(data, "little", signed=described.signed)
-        refused = self._out_of_range(key, value, described) or self.judge(key, value)
-        if refused:
+        if refused := (
+            self._out_of_range(key, value, described)
+            or self._contradiction(key, value)
+            or self.judge(key, value)
+        ):
             raise Abort(refused)
         if key not in self.stuck:
             self._values[key] = value
@@ -182,6 +188,18 @@ class DriveObjects:
         low, high = self._behaviour.ranges.get(key, (described.low, described.high))
         inside = (low is None or value >= low) and (high is None or value <= high)
         return 0 if inside else OUT_OF_RANGE
+
+    def _contradiction(self, key: Key, value: int) -> int:
+        """Abort code of a value that contradicts other sub-indices; 0 for none."""
+        index, sub = key
+        if index == HEARTBEAT_CONSUMERS and value & 0xFFFF:
+            entries = (self[index, other] for other in self.subs(index) if other not in (0, sub))
+            taken = [entry >> 16 & 0x7F for entry in entries if entry & 0xFFFF]
+            return NO_DUPLICATE_CONSUMER if value >> 16 & 0x7F in taken else 0
+        if index == SOFTWARE_LIMITS:
+            low, high = (value if one == sub else self.get((index, one), value) for one in (1, 2))
+            return MAXIMUM_BELOW_MINIMUM if low > high else 0
+        return 0
 
     def _find(self, key: Key) -> ObjectDescription:
         if key in self.refusals:

@@ -17,6 +17,7 @@ from drivers.cia402.state_machine import FAULTED, TORQUE_ON, DriveState
 from simulation.drives.behaviour import DriveBehaviour
 from simulation.drives.object_dictionary import (
     ACCELERATION_UNIT,
+    SOFTWARE_LIMITS,
     VELOCITY_UNIT,
     DriveObjects,
     counts_in,
@@ -195,7 +196,8 @@ class PowerStage(ABC):
         self._window = get((0x6065, 0), NO_WINDOW)
         self._window_time = get((0x6066, 0), 0) / 1000.0
         home, self._offset = get((0x607C, 0), 0), get((0x60B0, 0), 0)  # CiA 402-2
-        self._limits = get((0x607D, 1), -(2**31)) - home, get((0x607D, 2), 2**31 - 1) - home
+        low, high = get((SOFTWARE_LIMITS, 1), -(2**31)), get((SOFTWARE_LIMITS, 2), 2**31 - 1)
+        self._limits = low - home, high - home
         self._interpolation = get((0x60C2, 1), 1) * 10.0 ** get((0x60C2, 2), -3)
         self._stop_option = get((0x605A, 0), 2)
 

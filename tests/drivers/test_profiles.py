@@ -27,6 +27,7 @@ from drivers.cia402.profile import (
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork
 from drivers.cia402.sdo_jobs import monitoring_off
 from drivers.factory import make_drive_group
+from drivers.plausibility import position_limits
 from drivers.stopping_distance import lost_master, require_stopping_room
 from model.errors import BadInput, CdprError, InvalidFile, Refused
 from model.files.rig_file import RigDocument
@@ -372,6 +373,22 @@ def test_a_position_range_that_cannot_be_read_now_is_not_taken_for_none(
     with pytest.raises(Refused, match="607Bh"):
         set_up(rig, bus)
     assert not downloads(bus)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(-(10**9), -(10**8)), (0, 0), (-(2**31), 2**31 - 1), (10**8, 10**9)], ids=str
+)
+def test_the_software_limits_never_cross_while_they_are_written(
+    rig: Rig, low: int, high: int
+) -> None:
+    """A drive may abort with 06090036h or go into fault; drive 1 gets -306354 and 385549."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values |= {(0x607D, 1): low, (0x607D, 2): high}
+    assert set_up(rig, bus) == ()
+    limits = [position_limits(rig, drive, WinchMap(rig)) for drive in range(8)]
+    held = [(d.values[0x607D, 1], d.values[0x607D, 2]) for d in bus.drives.values()]
+    assert held == limits
 
 
 @pytest.mark.parametrize("key", [(0x6065, 0), (0x607D, 1)], ids=str)

@@ -239,6 +239,14 @@ def test_software_limits_hold(line: Line) -> None:
     assert line.drive.motor.position == 1040
 
 
+def test_the_software_limits_never_cross(line: Line) -> None:
+    line.drive.objects[0x607D, 1] = line.drive.objects[0x607D, 2] = 0
+    assert line.abort(0x607D, 1, "<i", 5) == 0x06090036  # CiA 301: maximum less than minimum
+    assert line.abort(0x607D, 2, "<i", -5) == 0x06090036
+    assert line.abort(0x607D, 2, "<i", 9) == line.abort(0x607D, 1, "<i", 9) == 0
+    assert (line.read(0x607D, 1), line.read(0x607D, 2)) == (9, 9)
+
+
 def test_a_short_set_point_is_ignored_and_reported(line: Line) -> None:
     line.enable()
     line.drive.on_set_point(b"\0" * 6)
