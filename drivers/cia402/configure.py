@@ -43,6 +43,7 @@ from drivers.cia402.sdo import NOT_NOW, SetupNetwork, means_absent
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import HOLDS
 from drivers.drive_group import OnRestarted, Pump
+from drivers.plausibility import require_within_limits
 from model.errors import Refused
 from model.files.drive_profile_file import ProfileDocument
 from model.rig import Rig
@@ -69,6 +70,8 @@ UNFINISHED = (
     "the set-up was not finished: the drives are in NMT pre-operational with part of their"
     " settings, and none is enabled"
 )
+
+_POSITION = 0x6064, 0, "position actual value"
 
 PDO_OBJECTS = 0xF9FF
 """Mask that maps a PDO's parameters (1400h, 1800h) and mapping (1600h, 1A00h) to one index."""
@@ -120,8 +123,9 @@ def configure_drives(
         HardwareMissing: Drives do not answer; with all their nodes.
         DriveRestarted: A drive restarted meanwhile.
         TorqueLost: A drive that held its cable released it meanwhile.
-        Refused: A drive is not a CiA 402 drive, is already enabled, or refuses or changes an
-            object; two devices have one node id; or another master is active on this bus.
+        Refused: A drive is not a CiA 402 drive, is already enabled, holds its cable outside its
+            position limits, or refuses or changes an object; two devices have one node id; or
+            another master is active on this bus.
         BadInput: A value of the rig does not fit its object.
         Fault: The bus does not accept frames.
     """
@@ -147,9 +151,15 @@ def configure_drives(
         refusals.note(refuse_scale, nodes[wrong.drive], wrong)
     refusals.raise_any(UNCHANGED)
     _refuse_duplicates(network)
+    holding = {node for node in nodes if network.client(node).read_state() in HOLDS}
+    held = {
+        drive: int.from_bytes(network.client(node).read(*_POSITION), "little", signed=True)
+        for drive, node in enumerate(nodes)
+        if node in holding
+    }
+    require_within_limits(rig, held, UNCHANGED)
     restarted = _restarted(network, nodes, settings)
     on_restarted(restarted)
-    holding = {node for node in nodes if network.client(node).read_state() in HOLDS}
     try:
         absent = _write_settings(rig, network, settings, entries, holding)
         simulated = are_simulated(network, nodes)

@@ -391,6 +391,26 @@ def test_the_software_limits_never_cross_while_they_are_written(
     assert held == limits
 
 
+@pytest.mark.parametrize("end", [0, 1])
+@pytest.mark.parametrize("beyond", [0, 1])
+@pytest.mark.parametrize("word", [0x0217, 0x0250])
+def test_no_limits_are_written_to_a_drive_that_holds_its_cable_outside_them(
+    rig: Rig, end: int, beyond: int, word: int
+) -> None:
+    """A drive that monitors its actual position trips with 8612h, and releases its cable."""
+    bus = eight_of("cia402")
+    limit = position_limits(rig, 4, WinchMap(rig))[end]
+    bus.drives[5].values |= {(0x6041, 0): word, (0x6064, 0): limit + (beyond if end else -beyond)}
+    if not beyond or word == 0x0250:  # without torque there is nothing to release
+        assert set_up(rig, bus) == ()
+        return
+    with pytest.raises(Refused, match=r"cable 5.*outside its position limits") as caught:
+        set_up(rig, bus)
+    assert "cdpr home" in caught.value.next_step
+    assert caught.value.next_step.endswith("the drives were not changed")
+    assert not downloads(bus)
+
+
 @pytest.mark.parametrize("key", [(0x6065, 0), (0x607D, 1)], ids=str)
 @pytest.mark.parametrize("code", ABORTS, ids=hex)
 def test_a_required_object_that_is_missing_is_refused_before_anything_is_written(
