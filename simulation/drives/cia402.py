@@ -24,6 +24,7 @@ from drivers.cia402.pdo import (
     make_heartbeat,
 )
 from drivers.cia402.state_machine import DriveState
+from model.files.drive_profile_file import TorqueLimit
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.eds_file import Eds, Key, profile_path, read_eds
 from simulation.drives.object_dictionary import (
@@ -35,6 +36,7 @@ from simulation.drives.object_dictionary import (
     DriveObjects,
     SdoServer,
     counts_in,
+    motion_settings,
 )
 from simulation.drives.pdo import (
     ACTING,
@@ -50,7 +52,7 @@ from simulation.drives.pdo import (
     ProcessData,
     ReceivePdo,
 )
-from simulation.drives.power import MODE_FOLLOWS, NO_WINDOW, TIMED, Motor, PowerStage
+from simulation.drives.power import MODE_FOLLOWS, TIMED, Motor, PowerStage
 
 Frame = bytes | bytearray
 Send = Callable[[int, Frame], None]
@@ -98,6 +100,7 @@ class SimulatedDrive(PowerStage):
         eds: Eds | None = None,
         behaviour: DriveBehaviour = STRICT,
         counts_per_turn: float = 4096.0,
+        torque_limit: TorqueLimit | None = None,
     ) -> None:
         """Powers the drive on: it sends boot-up and waits in PRE-OPERATIONAL.
 
@@ -109,9 +112,11 @@ class SimulatedDrive(PowerStage):
             eds: Its objects (default: those of the profile ``cia402``).
             behaviour: Choices within the standards.
             counts_per_turn: Of the motor shaft, for drives with speed in revolutions.
+            torque_limit: Object that limits its torque instead of 6072h.
         """
         motor = Motor(position, position, top_speed, stick=behaviour.stick)
-        super().__init__(motor, behaviour, counts_per_turn, seed=node)
+        super().__init__(motor, behaviour, seed=node)
+        self._counts_per_turn, self._torque_limit = counts_per_turn, torque_limit
         self.node = node
         self._bus_send = send
         self._eds = eds or read_eds(profile_path("cia402"))
@@ -179,7 +184,7 @@ class SimulatedDrive(PowerStage):
             return
         now = self._now = self._now + elapsed
         self._move(elapsed)
-        if self._window != NO_WINDOW:
+        if self._motion.window < inf:
             self._check_following(elapsed)
         if now > self._deadlines.earliest:
             self._on_deadlines()
@@ -324,7 +329,7 @@ class SimulatedDrive(PowerStage):
 
     def _read_settings(self) -> None:
         """Caches settings of time-outs, so that `advance` reads no objects."""
-        self._read_motion_settings()
+        self._motion = motion_settings(self.objects, self._counts_per_turn, self._torque_limit)
         get = self.objects.get
         self._heartbeat_period = get((0x1017, 0), 0) / 1000.0
         self._sync_timeout = self.behaviour.sync_periods * get((0x1006, 0), 0) / 1e6

@@ -5,9 +5,11 @@ from __future__ import annotations
 import heapq
 import struct
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from itertools import count
 from math import inf
 
+from model.files.drive_profile_file import TorqueLimit, object_key
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.eds_file import Eds, Key, ObjectDescription
 
@@ -384,3 +386,66 @@ def counts_in(unit: int, counts_per_turn: float) -> float | None:
     if numerator is None or seconds is None:
         return None
     return numerator * 10.0**exponent / seconds
+
+
+# Settings of a drive's motion, from its objects.
+
+
+_NOT_MONITORED = 0xFFFFFFFF
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSettings:
+    """What the objects of a drive state about its motion.
+
+    Attributes:
+        deceleration: Of a quick stop (6085h), [counts/s²].
+        max_torque: Torque limit, [per mille of rated torque].
+        window: Largest following error (6065h), [counts]; infinity if it is not monitored.
+        window_time: Time for which it may be exceeded (6066h), [s].
+        offset: Added to every target (60B0h), [counts].
+        limits: Smallest and largest target (607Dh), [counts].
+        interpolation: Time in which a target is reached (60C2h), [s].
+        stop_option: Quick stop option code (605Ah).
+    """
+
+    deceleration: float
+    max_torque: float
+    window: float
+    window_time: float
+    offset: int
+    limits: tuple[int, int]
+    interpolation: float
+    stop_option: int
+
+
+def motion_settings(
+    objects: DriveObjects, counts_per_turn: float, torque_limit: TorqueLimit | None
+) -> MotionSettings:
+    """Reads the settings of a drive's motion; an absent object limits nothing.
+
+    Args:
+        objects: Of the drive.
+        counts_per_turn: Of the motor shaft.
+        torque_limit: Object that limits the torque instead of 6072h.
+    """
+    get = objects.get
+    unit = get((ACCELERATION_UNIT, 0), get((VELOCITY_UNIT, 0), 0))  # of speed, per second
+    acceleration = counts_in(unit, counts_per_turn) or 1.0
+    home = get((0x607C, 0), 0)  # the drive subtracts it from its limits: CiA 402-2
+    low, high = get((SOFTWARE_LIMITS, 1), -(2**31)), get((SOFTWARE_LIMITS, 2), 2**31 - 1)
+    window = get((0x6065, 0), _NOT_MONITORED)
+    limiting, rated = (0x6072, 0), 1000
+    if torque_limit is not None:
+        limiting = object_key(torque_limit.object)
+        rated = 1000 if torque_limit.rated is None else get(object_key(torque_limit.rated), 0)
+    return MotionSettings(
+        deceleration=max(1e-3, get((0x6085, 0), 1_000_000) * acceleration),
+        max_torque=1000.0 * get(limiting, 2**32) / rated if rated else 0.0,
+        window=inf if window == _NOT_MONITORED else window,
+        window_time=get((0x6066, 0), 0) / 1000.0,
+        offset=get((0x60B0, 0), 0),
+        limits=(low - home, high - home),
+        interpolation=get((0x60C2, 1), 1) * 10.0 ** get((0x60C2, 2), -3),
+        stop_option=get((0x605A, 0), 2),
+    )

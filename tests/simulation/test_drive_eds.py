@@ -10,14 +10,14 @@ import canopen
 import pytest
 
 from drivers.cia402.object_dictionary import settings_for
-from drivers.cia402.profile import profile_names
+from drivers.cia402.profile import load_profile, profile_names
 from model.errors import BadInput
 from model.files.rig_file import RigDocument
 from model.rig import Rig, rig_from_document
 from model.winches import WinchMap
 from simulation.drives.eds_file import EDS_FOLDER, profile_path, read_eds
 from simulation.drives.object_dictionary import READ_ONLY, Abort, DriveObjects, counts_in
-from tests.simulation.drive_line import Line
+from tests.simulation.drive_line import CYCLE, Line
 
 EDS = EDS_FOLDER / "cia402.eds"
 LENGTHS = {1: 1, 2: 1, 3: 2, 4: 4, 5: 1, 6: 2, 7: 4}  # CANopen type: bytes
@@ -141,6 +141,27 @@ def test_the_quick_stop_that_is_set_up_takes_one_cycle_on_drives_of_every_make(
     assert line.drive.motor.demand - 1000.0 == pytest.approx(0.5 * top * cycle, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("profile", "limit", "rated"), [("epos4", (0x3001, 2), 5.0), ("cia402", (0x6072, 0), 1.0)]
+)
+@pytest.mark.parametrize(("torque", "position"), [(-119.0, 990.0), (-120.0, 1000.0)])
+def test_the_object_of_the_profile_limits_the_torque(
+    profile: str, limit: tuple[int, int], rated: float, torque: float, position: float
+) -> None:
+    """At 120 per mille no cable is wound in that pulls with as much."""
+    eds, limited = read_eds(profile_path(profile)), load_profile(profile).torque_limit
+    line = Line(eds=eds, torque_limit=limited)
+    line.write(0x6060, 0, "<b", 8)
+    line.drive.objects[limit] = round(120 * rated)
+    line.drive.objects[0x607D, 2] = 10_000
+    for word in (0x06, 0x07, 0x0F):
+        line.write(0x6040, 0, "<H", word)
+    line.drive.torque = torque
+    line.write(0x607A, 0, "<i", 990)
+    line.drive.advance(CYCLE)
+    assert line.drive.motor.position == position
+
+
 def test_an_epos4_runs_csp_without_listing_it() -> None:
     line = Line(eds=read_eds(profile_path("epos4")))
     assert line.read(0x6502, 0) == 0x225
@@ -165,7 +186,7 @@ def test_a_makers_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
     assert line.abort(0x60C2, 2, "<b", -3) == 0
     assert line.sdo(0x40, 0x2000, 0)[4:] == struct.pack("<I", 0x06010001)
     # 6000 rpm/s of 4000 counts a turn
-    assert line.drive._deceleration == pytest.approx(400_000.0)
+    assert line.drive._motion.deceleration == pytest.approx(400_000.0)
     eds = read_eds(path)
     assert (eds.objects[0x607A, 0].to_rpdo, eds.objects[0x607A, 0].to_tpdo) == (True, False)
     assert (eds.objects[0x6064, 0].to_rpdo, eds.objects[0x6064, 0].to_tpdo) == (False, True)
@@ -289,7 +310,7 @@ def test_a_unit_that_is_not_known_is_refused(tmp_path: Path) -> None:
     line = Line(eds=read_eds(path), counts_per_turn=4000.0)
     assert line.abort(0x60AA, 0, "<I", 0x00410300) == 0x06090030
     assert line.abort(0x60AA, 0, "<I", 0x00B55700) == 0
-    assert line.drive._deceleration == pytest.approx(6000.0)
+    assert line.drive._motion.deceleration == pytest.approx(6000.0)
 
 
 def test_it_says_that_it_is_simulated_whatever_the_file_says(tmp_path: Path) -> None:
