@@ -128,6 +128,7 @@ _STATUS_CODES = {
 }
 _VOLTAGE_AND_REMOTE = 0x0210
 _WARNING_BIT = 0x0080
+_INTERNAL_LIMIT = 0x0800
 _FOLLOWS_COMMAND = 0x1000
 _FOLLOWING_ERROR_BIT = 0x2000
 
@@ -171,7 +172,7 @@ class PowerStage(ABC):
         self._wanted_mode = self._mode
         self._target = self.motor.position
         self._time_to_target = self._error_time = 0.0
-        self._at_limit = self._warned = False
+        self._at_limit = self._is_clipped = self._warned = False
         self._fault_code = self._flicker = 0
 
     @property
@@ -194,7 +195,9 @@ class PowerStage(ABC):
     def _status_shown(self) -> int:
         word = self._status
         if self._enabled and self._mode == CYCLIC_POSITION:
-            word |= _FOLLOWS_COMMAND
+            word |= _INTERNAL_LIMIT if self._is_clipped else _FOLLOWS_COMMAND
+        if self._at_limit and self._torque_on:
+            word |= _INTERNAL_LIMIT
         if self._error_time > 0.0:
             word |= _FOLLOWING_ERROR_BIT
         if self._warned:
@@ -312,6 +315,7 @@ class PowerStage(ABC):
         target += self._motion.offset
         low, high = self._motion.limits
         self._target = float(low if target < low else high if target > high else target)
+        self._is_clipped = self._target != target
         self._time_to_target = self._motion.interpolation
 
     def _take_control_word(self, word: int) -> None:
