@@ -38,7 +38,13 @@ from drivers.cia402.object_dictionary import (
     stated_absent,
 )
 from drivers.cia402.pdo import NmtCommand
-from drivers.cia402.profile import for_unused_pdos, profile_of, unwatched_peers, used_pdos
+from drivers.cia402.profile import (
+    for_unused_pdos,
+    limits_out_of_force,
+    profile_of,
+    unwatched_peers,
+    used_pdos,
+)
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork, means_absent
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import HOLDS
@@ -170,7 +176,7 @@ def configure_drives(
         raise
     for wrong in scales:
         absent.setdefault(f"{wrong}: {HOW_SCALED}", []).append(nodes[wrong.drive])
-    for remark in left_out(profile):
+    for remark in (*left_out(profile), *limits_out_of_force(profile)):
         absent.setdefault(remark, []).extend(nodes)
     remarks = (*_absent(absent), *unwatched_peers(profile, nodes, entries))
     watched = (

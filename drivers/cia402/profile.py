@@ -149,6 +149,15 @@ def unwatched_peers(
         )
 
 
+def limits_out_of_force(profile: ProfileDocument) -> tuple[str, ...]:
+    """A remark for drives whose position limits do not apply as they are written."""
+    remark = (
+        "607Dh software position limits are in force only once they are saved and the drive"
+        " restarts: until then it limits set-points by those it started with, if at all"
+    )
+    return (remark,) if profile.limits_need_restart else ()
+
+
 def interpolation_time(
     cycle: float, values: Range | None = None, exponents: Range | None = None
 ) -> tuple[int, int]:

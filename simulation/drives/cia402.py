@@ -23,8 +23,9 @@ from drivers.cia402.pdo import (
     make_emergency,
     make_heartbeat,
 )
+from drivers.cia402.profile import load_profile
 from drivers.cia402.state_machine import DriveState
-from model.files.drive_profile_file import TorqueLimit
+from model.files.drive_profile_file import ProfileDocument
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.eds_file import Eds, Key, profile_path, read_eds
 from simulation.drives.object_dictionary import (
@@ -100,7 +101,7 @@ class SimulatedDrive(PowerStage):
         eds: Eds | None = None,
         behaviour: DriveBehaviour = STRICT,
         counts_per_turn: float = 4096.0,
-        torque_limit: TorqueLimit | None = None,
+        profile: ProfileDocument | None = None,
     ) -> None:
         """Powers the drive on: it sends boot-up and waits in PRE-OPERATIONAL.
 
@@ -112,11 +113,11 @@ class SimulatedDrive(PowerStage):
             eds: Its objects (default: those of the profile ``cia402``).
             behaviour: Choices within the standards.
             counts_per_turn: Of the motor shaft, for drives with speed in revolutions.
-            torque_limit: Object that limits its torque instead of 6072h.
+            profile: Of its make (default: ``cia402``).
         """
         motor = Motor(position, position, top_speed, stick=behaviour.stick)
         super().__init__(motor, behaviour, seed=node)
-        self._counts_per_turn, self._torque_limit = counts_per_turn, torque_limit
+        self._counts_per_turn, self._profile = counts_per_turn, profile or load_profile("cia402")
         self.node = node
         self._bus_send = send
         self._eds = eds or read_eds(profile_path("cia402"))
@@ -329,7 +330,7 @@ class SimulatedDrive(PowerStage):
 
     def _read_settings(self) -> None:
         """Caches settings of time-outs, so that `advance` reads no objects."""
-        self._motion = motion_settings(self.objects, self._counts_per_turn, self._torque_limit)
+        self._motion = motion_settings(self.objects, self._counts_per_turn, self._profile)
         get = self.objects.get
         self._heartbeat_period = get((0x1017, 0), 0) / 1000.0
         self._sync_timeout = self.behaviour.sync_periods * get((0x1006, 0), 0) / 1e6

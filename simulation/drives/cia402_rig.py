@@ -100,7 +100,7 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
             eds=self._eds,
             behaviour=self.behaviour,
             counts_per_turn=winch.counts_per_turn,
-            torque_limit=profile_of(self._rig).torque_limit,
+            profile=profile_of(self._rig),
         )
 
     def _friction(self) -> float:

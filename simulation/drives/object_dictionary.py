@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import count
 from math import inf
 
-from model.files.drive_profile_file import TorqueLimit, object_key
+from model.files.drive_profile_file import ProfileDocument, object_key
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.eds_file import Eds, Key, ObjectDescription
 
@@ -391,9 +391,6 @@ def counts_in(unit: int, counts_per_turn: float) -> float | None:
 # Settings of a drive's motion, from its objects.
 
 
-_NOT_MONITORED = 0xFFFFFFFF
-
-
 @dataclass(frozen=True, slots=True)
 class MotionSettings:
     """What the objects of a drive state about its motion.
@@ -404,7 +401,8 @@ class MotionSettings:
         window: Largest following error (6065h), [counts]; infinity if it is not monitored.
         window_time: Time for which it may be exceeded (6066h), [s].
         offset: Added to every target (60B0h), [counts].
-        limits: Smallest and largest target (607Dh), [counts].
+        limits: Smallest and largest target (607Dh), [counts]; infinite until a restart, if one is
+            needed, as this drive stores nothing.
         interpolation: Time in which a target is reached (60C2h), [s].
         stop_option: Quick stop option code (605Ah).
     """
@@ -414,38 +412,38 @@ class MotionSettings:
     window: float
     window_time: float
     offset: int
-    limits: tuple[int, int]
+    limits: tuple[float, float]
     interpolation: float
     stop_option: int
 
 
 def motion_settings(
-    objects: DriveObjects, counts_per_turn: float, torque_limit: TorqueLimit | None
+    objects: DriveObjects, counts_per_turn: float, profile: ProfileDocument
 ) -> MotionSettings:
     """Reads the settings of a drive's motion; an absent object limits nothing.
 
     Args:
         objects: Of the drive.
         counts_per_turn: Of the motor shaft.
-        torque_limit: Object that limits the torque instead of 6072h.
+        profile: Of its make: what limits its torque, and when its position limits are in force.
     """
     get = objects.get
     unit = get((ACCELERATION_UNIT, 0), get((VELOCITY_UNIT, 0), 0))  # of speed, per second
     acceleration = counts_in(unit, counts_per_turn) or 1.0
     home = get((0x607C, 0), 0)  # the drive subtracts it from its limits: CiA 402-2
     low, high = get((SOFTWARE_LIMITS, 1), -(2**31)), get((SOFTWARE_LIMITS, 2), 2**31 - 1)
-    window = get((0x6065, 0), _NOT_MONITORED)
+    window = get((0x6065, 0), 0xFFFFFFFF)
     limiting, rated = (0x6072, 0), 1000
-    if torque_limit is not None:
-        limiting = object_key(torque_limit.object)
-        rated = 1000 if torque_limit.rated is None else get(object_key(torque_limit.rated), 0)
+    if (limit := profile.torque_limit) is not None:
+        limiting = object_key(limit.object)
+        rated = 1000 if limit.rated is None else get(object_key(limit.rated), 0)
     return MotionSettings(
         deceleration=max(1e-3, get((0x6085, 0), 1_000_000) * acceleration),
         max_torque=1000.0 * get(limiting, 2**32) / rated if rated else 0.0,
-        window=inf if window == _NOT_MONITORED else window,
+        window=inf if window == 0xFFFFFFFF else window,
         window_time=get((0x6066, 0), 0) / 1000.0,
         offset=get((0x60B0, 0), 0),
-        limits=(low - home, high - home),
+        limits=(-inf, inf) if profile.limits_need_restart else (low - home, high - home),
         interpolation=get((0x60C2, 1), 1) * 10.0 ** get((0x60C2, 2), -3),
         stop_option=get((0x605A, 0), 2),
     )

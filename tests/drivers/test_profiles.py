@@ -391,6 +391,15 @@ def test_the_software_limits_never_cross_while_they_are_written(
     assert held == limits
 
 
+@pytest.mark.parametrize("name", ["cia402", *MAKERS])
+def test_limits_that_are_not_in_force_are_a_remark_of_every_set_up(rig: Rig, name: str) -> None:
+    theirs, bus = with_profile(rig, name), eight_of(name)
+    for _ in range(2):
+        said = [remark for remark in set_up(theirs, bus) if "607Dh" in remark]
+        assert len(said) == (name == "akd")
+        assert all(remark.startswith("drive 1, 2, 3, 4, 5, 6, 7, 8: ") for remark in said)
+
+
 @pytest.mark.parametrize("end", [0, 1])
 @pytest.mark.parametrize("beyond", [0, 1])
 @pytest.mark.parametrize("word", [0x0217, 0x0250])

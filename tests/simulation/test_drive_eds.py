@@ -149,8 +149,7 @@ def test_the_object_of_the_profile_limits_the_torque(
     profile: str, limit: tuple[int, int], rated: float, torque: float, position: float
 ) -> None:
     """At 120 per mille no cable is wound in that pulls with as much."""
-    eds, limited = read_eds(profile_path(profile)), load_profile(profile).torque_limit
-    line = Line(eds=eds, torque_limit=limited)
+    line = Line(eds=read_eds(profile_path(profile)), profile=load_profile(profile))
     line.write(0x6060, 0, "<b", 8)
     line.drive.objects[limit] = round(120 * rated)
     line.drive.objects[0x607D, 2] = 10_000
@@ -160,6 +159,21 @@ def test_the_object_of_the_profile_limits_the_torque(
     line.write(0x607A, 0, "<i", 990)
     line.drive.advance(CYCLE)
     assert line.drive.motor.position == position
+
+
+@pytest.mark.parametrize(("profile", "reached"), [("akd", 1100.0), ("cia402", 1040.0)])
+def test_limits_that_need_a_restart_are_not_in_force_when_they_are_written(
+    profile: str, reached: float
+) -> None:
+    line = Line(eds=read_eds(profile_path(profile)), profile=load_profile(profile))
+    line.write(0x6060, 0, "<b", 8)
+    for sub, limit in ((2, 1040), (1, 900)):
+        assert line.abort(0x607D, sub, "<i", limit) == 0
+    for word in (0x06, 0x07, 0x0F):
+        line.write(0x6040, 0, "<H", word)
+    line.write(0x607A, 0, "<i", 1100)
+    line.drive.advance(CYCLE)
+    assert line.drive.motor.position == reached
 
 
 def test_an_epos4_runs_csp_without_listing_it() -> None:
