@@ -135,6 +135,15 @@ def test_epos4_gets_its_limits_in_its_own_units(rig: Rig) -> None:
     assert values[0x1016, 1] == 127 << 16 | 100
 
 
+def test_an_akd_limits_its_current_as_it_has_no_6072h(rig: Rig) -> None:
+    """AKD CANopen Communication, edition H, page 102."""
+    bus, theirs = eight_of("akd"), with_profile(rig, "akd")
+    assert examined(theirs, bus).good
+    set_up(theirs, bus)
+    assert {drive.values[0x6073, 0] for drive in bus.drives.values()} == {1200}  # per mille
+    assert all((0x6072, 0) not in drive.values for drive in bus.drives.values())
+
+
 def test_a_torque_limit_that_is_a_share_of_nothing_is_refused_before_anything_is_written(
     rig: Rig,
 ) -> None:
