@@ -203,27 +203,28 @@ def position_limits(rig: Rig, drive: int, winch_map: WinchMap) -> tuple[int, int
     return low, high
 
 
-def require_within_limits(rig: Rig, positions: Sequence[int]) -> None:
-    """Refuses to enable a drive beyond its position limits, as it would move to them.
+def require_within_limits(rig: Rig, positions: Mapping[int, int], left: str) -> None:
+    """Refuses a drive beyond its position limits: it would move to them, or take it as a fault.
 
     Args:
         rig: The robot.
-        positions: Of all drives, [counts].
+        positions: By index of the drive, [counts].
+        left: The state that the drives are left in.
 
     Raises:
         Refused: A drive is beyond its limits (607Dh).
     """
     winch_map, names = WinchMap(rig), rig.drive_names
-    for drive, (node, position) in enumerate(zip(names, positions, strict=True)):
+    for drive, position in positions.items():
         low, high = position_limits(rig, drive, winch_map)
         if not low <= position <= high:
+            node = rig.winches[drive].node_id
             raise Refused(
                 f"{names[node]} is at {position} counts, outside its position limits {low} to"
                 f" {high}",
                 where="drive group",
-                why="once enabled it would move to its limit (607Dh)",
-                next_step=f"configure limits that include this position, or run {HOME};"
-                " nothing was enabled",
+                why="under torque it would move to its limit (607Dh), or stop with a fault (8612h)",
+                next_step=f"configure limits that include this position, or run {HOME}; {left}",
                 values={"node": node},
             )
 

@@ -30,6 +30,7 @@ from drivers.cia402.expected_objects import (
 from drivers.cia402.object_dictionary import (
     PDO_IDENTIFIER,
     PDO_INVALID,
+    SOFTWARE_LIMITS,
     Setting,
     heartbeat_consumers,
     left_out,
@@ -37,11 +38,18 @@ from drivers.cia402.object_dictionary import (
     stated_absent,
 )
 from drivers.cia402.pdo import NmtCommand
-from drivers.cia402.profile import for_unused_pdos, profile_of, used_pdos
+from drivers.cia402.profile import (
+    for_unused_pdos,
+    limits_out_of_force,
+    profile_of,
+    unwatched_peers,
+    used_pdos,
+)
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork, means_absent
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import HOLDS
 from drivers.drive_group import OnRestarted, Pump
+from drivers.plausibility import require_within_limits
 from model.errors import Refused
 from model.files.drive_profile_file import ProfileDocument
 from model.rig import Rig
@@ -68,6 +76,8 @@ UNFINISHED = (
     "the set-up was not finished: the drives are in NMT pre-operational with part of their"
     " settings, and none is enabled"
 )
+
+_POSITION = 0x6064, 0, "position actual value"
 
 PDO_OBJECTS = 0xF9FF
 """Mask that maps a PDO's parameters (1400h, 1800h) and mapping (1600h, 1A00h) to one index."""
@@ -119,8 +129,9 @@ def configure_drives(
         HardwareMissing: Drives do not answer; with all their nodes.
         DriveRestarted: A drive restarted meanwhile.
         TorqueLost: A drive that held its cable released it meanwhile.
-        Refused: A drive is not a CiA 402 drive, is already enabled, or refuses or changes an
-            object; two devices have one node id; or another master is active on this bus.
+        Refused: A drive is not a CiA 402 drive, is already enabled, holds its cable outside its
+            position limits, or refuses or changes an object; two devices have one node id; or
+            another master is active on this bus.
         BadInput: A value of the rig does not fit its object.
         Fault: The bus does not accept frames.
     """
@@ -146,9 +157,15 @@ def configure_drives(
         refusals.note(refuse_scale, nodes[wrong.drive], wrong)
     refusals.raise_any(UNCHANGED)
     _refuse_duplicates(network)
+    holding = {node for node in nodes if network.client(node).read_state() in HOLDS}
+    held = {
+        drive: int.from_bytes(network.client(node).read(*_POSITION), "little", signed=True)
+        for drive, node in enumerate(nodes)
+        if node in holding
+    }
+    require_within_limits(rig, held, UNCHANGED)
     restarted = _restarted(network, nodes, settings)
     on_restarted(restarted)
-    holding = {node for node in nodes if network.client(node).read_state() in HOLDS}
     try:
         absent = _write_settings(rig, network, settings, entries, holding)
         simulated = are_simulated(network, nodes)
@@ -159,9 +176,9 @@ def configure_drives(
         raise
     for wrong in scales:
         absent.setdefault(f"{wrong}: {HOW_SCALED}", []).append(nodes[wrong.drive])
-    for remark in left_out(profile):
+    for remark in (*left_out(profile), *limits_out_of_force(profile)):
         absent.setdefault(remark, []).extend(nodes)
-    remarks = (*_absent(absent), *_unwatched_peers(nodes, entries, profile))
+    remarks = (*_absent(absent), *unwatched_peers(profile, nodes, entries))
     watched = (
         min(count, rig.cable_count) if profile.watches_heartbeats else 0 for count in entries
     )
@@ -183,7 +200,9 @@ def _write_settings(
         refusals.note(_switch_off_used, network, node, profile)
         refused: list[str] = []  # switched off before another PDO takes its identifier
         refusals.note(_switch_off_unused, network, node, profile, refused)
-        refused += _write_all(network, node, settings[drive], refusals)
+        own = list(settings[drive])
+        refusals.note(_uncross_limits, network, node, own)
+        refused += _write_all(network, node, own, refusals)
         _require_held(network, holding & {node})  # not sooner: a drive may react late
         for remark in refused:
             absent.setdefault(remark, []).append(node)
@@ -291,37 +310,6 @@ def _absent(absent: dict[str, list[int]]) -> Iterator[str]:
         yield f"drive {', '.join(map(str, nodes))}: {remark}"
 
 
-def _unwatched_peers(
-    nodes: Sequence[int], entries: Sequence[int], profile: ProfileDocument
-) -> Iterator[str]:
-    """One remark for all drives that lack the same number of heartbeat entries."""
-    if not profile.watches_heartbeats:
-        reason = (
-            "take a lost heartbeat as a fault"
-            if profile.heartbeat_loss == "fault"
-            else "have no heartbeat consumer"
-        )
-        yield (
-            f"{profile.name} drives {reason}, so they monitor none; the SYNC time-out alone stops"
-            " them when the master is lost"
-        )
-        return
-    instead = (
-        "the master's heartbeat stops the drive"
-        if profile.monitoring == "heartbeat"
-        else "the SYNC time-out stops the drive"
-    )
-    for count in sorted(set(entries)):
-        if count >= len(nodes):
-            continue
-        drives = ", ".join(str(n) for n, own in zip(nodes, entries, strict=True) if own == count)
-        yield (
-            f"drive {drives}: 1016h has {count} heartbeat {'entry' if count == 1 else 'entries'},"
-            f" so the master and {count - 1} of {len(nodes) - 1} other drives are monitored; if"
-            f" another one is lost together with the master, {instead} instead"
-        )
-
-
 def _await_mode(network: SetupNetwork, node: int) -> None:
     """Waits up to `MODE_WAIT` until the drive shows the mode that was written."""
     deadline = network.clock() + MODE_WAIT
@@ -346,6 +334,18 @@ def _write_all(
         if not refusals.note(_write, network, node, setting, remarks) and _is_pdo(setting.index):
             refused.add(setting.index & PDO_OBJECTS)
     return remarks
+
+
+def _uncross_limits(network: SetupNetwork, node: int, settings: list[Setting]) -> None:
+    """Writes the upper software limit before the lower one, where the drive's is below that.
+
+    A drive may refuse a minimum above its maximum (06090036h), or treat it as a fault.
+    """
+    low, high = (each for each in settings if each.index == SOFTWARE_LIMITS)
+    held = network.client(node).read(high.index, high.sub, high.name, high.size)
+    if int.from_bytes(held, "little", signed=True) < low.value:
+        settings.remove(high)
+        settings.insert(settings.index(low), high)
 
 
 def _is_pdo(index: int) -> bool:

@@ -427,7 +427,8 @@ class Cia402Group(CyclicGroup):
         """Checks whether the drives may be released; see `DriveGroup.require_releasable`."""
         if not (self.capabilities.has_brake and self._watch.only_in_fault(self._faults)):
             self._refuse_latched("release the drives")
-        require_within_limits(self._rig, self._watch.positions)
+        positions = dict(enumerate(self._watch.positions))
+        require_within_limits(self._rig, positions, "nothing was enabled")
 
     def _begin_release(self) -> None:
         self.require_releasable()

@@ -6,7 +6,7 @@ elsewhere; ``drives.profile`` of the rig file names it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -110,6 +110,52 @@ def for_unused_pdos(profile: ProfileDocument, is_there: Callable[[int], bool]) -
         for index in indices:
             if not is_there(index) and index >= first + STANDARD_PDOS:
                 break
+
+
+def unwatched_peers(
+    profile: ProfileDocument, nodes: Sequence[int], entries: Sequence[int]
+) -> Iterator[str]:
+    """One remark for all drives that lack the same number of heartbeat entries.
+
+    Args:
+        profile: Of the drives.
+        nodes: The drives.
+        entries: Number of producers that each can monitor.
+    """
+    if not profile.watches_heartbeats:
+        reason = (
+            "take a lost heartbeat as a fault"
+            if profile.heartbeat_loss == "fault"
+            else "have no heartbeat consumer"
+        )
+        yield (
+            f"{profile.name} drives {reason}, so they monitor none; the SYNC time-out alone stops"
+            " them when the master is lost"
+        )
+        return
+    instead = (
+        "the master's heartbeat stops the drive"
+        if profile.monitoring == "heartbeat"
+        else "the SYNC time-out stops the drive"
+    )
+    for count in sorted(set(entries)):
+        if count >= len(nodes):
+            continue
+        drives = ", ".join(str(n) for n, own in zip(nodes, entries, strict=True) if own == count)
+        yield (
+            f"drive {drives}: 1016h has {count} heartbeat {'entry' if count == 1 else 'entries'},"
+            f" so the master and {count - 1} of {len(nodes) - 1} other drives are monitored; if"
+            f" another one is lost together with the master, {instead} instead"
+        )
+
+
+def limits_out_of_force(profile: ProfileDocument) -> tuple[str, ...]:
+    """A remark for drives whose position limits do not apply as they are written."""
+    remark = (
+        "607Dh software position limits are in force only once they are saved and the drive"
+        " restarts: until then it limits set-points by those it started with, if at all"
+    )
+    return (remark,) if profile.limits_need_restart else ()
 
 
 def interpolation_time(

@@ -180,6 +180,11 @@ class ProfileDocument(Document):
     torque_limit: TorqueLimit | None = Field(
         default=None, description="left out, 6072h limits the torque"
     )
+    limits_need_restart: bool = Field(
+        default=False,
+        description="position limits (607Dh) are in force only once they are saved and the drive"
+        " restarts; every set-up says so",
+    )
     warnings: list[CodePattern] = Field(
         default=[],
         description="EMCY codes of warnings with which the drive stays enabled; x is any digit",

@@ -23,18 +23,21 @@ from drivers.cia402.pdo import (
     make_emergency,
     make_heartbeat,
 )
+from drivers.cia402.profile import load_profile
 from drivers.cia402.state_machine import DriveState
+from model.files.drive_profile_file import ProfileDocument
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.eds_file import Eds, Key, profile_path, read_eds
 from simulation.drives.object_dictionary import (
     ACCELERATION_UNIT,
-    NO_DUPLICATE_CONSUMER,
+    HEARTBEAT_CONSUMERS,
     OUT_OF_RANGE,
     POSITION_UNIT,
     VELOCITY_UNIT,
     DriveObjects,
     SdoServer,
     counts_in,
+    motion_settings,
 )
 from simulation.drives.pdo import (
     ACTING,
@@ -50,7 +53,7 @@ from simulation.drives.pdo import (
     ProcessData,
     ReceivePdo,
 )
-from simulation.drives.power import MODE_FOLLOWS, NO_WINDOW, TIMED, Motor, PowerStage
+from simulation.drives.power import MODE_FOLLOWS, TIMED, Motor, PowerStage
 
 Frame = bytes | bytearray
 Send = Callable[[int, Frame], None]
@@ -98,6 +101,7 @@ class SimulatedDrive(PowerStage):
         eds: Eds | None = None,
         behaviour: DriveBehaviour = STRICT,
         counts_per_turn: float = 4096.0,
+        profile: ProfileDocument | None = None,
     ) -> None:
         """Powers the drive on: it sends boot-up and waits in PRE-OPERATIONAL.
 
@@ -109,9 +113,11 @@ class SimulatedDrive(PowerStage):
             eds: Its objects (default: those of the profile ``cia402``).
             behaviour: Choices within the standards.
             counts_per_turn: Of the motor shaft, for drives with speed in revolutions.
+            profile: Of its make (default: ``cia402``).
         """
         motor = Motor(position, position, top_speed, stick=behaviour.stick)
-        super().__init__(motor, behaviour, counts_per_turn, seed=node)
+        super().__init__(motor, behaviour, seed=node)
+        self._counts_per_turn, self._profile = counts_per_turn, profile or load_profile("cia402")
         self.node = node
         self._bus_send = send
         self._eds = eds or read_eds(profile_path("cia402"))
@@ -179,7 +185,7 @@ class SimulatedDrive(PowerStage):
             return
         now = self._now = self._now + elapsed
         self._move(elapsed)
-        if self._window != NO_WINDOW:
+        if self._motion.window < inf:
             self._check_following(elapsed)
         if now > self._deadlines.earliest:
             self._on_deadlines()
@@ -281,24 +287,17 @@ class SimulatedDrive(PowerStage):
 
     def _judge(self, key: Key, value: int) -> int:
         """Abort code of an SDO write in the present state; 0 to accept it."""
-        index, sub = key
+        index = key[0]
         if index in RPDO or index in TPDO or index in RPDO_MAP or index in TPDO_MAP:
             pre_operational = self.nmt is NmtState.PRE_OPERATIONAL
             may_map = pre_operational or self.behaviour.maps_when_operational
             return self._pdos.refused(key, value, may_map=may_map)
-        if index == 0x1016 and self._is_consumed_already(sub, value):
-            return NO_DUPLICATE_CONSUMER
         if key == MODE and not self.objects.has_mode(value):
             return OUT_OF_RANGE
         if index in (POSITION_UNIT, VELOCITY_UNIT, ACCELERATION_UNIT):
             known = counts_in(value, self._counts_per_turn)
             return 0 if known and (index != POSITION_UNIT or known == 1.0) else OUT_OF_RANGE
         return 0
-
-    def _is_consumed_already(self, sub: int, value: int) -> bool:
-        node = value >> 16 & 0x7F
-        others = (self.objects[0x1016, s] for s in self.objects.subs(0x1016) if s not in (0, sub))
-        return bool(value & 0xFFFF) and any(e >> 16 & 0x7F == node and e & 0xFFFF for e in others)
 
     def _on_changed(self, key: Key, value: int) -> None:
         """Reacts to a changed object."""
@@ -311,7 +310,7 @@ class SimulatedDrive(PowerStage):
             for what in self._deadlines.kept():
                 if isinstance(what, int) and what not in watched:
                     self._deadlines.forget(what)
-        elif index == 0x1016:
+        elif index == HEARTBEAT_CONSUMERS:
             self._watched = self._heartbeat_consumers()
             for what in self._deadlines.kept():
                 if isinstance(what, tuple) and what[1] not in self._watched:
@@ -331,7 +330,7 @@ class SimulatedDrive(PowerStage):
 
     def _read_settings(self) -> None:
         """Caches settings of time-outs, so that `advance` reads no objects."""
-        self._read_motion_settings()
+        self._motion = motion_settings(self.objects, self._counts_per_turn, self._profile)
         get = self.objects.get
         self._heartbeat_period = get((0x1017, 0), 0) / 1000.0
         self._sync_timeout = self.behaviour.sync_periods * get((0x1006, 0), 0) / 1e6
@@ -342,8 +341,9 @@ class SimulatedDrive(PowerStage):
 
     def _heartbeat_consumers(self) -> dict[int, float]:
         """Nodes and times [s] of the heartbeat consumer, 1016h."""
-        entries = (self.objects[0x1016, sub] for sub in self.objects.subs(0x1016) if sub)
-        room = self.objects.get((0x1016, 0), 0)
+        subs = self.objects.subs(HEARTBEAT_CONSUMERS)
+        entries = (self.objects[HEARTBEAT_CONSUMERS, sub] for sub in subs if sub)
+        room = self.objects.get((HEARTBEAT_CONSUMERS, 0), 0)
         taken = [e for e, _ in zip(entries, range(room), strict=False)]
         return {e >> 16 & 0x7F: (e & 0xFFFF) / 1000.0 for e in taken if e & 0xFFFF}
 

@@ -21,6 +21,7 @@ from drivers.cia402.pdo import (
     SYNC_ID,
     TPDO1_BASE,
 )
+from drivers.cia402.profile import profile_of
 from drivers.plausibility import winding_signs
 from model.pose import Array, Pose
 from model.rig import Rig
@@ -99,6 +100,7 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
             eds=self._eds,
             behaviour=self.behaviour,
             counts_per_turn=winch.counts_per_turn,
+            profile=profile_of(self._rig),
         )
 
     def _friction(self) -> float:

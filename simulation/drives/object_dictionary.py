@@ -5,9 +5,11 @@ from __future__ import annotations
 import heapq
 import struct
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from itertools import count
 from math import inf
 
+from model.files.drive_profile_file import ProfileDocument, object_key
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.eds_file import Eds, Key, ObjectDescription
 
@@ -21,7 +23,10 @@ NOT_THERE = 0x06020000
 WRONG_LENGTH = 0x06070010
 NO_SUB_INDEX = 0x06090011
 OUT_OF_RANGE = 0x06090030
+MAXIMUM_BELOW_MINIMUM = 0x06090036
 NOT_IN_THIS_STATE = 0x08000022
+
+HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS = 0x1016, 0x607D
 
 DEVICE_NAME = b"cdpr simulated drive"
 
@@ -171,8 +176,11 @@ class DriveObjects:
         if len(data) != described.length:
             raise Abort(WRONG_LENGTH)
         value = int.from_bytes(data, "little", signed=described.signed)
-        refused = self._out_of_range(key, value, described) or self.judge(key, value)
-        if refused:
+        if refused := (
+            self._out_of_range(key, value, described)
+            or self._contradiction(key, value)
+            or self.judge(key, value)
+        ):
             raise Abort(refused)
         if key not in self.stuck:
             self._values[key] = value
@@ -182,6 +190,18 @@ class DriveObjects:
         low, high = self._behaviour.ranges.get(key, (described.low, described.high))
         inside = (low is None or value >= low) and (high is None or value <= high)
         return 0 if inside else OUT_OF_RANGE
+
+    def _contradiction(self, key: Key, value: int) -> int:
+        """Abort code of a value that contradicts other sub-indices; 0 for none."""
+        index, sub = key
+        if index == HEARTBEAT_CONSUMERS and value & 0xFFFF:
+            entries = (self[index, other] for other in self.subs(index) if other not in (0, sub))
+            taken = [entry >> 16 & 0x7F for entry in entries if entry & 0xFFFF]
+            return NO_DUPLICATE_CONSUMER if value >> 16 & 0x7F in taken else 0
+        if index == SOFTWARE_LIMITS:
+            low, high = (value if one == sub else self.get((index, one), value) for one in (1, 2))
+            return MAXIMUM_BELOW_MINIMUM if low > high else 0
+        return 0
 
     def _find(self, key: Key) -> ObjectDescription:
         if key in self.refusals:
@@ -366,3 +386,64 @@ def counts_in(unit: int, counts_per_turn: float) -> float | None:
     if numerator is None or seconds is None:
         return None
     return numerator * 10.0**exponent / seconds
+
+
+# Settings of a drive's motion, from its objects.
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSettings:
+    """What the objects of a drive state about its motion.
+
+    Attributes:
+        deceleration: Of a quick stop (6085h), [counts/s²].
+        max_torque: Torque limit, [per mille of rated torque].
+        window: Largest following error (6065h), [counts]; infinity if it is not monitored.
+        window_time: Time for which it may be exceeded (6066h), [s].
+        offset: Added to every target (60B0h), [counts].
+        limits: Smallest and largest target (607Dh), [counts]; infinite until a restart, if one is
+            needed, as this drive stores nothing.
+        interpolation: Time in which a target is reached (60C2h), [s].
+        stop_option: Quick stop option code (605Ah).
+    """
+
+    deceleration: float
+    max_torque: float
+    window: float
+    window_time: float
+    offset: int
+    limits: tuple[float, float]
+    interpolation: float
+    stop_option: int
+
+
+def motion_settings(
+    objects: DriveObjects, counts_per_turn: float, profile: ProfileDocument
+) -> MotionSettings:
+    """Reads the settings of a drive's motion; an absent object limits nothing.
+
+    Args:
+        objects: Of the drive.
+        counts_per_turn: Of the motor shaft.
+        profile: Of its make: what limits its torque, and when its position limits are in force.
+    """
+    get = objects.get
+    unit = get((ACCELERATION_UNIT, 0), get((VELOCITY_UNIT, 0), 0))  # of speed, per second
+    acceleration = counts_in(unit, counts_per_turn) or 1.0
+    home = get((0x607C, 0), 0)  # the drive subtracts it from its limits: CiA 402-2
+    low, high = get((SOFTWARE_LIMITS, 1), -(2**31)), get((SOFTWARE_LIMITS, 2), 2**31 - 1)
+    window = get((0x6065, 0), 0xFFFFFFFF)
+    limiting, rated = (0x6072, 0), 1000
+    if (limit := profile.torque_limit) is not None:
+        limiting = object_key(limit.object)
+        rated = 1000 if limit.rated is None else get(object_key(limit.rated), 0)
+    return MotionSettings(
+        deceleration=max(1e-3, get((0x6085, 0), 1_000_000) * acceleration),
+        max_torque=1000.0 * get(limiting, 2**32) / rated if rated else 0.0,
+        window=inf if window == 0xFFFFFFFF else window,
+        window_time=get((0x6066, 0), 0) / 1000.0,
+        offset=get((0x60B0, 0), 0),
+        limits=(-inf, inf) if profile.limits_need_restart else (low - home, high - home),
+        interpolation=get((0x60C2, 1), 1) * 10.0 ** get((0x60C2, 2), -3),
+        stop_option=get((0x605A, 0), 2),
+    )

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from drivers.cia402.state_machine import FAULTED, TORQUE_ON, DriveState
 from simulation.drives.behaviour import DriveBehaviour
-from simulation.drives.object_dictionary import ACCELERATION_UNIT, DriveObjects, counts_in
+from simulation.drives.object_dictionary import DriveObjects, MotionSettings
 from simulation.drives.pdo import Deadlines
 
 # Motion of the motor: following set-points, ramping down, holding. Pure.
@@ -113,9 +113,6 @@ SWITCH_DELAY = 0.0005
 
 CYCLIC_POSITION = 8
 FOLLOWING_ERROR = 0x8611
-NO_WINDOW = 0xFFFFFFFF
-"""Value of 6065h that disables following-error monitoring."""
-
 MODE_FOLLOWS, WARNING_CHANGES, ENABLES = TIMED = ("mode", "warning", "enabling")
 """Timed events of the power stage."""
 
@@ -131,6 +128,7 @@ _STATUS_CODES = {
 }
 _VOLTAGE_AND_REMOTE = 0x0210
 _WARNING_BIT = 0x0080
+_INTERNAL_LIMIT = 0x0800
 _FOLLOWS_COMMAND = 0x1000
 _FOLLOWING_ERROR_BIT = 0x2000
 
@@ -147,20 +145,17 @@ class PowerStage(ABC):
 
     objects: DriveObjects
     _deadlines: Deadlines
+    _motion: MotionSettings
 
-    def __init__(
-        self, motor: Motor, behaviour: DriveBehaviour, counts_per_turn: float, seed: int
-    ) -> None:
+    def __init__(self, motor: Motor, behaviour: DriveBehaviour, seed: int) -> None:
         """Takes the motor; `_switch_on` must be called next.
 
         Args:
             motor: What it moves.
             behaviour: Choices within the standards.
-            counts_per_turn: Of the motor shaft.
             seed: Of all noise.
         """
         self.motor, self.behaviour = motor, behaviour
-        self._counts_per_turn = counts_per_turn
         self._random = random.Random(seed)
         self._now, self._start = 0.0, motor.position
 
@@ -177,22 +172,8 @@ class PowerStage(ABC):
         self._wanted_mode = self._mode
         self._target = self.motor.position
         self._time_to_target = self._error_time = 0.0
-        self._at_limit = self._warned = False
+        self._at_limit = self._is_clipped = self._warned = False
         self._fault_code = self._flicker = 0
-
-    def _read_motion_settings(self) -> None:
-        """Caches settings of the motion, so that `_move` reads no objects."""
-        get = self.objects.get
-        unit = get((ACCELERATION_UNIT, 0), 0)
-        acceleration = counts_in(unit, self._counts_per_turn) or 1.0
-        self._deceleration = max(1e-3, get((0x6085, 0), 1_000_000) * acceleration)
-        self._max_torque = get((0x6072, 0), 0xFFFF)
-        self._window = get((0x6065, 0), NO_WINDOW)
-        self._window_time = get((0x6066, 0), 0) / 1000.0
-        home, self._offset = get((0x607C, 0), 0), get((0x60B0, 0), 0)  # CiA 402-2
-        self._limits = get((0x607D, 1), -(2**31)) - home, get((0x607D, 2), 2**31 - 1) - home
-        self._interpolation = get((0x60C2, 1), 1) * 10.0 ** get((0x60C2, 2), -3)
-        self._stop_option = get((0x605A, 0), 2)
 
     @property
     def state(self) -> DriveState:
@@ -214,7 +195,9 @@ class PowerStage(ABC):
     def _status_shown(self) -> int:
         word = self._status
         if self._enabled and self._mode == CYCLIC_POSITION:
-            word |= _FOLLOWS_COMMAND
+            word |= _INTERNAL_LIMIT if self._is_clipped else _FOLLOWS_COMMAND
+        if self._at_limit and self._torque_on:
+            word |= _INTERNAL_LIMIT
         if self._error_time > 0.0:
             word |= _FOLLOWING_ERROR_BIT
         if self._warned:
@@ -275,15 +258,15 @@ class PowerStage(ABC):
             left = self._time_to_target - elapsed
             self._time_to_target = left if left > 0.0 else 0.0
         elif self._state is DriveState.QUICK_STOP_ACTIVE:
-            self.motor.ramp_down(self._deceleration, elapsed, load)
-            if self._stop_option < 5 and self.motor.speed == 0.0:
+            self.motor.ramp_down(self._motion.deceleration, elapsed, load)
+            if self._motion.stop_option < 5 and self.motor.speed == 0.0:
                 self._power_off(DriveState.SWITCH_ON_DISABLED)  # transition 12
         elif self.state is DriveState.FAULT_REACTION_ACTIVE:
-            self.motor.ramp_down(self._deceleration, elapsed, load)
+            self.motor.ramp_down(self._motion.deceleration, elapsed, load)
             if self.motor.speed == 0.0:
                 self._power_off(DriveState.FAULT)
         if load and self._torque_on:
-            room = 1.0 - abs(self.torque) / max(1, self._max_torque)
+            room = 1.0 - abs(self.torque) / max(1, self._motion.max_torque)
             speed = SLIP_SHARE * self.motor.top_speed * max(-1.0, min(1.0, room))
             self.motor.yield_to(load, speed * elapsed)
 
@@ -293,7 +276,7 @@ class PowerStage(ABC):
         A load above the limit moves the motor back; it stays at the limit until it reaches its
         demand.
         """
-        limited = abs(self.torque) >= self._max_torque
+        limited = abs(self.torque) >= self._motion.max_torque
         if not (limited or self._at_limit):
             return 0
         pull = 1 if self.torque > 0 else -1
@@ -303,9 +286,9 @@ class PowerStage(ABC):
     def _check_following(self, elapsed: float) -> None:
         """Following error above 6065h for longer than 6066h."""
         motor = self.motor
-        if self._torque_on and abs(motor.demand - motor.position) > self._window:
+        if self._torque_on and abs(motor.demand - motor.position) > self._motion.window:
             self._error_time += elapsed
-            if self._error_time > self._window_time:
+            if self._error_time > self._motion.window_time:
                 self.fail(FOLLOWING_ERROR)
         else:
             self._error_time = 0.0
@@ -329,10 +312,11 @@ class PowerStage(ABC):
         """Takes a target plus its offset (60B0h), limited to the software limits (607Dh)."""
         if self._mode != CYCLIC_POSITION:
             return
-        target += self._offset
-        low, high = self._limits
+        target += self._motion.offset
+        low, high = self._motion.limits
         self._target = float(low if target < low else high if target > high else target)
-        self._time_to_target = self._interpolation
+        self._is_clipped = self._target != target
+        self._time_to_target = self._motion.interpolation
 
     def _take_control_word(self, word: int) -> None:
         """Executes a command; level-sensitive, except for the rising edge of a reset."""
@@ -380,7 +364,7 @@ class PowerStage(ABC):
     def _command_enable(self) -> None:
         """Transitions 4 and 16, and 3 with 4; 16 only if 605Ah holds after a quick stop."""
         if self.state is DriveState.QUICK_STOP_ACTIVE:
-            if self._stop_option >= 5:
+            if self._motion.stop_option >= 5:
                 self._enable()
         elif self.state in (DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON):
             if not self.behaviour.enable_delay:
@@ -419,7 +403,7 @@ class PowerStage(ABC):
     def _quick_stop(self) -> None:
         """605Ah: 5 to 8 hold after the ramp, 1 to 4 then remove the torque, 0 at once."""
         self.state = DriveState.QUICK_STOP_ACTIVE
-        if self._stop_option == 0:
+        if self._motion.stop_option == 0:
             self._power_off(DriveState.SWITCH_ON_DISABLED)
 
     @property

@@ -17,7 +17,7 @@ EDS = Path(simulation.__file__).parent / "drives" / "eds"
 STANDARD = EDS / "cia402.eds"
 FORMS = {2: "<b", 3: "<h", 4: "<i", 5: "<B", 6: "<H", 7: "<I"}
 ABSENT, NO_SUB, READ_ONLY = 0x06020000, 0x06090011, 0x06010002
-TOO_HIGH, TOO_LOW = 0x06090031, 0x06090032
+TOO_HIGH, TOO_LOW, CROSSED = 0x06090031, 0x06090032, 0x06090036
 
 Key = tuple[int, int]
 Times = Callable[[int, Key], Iterable[float]]
@@ -97,6 +97,10 @@ class ScriptedDrive:
             return TOO_HIGH
         if entry.min is not None and value < entry.min:
             return TOO_LOW
+        if key[0] == 0x607D:
+            low, high = (value if sub == key[1] else self.values[0x607D, sub] for sub in (1, 2))
+            if low > high:
+                return CROSSED
         if key in ((0x1400, 1), (0x1800, 1)):
             value &= ~(1 << 30)  # a drive may keep bit 30 or not
         self.values[key] = self.keeps.get(key, value)

@@ -27,6 +27,7 @@ from drivers.cia402.profile import (
 from drivers.cia402.sdo import NOT_NOW, SetupNetwork
 from drivers.cia402.sdo_jobs import monitoring_off
 from drivers.factory import make_drive_group
+from drivers.plausibility import position_limits
 from drivers.stopping_distance import lost_master, require_stopping_room
 from model.errors import BadInput, CdprError, InvalidFile, Refused
 from model.files.rig_file import RigDocument
@@ -132,6 +133,15 @@ def test_epos4_gets_its_limits_in_its_own_units(rig: Rig) -> None:
     assert values[0x6066, 0] == 0
     assert (values[0x60C2, 1], values[0x60C2, 2]) == (10, -3)
     assert values[0x1016, 1] == 127 << 16 | 100
+
+
+def test_an_akd_limits_its_current_as_it_has_no_6072h(rig: Rig) -> None:
+    """AKD CANopen Communication, edition H, page 102."""
+    bus, theirs = eight_of("akd"), with_profile(rig, "akd")
+    assert examined(theirs, bus).good
+    set_up(theirs, bus)
+    assert {drive.values[0x6073, 0] for drive in bus.drives.values()} == {1200}  # per mille
+    assert all((0x6072, 0) not in drive.values for drive in bus.drives.values())
 
 
 def test_a_torque_limit_that_is_a_share_of_nothing_is_refused_before_anything_is_written(
@@ -371,6 +381,51 @@ def test_a_position_range_that_cannot_be_read_now_is_not_taken_for_none(
     ]
     with pytest.raises(Refused, match="607Bh"):
         set_up(rig, bus)
+    assert not downloads(bus)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(-(10**9), -(10**8)), (0, 0), (-(2**31), 2**31 - 1), (10**8, 10**9)], ids=str
+)
+def test_the_software_limits_never_cross_while_they_are_written(
+    rig: Rig, low: int, high: int
+) -> None:
+    """A drive may abort with 06090036h or go into fault; drive 1 gets -306354 and 385549."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values |= {(0x607D, 1): low, (0x607D, 2): high}
+    assert set_up(rig, bus) == ()
+    limits = [position_limits(rig, drive, WinchMap(rig)) for drive in range(8)]
+    held = [(d.values[0x607D, 1], d.values[0x607D, 2]) for d in bus.drives.values()]
+    assert held == limits
+
+
+@pytest.mark.parametrize("name", ["cia402", *MAKERS])
+def test_limits_that_are_not_in_force_are_a_remark_of_every_set_up(rig: Rig, name: str) -> None:
+    theirs, bus = with_profile(rig, name), eight_of(name)
+    for _ in range(2):
+        said = [remark for remark in set_up(theirs, bus) if "607Dh" in remark]
+        assert len(said) == (name == "akd")
+        assert all(remark.startswith("drive 1, 2, 3, 4, 5, 6, 7, 8: ") for remark in said)
+
+
+@pytest.mark.parametrize("end", [0, 1])
+@pytest.mark.parametrize("beyond", [0, 1])
+@pytest.mark.parametrize("word", [0x0217, 0x0250])
+def test_no_limits_are_written_to_a_drive_that_holds_its_cable_outside_them(
+    rig: Rig, end: int, beyond: int, word: int
+) -> None:
+    """A drive that monitors its actual position trips with 8612h, and releases its cable."""
+    bus = eight_of("cia402")
+    limit = position_limits(rig, 4, WinchMap(rig))[end]
+    bus.drives[5].values |= {(0x6041, 0): word, (0x6064, 0): limit + (beyond if end else -beyond)}
+    if not beyond or word == 0x0250:  # without torque there is nothing to release
+        assert set_up(rig, bus) == ()
+        return
+    with pytest.raises(Refused, match=r"cable 5.*outside its position limits") as caught:
+        set_up(rig, bus)
+    assert "cdpr home" in caught.value.next_step
+    assert caught.value.next_step.endswith("the drives were not changed")
     assert not downloads(bus)
 
 

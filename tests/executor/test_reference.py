@@ -82,7 +82,7 @@ def test_the_next_step_without_one_names_the_ways_to_state_the_pose() -> None:
     with pytest.raises(Refused) as moved:
         require_still_referenced(rig, reference_of(rig), (1,), seen_at(rig))
     with pytest.raises(Refused) as beyond:
-        require_within_limits(rig, [2**31 - 1] * 8)
+        require_within_limits(rig, dict.fromkeys(range(8), 2**31 - 1), "unchanged")
     for caught in (unhomed, moved, beyond):
         wanted = "`cdpr home RIG` with --at-home, --pose-mm X Y Z or --camera SOURCE"
         assert wanted in caught.value.next_step

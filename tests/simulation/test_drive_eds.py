@@ -9,10 +9,15 @@ from pathlib import Path
 import canopen
 import pytest
 
+from drivers.cia402.object_dictionary import settings_for
+from drivers.cia402.profile import load_profile, profile_names
 from model.errors import BadInput
+from model.files.rig_file import RigDocument
+from model.rig import Rig, rig_from_document
+from model.winches import WinchMap
 from simulation.drives.eds_file import EDS_FOLDER, profile_path, read_eds
 from simulation.drives.object_dictionary import READ_ONLY, Abort, DriveObjects, counts_in
-from tests.simulation.drive_line import Line
+from tests.simulation.drive_line import CYCLE, Line
 
 EDS = EDS_FOLDER / "cia402.eds"
 LENGTHS = {1: 1, 2: 1, 3: 2, 4: 4, 5: 1, 6: 2, 7: 4}  # CANopen type: bytes
@@ -113,6 +118,64 @@ def test_a_drive_of_every_profile_answers(path: Path) -> None:
     line.drive.on_sync()
 
 
+@pytest.mark.parametrize("profile", profile_names())
+def test_the_quick_stop_that_is_set_up_takes_one_cycle_on_drives_of_every_make(
+    rig: Rig, profile: str
+) -> None:
+    """The distance from top speed is half of that in a cycle, in whatever unit 6085h is."""
+    document = rig.document.model_dump()
+    document["drives"]["profile"] = profile
+    theirs = rig_from_document(RigDocument.model_validate(document))
+    winch, cycle = theirs.winches[0], theirs.cycle
+    line = Line(eds=read_eds(profile_path(profile)), counts_per_turn=winch.counts_per_turn)
+    values = {s.index: s.value for s in settings_for(theirs, 0, WinchMap(theirs))}
+    for index, form in ((0x6085, "<I"), (0x605A, "<h"), (0x6060, "<b")):
+        assert line.abort(index, 0, form, values[index]) == 0
+    for word in (0x06, 0x07, 0x0F):
+        line.write(0x6040, 0, "<H", word)
+    line.drive.motor.speed = top = winch.max_speed * abs(winch.counts_per_metre)
+    line.write(0x6040, 0, "<H", 0x02)
+    for _ in range(100):
+        line.drive.advance(cycle / 20.0)
+    assert line.drive.motor.speed == 0.0
+    assert line.drive.motor.demand - 1000.0 == pytest.approx(0.5 * top * cycle, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("profile", "limit", "rated"), [("epos4", (0x3001, 2), 5.0), ("cia402", (0x6072, 0), 1.0)]
+)
+@pytest.mark.parametrize(("torque", "position"), [(-119.0, 990.0), (-120.0, 1000.0)])
+def test_the_object_of_the_profile_limits_the_torque(
+    profile: str, limit: tuple[int, int], rated: float, torque: float, position: float
+) -> None:
+    """At 120 per mille no cable is wound in that pulls with as much."""
+    line = Line(eds=read_eds(profile_path(profile)), profile=load_profile(profile))
+    line.write(0x6060, 0, "<b", 8)
+    line.drive.objects[limit] = round(120 * rated)
+    line.drive.objects[0x607D, 2] = 10_000
+    for word in (0x06, 0x07, 0x0F):
+        line.write(0x6040, 0, "<H", word)
+    line.drive.torque = torque
+    line.write(0x607A, 0, "<i", 990)
+    line.drive.advance(CYCLE)
+    assert line.drive.motor.position == position
+
+
+@pytest.mark.parametrize(("profile", "reached"), [("akd", 1100.0), ("cia402", 1040.0)])
+def test_limits_that_need_a_restart_are_not_in_force_when_they_are_written(
+    profile: str, reached: float
+) -> None:
+    line = Line(eds=read_eds(profile_path(profile)), profile=load_profile(profile))
+    line.write(0x6060, 0, "<b", 8)
+    for sub, limit in ((2, 1040), (1, 900)):
+        assert line.abort(0x607D, sub, "<i", limit) == 0
+    for word in (0x06, 0x07, 0x0F):
+        line.write(0x6040, 0, "<H", word)
+    line.write(0x607A, 0, "<i", 1100)
+    line.drive.advance(CYCLE)
+    assert line.drive.motor.position == reached
+
+
 def test_an_epos4_runs_csp_without_listing_it() -> None:
     line = Line(eds=read_eds(profile_path("epos4")))
     assert line.read(0x6502, 0) == 0x225
@@ -137,7 +200,7 @@ def test_a_makers_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
     assert line.abort(0x60C2, 2, "<b", -3) == 0
     assert line.sdo(0x40, 0x2000, 0)[4:] == struct.pack("<I", 0x06010001)
     # 6000 rpm/s of 4000 counts a turn
-    assert line.drive._deceleration == pytest.approx(400_000.0)
+    assert line.drive._motion.deceleration == pytest.approx(400_000.0)
     eds = read_eds(path)
     assert (eds.objects[0x607A, 0].to_rpdo, eds.objects[0x607A, 0].to_tpdo) == (True, False)
     assert (eds.objects[0x6064, 0].to_rpdo, eds.objects[0x6064, 0].to_tpdo) == (False, True)
@@ -261,7 +324,7 @@ def test_a_unit_that_is_not_known_is_refused(tmp_path: Path) -> None:
     line = Line(eds=read_eds(path), counts_per_turn=4000.0)
     assert line.abort(0x60AA, 0, "<I", 0x00410300) == 0x06090030
     assert line.abort(0x60AA, 0, "<I", 0x00B55700) == 0
-    assert line.drive._deceleration == pytest.approx(6000.0)
+    assert line.drive._motion.deceleration == pytest.approx(6000.0)
 
 
 def test_it_says_that_it_is_simulated_whatever_the_file_says(tmp_path: Path) -> None:

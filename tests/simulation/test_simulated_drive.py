@@ -239,6 +239,37 @@ def test_software_limits_hold(line: Line) -> None:
     assert line.drive.motor.position == 1040
 
 
+def test_a_target_beyond_the_software_limits_shows_in_the_status_word(line: Line) -> None:
+    """Bit 11 internal limit active, bit 12 follows the command value; CiA 402-2, 6041h and CSP."""
+    line.write(0x607D, 2, "<i", 1040)
+    line.enable()
+    seen = []
+    for target in (1040, 1041, 1040, 1040):
+        line.sync(0x0F, target)
+        seen.append(line.word & 0x1800)
+    assert seen == [0x1000, 0x1000, 0x0800, 0x1000]  # of the target at the SYNC before
+
+
+def test_the_torque_limit_shows_in_the_status_word(line: Line) -> None:
+    """The position loop still takes the target: bit 12 stays."""
+    line.write(0x6072, 0, "<H", 800)
+    line.enable()
+    seen = []
+    for torque in (-799.0, -800.0, -799.0):
+        line.drive.torque = torque  # holds a cable whose positive counts pay out
+        line.sync(0x0F)
+        seen.append(line.word & 0x1800)
+    assert seen == [0x1000, 0x1800, 0x1000]
+
+
+def test_the_software_limits_never_cross(line: Line) -> None:
+    line.drive.objects[0x607D, 1] = line.drive.objects[0x607D, 2] = 0
+    assert line.abort(0x607D, 1, "<i", 5) == 0x06090036  # CiA 301: maximum less than minimum
+    assert line.abort(0x607D, 2, "<i", -5) == 0x06090036
+    assert line.abort(0x607D, 2, "<i", 9) == line.abort(0x607D, 1, "<i", 9) == 0
+    assert (line.read(0x607D, 1), line.read(0x607D, 2)) == (9, 9)
+
+
 def test_a_short_set_point_is_ignored_and_reported(line: Line) -> None:
     line.enable()
     line.drive.on_set_point(b"\0" * 6)
