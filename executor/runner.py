@@ -416,7 +416,7 @@ def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
         cameras=() if moved.seen is None else tuple(moved.seen.cameras),
         troubles=tuple(moved.troubles),
     )
-    evaluated, summary = _evaluated(job.prepared, moved, outcome, course)
+    evaluated, summary = _evaluated(job, moved, outcome, course)
     result = RunResult(job.folder.path, summary)
     supervisor.on_verdict(result)
     with job.options.listener.waiting("writing the run folder and report"):
@@ -428,13 +428,15 @@ def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
 
 
 def _evaluated(
-    prepared: PreparedRun, moved: _MotionData, outcome: Outcome, course: RunCourse
+    job: _Job, moved: _MotionData, outcome: Outcome, course: RunCourse
 ) -> tuple[EvaluatedRun | None, dict[str, Any]]:
     """The evaluation and its summary; if that fails, a summary without tables."""
+    assert moved.recorder is not None
     try:
         seen = moved.seen or CameraRecords()
-        evaluated = evaluate(prepared, outcome, seen, course)
+        with job.options.listener.waiting("evaluating the run"):
+            evaluated = evaluate(job.prepared, outcome, seen, course, moved.recorder)
     except Exception as error:
         trouble = f"{type(error).__name__}: {error}".rstrip(": ")
-        return None, not_evaluated(prepared, outcome, course, trouble)
+        return None, not_evaluated(job.prepared, outcome, course, trouble)
     return evaluated, evaluated.summary

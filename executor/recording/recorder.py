@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from types import TracebackType
 
@@ -233,7 +234,7 @@ class RecordWriter:
         self._queued, self._written = 0, 0
         self._queued_until, self._written_until = 0.0, 0.0
         self._trouble: CdprError | None = None
-        self._waiting: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         if own_thread:
             self._thread = threading.Thread(target=self._write, name="cdpr-record", daemon=True)
@@ -270,6 +271,21 @@ class RecordWriter:
             CdprError: As for `take_cycles`.
         """
         self._put(partial(self._folder.append_event, event))
+
+    def take_file(self, write: Callable[[], object]) -> None:
+        """Queues a function that writes a file, behind all cycles so far.
+
+        It is called also after an earlier failure, as there may be room for it.
+
+        Raises:
+            CdprError: The function raised it, and no thread writes.
+        """
+        with suppress(CdprError):
+            self._queue_cycles(self._queued_until)
+        if self._thread is None:
+            write()
+        else:
+            self._waiting.put(write)
 
     def close(self) -> None:
         """Writes the rest, and waits for it; never raises."""
