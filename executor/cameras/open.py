@@ -15,7 +15,13 @@ from drivers.cameras.live import LiveCamera
 from executor.cameras.client import CameraClient, samples_at_rest, wait_until_ready
 from executor.cameras.live_image import ImageBoard, memory_for
 from executor.cameras.multi_camera import RunCameras
-from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, ImageSource
+from executor.cameras.process import (
+    KEPT_IMAGES,
+    CameraProcess,
+    CameraWorker,
+    FrameRequest,
+    ImageSource,
+)
 from executor.cameras.sources import SYNTHETIC
 from executor.kernels import ready_for_camera_processes, ready_to_measure
 from executor.realtime.shared_memory import SharedMemory
@@ -33,9 +39,6 @@ from tracking.measurement import Observation
 
 if TYPE_CHECKING:  # a real camera loads no simulator
     from simulation.camera.camera import ImageSequence
-
-#: Approximate number of a run's images kept for its report.
-KEPT_IMAGES = 12
 
 
 @contextmanager
@@ -57,7 +60,7 @@ def open_cameras(
         scene: What the cameras see besides it.
         sources: From `resolve_cameras`.
         folder: The run folder.
-        pictures: Expected number of images per camera; some of them are kept.
+        pictures: Expected number of images per camera; about `KEPT_IMAGES` of them are kept.
         board: A stop request ends the opening.
         simulated_time: The run waits for late images instead of dropping them.
         listener: Receives the wait.

@@ -6,7 +6,7 @@ Source: the Foxglove schemas, https://docs.foxglove.dev/docs/sdk/schemas (well-k
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,8 +31,9 @@ Typed = (
     | fox.PoseInFrame
     | fox.SceneUpdate
 )
-#: One message: topic, time since the start of the run [s], content; dicts for JSON.
-Message = tuple[str, float, Typed | dict[str, Any]]
+#: One message: topic, time since the start of the run [s], content; dicts for JSON. A function
+#: makes a content that is too large to be in memory with all others.
+Message = tuple[str, float, Typed | dict[str, Any] | Callable[[], Typed]]
 
 #: Topic → message type, for Foxglove messages.
 TYPED: dict[str, type[Typed]] = {
@@ -134,8 +135,10 @@ def schema_of(topic: str) -> tuple[str, str, str, bytes]:
     return schema.encoding, schema.name, schema.encoding, schema.data
 
 
-def encoded(content: Typed | dict[str, Any]) -> bytes:
+def encoded(content: Typed | dict[str, Any] | Callable[[], Typed]) -> bytes:
     """Encodes a message."""
+    if callable(content):
+        content = content()
     if isinstance(content, dict):
         return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
     return content.encode()
