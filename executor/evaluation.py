@@ -39,7 +39,7 @@ from executor.recording.run_folder import (
     RunEvent,
     RunFolder,
 )
-from executor.recording.summary import RunContext, summarize, versions
+from executor.recording.summary import RunContext, summarize
 from executor.recording.tables import OK, CycleTable, PoseTable, fused_table, no_poses
 from executor.recording.verdict import HARMLESS, NOT_ENDED, ORDINARY, judge_without_tables
 from executor.report import build_report
@@ -198,7 +198,7 @@ def _context_of(
         duration=float(cycles.time[-1]) + rig.cycle if len(cycles) else 0.0,
         final_state=course.final_state,
         events=tuple(events),
-        versions=versions(),
+        versions=dict(course.versions),
         cause=course.cause,
         cameras=course.cameras,
         troubles=course.troubles,
