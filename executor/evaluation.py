@@ -418,6 +418,7 @@ def _clearance(rig: Rig, scene: Scene, cycles: CycleTable, seen: CameraRecords) 
     if model.obstacle_names and len(cycles):
         every = max(1, round(1000.0 / (CLEARANCE_RATE * rig.document.bus.cycle_ms)))
         chosen = np.arange(0, len(cycles), every)
+        chosen = chosen[cycles.has_encoder_pose[chosen]]
         rows += encoder_rows(
             model,
             WinchMap(rig),

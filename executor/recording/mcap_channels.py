@@ -254,11 +254,8 @@ def frame_of(camera: str) -> str:
 
 def robot_messages(rig: Rig, cycles: CycleTable, start: int) -> Iterator[Message]:
     """Platform and cables at the encoder pose, at `ROBOT_RATE`."""
-    known = np.isfinite(cycles.encoder).all(axis=1) & np.isfinite(cycles.encoder_rotation).all(
-        axis=1
-    )
     last = -np.inf
-    for i in np.flatnonzero(known).tolist():
+    for i in np.flatnonzero(cycles.has_encoder_pose).tolist():
         time = float(cycles.time[i])
         if time - last < 1.0 / ROBOT_RATE - 1e-6:
             continue

@@ -70,6 +70,7 @@ class RunLog:
         """An empty log for a run of a checked table."""
         self._rig, self._scene, self._checked = rig, scene, checked
         self._delay = cycles_until_reported(rig)
+        self._fits_within = rig.motion.start_tolerance + rig.motion.following_error
         per_drive = (rig.cable_count,)
         self._format = np.dtype(
             [
@@ -120,9 +121,10 @@ class RunLog:
         lengths, _ = self._lengths(cycle, np.array([row]))
         try:
             guess = Pose(planned.positions[row], planned.rotations[row])
-            return forward_kinematics(self._rig, lengths[0], guess).pose
+            found = forward_kinematics(self._rig, lengths[0], guess)
         except Fault:
             return None
+        return found.pose if found.worst <= self._fits_within else None
 
     def table(self, first: int = 0, end: int | None = None) -> CycleTable:
         """The table of the run's cycles, or of those from ``first`` up to ``end``.
@@ -135,9 +137,10 @@ class RunLog:
         index = self._reported_index(cycles, first)
         rows = np.rint(index).astype(np.int64)
         lengths, tensions = self._lengths(cycles, rows)
-        encoder, rotations = poses_near(
+        encoder, rotations, off = poses_near(
             rig, lengths, planned.positions[rows], planned.rotations[rows]
         )
+        fits = off <= self._fits_within  # else a cable is slack, slipped, or was wound in alone
         return CycleTable(
             time=cycles["at"] - began,
             state=tuple(_STATES[k].value for k in cycles["state"].tolist()),
@@ -151,8 +154,8 @@ class RunLog:
             error_frames=cycles["error_frames"].astype(np.int64),
             planned=between(planned.positions, index),
             planned_rotation=quaternions_of(planned.rotations[rows]),
-            encoder=encoder,
-            encoder_rotation=quaternions_of(rotations),
+            encoder=np.where(fits[:, None], encoder, np.nan),
+            encoder_rotation=np.where(fits[:, None], quaternions_of(rotations), np.nan),
             following_error=cycles["following_error"].copy(),
             set_counts=cycles["targets"].copy(),
             actual_counts=cycles["actual"].copy(),
