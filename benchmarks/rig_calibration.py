@@ -87,7 +87,7 @@ def position_error(rig: Rig, truth: Truth) -> float:
     """Error of the platform position by forward kinematics of a rig, RMS, [mm]."""
     winches, data = WinchMap(rig), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
-    found, _ = poses_near(rig, lengths, truth.positions, truth.rotations, steps=20)
+    found, _, _ = poses_near(rig, lengths, truth.positions, truth.rotations, steps=20)
     squares = np.sum((found - truth.positions) ** 2, axis=1)
     return float(np.sqrt(np.mean(squares))) * 1e3
 

@@ -23,6 +23,7 @@ from executor.recording.clearance import (
 )
 from executor.recording.mcap import write_mcap
 from executor.recording.record_files import AGAIN, RunCourse
+from executor.recording.recorder import Recorder
 from executor.recording.run_folder import (
     CLEARANCE,
     COURSE,
@@ -38,7 +39,7 @@ from executor.recording.run_folder import (
     RunEvent,
     RunFolder,
 )
-from executor.recording.summary import RunContext, summarize, versions
+from executor.recording.summary import RunContext, summarize
 from executor.recording.tables import OK, CycleTable, PoseTable, fused_table, no_poses
 from executor.recording.verdict import HARMLESS, NOT_ENDED, ORDINARY, judge_without_tables
 from executor.report import build_report
@@ -92,21 +93,29 @@ def evaluate(
     outcome: Outcome,
     seen: CameraRecords,
     course: RunCourse,
+    recorder: Recorder,
 ) -> EvaluatedRun:
-    """Computes the verdict of a run and its tables; writes nothing.
+    """Computes the verdict of a run and its tables.
+
+    First it has the end of the run and the camera poses written, which would be lost if the
+    program were killed during the evaluation of a long run.
 
     Args:
         prepared: The run.
         outcome: Of the motion.
         seen: Camera records.
         course: Of the run, with its end.
+        recorder: Of the run.
     """
+    folder, take_file = recorder.folder, recorder.writer.take_file
+    take_file(partial(_written, [(COURSE, partial(folder.write_end_of_course, course))]))
     cycles = outcome.log.table()
     poses = _pose_table(seen.together, cycles)
     alone = {name: _pose_table(samples, cycles) for name, samples in seen.alone.items()}
+    if len(poses):
+        take_file(partial(_written, _pose_files(folder, poses, alone)))
     clearance = _clearance(prepared.rig, prepared.scene, cycles, seen)
-    plan, events = prepared.plan.plan, outcome.log.events
-    context = _context_of(plan, prepared.rig, course, cycles, events)
+    context = _context_of(prepared.plan.plan, prepared.rig, course, cycles, outcome.log.events)
     summary = summarize(context, cycles, poses, clearance)
     return EvaluatedRun(context, cycles, poses, alone, clearance, summary)
 
@@ -186,10 +195,10 @@ def _context_of(
         simulated=simulated,
         fast=course.fast,
         started=course.started,
-        duration=_duration(cycles, rig.cycle),
+        duration=float(cycles.time[-1]) + rig.cycle if len(cycles) else 0.0,
         final_state=course.final_state,
         events=tuple(events),
-        versions=versions(),
+        versions=dict(course.versions),
         cause=course.cause,
         cameras=course.cameras,
         troubles=course.troubles,
@@ -252,7 +261,7 @@ def write_results(folder: RunFolder, result: EvaluatedRun) -> None:
     """
     files = _files(folder, result)
     todo = [file for file in files if file[0] in _RENEWED or not folder.has(file[0])]
-    missing = _written(todo, lambda: False)
+    missing = _written(todo)
     if missing:
         name, error = next(iter(missing.items()))
         unwritable = error.why and error.where == str(folder.path / name)
@@ -286,11 +295,7 @@ def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:
 
     return [
         (CYCLES, partial(folder.write_cycles, cycles)),
-        (POSES, partial(folder.write_poses, poses)),
-        *(
-            (POSES_OF.format(name), partial(folder.write_poses_of, name, table))
-            for name, table in result.alone.items()
-        ),
+        *_pose_files(folder, poses, result.alone),
         (CLEARANCE, partial(folder.write_clearance, clearance)),
         (SUMMARY, partial(folder.write_summary, result.summary)),
         (FUSED, lambda: folder.write_fused(fused_table(cycles, poses))),
@@ -300,7 +305,17 @@ def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:
     ]
 
 
-def _written(files: Sequence[_File], given_up: Callable[[], bool]) -> dict[str, CdprError]:
+def _pose_files(folder: RunFolder, poses: PoseTable, alone: Mapping[str, PoseTable]) -> list[_File]:
+    each = [
+        (POSES_OF.format(name), partial(folder.write_poses_of, name, table))
+        for name, table in alone.items()
+    ]
+    return [(POSES, partial(folder.write_poses, poses)), *each]
+
+
+def _written(
+    files: Sequence[_File], given_up: Callable[[], bool] = lambda: False
+) -> dict[str, CdprError]:
     """Writes each; returns the errors of those that failed."""
     missing: dict[str, CdprError] = {}
     for name, write in files:
@@ -337,11 +352,6 @@ def _complete_events(folder: RunFolder, events: Sequence[RunEvent]) -> None:
         complete = False
     if not complete:
         folder.write_events(events)
-
-
-def _duration(cycles: CycleTable, cycle: float) -> float:
-    """Time from the beginning of the first cycle to the end of the last, [s]."""
-    return float(cycles.time[-1]) + cycle if len(cycles) else 0.0
 
 
 def _pose_table(samples: Sequence[CameraSample], cycles: CycleTable) -> PoseTable:
@@ -408,6 +418,7 @@ def _clearance(rig: Rig, scene: Scene, cycles: CycleTable, seen: CameraRecords) 
     if model.obstacle_names and len(cycles):
         every = max(1, round(1000.0 / (CLEARANCE_RATE * rig.document.bus.cycle_ms)))
         chosen = np.arange(0, len(cycles), every)
+        chosen = chosen[cycles.has_encoder_pose[chosen]]
         rows += encoder_rows(
             model,
             WinchMap(rig),

@@ -40,6 +40,7 @@ from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import RunCourse, dated_folder
 from executor.recording.recorder import Recorder, require_readable_record
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
+from executor.recording.summary import versions
 from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import RunStatus
 from executor.run_result import RunResult
@@ -196,16 +197,17 @@ def run_prepared(
 
 def _recorded(job: _Job) -> RunResult:
     """Moves and measures, with a run folder."""
-    prepared, folder, moved = job.prepared, job.folder, _MotionData()
+    prepared, folder = job.prepared, job.folder
     interface, simulated = prepared.rig.document.bus.interface, is_simulated(prepared.rig)
-    course = RunCourse(datetime.now(UTC), interface, simulated, not job.options.realtime)
+    now, fast = datetime.now(UTC), not job.options.realtime
+    moved = _MotionData(RunCourse(now, interface, simulated, fast, versions=versions()))
     try:
         folder.write_plan(prepared.plan.plan.document)
         folder.write_rig(prepared.rig.document)
-        folder.write_course(course)
+        folder.write_course(moved.course)
         with folder.held():
             _move_and_measure(job, moved)
-            result = job.commands.supervisor.conclude(partial(_conclude, job, moved, course))
+            result = job.commands.supervisor.conclude(partial(_conclude, job, moved))
     except StoppedByOperator:
         moved.leave()
         raise
@@ -233,8 +235,8 @@ class _MotionData:
     """Data of the motion, as far as it got.
 
     Attributes:
+        course: Start of the run; its time is that of the motion once this begins.
         begun: The platform was about to move.
-        started: When that was.
         recorder: Of cycles and events.
         outcome: Of the motion.
         seen: Camera records.
@@ -242,8 +244,8 @@ class _MotionData:
         callbacks: Functions of the caller.
     """
 
+    course: RunCourse
     begun: bool = False
-    started: datetime | None = None
     recorder: Recorder | None = None
     outcome: Outcome | None = None
     seen: CameraRecords | None = None
@@ -294,8 +296,7 @@ def _move_and_measure(job: _Job, moved: _MotionData) -> None:
         text = f"{type(error).__name__}: {error}".rstrip(": ")
         if moved.outcome is None:
             text = f"the program failed during the motion: {text}"
-            log = moved.recorder.log
-            started = moved.started or datetime.now(UTC)
+            log, started = moved.recorder.log, moved.course.started
             moved.outcome = Outcome(State.LATCHED, text, log, False, started)
         else:
             moved.troubles.append(f"writing the results failed: {text}")
@@ -350,7 +351,9 @@ def _move(
     """Arms the drives and runs the loop: here in simulated time, else in another process."""
 
     def before_motion() -> None:
-        moved.begun, moved.started = True, datetime.now(UTC)
+        moved.course = replace(moved.course, started=datetime.now(UTC))
+        recorder.writer.take_file(partial(job.folder.write_course, moved.course))
+        moved.begun = True
         job.commands.supervisor.on_motion()
 
     if isinstance(board, SharedRequests):
@@ -403,7 +406,7 @@ def _move_in_real_time(
     )
 
 
-def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
+def _conclude(job: _Job, moved: _MotionData) -> RunResult:
     """Computes the verdict, reports it, then writes the result files."""
     outcome, supervisor = moved.outcome, job.commands.supervisor
     assert outcome is not None
@@ -411,7 +414,7 @@ def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
     if late and late not in outcome.cause:
         moved.troubles.append(late)
     course = replace(
-        course,
+        moved.course,
         started=outcome.started,
         final_state=outcome.state.value,
         cause=outcome.cause,
@@ -419,7 +422,7 @@ def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
         cameras=() if moved.seen is None else tuple(moved.seen.cameras),
         troubles=tuple(moved.troubles),
     )
-    evaluated, summary = _evaluated(job.prepared, moved, outcome, course)
+    evaluated, summary = _evaluated(job, moved, outcome, course)
     result = RunResult(job.folder.path, summary)
     supervisor.on_verdict(result)
     with job.options.listener.waiting("writing the run folder and report"):
@@ -431,13 +434,15 @@ def _conclude(job: _Job, moved: _MotionData, course: RunCourse) -> RunResult:
 
 
 def _evaluated(
-    prepared: PreparedRun, moved: _MotionData, outcome: Outcome, course: RunCourse
+    job: _Job, moved: _MotionData, outcome: Outcome, course: RunCourse
 ) -> tuple[EvaluatedRun | None, dict[str, Any]]:
     """The evaluation and its summary; if that fails, a summary without tables."""
+    assert moved.recorder is not None
     try:
         seen = moved.seen or CameraRecords()
-        evaluated = evaluate(prepared, outcome, seen, course)
+        with job.options.listener.waiting("evaluating the run"):
+            evaluated = evaluate(job.prepared, outcome, seen, course, moved.recorder)
     except Exception as error:
         trouble = f"{type(error).__name__}: {error}".rstrip(": ")
-        return None, not_evaluated(prepared, outcome, course, trouble)
+        return None, not_evaluated(job.prepared, outcome, course, trouble)
     return evaluated, evaluated.summary

@@ -219,7 +219,7 @@ def forward_kinematics(
 
 def poses_near(
     rig: Rig, lengths: Array, positions: Array, rotations: Array, *, steps: int = 4
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Forward kinematics of many poses at once, each near a known one (Gauss–Newton).
 
     Args:
@@ -230,9 +230,10 @@ def poses_near(
         steps: Gauss–Newton steps; each squares an error of millimetres, so four reach round-off.
 
     Returns:
-        Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3).
+        Positions, shape (n, 3), [m]; rotations, shape (n, 3, 3); and for each pose the largest
+        absolute residual of a cable before the last step, shape (n,), [m].
     """
-    scale = step_scale(rig)
+    scale, residuals = step_scale(rig), np.zeros_like(lengths)
     for _ in range(steps):
         anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
         cables = cables_to(rig, anchors)
@@ -244,7 +245,7 @@ def poses_near(
         positions = positions + twists[:, :3]
         turns = [matrix_from_rotation_vector(v) for v in twists[:, 3:]]
         rotations = np.reshape(turns, (-1, 3, 3)) @ rotations
-    return positions, rotations
+    return positions, rotations, np.max(np.abs(residuals), axis=1)
 
 
 def _cold_starts(rig: Rig) -> list[Pose]:

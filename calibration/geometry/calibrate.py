@@ -137,7 +137,7 @@ def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, po
         return np.asarray(np.sqrt(np.mean(apart**2, axis=1)))
     rotations = measured.first_rotations(rig)
     arms = measured.measured_points(np.zeros((len(rotations), 3)), rotations)
-    found = poses_near(rig, lengths, measured.positions - arms, rotations, steps=8)
+    found = poses_near(rig, lengths, measured.positions - arms, rotations, steps=8)[:2]
     apart = measured.measured_points(*found) - measured.positions
     return np.asarray(np.linalg.norm(apart, axis=1))
 

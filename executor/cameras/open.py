@@ -15,7 +15,13 @@ from drivers.cameras.live import LiveCamera
 from executor.cameras.client import CameraClient, samples_at_rest, wait_until_ready
 from executor.cameras.live_image import ImageBoard, memory_for
 from executor.cameras.multi_camera import RunCameras
-from executor.cameras.process import CameraProcess, CameraWorker, FrameRequest, ImageSource
+from executor.cameras.process import (
+    KEPT_IMAGES,
+    CameraProcess,
+    CameraWorker,
+    FrameRequest,
+    ImageSource,
+)
 from executor.cameras.sources import SYNTHETIC, cycles_per_image
 from executor.kernels import ready_for_camera_processes, ready_to_measure
 from executor.realtime.shared_memory import SharedMemory
@@ -36,9 +42,6 @@ if TYPE_CHECKING:  # a real camera loads no simulator, and its process no planne
     from executor.trajectory.setpoints import PreparedRun
     from simulation.camera.camera import ImageSequence
 
-#: Approximate number of a run's images kept for its report.
-KEPT_IMAGES = 12
-
 
 @contextmanager
 def open_cameras(
@@ -55,7 +58,7 @@ def open_cameras(
     Args:
         prepared: The run.
         sources: From `resolve_cameras`.
-        folder: The run folder, which keeps some of the images.
+        folder: The run folder, which keeps about `KEPT_IMAGES` of each camera's images.
         board: A stop request ends the opening.
         simulated_time: The run waits for late images instead of dropping them.
         listener: Receives the wait, and a remark on what cannot be measured.

@@ -92,6 +92,10 @@ _NOTHING: tuple[int, NDArray[np.uint8], Observation] = (
 )  # fmt: skip
 
 
+#: Number of kept images after which the interval of kept images doubles.
+KEPT_IMAGES = 12
+
+
 class CameraWorker:
     """Takes images with one camera and measures them, as a context manager."""
 
@@ -113,11 +117,13 @@ class CameraWorker:
             camera: The camera.
             source: Of its images.
             folder: For kept images; None to keep none.
-            keep_every: Interval of kept images, in frames.
+            keep_every: First interval of kept images, in frames; it doubles after every
+                `KEPT_IMAGES`, so that a run on hold for hours does not fill the disk.
             named: Keep images in a folder of the camera's name, as there are several cameras.
             live: For viewers; None to show no images.
         """
         self._source, self._folder, self._keep_every = source, folder, keep_every
+        self._kept = 0
         self._name = camera.name if named else ""
         self._tracker, self._drives = Tracker(rig, camera), EncoderExtrapolator()
         self._live, self._newest = live, _NOTHING
@@ -139,6 +145,9 @@ class CameraWorker:
         name = ""
         if self._folder is not None and trigger.frame % self._keep_every == 0:
             name = self._folder.write_picture(trigger.frame, image, self._name)
+            self._kept += 1
+            if self._kept % KEPT_IMAGES == 0:
+                self._keep_every *= 2
         taken = trigger.time + delay
         encoder_pose = self._drives.at(taken, trigger.time, trigger.encoder_pose)
         began = time.monotonic()

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from foxglove.messages import CompressedImage, Log, LogLevel
+from foxglove.messages import CompressedImage, Log, LogLevel, Timestamp
 from mcap.writer import Writer
 
 from executor.recording.clearance import ClearanceTable, camera_of
@@ -88,13 +89,13 @@ def _pictures(
 ) -> Iterator[Message]:
     for time, name in zip(poses.time.tolist(), poses.picture, strict=True):
         if name and folder.has_picture(name):
-            picture = CompressedImage(
-                timestamp=stamp_of(start, time),
-                frame_id=frame_of(camera),
-                data=folder.picture(name),
-                format="jpeg",
-            )
+            picture = partial(_picture, folder, name, stamp_of(start, time), frame_of(camera))
             yield topic_of("/pictures", camera), time, picture
+
+
+def _picture(folder: RunFolder, name: str, stamp: Timestamp, frame: str) -> CompressedImage:
+    data = folder.picture(name)
+    return CompressedImage(timestamp=stamp, frame_id=frame, data=data, format="jpeg")
 
 
 def write_mcap(
@@ -118,7 +119,8 @@ def write_mcap(
         alone: Poses of each of several cameras, by name; empty for a single camera.
 
     Raises:
-            Fault: The disk is full or gone; no partial file is left.
+        BadInput: An image cannot be read.
+        Fault: The disk is full or gone; no partial file is left.
     """
     start = int(context.started.timestamp() * 1e6) * 1000
     messages = [
@@ -155,13 +157,14 @@ def write_messages(
         _write(unfinished, sorted(messages, key=lambda message: message[1]), start, attached)
         unfinished.replace(path)
     except OSError as error:
-        unfinished.unlink(missing_ok=True)
         raise Fault(
             "the log cannot be written",
             where=str(path),
             why=error.strerror or str(error),
             next_step="free some space; the CSV files hold the same data",
         ) from None
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def _write(path: Path, messages: Sequence[Message], start: int, attached: Sequence[Path]) -> None:

@@ -6,7 +6,7 @@ Source: the Foxglove schemas, https://docs.foxglove.dev/docs/sdk/schemas (well-k
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,8 +31,9 @@ Typed = (
     | fox.PoseInFrame
     | fox.SceneUpdate
 )
-#: One message: topic, time since the start of the run [s], content; dicts for JSON.
-Message = tuple[str, float, Typed | dict[str, Any]]
+#: One message: topic, time since the start of the run [s], content; dicts for JSON. A function
+#: makes a content that is too large to be in memory with all others.
+Message = tuple[str, float, Typed | dict[str, Any] | Callable[[], Typed]]
 
 #: Topic → message type, for Foxglove messages.
 TYPED: dict[str, type[Typed]] = {
@@ -135,8 +136,10 @@ def schema_of(topic: str) -> tuple[str, str, str, bytes]:
     return schema.encoding, schema.name, schema.encoding, schema.data
 
 
-def encoded(content: Typed | dict[str, Any]) -> bytes:
+def encoded(content: Typed | dict[str, Any] | Callable[[], Typed]) -> bytes:
     """Encodes a message."""
+    if callable(content):
+        content = content()
     if isinstance(content, dict):
         return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
     return content.encode()
@@ -252,11 +255,8 @@ def frame_of(camera: str) -> str:
 
 def robot_messages(rig: Rig, cycles: CycleTable, start: int) -> Iterator[Message]:
     """Platform and cables at the encoder pose, at `ROBOT_RATE`."""
-    known = np.isfinite(cycles.encoder).all(axis=1) & np.isfinite(cycles.encoder_rotation).all(
-        axis=1
-    )
     last = -np.inf
-    for i in np.flatnonzero(known).tolist():
+    for i in np.flatnonzero(cycles.has_encoder_pose).tolist():
         time = float(cycles.time[i])
         if time - last < 1.0 / ROBOT_RATE - 1e-6:
             continue

@@ -4,18 +4,19 @@ Unknown keys are ignored: a later version may add some. `executor.recording.summ
 keys; a damaged or edited run folder causes one message that names the key.
 
 ``run.json`` (``schema_version`` 1) has ``started`` (ISO 8601, UTC), ``interface``, ``simulated``,
-``fast``, ``final_state``, ``cause``, ``cycles``, ``cameras`` (as in ``summary.json``) and
-``troubles`` (missing data, a sentence each). Until the motion is over, and if the program is
-killed, all after ``fast`` are empty or 0.
+``fast``, ``versions``, ``final_state``, ``cause``, ``cycles``, ``cameras`` (as in
+``summary.json``) and ``troubles`` (missing data, a sentence each). Until the motion is over, and
+if the program is killed, all after ``versions`` are empty or 0; until it begins, ``started`` is the
+time at which the folder was created.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -212,6 +213,7 @@ class CourseDocument(_Record):
     interface: str
     simulated: bool
     fast: bool
+    versions: dict[str, str] = {}
     final_state: str
     cause: str
     cycles: Count
@@ -343,6 +345,7 @@ class RunCourse:
         interface: Of the bus.
         simulated: The drives are simulated in the run's own process.
         fast: Simulated time.
+        versions: Of programs and libraries, by name; empty in files of earlier versions.
         final_state: Of the motion; empty until its end.
         cause: Why it did not finish, if it did not.
         cycles: Number of cycles; 0 until the end.
@@ -354,6 +357,7 @@ class RunCourse:
     interface: str
     simulated: bool
     fast: bool
+    versions: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     final_state: str = ""
     cause: str = ""
     cycles: int = 0
@@ -379,6 +383,7 @@ class RunCourse:
             kept.cycles,
             tuple(CameraRecord(**dict(camera)) for camera in kept.cameras),
             tuple(kept.troubles),
+            versions=kept.versions,
         )
 
     def save(self, path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from types import TracebackType
 
@@ -69,6 +70,7 @@ class RunLog:
         """An empty log for a run of a checked table."""
         self._rig, self._scene, self._checked = rig, scene, checked
         self._delay = cycles_until_reported(rig)
+        self._fits_within = rig.motion.start_tolerance + rig.motion.following_error
         per_drive = (rig.cable_count,)
         self._format = np.dtype(
             [
@@ -119,9 +121,10 @@ class RunLog:
         lengths, _ = self._lengths(cycle, np.array([row]))
         try:
             guess = Pose(planned.positions[row], planned.rotations[row])
-            return forward_kinematics(self._rig, lengths[0], guess).pose
+            found = forward_kinematics(self._rig, lengths[0], guess)
         except Fault:
             return None
+        return found.pose if found.worst <= self._fits_within else None
 
     def table(self, first: int = 0, end: int | None = None) -> CycleTable:
         """The table of the run's cycles, or of those from ``first`` up to ``end``.
@@ -134,9 +137,10 @@ class RunLog:
         index = self._reported_index(cycles, first)
         rows = np.rint(index).astype(np.int64)
         lengths, tensions = self._lengths(cycles, rows)
-        encoder, rotations = poses_near(
+        encoder, rotations, off = poses_near(
             rig, lengths, planned.positions[rows], planned.rotations[rows]
         )
+        fits = off <= self._fits_within  # else a cable is slack, slipped, or was wound in alone
         return CycleTable(
             time=cycles["at"] - began,
             state=tuple(_STATES[k].value for k in cycles["state"].tolist()),
@@ -150,8 +154,8 @@ class RunLog:
             error_frames=cycles["error_frames"].astype(np.int64),
             planned=between(planned.positions, index),
             planned_rotation=quaternions_of(planned.rotations[rows]),
-            encoder=encoder,
-            encoder_rotation=quaternions_of(rotations),
+            encoder=np.where(fits[:, None], encoder, np.nan),
+            encoder_rotation=np.where(fits[:, None], quaternions_of(rotations), np.nan),
             following_error=cycles["following_error"].copy(),
             set_counts=cycles["targets"].copy(),
             actual_counts=cycles["actual"].copy(),
@@ -233,7 +237,7 @@ class RecordWriter:
         self._queued, self._written = 0, 0
         self._queued_until, self._written_until = 0.0, 0.0
         self._trouble: CdprError | None = None
-        self._waiting: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         if own_thread:
             self._thread = threading.Thread(target=self._write, name="cdpr-record", daemon=True)
@@ -270,6 +274,21 @@ class RecordWriter:
             CdprError: As for `take_cycles`.
         """
         self._put(partial(self._folder.append_event, event))
+
+    def take_file(self, write: Callable[[], object]) -> None:
+        """Queues a function that writes a file, behind all cycles so far.
+
+        It is called also after an earlier failure, as there may be room for it.
+
+        Raises:
+            CdprError: The function raised it, and no thread writes.
+        """
+        with suppress(CdprError):
+            self._queue_cycles(self._queued_until)
+        if self._thread is None:
+            write()
+        else:
+            self._waiting.put(write)
 
     def close(self) -> None:
         """Writes the rest, and waits for it; never raises."""

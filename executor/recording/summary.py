@@ -57,7 +57,7 @@ class RunContext:
         simulated: The drives were simulated, here or by a program at the other end of the bus.
         fast: Simulated time, so that lateness has no meaning.
         started: Start time, with time zone.
-        duration: [s].
+        duration: From the beginning of the first cycle to the end of the last, [s].
         final_state: ``finished``, ``stopped`` or the state of a fault.
         events: All events, in order.
         versions: Of programs and libraries, by name.

@@ -56,7 +56,8 @@ class CycleTable:
         error_frames: Error frames of the bus so far, shape (n,).
         planned: Commanded position of the platform, world frame, shape (n, 3), [m].
         planned_rotation: Commanded ``world_from_platform``, quaternions (w, x, y, z), shape (n, 4).
-        encoder: Position from the encoders, world frame, shape (n, 3), [m].
+        encoder: Position from the encoders, world frame, shape (n, 3), [m]; NaN if the actual
+            positions fit no pose within start tolerance and following error.
         encoder_rotation: As ``planned_rotation``, from the encoders, shape (n, 4).
         following_error: Largest of all cables, shape (n,), [m].
         set_counts: Set-points sent, shape (n, m), [counts].
@@ -107,6 +108,12 @@ class CycleTable:
         """
         on_path = np.isin(self.state, _ON_PATH)
         return float(self.time[np.argmax(on_path)]) if on_path.any() else np.inf
+
+    @property
+    def has_encoder_pose(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """Whether the encoders give a pose, shape (n,)."""
+        pose = np.hstack([self.encoder, self.encoder_rotation])
+        return np.asarray(np.isfinite(pose).all(axis=1), dtype=bool)
 
     @property
     def encoder_error(self) -> Array:
@@ -417,9 +424,7 @@ class FusedTable:
 
 def fused_table(cycles: CycleTable, poses: PoseTable) -> FusedTable:
     """The encoder poses of a run, corrected by its images."""
-    known = np.isfinite(cycles.encoder).all(axis=1) & np.isfinite(cycles.encoder_rotation).all(
-        axis=1
-    )
+    known = cycles.has_encoder_pose
     pairs = zip(cycles.encoder[known], cycles.encoder_rotation[known], strict=True)
     by_drives = [Pose.from_quaternion(position, rotation) for position, rotation in pairs]
     measured = [

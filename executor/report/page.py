@@ -144,9 +144,7 @@ def plan_labels(plan: Plan) -> tuple[Label, ...]:
 
 def _moments(run: RunData) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
     """Cycles at which the platform is drawn, shape (k,)."""
-    known = np.isfinite(run.cycles.encoder).all(axis=1)
-    known &= np.isfinite(run.cycles.encoder_rotation).all(axis=1)
-    rows = np.flatnonzero(known)
+    rows = np.flatnonzero(run.cycles.has_encoder_pose)
     if len(rows) <= MOST_MOMENTS:
         return rows
     return rows[np.linspace(0, len(rows) - 1, MOST_MOMENTS).astype(np.int64)]
@@ -242,7 +240,8 @@ def _scene(run: RunData, view: RunScene) -> str:
 
 def _clearance(run: RunData) -> str:
     if not len(run.clearance):
-        return paragraph("The scene has no obstacles.")
+        measured = "No clearance was measured." if run.plan.scene.obstacles else ""
+        return paragraph(measured or "The scene has no obstacles.")
     text = (
         f"Distances between surfaces. The shaded band is the {INTERVAL} of the measurement;"
         " planned is for the pose commanded at the same time."

@@ -109,7 +109,7 @@ def test_the_recorded_session_calibrates_its_rig_to_a_tenth_of_a_millimetre(
     truth = samples(rig, 20, tilt=0.05, seed=8, noise=0.0)
     winches, data = WinchMap(corrected), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
-    found, _ = poses_near(corrected, lengths, truth.positions, truth.rotations, steps=10)
+    found, _, _ = poses_near(corrected, lengths, truth.positions, truth.rotations, steps=10)
     assert np.linalg.norm(found - truth.positions, axis=1).max() < 0.2e-3
     motion = ("--by-mm", "0", "0", "2", "--no-scene", "--fast", "-o", tmp_path / "jog")
     jogged = call("jog", RIG, *motion, "--calibration", result, "--json")

@@ -8,11 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drivers.cameras.live import Frame
 from executor.cameras.open import LiveImages, RenderedImages
-from executor.cameras.process import FrameRequest, _serve
+from executor.cameras.process import KEPT_IMAGES, CameraWorker, FrameRequest, _serve
 from model.pose import Pose
+from model.rig import load_rig
+from tests.cli.plans import RIG
+from tracking.measurement import NoPose
+
+_RIG = load_rig(RIG)
 
 
 class _Camera:
@@ -38,6 +45,31 @@ def test_it_ends_without_a_word_when_its_parent_is_gone(make: Any, closed: str) 
         child.close()
     _serve(make, child)
     child.close()
+
+
+class Dark:
+    """A camera without light."""
+
+    def picture(self, _trigger: FrameRequest) -> tuple[np.ndarray, float]:
+        return np.zeros((4, 4), np.uint8), 0.0
+
+
+@given(frames=st.integers(1, 40_000), planned=st.integers(1, 400))
+def test_a_run_on_hold_for_hours_keeps_few_images_over_all_of_it(frames: int, planned: int) -> None:
+    """Each doubling of the run adds as many as its first half has."""
+    kept: list[int] = []
+    folder: Any = SimpleNamespace(write_picture=lambda n, *_: kept.append(n) or "x")
+    tracker: Any = SimpleNamespace(observe=lambda *_: NoPose(0.0, "dark"))
+    every = max(1, planned // KEPT_IMAGES)
+    worker = CameraWorker(_RIG, _RIG.cameras[0], Dark(), folder, every, named=False)
+    worker._tracker = tracker
+    names = [worker.measure(FrameRequest(n, 0.1 * n, 0.0, None)).picture for n in range(frames)]
+    assert [n for n, name in enumerate(names) if name] == kept
+    assert kept[0] == 0
+    doublings = max(0.0, np.log2(frames / (every * KEPT_IMAGES)))
+    assert len(kept) <= KEPT_IMAGES * (doublings + 2)
+    gaps = np.diff([*kept, frames])
+    assert gaps.max() <= every + frames / KEPT_IMAGES
 
 
 class Film:

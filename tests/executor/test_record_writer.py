@@ -138,6 +138,26 @@ def test_a_full_disk_is_a_fault_and_leaves_whole_lines(folder: RunFolder) -> Non
     assert 100 < rows[-1] < 400
 
 
+@pytest.mark.parametrize("own_thread", [False, True])
+def test_a_file_is_written_behind_all_cycles_and_also_after_a_failure(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, own_thread: bool
+) -> None:
+    log, seen = Log(), list[list[int]]()
+    with RecordWriter(folder, log, own_thread=own_thread) as writer:  # type: ignore[arg-type]
+        for number in range(75):
+            log.count += 1
+            writer.take_cycles(5.0 + number * CYCLE)
+        writer.take_file(lambda: seen.append(recorded(folder)))
+        writer.take_file(lambda: monkeypatch.setattr(RunFolder, "append_cycles", _full))
+        log.count += 1
+        writer.take_file(lambda: seen.append(recorded(folder)))
+    assert seen == [list(range(75))] * 2
+
+
+def _full(*_: object, **__: object) -> None:
+    raise Fault("No space left on device")
+
+
 def test_a_folder_that_is_gone_is_a_fault(folder: RunFolder) -> None:
     log: Any = Log()
     writer = RecordWriter(folder, log, own_thread=False)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from google.protobuf.json_format import MessageToDict
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from executor.recording.mcap import write_mcap
@@ -19,7 +20,7 @@ from executor.recording.mcap_channels import OWN, TYPED
 from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunFolder
 from executor.recording.tables import fused_table
-from model.errors import Fault
+from model.errors import BadInput, Fault
 from tests.executor import fake_run
 
 #: Of each channel: time, and the message as its own schema in the file decodes it.
@@ -223,6 +224,44 @@ def assert_fits(value: Any, schema: dict[str, Any], path: str) -> None:
     elif isinstance(value, list):
         for inner in value[:3]:
             assert_fits(inner, schema["items"], f"{path}[]")
+
+
+def test_one_image_at_a_time_is_in_memory(
+    folder: RunFolder, tmp_path: Path, run: fake_run.FakeRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A long run keeps many, of several megabytes each."""
+    order: list[str] = []
+    read_picture, add_message = RunFolder.picture, Writer.add_message
+
+    def reading(self: RunFolder, name: str) -> bytes:
+        order.append("read")
+        return read_picture(self, name)
+
+    def writing(self: Writer, channel: int, at: int, data: bytes, *more: int) -> None:
+        if b"jpeg" in data:
+            order.append("written")
+        add_message(self, channel, at, data, *more)
+
+    monkeypatch.setattr(RunFolder, "picture", reading)
+    monkeypatch.setattr(Writer, "add_message", writing)
+    poses, fused = folder.poses(), fused_table(run.cycles, run.poses)
+    write_mcap(folder, run.context, run.cycles, poses, run.clearance, fused, {})
+    assert order == ["read", "written"] * sum(map(bool, poses.picture))
+    assert len(order) > 4
+
+
+def test_an_image_that_cannot_be_read_leaves_no_broken_log(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    folder = fake_run.write(run, tmp_path / "run")
+    poses, before = folder.poses(), {*folder.path.iterdir()}
+    poses = replace(poses, picture=tuple("rig.json" if name else "" for name in poses.picture))
+    with pytest.raises(BadInput, match="image cannot be read"):
+        write_mcap(
+            folder, run.context, run.cycles, poses, run.clearance,
+            fused_table(run.cycles, run.poses), {},
+        )  # fmt: skip
+    assert {*folder.path.iterdir()} == before
 
 
 def test_a_full_disk_leaves_no_broken_log(

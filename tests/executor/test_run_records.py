@@ -83,8 +83,17 @@ def test_a_value_that_no_run_writes_is_named(folder: RunFolder, key: str, value:
     ("key", "value"),
     [
         (key, value)
-        for key in ("started", "interface", "simulated", "fast", "final_state", "cause", "cycles")
-        for value in ([], {}, None, 1.5, -1, "yesterday", "2026-01-01T00:00:00")
+        for key in (
+            "started",
+            "interface",
+            "simulated",
+            "fast",
+            "versions",
+            "final_state",
+            "cause",
+            "cycles",
+        )
+        for value in ([], {"cdpr": 1}, None, 1.5, -1, "yesterday", "2026-01-01T00:00:00")
         if not (isinstance(value, str) and key in ("interface", "final_state", "cause"))
     ],
 )

@@ -65,7 +65,8 @@ def test_many_poses_near_known_ones_are_found_together(name: str) -> None:
     lengths = np.array([cable_lengths(rig, pose) for pose in poses])
     guesses = np.array([pose.position for pose in poses]) + rng.uniform(-0.003, 0.003, (9, 3))
     rotations = np.array([pose.rotation for pose in poses])
-    positions, turns = poses_near(rig, lengths, guesses, rotations)
+    positions, turns, off = poses_near(rig, lengths, guesses, rotations)
+    assert off.max() < 1e-9
     for pose, position, rotation in zip(poses, positions, turns, strict=True):
         agree(Pose(position, rotation), pose)
 

@@ -60,6 +60,7 @@ class Stage:
     now: float = 0.0
     armed: bool = False
     status: RunStatus | None = None
+    recorder: Recorder | None = None
     drive_states: list[tuple[DriveState, ...]] = field(default_factory=list)
 
     def next_cycle(self) -> float:
@@ -103,7 +104,7 @@ class Stage:
             before_motion()
 
         self.status = RunStatus(self.prepared, self.folder.path, self.board, simulated_time=True)
-        recorder = Recorder(
+        recorder = self.recorder = Recorder(
             self.prepared,
             self.folder,
             self.status,
@@ -134,7 +135,8 @@ def concluded(stage: Stage, outcome: Outcome) -> dict[str, Any]:
     folder.write_rig(prepared.rig.document)
     state, cause = outcome.state.value, outcome.cause
     course = RunCourse(outcome.started, "virtual", True, True, state, cause)
-    result = evaluate(prepared, outcome, CameraRecords(), course)
+    assert stage.recorder is not None
+    result = evaluate(prepared, outcome, CameraRecords(), course, stage.recorder)
     assert write_end(folder, course, result, outcome.log.events) == {}
     return result.summary
 

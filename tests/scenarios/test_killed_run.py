@@ -9,7 +9,10 @@ import signal
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.can_bus import BusSettings
+from executor import evaluation
+from executor.cameras.multi_camera import CameraRecords
+from executor.cameras.process import sample_without_pose
 from executor.evaluation import evaluate_folder
 from executor.interlock.fault_latch import FaultLatch
 from executor.recording.record_files import RunCourse
@@ -191,11 +197,69 @@ def test_a_program_that_is_killed_once_the_verdict_is_out_leaves_that_verdict(
     run = tmp_path / "run"
     answer = call("run", short_plan, "--rig", RIG, "--fast", "--no-camera", "-o", run)
     assert "\nPASSED " in answer.out, answer
-    assert RunFolder(run).course().final_state == ""
     again = call("report", run, "--json")
     assert again.code == 0, again
     summary = json.loads(again.out)
     assert (summary["verdict"], summary["final_state"]) == ("PASSED", "finished")
+
+
+def test_a_killed_run_has_the_start_of_its_motion_and_the_versions_that_ran_it(
+    short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder is created before the cameras open and the drives are armed: minutes earlier."""
+    run, killed, append = tmp_path / "run", tmp_path / "killed", RunFolder.append_cycles
+    created, moved = (datetime(2026, 1, 1, 12, minute, tzinfo=UTC) for minute in (0, 3))
+    times = iter([created, moved])
+    monkeypatch.setattr("executor.runner.datetime", SimpleNamespace(now=lambda _: next(times)))
+    monkeypatch.setattr("executor.runner.versions", lambda: {"cdpr": "0.0.9"})
+
+    def killed_then(self: RunFolder, lines: str, *, fsync: bool) -> None:
+        append(self, lines, fsync=fsync)
+        if not killed.exists():
+            shutil.copytree(run, killed)
+
+    monkeypatch.setattr(RunFolder, "append_cycles", killed_then)
+    answer = call("run", short_plan, "--rig", RIG, "--fast", "--no-camera", "-o", run)
+    assert answer.code == 0, answer
+    monkeypatch.undo()
+    context = evaluate_folder(RunFolder(killed)).context
+    assert (context.started, context.versions) == (moved, {"cdpr": "0.0.9"})
+    assert RunFolder(run).summary()["versions"] == {"cdpr": "0.0.9"}
+
+
+def test_a_run_json_of_an_earlier_version_names_no_versions(
+    killed: RunFolder, tmp_path: Path
+) -> None:
+    folder = cut(killed, tmp_path / "run")
+    kept = json.loads((folder.path / "run.json").read_text())
+    kept.pop("versions")
+    (folder.path / "run.json").write_text(json.dumps(kept))
+    assert evaluate_folder(folder).summary["versions"] == {}
+
+
+def test_a_kill_during_the_evaluation_loses_neither_the_end_nor_the_camera_poses(
+    short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The evaluation of a long run takes minutes."""
+    run, killed, clearance = tmp_path / "run", tmp_path / "killed", evaluation._clearance
+    samples = (sample_without_pose(0, 0.5, "no tag"), sample_without_pose(1, 0.6, "no tag"))
+    seen = CameraRecords(samples, {"front": samples, "side": samples[:1]})
+    monkeypatch.setattr("executor.runner.CameraRecords", lambda: seen)
+
+    def killed_then(*arguments: Any) -> Any:
+        shutil.copytree(run, killed)
+        return clearance(*arguments)
+
+    monkeypatch.setattr(evaluation, "_clearance", killed_then)
+    answer = call("run", short_plan, "--rig", RIG, "--fast", "--no-camera", "-o", run)
+    assert answer.code == 1, answer  # no pose was measured
+    before, after = RunFolder(killed), RunFolder(run)
+    assert before.course() == after.course()
+    assert before.course().final_state == "finished"
+    assert (killed / "cycles.csv").read_bytes() == (run / "cycles.csv").read_bytes()
+    for name in ("poses.csv", "poses-front.csv", "poses-side.csv"):
+        assert (killed / name).read_bytes() == (run / name).read_bytes()
+    assert before.poses().status == ("no tag", "no tag")
 
 
 def test_the_end_of_a_run_has_room_on_a_full_disk(

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from executor.cameras.multi_camera import CameraRecords
+from executor.evaluation import _clearance
+from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
 from model.pose import Pose
 from tests.scenarios.stage import staged
@@ -37,3 +41,36 @@ def test_each_image_comes_with_the_drives_pose_of_its_own_time(
         if beside.min() > 1e-4:  # it moves: another cycle's pose would be seen
             before = np.linalg.norm(pose.position - cycles.encoder[row - 1])
             assert before > 5e-5
+
+
+def test_positions_that_fit_no_pose_give_neither_a_pose_nor_a_clearance(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """A drive that let go coasts by 30 mm: its cable is slack, and the pose unknown."""
+    with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
+        log = stage.run().log
+    assert log.table().has_encoder_pose.all()
+    last, before = log.last, len(log)
+    assert last is not None
+    coasted = list(last.actual)
+    coasted[2] += round(0.030 * float(prepared.checked.winches.counts_per_metre[2]))
+    for k in range(1, 101):
+        log.add(
+            replace(
+                last,
+                cycle=last.cycle + k,
+                at=last.at + 0.01 * k,
+                state=State.LATCHED,
+                actual=tuple(coasted),
+                following_error=np.nan,
+            )
+        )
+    assert log.last is not None
+    assert log.encoder_pose(last) is not None
+    assert log.encoder_pose(log.last) is None
+    cycles = log.table()
+    assert cycles.has_encoder_pose.tolist() == [True] * before + [False] * 100
+    scene = stage.prepared.scene
+    assert scene.obstacles
+    clearance = _clearance(prepared.rig, scene, cycles, CameraRecords())
+    assert 0.0 < cycles.time[before - 1] - clearance.time.max() < 0.1

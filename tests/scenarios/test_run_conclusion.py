@@ -186,9 +186,12 @@ class Left(BaseException):
 
 @pytest.mark.parametrize("end", ENDS)
 def test_ctrl_c_while_the_report_is_made_ends_with_the_verdict_of_the_run(
-    run: Callable[..., Answer], monkeypatch: pytest.MonkeyPatch, end: str
+    run: Callable[..., Answer],
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    end: str,
 ) -> None:
-    """Ignored before the verdict; then it leaves out the files; then it ends the program."""
+    """Only answered before the verdict; then it leaves out the files; then it ends the program."""
     summarize = executor.recording.summary.summarize
 
     def pressed_before(*arguments: object) -> object:
@@ -204,6 +207,9 @@ def test_ctrl_c_while_the_report_is_made_ends_with_the_verdict_of_the_run(
     answer = run(end)
     assert_verdict(answer, end)
     assert "fused.csv, run.mcap, report.html: interrupted" in answer.err
+    said = capfd.readouterr().err
+    assert said.count("is being evaluated, please wait for its verdict") == 2
+    assert said.index("skipping the files") > said.rindex("its verdict")
 
 
 def test_ctrl_c_again_leaves_at_once_with_the_exit_code_of_the_run(

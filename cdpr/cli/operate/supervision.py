@@ -27,6 +27,7 @@ _T = TypeVar("_T")
 
 #: A closed terminal (SIGHUP) must not leave the rig without its loop.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_EVALUATING = b"\nthe motion has ended; the run is being evaluated, please wait for its verdict\n"
 _GIVING_UP = b"\nskipping the files not yet written; press Ctrl-C again to exit at once\n"
 
 
@@ -176,20 +177,18 @@ class RunSupervisor(SignalSupervisor):
         return self._given_up
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
-        """Interrupts before the motion, does nothing until the verdict, then skips the files.
+        """Interrupts before the motion, only answers until the verdict, then skips the files.
 
         Raises:
             KeyboardInterrupt: Nothing moved.
         """
         if not self.moved:
             raise KeyboardInterrupt
-        if self.code is None:
-            return
-        if self._given_up:
+        if self._given_up and self.code is not None:
             os._exit(self.code)  # a disk that hangs would block any cleaner exit
-        self._given_up = True
-        with suppress(OSError):
-            os.write(2, _GIVING_UP)  # print is not safe in a signal handler
+        self._given_up = self.code is not None
+        with suppress(OSError):  # print is not safe in a signal handler
+            os.write(2, _GIVING_UP if self._given_up else _EVALUATING)
 
 
 def print_safely(write: Callable[[], None], result: Any) -> None:
