@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -158,6 +159,30 @@ def test_a_suspended_robot_gets_a_home_below_its_outlets(tmp_path: Path) -> None
     assert 0.0 < rig.home.position[2] < 4.0
     assert rig.workspace_lower[2] < rig.home.position[2] - 0.3
     assert rig.at(rig.home).is_wrench_feasible
+
+
+@pytest.mark.parametrize(
+    ("mass", "parts"),
+    [
+        ("0.4", ("cannot pull less than t_min", "lower the smallest tensions, add weight")),
+        ("80", ("cannot pull harder than t_max", "lower the load, raise the largest tensions")),
+        ("5", ()),
+    ],
+)
+def test_a_ceiling_robot_that_cannot_hold_its_platform_at_home_gets_a_remark(
+    tmp_path: Path, mass: str, parts: tuple[str, ...]
+) -> None:
+    rows = []
+    for x, y in product((1, -1), repeat=2):
+        rows.append([1000 * x, 900 * y, 2000, 65 * x, 65 * y, -65])
+        rows.append([900 * x, 1000 * y, 2000, 65 * x, 65 * y, 65])
+    table = tmp_path / "cables.csv"
+    lines = [",".join(CSV_COLUMNS), *(",".join(map(str, row)) for row in rows)]
+    table.write_text("\n".join(lines) + "\n")
+    answer = call("new", tmp_path / "rig.yaml", "--from", table, "--mass-kg", mass)
+    assert answer.code == 0, answer
+    assert ("remark platform.home: no tensions" in answer.err) == bool(parts)
+    assert all(part in answer.err for part in parts)
 
 
 def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:
