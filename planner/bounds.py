@@ -1,8 +1,8 @@
 """The smallest value of a function along a path, proved from how fast it can change.
 
-A function that changes by no more than ``slope`` per unit of path is, between two samples v and w
-at a distance d, at least (v + w - slope d) / 2. All undecided intervals are bisected together
-until none can hold a value that matters.
+A function that changes by no more than c between two samples v and w is, between them, at least
+(v + w - c) / 2. All undecided intervals are bisected together until none can hold a value that
+matters.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from model.errors import Fault
 from model.pose import Array, Pose
 from planner.path import PosePath
 
-SHORTEST = 1e-6
+SHORTEST = 1e-7
+"""Shortest interval, [m] of motion: with lever arms of 60 m far below the planner's reserves."""
 MOST_SAMPLES = 40000
+"""Samples after which only the limit is still to be proved; at twice as many bisection ends."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,22 +44,24 @@ class Smallest:
 def smallest_along(
     positions: Array,
     evaluate: Callable[[Array], Array],
-    slope: float,
+    largest_change: Callable[[Array], Array],
     required: float,
     tolerance: float,
     share: float = 0.0,
 ) -> Smallest:
     """Finds the smallest value to a tolerance, or finer where a limit is otherwise not proved.
 
-    Where a value stays the same along a path, every interval must be bisected until its slope is
-    within the tolerance: far above its limit a value is worth less effort.
+    Where a value stays the same along a path, every interval must be bisected until its change is
+    within the tolerance: far above its limit a value is worth less effort. Where the tolerance
+    takes too many samples, the proof is of the limit alone.
 
     Args:
         positions: First samples along the path, increasing, with both ends, shape (k,).
         evaluate: Values at positions, shape (k,) → (k,).
-        slope: Largest change of the value per unit of path.
+        largest_change: Of the value from the start to positions, shape (k,) → (k,); see
+            `planner.path.PosePath.largest_change`.
         required: Limit of the value; if every sample keeps it, the proof must as well.
-        tolerance: Largest ``value - proved``.
+        tolerance: Largest ``value - proved``, unless it takes more than `MOST_SAMPLES`.
         share: Part of ``value - required`` that the tolerance may be, where that is more.
 
     Raises:
@@ -70,11 +74,12 @@ def smallest_along(
     low_values, high_values = values[:-1], values[1:]
     proved = smallest
     while len(low):
-        bounds = (low_values + high_values - slope * (high - low)) / 2.0
+        change = largest_change(high) - largest_change(low)
+        bounds = (low_values + high_values - change) / 2.0
         target = to_be_proved(smallest, required, tolerance, share)
-        final = (bounds >= target) | (high - low < SHORTEST)
         if samples > MOST_SAMPLES:
-            final[:] = True
+            target = min(target, required)
+        final = (bounds >= target) | (high - low < SHORTEST) | (samples > 2 * MOST_SAMPLES)
         proved = min(proved, float(bounds[final].min(initial=np.inf)))
         low, high = low[~final], high[~final]
         low_values, high_values = low_values[~final], high_values[~final]

@@ -5,8 +5,8 @@ sampled along the path, and bounded between samples by how fast it can change (`
 
 * obstacle clearance: no faster than the motion, as no point of the robot moves farther; without
   rotation and pulleys by separating planes over whole intervals;
-* self clearance: no faster than the motion in translation with point exits, else by a stated
-  multiple;
+* self clearance: by what two points of the robot can move relative to each other, per metre of
+  translation and per radian of rotation;
 * capacity margin: by the sum of what each cable's wrench can change at its largest tension.
 
 Tensions and cable speeds are those at the samples, at most 5 mm apart; the capacity margin proves
@@ -278,7 +278,7 @@ class _Check:
             def distances(poses: Sequence[Pose]) -> Array:
                 return np.array([nearest(pose).distance for pose in poses])
 
-            closest, proof = self._closest(nearest, distances, 1.0, required)
+            closest, proof = self._closest(nearest, distances, lambda motion: motion, required)
         else:
             proof = smallest_over_intervals(self.model, self.path, required, CLEARANCE_TOLERANCE)
             pose = self.path.pose(proof.at)
@@ -292,32 +292,35 @@ class _Check:
             rotations = np.array([pose.rotation for pose in poses])
             return self.model.self_clearances(positions, rotations)
 
-        required, slope = self.scene.self_clearance, self._self_slope()
+        required, change = self.scene.self_clearance, self._self_change()
         closest, proof = self._closest(
-            self.model.self_clearance, distances, slope, required, SELF_CLEARANCE_SHARE
+            self.model.self_clearance, distances, change, required, SELF_CLEARANCE_SHARE
         )
         self._clearance_violation("self clearance", closest, proof, required)
         return closest, proof
 
-    def _self_slope(self) -> float:
-        """Largest change of self clearance per unit of motion.
+    def _self_change(self) -> Callable[[Array], Array]:
+        """Largest change of self clearance from the start to positions along the path.
 
-        Between two cables whose anchors move alike it is 1; exits on pulleys add a half each;
-        rotation adds the lever arms of anchors and, for the platform, of exits.
+        Two cables: in translation their anchors move alike, so their points by at most that motion
+        relative to each other; exits on pulleys add half of it each. In rotation anchors move by
+        up to the platform's reach each, exits by half of it. Cable and platform: seen from the
+        platform, a cable's point moves no farther than its exit, in rotation by its lever arm.
+        That is largest at an end of a move.
         """
-        slope = 1.0 if self.rig.pulley_radius == 0.0 else 2.0
-        if self.path.turns:
-            positions = np.array([pose.position for pose in self.path.poses])
-            levers = np.linalg.norm(self.rig.outlets - positions[:, None, :], axis=-1)
-            farthest = float(levers.max()) + 2.0 * self.rig.pulley_radius
-            slope = max(2.0 * slope, 2.0 + farthest / self.path.radius)
-        return slope
+        exits = 0.0 if self.rig.pulley_radius == 0.0 else 0.5
+        positions = np.array([pose.position for pose in self.path.poses])
+        arms = np.linalg.norm(self.rig.outlets - positions[:, None, :], axis=-1).max(axis=1)
+        levers = np.maximum(arms[:-1], arms[1:]) + 2.0 * self.rig.pulley_radius
+        radius = self.path.radius
+        per_radian = np.maximum(2.0 * (1.0 + exits) * radius, levers + exits * radius)
+        return self.path.largest_change(1.0 + 2.0 * exits, per_radian)
 
     def _closest(
         self,
         nearest: Callable[[Pose], Nearest],
         distances: Callable[[Sequence[Pose]], Array],
-        slope: float,
+        change: Callable[[Array], Array],
         required: float,
         share: float = 0.0,
     ) -> tuple[Closest, Smallest]:
@@ -326,7 +329,7 @@ class _Check:
         def evaluate(positions: Array) -> Array:
             return distances([self._pose(p) for p in positions.tolist()])
 
-        proof = smallest_along(self.samples, evaluate, slope, required, CLEARANCE_TOLERANCE, share)
+        proof = smallest_along(self.samples, evaluate, change, required, CLEARANCE_TOLERANCE, share)
         pose = self._pose(proof.at)
         return Closest(nearest(pose), pose, proof.at), proof
 
@@ -363,7 +366,7 @@ class _Check:
             )
 
         tolerance = MARGIN_TOLERANCE * self.rig.max_tension
-        found = smallest_along(self.samples, evaluate, self._margin_slope(), 0.0, tolerance)
+        found = smallest_along(self.samples, evaluate, self._margin_change(), 0.0, tolerance)
         what = (
             "the cables cannot hold every required load: capacity margin",
             "capacity margin not proved between samples",
@@ -371,8 +374,8 @@ class _Check:
         self._smallest_violation(what, found, 0.0, "N")
         return found
 
-    def _margin_slope(self) -> float:
-        """Largest change of the available wrench set, [N] per metre of motion.
+    def _margin_change(self) -> Callable[[Array], Array]:
+        """Largest change of the available wrench set, [N], from the start to positions.
 
         A cable's direction rotates by at most the motion of its ends over its free length. Its
         force changes by that, its moment by that times its lever arm over the unit of length. The
@@ -389,15 +392,13 @@ class _Check:
         arms = np.linalg.norm(self.rig.anchors, axis=1) / self.length_unit
         turn = ends / np.maximum(free - SPACING * ends, 1e-6)
         change = turn * np.sqrt(1.0 + arms**2)
-        slope = float(np.sum(self.rig.max_tension * change))
-        if self.path.turns:
-            load = self.scene.load
-            moment = self.rig.mass * float(np.linalg.norm(self.rig.centre_of_mass))
-            moment += load.payload_mass * float(np.linalg.norm(load.payload_centre))
-            levers = self.rig.max_tension * float(arms.sum())
-            levers += moment * STANDARD_GRAVITY / self.length_unit
-            slope += levers / self.path.radius
-        return slope
+        per_metre = float(np.sum(self.rig.max_tension * change))
+        load = self.scene.load
+        moment = self.rig.mass * float(np.linalg.norm(self.rig.centre_of_mass))
+        moment += load.payload_mass * float(np.linalg.norm(load.payload_centre))
+        levers = self.rig.max_tension * float(arms.sum())
+        levers += moment * STANDARD_GRAVITY / self.length_unit
+        return self.path.largest_change(per_metre, per_metre * self.path.radius + levers)
 
     def _tensions(self) -> tuple[float, float]:
         low, high = np.inf, -np.inf

@@ -9,13 +9,16 @@ import numpy as np
 from model.clearance import PLATFORM, ClearanceModel, Nearest, SelfModel, cable_name
 from model.errors import BadInput
 from model.files.new_rig import CABLES_MOST
-from model.kinematics import axis_distances
+from model.kinematics import axis_distances, structure_matrix
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Leg, Scene, legs_of
+from model.statics.feasibility import limiting_cables
+from model.statics.tension_distribution import remedy
+from model.statics.wrench_sets import rms_anchor_radius
 from planner.check import NEAR_AXIS, SLOWER, least_axis_distance
 from planner.check_report import CheckReport
-from planner.costs import capacity_margins
+from planner.costs import capacity_margins, external_wrenches
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
 SAME_ROTATION = 1e-7
@@ -257,6 +260,13 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
             next_step=f"move the {name}, or change the rig's outlets and anchors",
         )
     values: dict[str, float | str] = {"margin_n": margin, "required_n": reserve}
+    binding = limiting_cables(
+        structure_matrix(rig, pose),
+        rig.min_tension,
+        rig.max_tension,
+        external_wrenches(rig, scene, pose.rotation),
+        rms_anchor_radius(rig.anchors),
+    )
     if margin >= 0.0:
         raise BadInput(
             f"at the {name} the cables can hold the platform, but the capacity margin is"
@@ -264,9 +274,9 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
             where=f"scene {name}",
             why=f"with less than {MARGIN_RESERVE:.1%} of max_tension_n, wrench feasibility between"
             " poses is seldom proved",
-            next_step=f"move the {name} to a larger margin (`cdpr workspace` maps it), lower the"
-            " load, widen the tension limits, or give waypoints to `cdpr.plan_from_waypoints`,"
-            " which keeps no reserve",
+            next_step=f"move the {name} to a larger margin (`cdpr workspace` maps it),"
+            f" {remedy(*binding)}, or give waypoints to `cdpr.plan_from_waypoints`, which keeps no"
+            " reserve",
             values=values,
         )
     raise BadInput(
@@ -274,6 +284,6 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
         f" {margin:.2f} N, required {reserve:.2f} N",
         where=f"scene {name}",
         why="weight, payload and disturbances need tensions outside min_tension_n..max_tension_n",
-        next_step=f"move the {name} inward, lower the load, or widen the tension limits",
+        next_step=f"{remedy(*binding)}, or move the {name} inward",
         values=values,
     )

@@ -136,15 +136,36 @@ class PosePath:
         self.poses = tuple(poses)
         self.radius = rig.reach
         self._positions = np.array([pose.position for pose in self.poses])
-        lengths = np.linalg.norm(np.diff(self._positions, axis=0), axis=1)
+        self._lengths = np.linalg.norm(np.diff(self._positions, axis=0), axis=1)
         rotations = np.array([pose.rotation for pose in self.poses])
         moved = np.any(rotations[1:] != rotations[:-1], axis=(1, 2))
-        angles = np.zeros(len(lengths))
+        self._angles = np.zeros(len(self._lengths))
         for k in np.flatnonzero(moved).tolist():
-            angles[k] = self.poses[k].angle_to(self.poses[k + 1])
-        self.turns = bool(angles.any())
-        self.length = float(lengths.sum())
-        self.marks: Array = np.append(0.0, np.cumsum(lengths + self.radius * angles))
+            self._angles[k] = self.poses[k].angle_to(self.poses[k + 1])
+        self.turns = bool(self._angles.any())
+        self.length = float(self._lengths.sum())
+        self.marks = self._sums(1.0, self.radius)
+
+    def _sums(self, per_metre: float, per_radian: float | Array) -> Array:
+        steps = per_metre * self._lengths + per_radian * self._angles
+        sums: Array = np.append(0.0, np.cumsum(steps))
+        return sums
+
+    def largest_change(
+        self, per_metre: float, per_radian: float | Array
+    ) -> Callable[[Array], Array]:
+        """The largest change of a value from the start to positions along the path.
+
+        Args:
+            per_metre: Largest change per metre that the origin travels.
+            per_radian: Largest change per radian of rotation, of each move or of all, shape
+                (k - 1,) or ().
+
+        Returns:
+            A function of positions, [m] of motion, shape (n,) → (n,).
+        """
+        sums = self._sums(per_metre, per_radian)
+        return lambda positions: np.interp(positions, self.marks, sums)
 
     def samples(self, spacing: float) -> Array:
         """Positions at most ``spacing`` apart, with both ends and every corner of a coarse path.

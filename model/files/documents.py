@@ -326,22 +326,18 @@ def _validated(
         found = document.findings()
     except ValidationError as error:
         problems = problems_of(error, model, positions)
-        found = _findings_of_sound_parts(data, model, error)
+        found = findings_of_sound_parts(data, model, error.errors(include_url=False))
     problems += [
         Problem(key_path(parts), what, *position_of(parts, positions)) for parts, what in found
     ]
     return (document if not problems else None), problems
 
 
-def _findings_of_sound_parts(
-    data: dict[str, Any], model: type[Document], error: ValidationError
+def findings_of_sound_parts(
+    data: dict[str, Any], model: type[Document], errors: Sequence[Any] = ()
 ) -> list[Finding]:
-    """Findings of the rules whose parts are valid."""
-    unsound = {
-        item["loc"]
-        for item in error.errors(include_url=False)
-        if item["type"] not in ("missing", "extra_forbidden")
-    }
+    """Findings of the rules whose parts are there and valid; ``errors`` are pydantic's."""
+    unsound = {item["loc"] for item in errors if item["type"] not in ("missing", "extra_forbidden")}
     partial: Any = _unchecked(model, data, (), unsound)
     found: list[Finding] = []
     for rule in partial.rules():

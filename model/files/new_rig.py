@@ -16,7 +16,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from model.errors import BadInput
 from model.files.csv_table import CsvTable
-from model.files.documents import Name, NonNegative, Number, Positive
+from model.files.documents import Name, NonNegative, Number, Positive, findings_of_sound_parts
+from model.files.rig_file import RigDocument
 
 Answers = Mapping[str, Any]
 CABLES_MOST = 24
@@ -141,12 +142,13 @@ def _suggested_outlet(index: int, count: int) -> list[float]:
 
 def _suggested_anchor(outlet: list[float], answers: Answers) -> list[float]:
     """The nearest edge of the platform: below for a high outlet and above for a low one."""
+    frame = _Frame.of(answers)
     x, y, z = (size / 2.0 for size in answers["platform_mm"])
-    middle = sum(point[2] for point in answers["outlets_mm"]) / len(answers["outlets_mm"])
+    high = frame.is_level or outlet[2] > frame.centre[2]
     return [
-        math.copysign(x, outlet[0]),
-        math.copysign(y, outlet[1]),
-        -z if outlet[2] > middle else z,
+        math.copysign(x, outlet[0] - frame.centre[0]),
+        math.copysign(y, outlet[1] - frame.centre[1]),
+        -z if high else z,
     ]
 
 
@@ -154,14 +156,30 @@ _LEVEL = 0.2
 """Outlets are level, and the robot is suspended, if heights differ by less, as a share of width."""
 
 
+@dataclass(frozen=True)
+class _Frame:
+    """The box around the outlets, [mm]: its centre, larger width, lowest and level outlets."""
+
+    centre: list[float]
+    width: float
+    lowest: float
+    is_level: bool
+
+    @staticmethod
+    def of(answers: Answers) -> _Frame:
+        columns = list(zip(*answers["outlets_mm"], strict=True))
+        centre = [(min(column) + max(column)) / 2.0 for column in columns]
+        *sides, height = (max(column) - min(column) for column in columns)
+        return _Frame(centre, max(sides), min(columns[2]), height < _LEVEL * max(sides))
+
+
 def _middle(answers: Answers) -> list[float]:
     """Between the outlets; below them if they are level."""
-    columns = list(zip(*answers["outlets_mm"], strict=True))
-    x, y, z = ((min(column) + max(column)) / 2.0 for column in columns)
-    wide = max(max(column) - min(column) for column in columns[:2])
-    lowest, height = min(columns[2]), max(columns[2]) - min(columns[2])
-    if height < _LEVEL * wide:
-        z = max(lowest - 0.4 * wide, 0.3 * lowest) if lowest > 0.0 else lowest - 0.4 * wide
+    frame = _Frame.of(answers)
+    x, y, z = frame.centre
+    if frame.is_level:
+        z = frame.lowest - 0.4 * frame.width
+        z = max(z, 0.3 * frame.lowest) if frame.lowest > 0.0 else z
     return [round(value, 1) for value in (x, y, z)]
 
 
@@ -195,35 +213,46 @@ def _above_least(value: float, answers: Answers) -> str:
     return "" if value > least else f"it must be more than the smallest tension, {least:g} N"
 
 
-def coordinate_questions(answers: Answers) -> list[RigQuestion]:
-    """The questions about one end of the cables, once their number is known."""
+def coordinate_questions(ends: str, answers: Answers) -> list[RigQuestion]:
+    """The questions about ``outlets_mm`` or ``anchors_mm``; a repeated one has its last answer."""
     count = answers["cables"]
-    if "outlets_mm" not in answers:
-        return [
-            RigQuestion(
-                f"outlet {i + 1}",
-                f"outlet of cable {i + 1}, X Y Z in the world frame",
-                "mm",
-                _point(),
-                _always(_suggested_outlet(i, count)),
-            )
-            for i in range(count)
-        ]
+    if ends == "outlets_mm":
+        what, frame = "outlet", "world"
+        suggested = [_suggested_outlet(i, count) for i in range(count)]
+    else:
+        what, frame = "anchor", "platform"
+        suggested = [_suggested_anchor(outlet, answers) for outlet in answers["outlets_mm"]]
     return [
         RigQuestion(
-            f"anchor {i + 1}",
-            f"anchor of cable {i + 1}, X Y Z in the platform frame",
+            f"{what} {i + 1}",
+            f"{what} of cable {i + 1}, X Y Z in the {frame} frame",
             "mm",
             _point(),
-            _always(_suggested_anchor(outlet, answers)),
+            _always(default),
         )
-        for i, outlet in enumerate(answers["outlets_mm"])
+        for i, default in enumerate(answers.get(ends, suggested))
     ]
 
 
+def _geometry_problems(answers: Answers) -> list[str]:
+    """What is wrong with platform, outlets and anchors, as far as they are answered."""
+    known: dict[str, Any] = {
+        key: answers[key] for key in ("outlets_mm", "anchors_mm") if key in answers
+    }
+    known["platform"] = {"size_mm": answers["platform_mm"]}
+    return [what for _, what in findings_of_sound_parts(known, RigDocument)]
+
+
+_PLATFORM = RigQuestion(
+    "platform_mm",
+    "platform size X Y Z",
+    "mm",
+    _point(Positive),
+    lambda answers: answers.get("platform_mm", [130.0] * 3),
+)
 BEFORE_COORDINATES = (
     RigQuestion("name", "name of the rig", "", _name, lambda answers: answers["name"]),
-    RigQuestion("platform_mm", "platform size X Y Z", "mm", _point(Positive), _always([130.0] * 3)),
+    _PLATFORM,
     RigQuestion("mass_kg", "mass of the platform", "kg", _number(), _always(0.4)),
     RigQuestion("cables", "number of cables", "", _whole(6, CABLES_MOST), _always(8)),
 )
@@ -310,6 +339,8 @@ def collect_answers(
 ) -> dict[str, Any]:
     """The answers to all questions.
 
+    Platform, outlets and anchors that do not fit together are asked for again, options included.
+
     Args:
         name: Of the rig, where no other is given.
         given: Answers that need no question, by their keys.
@@ -322,7 +353,7 @@ def collect_answers(
     """
     answers: dict[str, Any] = {"name": name}
 
-    def answer(question: RigQuestion) -> Any:
+    def answer(question: RigQuestion, given: Answers = given) -> Any:
         if question.key in given:
             return _given(question, given[question.key], answers)
         while ask is not None:
@@ -335,9 +366,17 @@ def collect_answers(
 
     for question in BEFORE_COORDINATES:
         answers[question.key] = answer(question)
+    asked: list[str] = []
     for ends in ("outlets_mm", "anchors_mm"):
-        questions = [] if ends in given else coordinate_questions(answers)
-        answers[ends] = given.get(ends) or [answer(question) for question in questions]
+        asked.append(ends)
+        answers[ends] = given.get(ends) or [
+            answer(question) for question in coordinate_questions(ends, answers)
+        ]
+        while ask is not None and (problems := _geometry_problems(answers)):
+            refuse("; ".join(problems))
+            answers["platform_mm"] = answer(_PLATFORM, {})
+            for again in asked:
+                answers[again] = [answer(q, {}) for q in coordinate_questions(again, answers)]
     for question in AFTER_COORDINATES:
         answers[question.key] = answer(question)
     return answers

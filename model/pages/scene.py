@@ -12,7 +12,7 @@ from model.pages.charts import round_step
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
-from model.shapes import Obstacle, Solid, box_solid, convex_hull, solid_of
+from model.shapes import ConvexHull, Obstacle, Solid, box_solid, convex_hull, solid_of
 
 AZIMUTH, ELEVATION = -58.0, 24.0
 """From where a scene is seen at first, [deg]."""
@@ -241,13 +241,23 @@ def platform_surface(rig: Rig) -> SceneSurface:
 
 
 def frame_surface(rig: Rig) -> SceneSurface:
-    """The edges of the body that spans the outlets."""
-    try:
-        hull = convex_hull(rig.outlets)
-    except ValueError:  # all outlets in one plane
-        hull = convex_hull(np.vstack([rig.outlets, rig.outlets + _depth(rig)]))
+    """The edges of the body that spans the outlets; with the workspace if they are on one line."""
+    bodies = [
+        rig.outlets,
+        np.vstack([rig.outlets, rig.outlets + _depth(rig)]),  # all in one plane
+        np.vstack([rig.outlets, _workspace_box(rig).vertices]),
+    ]
+    hull = next(hull for hull in map(_hull, bodies) if hull is not None)
     solid = solid_of(Obstacle("frame", hull, Pose.level(np.zeros(3))))
     return SceneSurface("frame", "frame", solid.vertices, (), solid.edges)
+
+
+def _hull(points: Array) -> ConvexHull | None:
+    """The convex hull of points, [m]; None if they do not span a volume."""
+    try:
+        return convex_hull(points)
+    except ValueError:
+        return None
 
 
 def _depth(rig: Rig) -> Array:

@@ -15,6 +15,7 @@ from model.statics.wrench_sets import (
     WRENCH_SIZE,
     WrenchFacets,
     blocks,
+    cables_at_limits,
     checked_length,
     checked_limits,
     checked_structure_matrix,
@@ -99,6 +100,31 @@ def capacity_margin(
     return margins.reshape(batch)
 
 
+def limiting_cables(
+    structure_matrix: ArrayLike,
+    t_min: float,
+    t_max: float,
+    external: WrenchBox,
+    characteristic_length: float,
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the cables whose limits define the capacity margin of one pose of full rank.
+
+    Args:
+        structure_matrix: shape (6, m); force rows [-], moment rows [m].
+        t_min: Smallest tension, [N].
+        t_max: Largest tension, [N].
+        external: The external wrenches to hold, gravity included.
+        characteristic_length: [m], divides the moments.
+
+    Returns:
+        Those at their largest and those at their smallest tension, counted from 0.
+    """
+    facets = wrench_facets(structure_matrix, t_min, t_max, characteristic_length)
+    gaps = np.stack(_gaps(facets, external, characteristic_length))
+    side, facet = np.unravel_index(int(np.argmin(gaps)), gaps.shape)
+    return cables_at_limits(facets.cable_gains[facet] * (-1.0, 1.0)[side])
+
+
 def _for_each_pose(values: NDArray[np.float64], batch: tuple[int, ...]) -> NDArray[np.float64]:
     try:
         spread = np.broadcast_to(values, (*batch, values.shape[-1]))
@@ -110,14 +136,21 @@ def _for_each_pose(values: NDArray[np.float64], batch: tuple[int, ...]) -> NDArr
 def _margins(
     facets: WrenchFacets, external: WrenchBox, characteristic_length: float
 ) -> NDArray[np.float64]:
+    below, above = _gaps(facets, external, characteristic_length)
+    gaps = np.minimum(below, above).min(axis=-1, initial=np.inf)
+    return np.asarray(np.where(facets.full_rank, gaps, -np.inf))
+
+
+def _gaps(
+    facets: WrenchFacets, external: WrenchBox, characteristic_length: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return distances of the required wrenches from lower and upper facet planes, (..., k)."""
     # The cables give the opposite of the external wrench.
     centre = -external.centre / _units(characteristic_length)
     half_widths = external.half_widths / _units(characteristic_length)
     along = (facets.normals @ centre[..., np.newaxis])[..., 0]
     spread = (np.abs(facets.normals) @ half_widths[..., np.newaxis])[..., 0]
-    below, above = along - spread - facets.lower, facets.upper - along - spread
-    gaps = np.minimum(below, above).min(axis=-1, initial=np.inf)
-    return np.asarray(np.where(facets.full_rank, gaps, -np.inf))
+    return along - spread - facets.lower, facets.upper - along - spread
 
 
 def _units(characteristic_length: float) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ from model.statics.wrench_sets import (
     DEPENDENT_COLUMNS,
     RANK_TOLERANCE,
     WRENCH_SIZE,
+    cables_at_limits,
     checked_limits,
     checked_per_cable,
     checked_structure_matrix,
@@ -104,10 +105,19 @@ class TensionInfeasible(Refused):
             f"no tensions within the limits balance the wrench: every limit would have to"
             f" be relaxed by {shortfall:.4g} N",
             why=_blame(at_largest, at_smallest),
-            next_step="lower the load, widen the tension limits, or choose a pose farther inside"
-            " the workspace",
+            next_step=f"{remedy(at_largest, at_smallest)}, or choose a pose farther inside the"
+            " workspace",
             values={"shortfall_n": shortfall},
         )
+
+
+def remedy(at_largest: tuple[int, ...], at_smallest: tuple[int, ...]) -> str:
+    """What to change where these cables' limits keep tensions from balancing a wrench."""
+    if not at_largest:  # as of a light platform below all its outlets
+        return "lower the smallest tensions, add weight"
+    if not at_smallest:
+        return "lower the load, raise the largest tensions"
+    return "lower the load, widen the tension limits"
 
 
 def _blame(at_largest: tuple[int, ...], at_smallest: tuple[int, ...]) -> str:
@@ -354,9 +364,4 @@ def _raise_unless_round_off(
     if shortfall <= round_off:
         return
     gains = facets.cable_gains[facet] * (1.0 if side == 0 else -1.0)
-    counted = DEPENDENT_COLUMNS**0.5 * np.abs(gains).max()
-    raise TensionInfeasible(
-        shortfall,
-        at_largest=tuple(int(i) for i in np.flatnonzero(gains > counted)),
-        at_smallest=tuple(int(i) for i in np.flatnonzero(gains < -counted)),
-    )
+    raise TensionInfeasible(shortfall, *cables_at_limits(gains))

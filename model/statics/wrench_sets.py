@@ -288,6 +288,20 @@ def facet_gains(right: NDArray[np.float64]) -> NDArray[np.float64]:
     return gains
 
 
+def cables_at_limits(gains: NDArray[np.float64]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the cables at their largest and those at their smallest tension on a facet.
+
+    Args:
+        gains: Wrench along the facet's outward normal per unit tension, shape (m,).
+
+    Returns:
+        Two tuples, counted from 0; the cables that span the facet are in neither.
+    """
+    counted = DEPENDENT_COLUMNS**0.5 * np.abs(gains).max()
+    largest, smallest = (np.flatnonzero(side * gains > counted).tolist() for side in (1.0, -1.0))
+    return tuple(largest), tuple(smallest)
+
+
 def generalised_cross(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the vector orthogonal to d vectors of d + 1 components.
 

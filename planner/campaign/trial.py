@@ -280,7 +280,8 @@ def _clearance(rig: Rig, scene: Scene, path: PosePath) -> float:
         return np.array([near.distance for near in nearest if near is not None])
 
     samples = path.samples(_SPACING)
-    return smallest_along(samples, evaluate, 1.0, -np.inf, _CLEARANCE_TOLERANCE).value
+    found = smallest_along(samples, evaluate, lambda motion: motion, -np.inf, _CLEARANCE_TOLERANCE)
+    return found.value
 
 
 @lru_cache(maxsize=64)

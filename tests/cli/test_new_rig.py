@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields
+from itertools import product
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cdpr.cli.start import RigOptions
 from model.files.examples import rig_text
@@ -88,6 +91,69 @@ def test_a_bad_answer_is_asked_again_with_the_reason(
     load_rig(rig)
 
 
+def typed(points) -> list[str]:
+    """Points as typed, a line each."""
+    return [" ".join(map(str, point)) for point in points]
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.0])
+def test_outlets_in_metres_or_at_one_point_are_asked_for_again_with_the_last_as_defaults(
+    tmp_path: Path, scale: float
+) -> None:
+    """They were refused after the last question, and all answers were lost."""
+    outlets, anchors = PAPER.document.outlets_mm, PAPER.document.anchors_mm
+    wrong = typed([[scale * x for x in point] for point in outlets])
+    begin, anchors_too = ["", "", "", "8", *wrong], [] if scale else [*typed(anchors)]
+    lines = [*begin, *anchors_too, "", *typed(outlets), *typed(anchors)]
+    answer = call("new", tmp_path / "rig.yaml", answers="\n".join(lines) + "\n" * 50)
+    assert answer.code == 0, answer
+    assert answer.err.count("; try again") == 1
+    assert ("write lengths in mm, not in m" if scale else "are at one point") in answer.err
+    assert "outlet of cable 1, X Y Z in the world frame [-0" in answer.err
+    document = load_rig(tmp_path / "rig.yaml").document
+    assert document.outlets_mm == outlets
+    assert document.anchors_mm == anchors
+
+
+def test_a_platform_too_thin_or_a_cable_entered_twice_can_be_corrected_alone(
+    tmp_path: Path,
+) -> None:
+    outlets = [list(point) for point in PAPER.document.outlets_mm]
+    anchors = [list(point) for point in PAPER.document.anchors_mm]
+    twice = [*typed(outlets[:7]), typed(outlets)[0], *typed(anchors[:7]), typed(anchors)[0]]
+    again = ["130 130 130", *[""] * 7, typed(outlets)[7], *[""] * 7, typed(anchors)[7]]
+    lines = ["", "", "8", *twice, *again]
+    options = ("--platform-mm", "0.13", "0.13", "0.13")
+    answer = call("new", tmp_path / "rig.yaml", *options, answers="\n".join(lines) + "\n" * 50)
+    assert answer.code == 0, answer
+    assert "cable 8 has the outlet and anchor of cable 1; an edge of 0.13 mm" in answer.err
+    document = load_rig(tmp_path / "rig.yaml").document
+    assert document.platform.size_mm == [130.0, 130.0, 130.0]
+    assert document.outlets_mm == outlets
+    assert document.anchors_mm == anchors
+
+
+def suggested(outlets) -> list[list[float]]:
+    """Anchors for outlets, [mm]; those of a table would not be asked for."""
+    given = {"cables": len(outlets), "outlets_mm": outlets}
+    anchors: list[list[float]] = collect_answers("rig", given)["anchors_mm"]
+    return anchors
+
+
+@given(shift=st.tuples(*[st.integers(-5000, 5000)] * 3))
+def test_suggested_anchors_do_not_depend_on_the_origin_of_the_world_frame(shift) -> None:
+    """A frame whose corner is the origin got all its anchors at one corner of the platform."""
+    outlets = PAPER.document.outlets_mm
+    moved = [[x + d for x, d in zip(point, shift, strict=True)] for point in outlets]
+    assert suggested(moved) == suggested(outlets) == PAPER.document.anchors_mm
+
+
+def test_level_outlets_all_get_anchors_at_the_lower_edges() -> None:
+    """Heights of 2000 mm measured to 1 mm were split at random."""
+    outlets = [[x, y, 2000.0 + dz] for x in (0, 900) for y in (0, 800) for dz in (-1.0, 1.0)]
+    assert {anchor[2] for anchor in suggested(outlets)} == {-65.0}
+
+
 def test_answers_are_in_the_file(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     answer = call("new", rig, answers="beam\n200 100, 50\n1.5\n" + "\n" * 50)
@@ -158,6 +224,30 @@ def test_a_suspended_robot_gets_a_home_below_its_outlets(tmp_path: Path) -> None
     assert 0.0 < rig.home.position[2] < 4.0
     assert rig.workspace_lower[2] < rig.home.position[2] - 0.3
     assert rig.at(rig.home).is_wrench_feasible
+
+
+@pytest.mark.parametrize(
+    ("mass", "parts"),
+    [
+        ("0.4", ("cannot pull less than t_min", "lower the smallest tensions, add weight")),
+        ("80", ("cannot pull harder than t_max", "lower the load, raise the largest tensions")),
+        ("5", ()),
+    ],
+)
+def test_a_ceiling_robot_that_cannot_hold_its_platform_at_home_gets_a_remark(
+    tmp_path: Path, mass: str, parts: tuple[str, ...]
+) -> None:
+    rows = []
+    for x, y in product((1, -1), repeat=2):
+        rows.append([1000 * x, 900 * y, 2000, 65 * x, 65 * y, -65])
+        rows.append([900 * x, 1000 * y, 2000, 65 * x, 65 * y, 65])
+    table = tmp_path / "cables.csv"
+    lines = [",".join(CSV_COLUMNS), *(",".join(map(str, row)) for row in rows)]
+    table.write_text("\n".join(lines) + "\n")
+    answer = call("new", tmp_path / "rig.yaml", "--from", table, "--mass-kg", mass)
+    assert answer.code == 0, answer
+    assert ("remark platform.home: no tensions" in answer.err) == bool(parts)
+    assert all(part in answer.err for part in parts)
 
 
 def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:

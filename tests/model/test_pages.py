@@ -26,7 +26,7 @@ from model.pages.scene import (
 )
 from model.pages.viewer import SCENE_SCRIPTS, page_data, still_image, viewer
 from model.pose import Array, matrix_from_rotation_vector
-from tests.model.rig_builds import paper_rig
+from tests.model.rig_builds import hall_rig, paper_rig
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)> & \"'"
 
@@ -251,3 +251,17 @@ def test_a_frame_is_drawn_of_outlets_in_any_plane(
     assert np.linalg.matrix_rank(frame.vertices - frame.vertices.mean(axis=0), tol=0.01) == 3
     assert np.linalg.norm(flat[0] - frame.vertices, axis=1).min() < 1e-9
     assert len(frame.edges) >= 9
+
+
+@given(st.tuples(*[st.floats(-2.0, 2.0)] * 3), st.tuples(*[st.floats(-2.0, 2.0)] * 3))
+@example((-2.0, 0.0, 2.0), (2.0, 0.0, 2.0))
+def test_a_frame_is_drawn_of_pulleys_on_any_line_with_the_workspace(
+    start: tuple[float, ...], end: tuple[float, ...]
+) -> None:
+    """With pulleys such a rig is valid: the exits move off the line."""
+    rig = hall_rig()
+    line = np.linspace(start, end, rig.cable_count)
+    frame = frame_surface(replace(rig, outlets=line))
+    inside = np.vstack([line, [rig.workspace_lower, rig.workspace_upper]])
+    assert (frame.vertices.min(axis=0) <= inside.min(axis=0) + 1e-9).all()
+    assert (frame.vertices.max(axis=0) >= inside.max(axis=0) - 1e-9).all()

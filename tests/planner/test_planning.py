@@ -180,6 +180,19 @@ def test_a_load_too_heavy_for_the_cables_is_bad_input(gachon, scene_with) -> Non
         make_plan(gachon, scene_with(load={"payload_kg": 60.0}), QUICK)
 
 
+def test_a_platform_too_light_below_its_outlets_is_not_advised_to_carry_less(
+    gachon, scene_with
+) -> None:
+    """With smallest tensions of 5 N eight cables from a ceiling lift 0.4 kg."""
+    corners = [(x, y) for x in (1, -1) for y in (1, -1)]
+    outlets = [[a * x, b * y, 2000] for x, y in corners for a, b in ((1000, 900), (900, 1000))]
+    anchors = [[65 * x, 65 * y, z] for x, y in corners for z in (-65, 65)]
+    rig = Rig.from_dict({**gachon.as_dict(), "outlets_mm": outlets, "anchors_mm": anchors})
+    with pytest.raises(BadInput, match="cannot hold the platform") as refusal:
+        make_plan(rig, scene_with(), QUICK)
+    assert "lower the smallest tensions, add weight" in refusal.value.next_step
+
+
 def test_an_end_that_only_lacks_the_reserve_is_not_called_infeasible(gachon, scene_with) -> None:
     """The check accepts such a path: tensions within the limits exist."""
     reserve, low, high = MARGIN_RESERVE * gachon.max_tension, 0.0, 60.0

@@ -49,7 +49,7 @@ def test_the_smallest_clearance_is_that_of_the_bound_by_motion(gachon, scene_wit
 
     required = 0.010
     found = smallest_over_intervals(model, path, required, TOLERANCE)
-    other = smallest_along(samples, evaluate, 1.0, required, TOLERANCE)
+    other = smallest_along(samples, evaluate, lambda motion: motion, required, TOLERANCE)
     if other.proved <= 0.0:
         assert found.proved <= 1e-9
         return

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from model.errors import BadInput
-from model.statics.feasibility import WrenchBox, capacity_margin
+from model.statics.feasibility import WrenchBox, capacity_margin, limiting_cables
 from model.statics.wrench_sets import wrench_facets
 from tests.model.statics.robots import (
     PAPER_LENGTH,
@@ -154,6 +154,34 @@ def test_the_paper_holds_its_weight_with_taut_cables_but_not_fifty_times_as_much
     light, heavy = WrenchBox.of_one(PAPER_WEIGHT), WrenchBox.of_one(100.0 * PAPER_WEIGHT)
     assert capacity_margin(paper_matrix(), 5.0, 100.0, light, PAPER_LENGTH) > 0.0
     assert capacity_margin(paper_matrix(), 5.0, 100.0, heavy, PAPER_LENGTH) < 0.0
+
+
+@settings(max_examples=60)
+@given(seed=seeds, cables=cable_counts)
+def test_only_the_limits_of_the_limiting_cables_change_the_margin(seed, cables):
+    matrix = random_matrix(seed, cables)
+    random = np.random.default_rng(seed)
+    wrench = -matrix @ random.uniform(-10.0, 120.0, cables)
+    box = WrenchBox(wrench, random.uniform(0.0, 3.0, 6) * UNITS)
+    low, high = np.full(cables, 5.0), np.full(cables, 100.0)
+    margin = float(capacity_margin(matrix, low, high, box, LENGTH))
+    at_largest, at_smallest = map(list, limiting_cables(matrix, 5.0, 100.0, box, LENGTH))
+    others_low, others_high = low - 1.0, high + 1.0
+    others_low[at_smallest], others_high[at_largest] = 5.0, 100.0
+    unchanged = capacity_margin(matrix, others_low, others_high, box, LENGTH)
+    assert unchanged == pytest.approx(margin, rel=1e-6, abs=1e-6)
+    low[at_smallest] += 1.0
+    high[at_largest] -= 1.0
+    assert capacity_margin(matrix, low, high, box, LENGTH) < margin
+
+
+@pytest.mark.parametrize("cables", [6, 7, 8, 9])
+def test_a_load_too_light_or_too_heavy_under_a_ceiling_binds_one_kind_of_limit(cables):
+    matrix = random_matrix(4, cables, suspended=True)
+    held = -matrix @ np.full(cables, 30.0)
+    light, heavy = WrenchBox.of_one(0.01 * held), WrenchBox.of_one(100.0 * held)
+    assert limiting_cables(matrix, 5.0, 100.0, light, LENGTH)[0] == ()
+    assert limiting_cables(matrix, 5.0, 100.0, heavy, LENGTH)[1] == ()
 
 
 def test_gravity_has_the_sign_of_an_external_wrench():

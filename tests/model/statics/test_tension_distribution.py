@@ -205,6 +205,18 @@ def test_an_overload_names_the_cables_and_the_missing_newtons():
     assert isinstance(refusal.value, CdprError)
 
 
+@pytest.mark.parametrize(
+    ("share", "advice"),
+    [(0.01, "lower the smallest tensions, add weight"), (100.0, "lower the load, raise the large")],
+)
+def test_the_advice_is_to_change_the_limits_that_bind(share, advice):
+    """Below a ceiling less load makes a light platform's case worse."""
+    matrix = random_matrix(4, 8, suspended=True)
+    with pytest.raises(TensionInfeasible) as refusal:
+        solve_tensions(matrix, share * -matrix @ np.full(8, 30.0), 5.0, 100.0)
+    assert refusal.value.next_step.startswith(advice)
+
+
 @pytest.mark.parametrize("matrix", [flat_matrix(), paper_matrix()[:, :5], np.zeros((6, 8))])
 def test_a_singular_pose_is_infeasible_even_without_load(matrix):
     with pytest.raises(TensionInfeasible, match="singular") as refusal:
