@@ -75,6 +75,11 @@ class ObjectDescription:
     low: int | None
     high: int | None
 
+    def holds(self, value: int) -> bool:
+        """Whether a value is within the limits."""
+        above = self.low is None or value >= self.low
+        return above and (self.high is None or value <= self.high)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eds:

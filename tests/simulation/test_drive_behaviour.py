@@ -16,6 +16,7 @@ from model.errors import BadInput
 from model.rig import Rig
 from simulation.drives.behaviour import BEHAVIOURS, STRICT, behaviour_named, table
 from simulation.drives.cia402_rig import SimulatedCia402Rig
+from simulation.drives.eds_file import profile_path, read_eds
 from tests.cli.program import call
 from tests.simulation.drive_line import ENABLED, FAULT, MASK, ON, STOPPED, Line, ready
 
@@ -190,6 +191,14 @@ def test_without_1006h_sync_is_not_watched() -> None:
     assert line.drive.state is DriveState.OPERATION_ENABLED
 
 
+def test_a_wider_range_than_that_of_the_eds_file_accepts_no_more() -> None:
+    eds = read_eds(profile_path("epos4"))
+    line = Line(eds=eds, behaviour=behaviour_named(["range=6066/0..65535", "range=60C2:01/0..50"]))
+    assert line.abort(0x6066, 0, "<H", 1) == 0x06090030  # the file's: 0 to 0
+    assert line.abort(0x6066, 0, "<H", 0) == line.abort(0x60C2, 1, "<B", 50) == 0
+    assert line.abort(0x60C2, 1, "<B", 51) == 0x06090030
+
+
 def test_range() -> None:
     line = Line(behaviour=behaviour_named(["range=6066/0..0", "range=60C2:02/-3..-3"]))
     assert line.abort(0x6066, 0, "<H", 20) == 0x06090030
@@ -360,7 +369,7 @@ def test_all_names_can_be_given_and_are_in_the_list() -> None:
     [
         *("kind", "sdo-lost=0", "sdo-lost=x", "warning=", "status-flicker=1", "absent"),
         *("absent=12", "absent=1006/1", "range=6066", "range=6066/2..1", "friction=-1"),
-        *("sync-periods=0.5", "friction=nan"),
+        *("sync-periods=0.5", "sync-periods=3.1", "friction=nan"),
     ],
 )
 def test_a_wrong_name_or_value_is_explained(text: str) -> None:
