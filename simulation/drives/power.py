@@ -357,7 +357,8 @@ class PowerStage(ABC):
             self._power_off(DriveState.READY_TO_SWITCH_ON)
 
     def _command_switch_on(self) -> None:
-        """Transitions 3 and 5."""
+        """Transitions 3 and 5; withdraws a command to enable that has not taken effect."""
+        self._deadlines.forget(ENABLES)
         if self.state in (DriveState.READY_TO_SWITCH_ON, DriveState.OPERATION_ENABLED):
             self._power_off(DriveState.SWITCHED_ON)
 

@@ -18,7 +18,17 @@ from simulation.drives.behaviour import BEHAVIOURS, STRICT, behaviour_named, tab
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.drives.eds_file import profile_path, read_eds
 from tests.cli.program import call
-from tests.simulation.drive_line import ENABLED, FAULT, MASK, ON, STOPPED, Line, ready
+from tests.simulation.drive_line import (
+    DISABLED,
+    ENABLED,
+    FAULT,
+    MASK,
+    ON,
+    READY,
+    STOPPED,
+    Line,
+    ready,
+)
 
 STATES = {"switch on disabled": [], "switched on": [6, 7], "stopped": [6, 7, 0x0F, 2]}
 
@@ -237,6 +247,17 @@ def test_enable_late() -> None:
         assert line.drive.torque == 0.0
     line.sync(0x06)
     assert [line.sync(0x0F) for _ in range(9)][-1] == ENABLED
+
+
+@pytest.mark.parametrize(("word", "state"), [(0x07, ON), (0x06, READY), (0x02, DISABLED)])
+def test_a_command_to_enable_that_is_withdrawn_in_time_enables_nothing(
+    word: int, state: int
+) -> None:
+    line = named("enable-late=45")
+    for each in (0x06, 0x07, 0x0F):
+        line.sync(each)
+    assert {line.sync(word) for _ in range(9)} == {ON, state}  # ON once, before it is taken
+    assert line.drive.torque == 0.0
 
 
 def test_a_warning_comes_and_goes_and_the_drive_goes_on() -> None:
