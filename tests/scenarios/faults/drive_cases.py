@@ -75,7 +75,7 @@ def at_limit_switch(bench: Bench) -> None:
     """From now on the third drive is beyond its limit switch, and coasts from SYNC to SYNC."""
     drive = bench.drives[2]
     drive.behaviour = replace(drive.behaviour, limit_switch=1.0)
-    drive._deceleration /= 50.0
+    drive._motion = replace(drive._motion, deceleration=drive._motion.deceleration / 50.0)
 
 
 DRIVES: dict[str, Fault] = {
