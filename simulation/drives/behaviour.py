@@ -46,6 +46,7 @@ class DriveBehaviour:
         torque_noise: Standard deviation of 6077h, [per mille].
         friction: Friction torque of the drive train, [per mille].
         stick: Following error at which a resting motor jumps, [counts].
+        limits_monitored: The actual position outside 607Dh is a fault under torque (8612h).
         limit_switch: Travel from the position at power-on to a limit switch, [counts]; 0: none.
             Beyond it the drive stops soon after each SYNC that enables it, without an EMCY; its
             replies, filled in after the set-points, always show operation enabled.
@@ -70,6 +71,7 @@ class DriveBehaviour:
     torque_noise: float = 0.0
     friction: float = 0.0
     stick: float = 0.0
+    limits_monitored: bool = False
     limit_switch: float = 0.0
 
     @property
@@ -282,6 +284,13 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "40",
         "stick-slip: the motor rests until its lag reaches this value, then jumps",
         _number("stick"),
+    ),
+    NamedBehaviour(
+        "limits-monitored",
+        "",
+        "",
+        "an actual position outside 607Dh is a fault under torque (EMCY 8612h)",
+        _switch(limits_monitored=True),
     ),
     NamedBehaviour(
         "limit-switch",

@@ -112,7 +112,7 @@ SWITCH_DELAY = 0.0005
 """Time from a SYNC that enables a drive until its limit switch stops it again, [s]."""
 
 CYCLIC_POSITION = 8
-FOLLOWING_ERROR = 0x8611
+FOLLOWING_ERROR, POSITION_LIMIT = 0x8611, 0x8612
 MODE_FOLLOWS, WARNING_CHANGES, ENABLES = TIMED = ("mode", "warning", "enabling")
 """Timed events of the power stage."""
 
@@ -292,6 +292,12 @@ class PowerStage(ABC):
                 self.fail(FOLLOWING_ERROR)
         else:
             self._error_time = 0.0
+
+    def _check_limits(self) -> None:
+        """Actual position outside 607Dh."""
+        low, high = self._motion.limits
+        if self._torque_on and not low <= self.motor.position <= high:
+            self.fail(POSITION_LIMIT)
 
     def _take_mode(self, mode: int) -> None:
         """6060h: at once, late, or only while enabled, according to the behaviour."""

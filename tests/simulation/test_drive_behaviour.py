@@ -284,6 +284,24 @@ def test_status_flicker_leaves_the_state_alone() -> None:
     assert changed == 0xEF90, "bit 12 shows that it follows"
 
 
+@pytest.mark.parametrize("behaviour", ["strict", "limits-monitored"])
+def test_limits_that_exclude_the_actual_position_stop_a_drive_that_monitors_it(
+    behaviour: str,
+) -> None:
+    line = named(behaviour)
+    line.enable()
+    line.sync(0x02)
+    line.write(0x607D, 2, "<i", 1000)
+    line.drive.advance(0.001)
+    assert line.emergencies() == []
+    line.write(0x607D, 2, "<i", 999)
+    line.drive.advance(0.001)
+    line.drive.advance(0.001)
+    trips = behaviour == "limits-monitored"
+    assert line.emergencies() == [0x8612] * trips
+    assert line.drive.torque_on is not trips
+
+
 def test_a_limit_switch_stops_the_drive_after_every_reply_that_shows_it_enabled() -> None:
     """605Ah = 6 and 0Fh every cycle: transitions 11 and 16 by turns, without an emergency."""
     line = named("limit-switch=100")

@@ -137,6 +137,7 @@ DRIVES: dict[str, Fault] = {
         words=("4210",),
         behaviour=("warning=4210",),
     ),
+    "D position limits monitored": with_drives("limits-monitored"),
     "D status bits flicker": with_drives("status-flicker"),
     "D a limit switch after each reply": Fault(
         broken(2, by=at_limit_switch),
