@@ -1,7 +1,7 @@
 """Named behaviours of simulated CiA 402 drives that the standards allow and real drives show.
 
-`STRICT` is the default, which enforces CiA 301 and CiA 402 literally. There is no more lenient
-preset; other behaviours add difficulties.
+`STRICT` is the default, which enforces CiA 301 and CiA 402 literally. Other behaviours add
+difficulties; only ``maps-when-operational`` accepts more, as many drives do.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class DriveBehaviour:
         sdo_twice: Delay after which every SDO answer is repeated, [s]; None: never.
         sdo_lost: Every N-th SDO answer is lost; 0: none.
         absent: Abort code by index and sub-index (None: all) of missing objects.
-        ranges: Smallest and largest value by object, replacing the EDS file's.
+        ranges: Smallest and largest value by object, within the EDS file's.
         mode_delay: Delay of the mode (6061h) after 6060h, [s].
         mode_when_enabled: The mode follows only while the drive is enabled.
         enable_delay: Time from the command to enable to "operation enabled", [s]: the motor is
@@ -46,6 +46,7 @@ class DriveBehaviour:
         torque_noise: Standard deviation of 6077h, [per mille].
         friction: Friction torque of the drive train, [per mille].
         stick: Following error at which a resting motor jumps, [counts].
+        limits_monitored: The actual position outside 607Dh is a fault under torque (8612h).
         limit_switch: Travel from the position at power-on to a limit switch, [counts]; 0: none.
             Beyond it the drive stops soon after each SYNC that enables it, without an EMCY; its
             replies, filled in after the set-points, always show operation enabled.
@@ -70,6 +71,7 @@ class DriveBehaviour:
     torque_noise: float = 0.0
     friction: float = 0.0
     stick: float = 0.0
+    limits_monitored: bool = False
     limit_switch: float = 0.0
 
     @property
@@ -106,11 +108,11 @@ def _switch(**changes: Any) -> Callable[[DriveBehaviour, str], DriveBehaviour]:
 
 
 def _number(
-    key: str, scale: float = 1.0, low: float = 0.0
+    key: str, scale: float = 1.0, low: float = 0.0, high: float = 1e9
 ) -> Callable[[DriveBehaviour, str], DriveBehaviour]:
     def put(behaviour: DriveBehaviour, text: str) -> DriveBehaviour:
         value = float(text)
-        if not low <= value < 1e9:
+        if not low <= value <= high:
             raise ValueError
         changes: dict[str, Any] = {key: value * scale}
         return replace(behaviour, **changes)
@@ -165,8 +167,8 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "sync-periods",
         "PERIODS",
         "1.5",
-        "periods of 1006h after which SYNC is overdue; strict: 3",
-        _number("sync_periods", low=1.0),
+        "periods of 1006h after which SYNC is overdue, from 1 to 3; strict: 3",
+        _number("sync_periods", low=1.0, high=STRICT.sync_periods),
     ),
     NamedBehaviour(
         "heartbeat-loss-is-fault",
@@ -212,7 +214,8 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "range",
         "INDEX[:SUB]/LOW..HIGH",
         "",
-        "accepts an object's values only from LOW to HIGH, and answers others with 06090030h:"
+        "accepts an object's values only from LOW to HIGH, within the EDS file's range, and answers"
+        " others with 06090030h:"
         " range=6066/0..0",
         _range,
     ),
@@ -281,6 +284,13 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "40",
         "stick-slip: the motor rests until its lag reaches this value, then jumps",
         _number("stick"),
+    ),
+    NamedBehaviour(
+        "limits-monitored",
+        "",
+        "",
+        "an actual position outside 607Dh is a fault under torque (EMCY 8612h)",
+        _switch(limits_monitored=True),
     ),
     NamedBehaviour(
         "limit-switch",

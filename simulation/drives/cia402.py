@@ -187,6 +187,8 @@ class SimulatedDrive(PowerStage):
         self._move(elapsed)
         if self._motion.window < inf:
             self._check_following(elapsed)
+        if self.behaviour.limits_monitored:
+            self._check_limits()
         if now > self._deadlines.earliest:
             self._on_deadlines()
         if self._heartbeat_period and now >= self._own_heartbeat_due - TOLERANCE:

@@ -2,8 +2,9 @@
 
 Source: CiA 306. Common deviations of manufacturers' files are accepted: hexadecimal limits of
 signed types, `$NODEID` anywhere in a sum, suffixes of C, a decimal comma, limits that are none, an
-empty access type, blanks in headers, comments behind a value and by ``#`` or ``//``, free text
-outside of objects, other encodings than ASCII, and the end-of-file character of DOS.
+empty access type, signed objects of CiA 402 typed as unsigned, blanks in headers, comments behind a
+value and by ``#`` or ``//``, free text outside of objects, other encodings than ASCII, and the
+end-of-file character of DOS.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import configparser
 import re
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -38,6 +39,10 @@ _SIGNED = {0x02: 1, 0x03: 2, 0x04: 4, 0x10: 3, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 
 _UNSIGNED = {0x01: 1, 0x05: 1, 0x06: 2, 0x07: 4, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8}
 _UNSIGNED |= {0x08: 4, 0x11: 8}  # reals as their bits
 _UNSIGNED_8 = 0x05
+_SIGNED_KEYS = frozenset({(0x607D, 1), (0x607D, 2), (0x60C2, 2)}) | {
+    (index, 0) for index in (0x6060, 0x6061, 0x6064, 0x6077, 0x607A, 0x607C, 0x60B0, 0x60B1, 0x60B2)
+}
+"""Objects that are signed in CiA 402-2, whatever type a file gives them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +74,11 @@ class ObjectDescription:
     of_node: bool
     low: int | None
     high: int | None
+
+    def holds(self, value: int) -> bool:
+        """Whether a value is within the limits."""
+        above = self.low is None or value >= self.low
+        return above and (self.high is None or value <= self.high)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,6 +168,7 @@ def read_eds(path: Path) -> Eds:
             where=str(path),
             next_step="pass the EDS file of a CiA 402 drive",
         )
+    objects |= {key: _signed(objects[key]) for key in _SIGNED_KEYS & objects.keys()}
     used = sections.get("dummyusage", {})
     dummies = {
         int(name[5:], 16)
@@ -263,6 +274,20 @@ def _variable(section: Mapping[str, str], where: str) -> ObjectDescription:
         of_node,
         *limits,
     )
+
+
+def _signed(described: ObjectDescription) -> ObjectDescription:
+    """The object with a signed value, and without limits that exclude every such value."""
+    if isinstance(described.default, bytes):
+        return described  # a text, which `ProcessData` does not map
+    limits = described.low, described.high
+    low, high = (
+        each if each is None else _wrapped(each, described.length, True) for each in limits
+    )
+    if low is not None and high is not None and low > high:
+        low = high = None
+    default = _wrapped(described.default, described.length, True)
+    return replace(described, signed=True, default=default, low=low, high=high)
 
 
 def _default(text: str, kind: int, length: int, where: str) -> tuple[int | bytes, bool]:

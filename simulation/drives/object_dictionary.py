@@ -187,8 +187,8 @@ class DriveObjects:
             self.changed(key, value)
 
     def _out_of_range(self, key: Key, value: int, described: ObjectDescription) -> int:
-        low, high = self._behaviour.ranges.get(key, (described.low, described.high))
-        inside = (low is None or value >= low) and (high is None or value <= high)
+        low, high = self._behaviour.ranges.get(key, (value, value))
+        inside = low <= value <= high and described.holds(value)
         return 0 if inside else OUT_OF_RANGE
 
     def _contradiction(self, key: Key, value: int) -> int:

@@ -112,7 +112,7 @@ SWITCH_DELAY = 0.0005
 """Time from a SYNC that enables a drive until its limit switch stops it again, [s]."""
 
 CYCLIC_POSITION = 8
-FOLLOWING_ERROR = 0x8611
+FOLLOWING_ERROR, POSITION_LIMIT = 0x8611, 0x8612
 MODE_FOLLOWS, WARNING_CHANGES, ENABLES = TIMED = ("mode", "warning", "enabling")
 """Timed events of the power stage."""
 
@@ -293,6 +293,12 @@ class PowerStage(ABC):
         else:
             self._error_time = 0.0
 
+    def _check_limits(self) -> None:
+        """Actual position outside 607Dh."""
+        low, high = self._motion.limits
+        if self._torque_on and not low <= self.motor.position <= high:
+            self.fail(POSITION_LIMIT)
+
     def _take_mode(self, mode: int) -> None:
         """6060h: at once, late, or only while enabled, according to the behaviour."""
         if not self.objects.has_mode(mode):
@@ -357,7 +363,8 @@ class PowerStage(ABC):
             self._power_off(DriveState.READY_TO_SWITCH_ON)
 
     def _command_switch_on(self) -> None:
-        """Transitions 3 and 5."""
+        """Transitions 3 and 5; withdraws a command to enable that has not taken effect."""
+        self._deadlines.forget(ENABLES)
         if self.state in (DriveState.READY_TO_SWITCH_ON, DriveState.OPERATION_ENABLED):
             self._power_off(DriveState.SWITCHED_ON)
 

@@ -16,8 +16,19 @@ from model.errors import BadInput
 from model.rig import Rig
 from simulation.drives.behaviour import BEHAVIOURS, STRICT, behaviour_named, table
 from simulation.drives.cia402_rig import SimulatedCia402Rig
+from simulation.drives.eds_file import profile_path, read_eds
 from tests.cli.program import call
-from tests.simulation.drive_line import ENABLED, FAULT, MASK, ON, STOPPED, Line, ready
+from tests.simulation.drive_line import (
+    DISABLED,
+    ENABLED,
+    FAULT,
+    MASK,
+    ON,
+    READY,
+    STOPPED,
+    Line,
+    ready,
+)
 
 STATES = {"switch on disabled": [], "switched on": [6, 7], "stopped": [6, 7, 0x0F, 2]}
 
@@ -190,6 +201,14 @@ def test_without_1006h_sync_is_not_watched() -> None:
     assert line.drive.state is DriveState.OPERATION_ENABLED
 
 
+def test_a_wider_range_than_that_of_the_eds_file_accepts_no_more() -> None:
+    eds = read_eds(profile_path("epos4"))
+    line = Line(eds=eds, behaviour=behaviour_named(["range=6066/0..65535", "range=60C2:01/0..50"]))
+    assert line.abort(0x6066, 0, "<H", 1) == 0x06090030  # the file's: 0 to 0
+    assert line.abort(0x6066, 0, "<H", 0) == line.abort(0x60C2, 1, "<B", 50) == 0
+    assert line.abort(0x60C2, 1, "<B", 51) == 0x06090030
+
+
 def test_range() -> None:
     line = Line(behaviour=behaviour_named(["range=6066/0..0", "range=60C2:02/-3..-3"]))
     assert line.abort(0x6066, 0, "<H", 20) == 0x06090030
@@ -230,6 +249,17 @@ def test_enable_late() -> None:
     assert [line.sync(0x0F) for _ in range(9)][-1] == ENABLED
 
 
+@pytest.mark.parametrize(("word", "state"), [(0x07, ON), (0x06, READY), (0x02, DISABLED)])
+def test_a_command_to_enable_that_is_withdrawn_in_time_enables_nothing(
+    word: int, state: int
+) -> None:
+    line = named("enable-late=45")
+    for each in (0x06, 0x07, 0x0F):
+        line.sync(each)
+    assert {line.sync(word) for _ in range(9)} == {ON, state}  # ON once, before it is taken
+    assert line.drive.torque == 0.0
+
+
 def test_a_warning_comes_and_goes_and_the_drive_goes_on() -> None:
     line = named("warning=4310")
     line.enable()
@@ -252,6 +282,24 @@ def test_status_flicker_leaves_the_state_alone() -> None:
     for before, after in pairwise(words):
         changed |= before ^ after
     assert changed == 0xEF90, "bit 12 shows that it follows"
+
+
+@pytest.mark.parametrize("behaviour", ["strict", "limits-monitored"])
+def test_limits_that_exclude_the_actual_position_stop_a_drive_that_monitors_it(
+    behaviour: str,
+) -> None:
+    line = named(behaviour)
+    line.enable()
+    line.sync(0x02)
+    line.write(0x607D, 2, "<i", 1000)
+    line.drive.advance(0.001)
+    assert line.emergencies() == []
+    line.write(0x607D, 2, "<i", 999)
+    line.drive.advance(0.001)
+    line.drive.advance(0.001)
+    trips = behaviour == "limits-monitored"
+    assert line.emergencies() == [0x8612] * trips
+    assert line.drive.torque_on is not trips
 
 
 def test_a_limit_switch_stops_the_drive_after_every_reply_that_shows_it_enabled() -> None:
@@ -360,7 +408,7 @@ def test_all_names_can_be_given_and_are_in_the_list() -> None:
     [
         *("kind", "sdo-lost=0", "sdo-lost=x", "warning=", "status-flicker=1", "absent"),
         *("absent=12", "absent=1006/1", "range=6066", "range=6066/2..1", "friction=-1"),
-        *("sync-periods=0.5", "friction=nan"),
+        *("sync-periods=0.5", "sync-periods=3.1", "friction=nan"),
     ],
 )
 def test_a_wrong_name_or_value_is_explained(text: str) -> None:

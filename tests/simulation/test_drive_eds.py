@@ -17,7 +17,7 @@ from model.rig import Rig, rig_from_document
 from model.winches import WinchMap
 from simulation.drives.eds_file import EDS_FOLDER, profile_path, read_eds
 from simulation.drives.object_dictionary import READ_ONLY, Abort, DriveObjects, counts_in
-from tests.simulation.drive_line import CYCLE, Line
+from tests.simulation.drive_line import CYCLE, Line, ready
 
 EDS = EDS_FOLDER / "cia402.eds"
 LENGTHS = {1: 1, 2: 1, 3: 2, 4: 4, 5: 1, 6: 2, 7: 4}  # CANopen type: bytes
@@ -269,6 +269,26 @@ def test_a_deviation_changes_nothing(tmp_path: Path, name: str, encoding: str) -
     expected = read_eds(plain).objects
     assert expected.keys() == {(0x6040, 0), (0x6085, 0), (0x1400, 1)}
     assert read_eds(other).objects == expected
+
+
+def test_positions_and_torques_are_signed_whatever_the_file_says(tmp_path: Path) -> None:
+    """Some makers' files type them as unsigned; a negative position then ended the simulation."""
+    path = tmp_path / "unsigned.eds"
+    text = EDS.read_text().replace("DefaultValue=-2147483648", "DefaultValue=0x80000000")
+    text = text.replace("DefaultValue=-3", "DefaultValue=0xFD")
+    for signed, unsigned in (("0002", "0005"), ("0003", "0006"), ("0004", "0007")):
+        full = f"LowLimit=0\nHighLimit={(1 << 8 * LENGTHS[int(unsigned)]) - 1}"
+        text = text.replace(f"DataType=0x{signed}\n", f"DataType=0x{unsigned}\n{full}\n")
+    path.write_text(text)
+    lines = [ready(eds=read_eds(path)), ready(eds=read_eds(EDS))]
+    for line in lines:
+        line.enable()
+        for target in (-500, -400, -400):
+            line.sync(0x0F, target)
+            line.drive.torque = -70.0
+    for line in lines:
+        assert (line.position, line.torque, line.read(0x6061, 0)) == (-400, -70, 8)
+        assert line.abort(0x607D, 1, "<i", -600) == line.abort(0x60C2, 2, "<b", -4) == 0
 
 
 def test_sub_objects_of_a_compact_array_have_values_and_names_of_their_own(tmp_path: Path) -> None:

@@ -15,10 +15,12 @@ from drivers.can_bus import BusSettings, open_bus
 from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import DriveGroup, GroupCommand, GroupState
 from drivers.factory import make_drive_group
+from model.errors import Refused
 from model.kinematics import cable_lengths
 from model.pose import Pose
-from model.rig import Rig
+from model.rig import Rig, rig_from_document
 from model.statics.gravity import working_tensions
+from simulation.drives.behaviour import behaviour_named
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.rig import RehearsalStatus
 
@@ -195,3 +197,25 @@ def test_serving_ends_quietly_on_an_interrupt_from_the_keyboard(
 
     with open_bus(channel) as bus:
         SimulatedCia402Rig(rig, bus, rig.home).serve(threading.Event().is_set, clock=interrupted)
+
+
+def test_no_set_up_makes_a_drive_that_monitors_its_limits_release_its_cable(
+    rig: Rig, channel: BusSettings
+) -> None:
+    """As after `cdpr home --as-rig-file` over another reference: the drives hold outside."""
+    document = rig.document
+    moved = [w.model_copy(update={"home_counts": w.home_counts + 10**6}) for w in document.winches]
+    other = rig_from_document(document.model_copy(update={"winches": moved}))
+    behaviour = behaviour_named(["limits-monitored"])
+    with open_bus(channel) as near, open_bus(channel) as far:
+        rehearsal = SimulatedCia402Rig(rig, far, rig.home, behaviour=behaviour)
+        group = make_drive_group(rig, near, rehearsal.pump)
+        enabled(rig, group, rehearsal)
+        group.command(GroupCommand.QUICK_STOP)
+        for _ in range(10):
+            group.send_cycle(group.targets.tolist())
+            group.receive(0.0)
+        with pytest.raises(Refused, match="outside its position limits"):
+            make_drive_group(other, near, rehearsal.pump).configure()
+        rehearsal.advance(0.05)
+        assert {d.state for d in rehearsal.drives} == {DriveState.QUICK_STOP_ACTIVE}

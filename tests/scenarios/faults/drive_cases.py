@@ -75,7 +75,7 @@ def at_limit_switch(bench: Bench) -> None:
     """From now on the third drive is beyond its limit switch, and coasts from SYNC to SYNC."""
     drive = bench.drives[2]
     drive.behaviour = replace(drive.behaviour, limit_switch=1.0)
-    drive._deceleration /= 50.0
+    drive._motion = replace(drive._motion, deceleration=drive._motion.deceleration / 50.0)
 
 
 DRIVES: dict[str, Fault] = {
@@ -137,6 +137,7 @@ DRIVES: dict[str, Fault] = {
         words=("4210",),
         behaviour=("warning=4210",),
     ),
+    "D position limits monitored": with_drives("limits-monitored"),
     "D status bits flicker": with_drives("status-flicker"),
     "D a limit switch after each reply": Fault(
         broken(2, by=at_limit_switch),
