@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from drivers.cameras.live import is_too_large
-from executor.recording.tables import PoseTable
+from executor.recording.tables import no_poses
 from executor.recording.verdict import faults_among, page_of, page_text
 from executor.report.run_data import RunData, markdown, missing_images
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
@@ -165,7 +165,7 @@ def camera_table(run: RunData) -> str:
             f"{one['poses']} of {one['pictures']}",
             str(one["dropped"]),
             known(one["measuring_ms"], 1, "ms"),
-            _alone(run.alone.get(one["name"])),
+            _alone(run, one["name"]),
             one["failed"],
         )
         for one in run.summary["cameras"]
@@ -174,11 +174,11 @@ def camera_table(run: RunData) -> str:
     return list_table(head, rows) if rows else ""
 
 
-def _alone(poses: PoseTable | None) -> str:
-    """Distance of one camera's poses from the plan."""
-    if poses is None or not poses.ok.any():
-        return "–"
-    return f"{float(np.sqrt(np.mean(poses.error[poses.ok] ** 2))) * 1e3:.2f} mm RMS"
+def _alone(run: RunData, camera: str) -> str:
+    """Distance of one camera's poses from the plan, along the path as in the summary."""
+    poses = run.alone.get(camera, no_poses())
+    error = poses.error[poses.ok & (poses.time >= run.cycles.path_began)]
+    return f"{float(np.sqrt(np.mean(error**2))) * 1e3:.2f} mm RMS" if len(error) else "–"
 
 
 def event_table(run: RunData) -> str:
