@@ -14,6 +14,7 @@ from executor.recording.verdict import faults_among, page_of, page_text
 from executor.report.run_data import RunData, markdown, missing_images
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
 from model.pages.page import known, list_table, paragraph, prose, table, tile, tiles
+from model.plan import raw_length_text
 from model.scene import legs_of
 from tracking.clearance import INTERVAL
 
@@ -209,9 +210,9 @@ def _plan(run: RunData) -> list[tuple[str, str]]:
         ("Required self clearance", f"{scene.self_clearance * 1e3:g} mm"),
         (
             "Length without rotation" if scene.rotation_limits else "Length",
-            f"{quality.length_mm:.1f} mm (before smoothing {quality.raw_length_mm:.1f} mm)",
+            f"{quality.length_mm:.1f} mm ({raw_length_text(document)})",
         ),
-        ("Corners", str(len(document.waypoints))),
+        ("Waypoints", str(len(document.waypoints))),
     ]
     if quality.obstacle_clearance is not None:
         near = quality.obstacle_clearance

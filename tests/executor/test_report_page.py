@@ -22,7 +22,7 @@ from model.errors import BadInput
 from model.files.rig_file import PulleysDocument
 from model.files.scene_file import SceneDocument
 from model.kinematics import cables_to
-from model.plan import Plan, plan_from_document, sealed
+from model.plan import Plan, plan_facts, plan_from_document, sealed
 from model.rig import rig_from_document
 from model.scene import scene_from_document
 from tests.executor import fake_run
@@ -84,6 +84,17 @@ def test_the_verdict_comes_first_and_every_section_is_there(page: Page) -> None:
         "Plan, rig and bus",
         "Events",
     ]
+
+
+def test_the_plan_is_described_in_the_words_of_cdpr_plan(page: Page, run: fake_run.FakeRun) -> None:
+    document = run.context.plan.document
+    facts = dict(plan_facts(document))
+    found = re.search(r"<th[^>]*>Length</th><td[^>]*>(.*?)</td>", page.text)
+    assert found
+    length, first = found[1].split(" (")
+    assert facts["length"].startswith(f"{length} ({len(document.waypoints)} waypoints;")
+    assert facts["length"].endswith(f" {first}")
+    assert re.search(rf"<th[^>]*>Waypoints</th><td[^>]*>{len(document.waypoints)}</td>", page.text)
 
 
 def test_nothing_is_asked_from_outside(page: Page) -> None:
