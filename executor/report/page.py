@@ -152,7 +152,7 @@ def _moments(run: RunData) -> NDArray[np.int64]:
 
 
 def _evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """At most so many of the rows, the first and the last among them."""
+    """At most ``most`` rows, evenly spaced, the first and the last among them."""
     if len(rows) <= most:
         return rows
     return rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]

@@ -329,7 +329,7 @@ def with_gaps(time: Array, *columns: Array, most: int = MOST_POINTS) -> tuple[Ar
 
 
 def _extremes(rows: NDArray[np.int64], parts: int, columns: Sequence[Array]) -> NDArray[np.int64]:
-    """The ends of rows and, in each of so many parts, every column's extremes and first gap."""
+    """The ends of rows and, in each of ``parts`` parts, every column's extremes and first gap."""
     keep = {int(rows[0]), int(rows[-1])}
     for part in np.array_split(rows, parts):
         for values in columns:
