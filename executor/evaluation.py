@@ -334,13 +334,14 @@ def _written(
 
 
 def _reasons(folder: RunFolder, missing: Mapping[str, CdprError]) -> dict[str, str]:
-    """Why each file is missing: the cause of those it is made from, and names any other file."""
+    """Why each file is missing: the cause of those it is made from; what is wrong with others."""
     causes = {str(folder.path / name): error for name, error in missing.items()}
     reasons = {}
     for name, error in missing.items():
         first = causes.get(error.where, error)
-        elsewhere = f"{error.where}: " if error.where and error.where not in causes else ""
-        reasons[name] = elsewhere + (first.why or first.what)
+        reasons[name] = first.why or first.what
+        if error.where and error.where not in causes:
+            reasons[name] = f"{error.where}: {error.what}" + f" ({error.why})" * bool(error.why)
     return reasons
 
 

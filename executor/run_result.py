@@ -18,6 +18,7 @@ from executor.recording.csv_columns import TableFile
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
 from executor.recording.verdict import faults_among
 from model.errors import path_of
+from model.files.reading import TABLE_LIMIT
 from model.pages.page import html_table
 
 if TYPE_CHECKING:
@@ -103,6 +104,9 @@ class RunResult:
         removed = "the folder was removed during the run, and its record with it"
         full = "free some disk space, then " if _FULL & {*self.missing.values()} else ""
         again = f"{full}run `cdpr report {quote(str(self.folder))}` to write the missing files"
+        cycles = self.folder / CYCLES
+        if cycles.is_file() and cycles.stat().st_size > TABLE_LIMIT:
+            again += " on a computer with more memory, which can read the record"
         then = again if self.folder.is_dir() else removed
         lines.append(f"  next: the verdict and the exit code are valid; {then}")
         return "\n".join(lines)

@@ -25,6 +25,7 @@ from executor.recording.mcap import write_track_mcap
 from executor.trajectory.setpoints import prepare
 from model.clearance import ClearanceModel
 from model.errors import BadInput, CdprError, StoppedByOperator, path_of
+from model.pages.page import FactsDisplay
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -51,7 +52,7 @@ PATIENCE = 50
 
 
 @dataclass(slots=True)
-class TrackResult:
+class TrackResult(FactsDisplay):
     """Result of tracking.
 
     Attributes:
@@ -84,17 +85,24 @@ class TrackResult:
         """Numbers of images and poses."""
         return f"<TrackResult {len(self.poses)} poses in {len(self.pictures)} images>"
 
-    def summary(self) -> dict[str, int | float]:
-        """Key figures, with units in their names."""
+    def facts(self) -> list[tuple[str, str]]:
+        """The summary as text."""
+        known = {
+            name: "–" if value is None else str(value) for name, value in self.summary().items()
+        }
+        return [(name.replace("_", " "), text) for name, text in known.items()]
+
+    def summary(self) -> dict[str, int | float | None]:
+        """Key figures, with units in their names; None where there is no pose or no image."""
         poses, logged = self.poses, self.pictures
-        deviations = np.array([np.linalg.norm(p.position_deviation) for p in poses])
-        facts: dict[str, int | float] = {
+        deviations = [float(np.linalg.norm(p.position_deviation)) for p in poses]
+        facts: dict[str, int | float | None] = {
             "pictures": len(logged),
             "poses": len(poses),
-            "position_deviation_mm": round(float(np.median(deviations)) * 1000, 4),
-            "reprojection_px": round(float(np.median([p.reprojection for p in poses])), 4),
-            "pictures_per_second": round(len(logged) / self.seconds, 1),
-            "measuring_ms": round(float(np.median(self.count.seconds)) * 1000, 2),
+            "position_deviation_mm": _median(deviations, 1000, 4),
+            "reprojection_px": _median([p.reprojection for p in poses], 1, 4),
+            "pictures_per_second": round(len(logged) / self.seconds, 1) if self.seconds else None,
+            "measuring_ms": _median(self.count.seconds, 1000, 2),
         }
         if self.together is not None:
             facts["pictures_without_partner"] = self.together.without_partner
@@ -134,6 +142,10 @@ class TrackResult:
         write_pose_log(path, self.pictures, with_clearance=self.with_clearance)
         if mcap is not None:
             write_track_mcap(path_of(mcap), self.pictures, self.by_camera, self.began)
+
+
+def _median(values: Sequence[float], scale: int, digits: int) -> float | None:
+    return round(float(np.median(values)) * scale, digits) if values else None
 
 
 def own_file(path: Path, name: str) -> Path:

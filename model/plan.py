@@ -238,7 +238,7 @@ def plan_facts(document: PlanDocument) -> list[tuple[str, str]]:
         (
             "length",
             f"{quality.length_mm:.1f} mm ({len(document.waypoints)} waypoints;"
-            f" {quality.raw_length_mm:.1f} mm {_before(document)})",
+            f" {raw_length_text(document)})",
         ),
     ]
     facts += _rotation(document)
@@ -255,9 +255,11 @@ def plan_facts(document: PlanDocument) -> list[tuple[str, str]]:
     return facts
 
 
-def _before(document: PlanDocument) -> str:
+def raw_length_text(document: PlanDocument) -> str:
+    """Length of the path that was improved, and which one it is."""
     is_paper = isinstance(document.planner, PlannerDocument)
-    return "before post-processing" if is_paper else "first path found"
+    which = "before post-processing" if is_paper else "first path found"
+    return f"{document.quality.raw_length_mm:.1f} mm {which}"
 
 
 def _rotation(document: PlanDocument) -> list[tuple[str, str]]:

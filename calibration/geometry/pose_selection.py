@@ -17,7 +17,8 @@ from model.files.documents import PoseDocument
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument, StopDocument
 from model.kinematics import NoCable, cables_at
-from model.plan import Plan, plan_from_document
+from model.pages.page import FactsDisplay
+from model.plan import Plan, plan_facts, plan_from_document
 from model.pose import Array, Pose, largest_rotations, matrix_from_rotation_vector
 from model.progress import SILENT, Listener
 from model.rig import Rig
@@ -214,7 +215,7 @@ ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MeasurementPlan:
+class MeasurementPlan(FactsDisplay):
     """Poses to measure at, and a plan through them.
 
     Attributes:
@@ -229,6 +230,10 @@ class MeasurementPlan:
     def plan(self) -> Plan:
         """The plan through the poses, for `cdpr.run`."""
         return plan_from_document(self.document)
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Number of poses, and what the plan through them is."""
+        return [("poses", str(len(self.poses))), *plan_facts(self.document)]
 
     def __repr__(self) -> str:
         """Number of poses."""

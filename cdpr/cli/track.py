@@ -81,7 +81,7 @@ def track(
         )
     result.save(output, mcap)
     found = {"poses_file": str(output), **result.summary()}
-    facts = [(name.replace("_", " "), str(value)) for name, value in found.items()]
+    facts = [("poses file", str(output)), *result.facts()]
     present(as_json, {**found, "unused": result.unused_files()}, f"poses in {output}", facts)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from cdpr.console.view import RobotNow, RobotView, commanded_pose
 from executor.cameras.live_image import ImageReader, LiveImage
-from executor.remote.client import Answer, RunLink
+from executor.remote.client import Answer, RunLink, cable_tension
 from executor.remote.command_socket import find_runs
 from executor.remote.protocol import make_line
 from executor.service import StatusResult
@@ -313,10 +313,7 @@ class RobotWatch:
         if status is not None and status["drives"]:
             robot = self._view.take(status)
             why_not = None if robot else "the cables fit no pose; some may be slack"
-            tensions = [
-                None if drive["torque"] == "none" else drive["tension_n"]
-                for drive in status["drives"]
-            ]
+            tensions = [cable_tension(drive) for drive in status["drives"]]
             self.now = RobotSeen(robot, tensions, why_not=why_not)
         elif self._read is not None:
             with self._lock:

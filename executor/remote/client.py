@@ -349,13 +349,23 @@ def status_text(status: Mapping[str, Any]) -> str:
     """The complete status."""
     drives = [
         f"  drive {d['node']:<3} {d['state']:<24} {d['position_counts']:>11}"
-        f" ({d['position_counts'] - d['set_counts']:+d}) counts {d['tension_n']:8.2f} N"
+        f" ({d['position_counts'] - d['set_counts']:+d}) counts"
+        f" {_number(cable_tension(d), '.2f'):>8} N"
         for d in status["drives"]
     ]
     cameras = [f"  camera {camera_line(camera)}" for camera in status["cameras"]]
     events = [f"  {e['time_s']:9.3f} s  {e['code']}: {e['text']}" for e in status["events"]]
     first = f"process {status['process']}: {status['rig']} on {status['bus']}, {status['folder']}"
     return "\n".join([first, status_line(status), *drives, *cameras, *events])
+
+
+def cable_tension(drive: Mapping[str, Any]) -> float | None:
+    """Tension of a drive's cable, [N]; None without torque, as a brake may hold the cable.
+
+    Args:
+        drive: Its entry in the status.
+    """
+    return None if drive["torque"] == "none" else float(drive["tension_n"])
 
 
 def status_line(status: Mapping[str, Any]) -> str:

@@ -144,7 +144,8 @@ def _difference(run: RunData) -> Chart:
 def _obstacle(run: RunData, index: int) -> Chart:
     lines = []
     for rows in _sources(run.clearance):
-        time, distance = with_gaps(rows.time, rows.distances[:, index] * 1e3)
+        near = rows.distances[:, index] * 1e3
+        time, distance = with_gaps(rows.time, near, most=SMALL_POINTS)
         by_camera = rows.source[0] == "tag"
         width, opacity = (4.0, 0.5) if by_camera else (1.3, 1.0)
         name = "camera" if by_camera else "drives"

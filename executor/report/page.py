@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
+from numpy.typing import NDArray
 
 from executor.recording.clearance import MEASURED_WITHIN, ClearanceTable
 from executor.report.figures import (
@@ -48,6 +49,8 @@ from model.pose import Array, matrix_from_quaternion
 from tracking.clearance import INTERVAL
 
 MOST_MOMENTS = 400
+MOST_SEEN = 900
+"""Camera poses of the path that is drawn."""
 MOST_BRANCHES = 4000
 #: Layer, its name on the page, the colour's role, whether it is shown at first.
 _LAYERS = (
@@ -125,7 +128,8 @@ def _tree(run: RunData) -> tuple[Array, int]:
 def _paths(run: RunData) -> tuple[Stroke, ...]:
     raw = np.array([pose.position for pose in run.plan.raw_path])
     path = np.array([pose.position for pose in run.plan.waypoints])
-    driven, seen = run.cycles.encoder[_moments(run)], run.poses.position[run.poses.ok]
+    driven = run.cycles.encoder[_moments(run)]
+    seen = run.poses.position[_evenly(np.flatnonzero(run.poses.ok), MOST_SEEN)]
     return (
         Stroke.along("seen", "tag", seen, 7.5, 0.6),
         Stroke.along("path", "ink", path, 4.5),
@@ -142,12 +146,16 @@ def plan_labels(plan: Plan) -> tuple[Label, ...]:
     return (start, *stops, Label("path", "goal", points[-1].position, "dot"))
 
 
-def _moments(run: RunData) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+def _moments(run: RunData) -> NDArray[np.int64]:
     """Cycles at which the platform is drawn, shape (k,)."""
-    rows = np.flatnonzero(run.cycles.has_encoder_pose)
-    if len(rows) <= MOST_MOMENTS:
+    return _evenly(np.flatnonzero(run.cycles.has_encoder_pose), MOST_MOMENTS)
+
+
+def _evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """At most ``most`` rows, evenly spaced, the first and the last among them."""
+    if len(rows) <= most:
         return rows
-    return rows[np.linspace(0, len(rows) - 1, MOST_MOMENTS).astype(np.int64)]
+    return rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 
 def _motion(run: RunData) -> tuple[Moment, ...]:

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from executor.recording.tables import PoseTable
+from executor.recording.tables import no_poses
 from executor.recording.verdict import faults_among, page_of, page_text
 from executor.report.run_data import RunData, markdown, missing_images
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
 from model.files.reading import is_too_large
 from model.pages.page import known, list_table, paragraph, prose, table, tile, tiles
+from model.plan import raw_length_text
 from model.scene import legs_of
 from tracking.clearance import INTERVAL
 
@@ -165,7 +166,7 @@ def camera_table(run: RunData) -> str:
             f"{one['poses']} of {one['pictures']}",
             str(one["dropped"]),
             known(one["measuring_ms"], 1, "ms"),
-            _alone(run.alone.get(one["name"])),
+            _alone(run, one["name"]),
             one["failed"],
         )
         for one in run.summary["cameras"]
@@ -174,11 +175,11 @@ def camera_table(run: RunData) -> str:
     return list_table(head, rows) if rows else ""
 
 
-def _alone(poses: PoseTable | None) -> str:
-    """Distance of one camera's poses from the plan."""
-    if poses is None or not poses.ok.any():
-        return "–"
-    return f"{float(np.sqrt(np.mean(poses.error[poses.ok] ** 2))) * 1e3:.2f} mm RMS"
+def _alone(run: RunData, camera: str) -> str:
+    """Distance of one camera's poses from the plan, along the path as in the summary."""
+    poses = run.alone.get(camera, no_poses())
+    error = poses.error[poses.ok & (poses.time >= run.cycles.path_began)]
+    return f"{float(np.sqrt(np.mean(error**2))) * 1e3:.2f} mm RMS" if len(error) else "–"
 
 
 def event_table(run: RunData) -> str:
@@ -209,9 +210,9 @@ def _plan(run: RunData) -> list[tuple[str, str]]:
         ("Required self clearance", f"{scene.self_clearance * 1e3:g} mm"),
         (
             "Length without rotation" if scene.rotation_limits else "Length",
-            f"{quality.length_mm:.1f} mm (before smoothing {quality.raw_length_mm:.1f} mm)",
+            f"{quality.length_mm:.1f} mm ({raw_length_text(document)})",
         ),
-        ("Corners", str(len(document.waypoints))),
+        ("Waypoints", str(len(document.waypoints))),
     ]
     if quality.obstacle_clearance is not None:
         near = quality.obstacle_clearance

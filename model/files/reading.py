@@ -52,7 +52,7 @@ SHORTEN = (
     " (docs/scene-file.md)"
 )
 _SHORTENED = {
-    TABLE_LIMIT: "check the path; for a longer run, split its plan",
+    TABLE_LIMIT: "check the path; a computer with more memory reads larger tables",
     YAML_LIMIT: f"check the path, or {SHORTEN}",
 }
 

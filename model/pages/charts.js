@@ -87,7 +87,7 @@
     const seen = data.lines.filter((line) => line.fits).flatMap((line) =>
       [line.y, line.low, line.high].filter(Boolean).flatMap((column) =>
         [...column.filter((_, k) => line.x[k] >= a && line.x[k] <= b), value(line.x, column, a), value(line.x, column, b)]));
-    const known = seen.filter((v) => v !== null), low = Math.min(...known), high = Math.max(...known);
+    const known = seen.filter((v) => v !== null), [low, high] = [Math.min, Math.max].map((of) => known.reduce((a, b) => of(a, b), known[0]));
     const room = 0.06 * (high - low) || 0.05 * Math.abs(high) || 1;
     return known.length ? [data.zero && low >= 0 ? 0 : low - room, high + room] : data.y;
   }

@@ -16,6 +16,7 @@ from html import escape
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.pose import Array
 
@@ -300,22 +301,44 @@ def thinned(time: Array, values: Array, most: int = MOST_POINTS) -> tuple[Array,
     known = np.flatnonzero(np.isfinite(values))
     if len(known) <= most:
         return time[known], values[known]
-    keep: set[int] = {int(known[0]), int(known[-1])}
-    for part in np.array_split(known, most // 2):
-        keep.add(int(part[np.argmin(values[part])]))
-        keep.add(int(part[np.argmax(values[part])]))
-    chosen = np.array(sorted(keep))
+    chosen = _extremes(known, most // 2, [values])
     return time[chosen], values[chosen]
 
 
-def with_gaps(time: Array, *columns: Array) -> tuple[Array, ...]:
-    """Puts a NaN where samples are missing, so that a line does not bridge the gap."""
+def with_gaps(time: Array, *columns: Array, most: int = MOST_POINTS) -> tuple[Array, ...]:
+    """Lines of common samples, thinned, with a NaN where samples are missing.
+
+    A line then does not bridge the gap. At most about ``most`` points are left, among them every
+    peak of each line; of several gaps that are too short to be seen one is left.
+
+    Args:
+        time: Shape (n,).
+        columns: A line and the edges of its band, each of shape (n,).
+        most: Points to keep.
+    """
     if len(time) < 3:
         return (time, *columns)
     steps = np.diff(time)
     gaps = np.flatnonzero(steps > 2.5 * np.median(steps)) + 1
-    between = (time[gaps - 1] + time[gaps]) / 2.0
-    return (np.insert(time, gaps, between), *(np.insert(c, gaps, np.nan) for c in columns))
+    time = np.insert(time, gaps, (time[gaps - 1] + time[gaps]) / 2.0)
+    columns = tuple(np.insert(column, gaps, np.nan) for column in columns)
+    if len(time) <= most:
+        return (time, *columns)
+    chosen = _extremes(np.arange(len(time)), most // (2 * len(columns) + 1), columns)
+    return (time[chosen], *(column[chosen] for column in columns))
+
+
+def _extremes(rows: NDArray[np.int64], parts: int, columns: Sequence[Array]) -> NDArray[np.int64]:
+    """The ends of rows and, in each of ``parts`` parts, every column's extremes and first gap."""
+    keep = {int(rows[0]), int(rows[-1])}
+    for part in np.array_split(rows, parts):
+        for values in columns:
+            known = part[np.isfinite(values[part])]
+            if len(known):
+                keep |= {int(known[np.argmin(values[known])]), int(known[np.argmax(values[known])])}
+            if len(known) < len(part):
+                keep.add(int(part[np.argmax(~np.isfinite(values[part]))]))
+    return np.array(sorted(keep))
 
 
 def spread(values: Sequence[float], gap: float) -> Array:

@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 
 import cdpr
+from calibration.geometry.pose_selection import MeasurementPlan
 from drivers import ImageFolder
+from executor.track import TrackResult
+from model.plan import plan_facts
+from tests.executor import fake_run
 from tracking.tracker import Tracker
 
 ROOT = Path(__file__).parents[2]
@@ -24,8 +28,30 @@ def rig() -> cdpr.Rig:
 def test_a_folder_of_images_is_tracked_and_logged(rig: cdpr.Rig, tmp_path: Path) -> None:
     result = cdpr.track(rig, str(SESSION / "pictures"), pictures=1)
     assert repr(result) == "<TrackResult 1 poses in 1 images>"
+    table = result._repr_html_()
+    assert table.count("<tr>") == len(result.summary())
+    assert f'<td style="text-align:left">{result.summary()["reprojection_px"]}</td>' in table
     result.save(str(tmp_path / "poses.csv"))
     assert len((tmp_path / "poses.csv").read_text().splitlines()) == 2
+
+
+def test_a_result_without_images_has_figures_that_are_unknown() -> None:
+    result = TrackResult()
+    assert result.summary() == {
+        **dict.fromkeys(("pictures", "poses"), 0),
+        **dict.fromkeys(("position_deviation_mm", "reprojection_px")),
+        **dict.fromkeys(("pictures_per_second", "measuring_ms")),
+    }
+    assert result._repr_html_().count("–") == 4
+    assert dict(result.facts())["measuring ms"] == "–"
+
+
+def test_the_poses_to_measure_at_are_a_table_with_their_plan() -> None:
+    plan = fake_run.make(rate_hz=2.0, every=20).context.plan
+    measuring = MeasurementPlan(plan.waypoints, plan.document)
+    assert repr(measuring) == f"<MeasurementPlan {len(plan.waypoints)} poses>"
+    assert measuring.facts()[1:] == plan_facts(plan.document)
+    assert measuring._repr_html_().count("<tr>") == len(measuring.facts())
 
 
 def test_what_was_measured_before_ctrl_c_is_kept_and_tracking_ends_when_told(

@@ -255,7 +255,8 @@ def test_the_monitor_shows_where_the_platform_is_by_the_runs_own_rig(tmp_path: P
     folder = fake_run.write(run, tmp_path / "run", pictures=False)
     k = len(run.cycles) // 2
     drives = [
-        {"node": i + 1, "state": "operation enabled", "position_counts": int(counts)}
+        {"node": i + 1, "state": "operation enabled", "torque": "enabled"}
+        | {"position_counts": int(counts)}
         | {"set_counts": int(counts), "tension_n": float(run.cycles.planned_tensions[k, i])}
         for i, counts in enumerate(run.cycles.set_counts[k])
     ]

@@ -53,6 +53,7 @@ def status(**changes: Any) -> dict[str, Any]:
             {
                 "node": 12,
                 "state": "operation enabled",
+                "torque": "enabled",
                 "position_counts": -4711,
                 "set_counts": -4708,
                 "tension_n": 20.5,
@@ -95,6 +96,32 @@ def test_everything_of_a_run_is_shown_as_it_is(shown: Any) -> None:
         "4 dropped, gave no answer for 2 s",
     ):
         assert part.lower() in text.lower(), part
+
+
+@pytest.mark.parametrize("shown", [live, status_text])
+def test_no_tension_is_shown_of_a_drive_without_torque(shown: Any) -> None:
+    """Its cable may hang from the brake under any tension; 0.00 N looked like a slack one."""
+    (drive,) = status()["drives"]
+    text = shown(status(drives=[drive | {"torque": "none", "tension_n": 0.0}]))
+    row = next(line for line in text.splitlines() if "-4711" in line)
+    assert "–" in row
+    assert "0.00" not in row
+    assert "20.50" in shown(status(drives=[drive | {"torque": "holding"}]))
+
+
+def test_a_tension_is_red_only_where_it_is_known_and_beyond_its_limits() -> None:
+    rig, (drive,) = load_rig(RIG), status()["drives"]
+    robot: Any = SimpleNamespace(rig=rig, scene=None, required_clearance=0.01)
+    now: Any = SimpleNamespace(pose=rig.home, nearest=None)
+
+    def styles(**changes: object) -> str:
+        console = Console(file=io.StringIO(), force_terminal=True, width=160)
+        console.print(_view(status(drives=[drive | changes]), (robot, now)))
+        assert isinstance(console.file, io.StringIO)
+        return console.file.getvalue()
+
+    assert "\x1b[1;31m" in styles(tension_n=0.0)
+    assert "\x1b[1;31m" not in styles(tension_n=0.0, torque="none")
 
 
 @pytest.mark.parametrize("shown", [live, status_text])

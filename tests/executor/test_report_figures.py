@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from executor.recording.run_folder import RunEvent
-from executor.report.figures import _obstacle, _smallest
+from executor.report.figures import _coordinate, _difference, _error, _obstacle, _smallest
+from executor.report.page import run_scene
 from executor.report.tiles import event_table
 from model.pages.charts import spread, thinned, with_gaps
 from model.pages.viewer import Eye
@@ -67,6 +69,69 @@ def test_an_even_line_is_not_broken() -> None:
     at, value = with_gaps(time, time)
     np.testing.assert_array_equal(at, time)
     np.testing.assert_array_equal(value, time)
+
+
+VALUES = st.floats(-1e3, 1e3)
+
+
+@given(
+    arrays(np.float64, st.tuples(st.integers(3, 3000), st.just(3)), elements=VALUES),
+    st.sets(st.integers(1, 2998), max_size=5),
+)
+def test_a_long_line_with_its_band_is_thinned_to_its_extremes_and_gaps(
+    columns: np.ndarray, after: set[int]
+) -> None:
+    """The peaks of a band's edges are not at those of its line."""
+    time = np.arange(len(columns), dtype=np.float64)
+    for row in after:
+        time[row:] += 1e4
+    at, *drawn = with_gaps(time, *columns.T, most=210)
+    assert len(at) <= 210 + 2
+    assert np.all(np.diff(at) > 0)
+    assert (at[0], at[-1]) == (time[0], time[-1])
+    for values, thin in zip(columns.T, drawn, strict=True):
+        known = np.isfinite(thin)
+        np.testing.assert_array_equal(thin[known], values[np.searchsorted(time, at[known])])
+        assert (thin[known].min(), thin[known].max()) == (values.min(), values.max())
+
+
+@given(gap=st.integers(1, 35_999))
+def test_the_gap_of_an_hour_of_images_is_drawn(gap: int) -> None:
+    time = 0.1 * np.arange(36_000.0)
+    time[gap:] += 60.0
+    at, value = with_gaps(time, time)
+    (row,) = np.flatnonzero(np.isnan(value))
+    assert time[gap - 1] < at[row] < time[gap]
+    assert len(at) < 1000
+
+
+def repeated(table: Any, times: np.ndarray) -> Any:
+    """A table whose rows repeat at other times."""
+    chosen = np.arange(len(times)) % len(table)
+    columns = {
+        field.name: getattr(table, field.name)
+        for field in fields(table)
+        if field.name not in ("obstacles", "time")
+    }
+    more = {
+        name: tuple(column[k] for k in chosen) if isinstance(column, tuple) else column[chosen]
+        for name, column in columns.items()
+    }
+    return replace(table, time=times, **more)
+
+
+def test_a_report_of_an_hour_holds_no_more_points_than_one_of_minutes() -> None:
+    run, times = fake_run.make(rate_hz=2.0, every=20), 0.1 * np.arange(36_000.0)
+    poses, clearance = repeated(run.poses, times), repeated(run.clearance, times)
+    data: Any = SimpleNamespace(
+        cycles=run.cycles, poses=poses, alone={"front": poses}, clearance=clearance,
+        plan=run.context.plan, rig=run.context.rig, summary=run.summary,
+    )  # fmt: skip
+    drawn = [*(_coordinate(data, i) for i in range(3)), _error(data)]
+    drawn += [_smallest(data), _difference(data), _obstacle(data, 0)]
+    assert max(len(line.x) for chart in drawn for line in chart.lines) < 1000
+    strokes = {stroke.layer: stroke for stroke in run_scene(data).scene.strokes}
+    assert len(strokes["seen"].segments) < 1000
 
 
 def test_the_planned_clearance_is_drawn_where_no_camera_saw_the_platform() -> None:

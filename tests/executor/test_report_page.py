@@ -12,14 +12,17 @@ import numpy as np
 import pytest
 
 from executor.recording.clearance import no_clearance
+from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.recording.tables import CycleTable, no_poses
 from executor.report import build_report
+from executor.report.run_data import read_run
+from executor.report.tiles import camera_table
 from model.errors import BadInput
 from model.files.rig_file import PulleysDocument
 from model.files.scene_file import SceneDocument
 from model.kinematics import cables_to
-from model.plan import Plan, plan_from_document, sealed
+from model.plan import Plan, plan_facts, plan_from_document, sealed
 from model.rig import rig_from_document
 from model.scene import scene_from_document
 from tests.executor import fake_run
@@ -81,6 +84,17 @@ def test_the_verdict_comes_first_and_every_section_is_there(page: Page) -> None:
         "Plan, rig and bus",
         "Events",
     ]
+
+
+def test_the_plan_is_described_in_the_words_of_cdpr_plan(page: Page, run: fake_run.FakeRun) -> None:
+    document = run.context.plan.document
+    facts = dict(plan_facts(document))
+    found = re.search(r"<th[^>]*>Length</th><td[^>]*>(.*?)</td>", page.text)
+    assert found
+    length, first = found[1].split(" (")
+    assert facts["length"].startswith(f"{length} ({len(document.waypoints)} waypoints;")
+    assert facts["length"].endswith(f" {first}")
+    assert re.search(rf"<th[^>]*>Waypoints</th><td[^>]*>{len(document.waypoints)}</td>", page.text)
 
 
 def test_nothing_is_asked_from_outside(page: Page) -> None:
@@ -187,6 +201,34 @@ def test_a_run_without_camera_has_no_camera_section(tmp_path: Path, run: fake_ru
     assert "Images" not in page.headings
     assert "Clearance" in page.headings
     assert "no camera" in page.text
+
+
+def test_each_camera_is_compared_with_the_plan_by_the_same_images_as_all(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    """Before the path the platform may be beside the start: it is not along the plan yet."""
+    waits = run.cycles.time < 5.0
+    states = tuple("enabling" if wait else "moving" for wait in waits)
+    off = np.where(run.poses.time < 5.0, 0.8, 0.0)[:, None] * [1e-3, 0.0, 0.0]
+    poses = replace(run.poses, position=run.poses.position + off)
+    used = (
+        CameraRecord("front", "0", 9, 9, 0, 2.0, ""),
+        CameraRecord("blind", "1", 0, 0, 9, None, ""),
+    )
+    made = replace(
+        run,
+        cycles=replace(run.cycles, state=states),
+        poses=poses,
+        context=replace(run.context, cameras=used),
+    )
+    folder = fake_run.write(made, tmp_path / "run", pictures=False)
+    for camera, table in (("front", poses), ("blind", no_poses())):
+        folder.write_poses_of(camera, table)
+    rms = made.summary["tag_error_mm"]["rms"]  # type: ignore[index]
+    rows = re.findall(r"<tr>(.*?)</tr>", camera_table(read_run(folder)))
+    assert f"{rms:.2f} mm RMS" in rows[1]
+    assert "RMS" not in rows[2]
+    assert f"{rms:.2f}" != f"{1e3 * np.sqrt(np.nanmean(poses.error**2)):.2f}"
 
 
 def test_a_scene_without_obstacles_reports_it(tmp_path: Path, run: fake_run.FakeRun) -> None:

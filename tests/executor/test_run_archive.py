@@ -21,6 +21,7 @@ from executor.evaluation import evaluate_folder, rewrite_report, write_end
 from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunFolder
+from executor.run_result import RunResult
 from model.errors import BadInput, Fault
 from tests.cli.program import call, one_message
 from tests.executor import fake_run
@@ -152,6 +153,32 @@ def test_a_report_that_a_full_disk_prevents_has_the_cause_of_its_missing_tables(
     missing = write_end(folder, course, result, events, lambda: False)
     assert {"cycles.csv", "summary.json", "report.html"} <= set(missing)
     assert set(missing.values()) == {"No space left on device"}
+
+
+def test_a_record_too_large_to_read_is_named_with_its_size_and_where_to_read_it(
+    blind: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It grew by a hold beyond what was foreseen; the same command cannot make its report here."""
+    folder = without(blind, tmp_path / "run", "report.html")
+    result, course, events = evaluate_folder(folder), folder.course(), folder.events()
+    limit = (folder.path / "cycles.csv").stat().st_size - 1
+    for module in ("executor.recording.csv_columns", "executor.run_result"):
+        monkeypatch.setattr(f"{module}.TABLE_LIMIT", limit)
+    missing = write_end(folder, course, result, events)
+    size = f"{folder.path / 'cycles.csv'}: the file has {(limit + 1) / 1e6:.1f} MB; at most"
+    assert missing.keys() == {"report.html"}
+    assert size in missing["report.html"]
+    text = RunResult(folder.path, result.summary, missing).missing_text()
+    assert size in text
+    assert f"run `cdpr report {folder.path}`" in text
+    assert "on a computer with more memory" in text
+    answer = call("report", folder.path)
+    one_message(answer, 2, "at most", "MB are read")
+    monkeypatch.undo()
+    assert (
+        "more memory"
+        not in RunResult(folder.path, {}, missing).missing_text().partition("next:")[2]
+    )
 
 
 # Missing tables.

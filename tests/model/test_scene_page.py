@@ -1,4 +1,4 @@
-"""The scene of a page in a real browser: opened from a folder, by WebGL and without it."""
+"""Charts and scene of a page in a real browser: from a folder, by WebGL and without it."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from model.pages.charts import Chart, ChartLine, charts
 from model.pages.page import page as html_page
 from model.pages.scene import Moment
 from model.pages.viewer import SCENE_SCRIPTS, page_data, viewer
@@ -96,6 +97,34 @@ def opened(browser: Browser, path: Path, script: str = COUNTED, **more: Any) -> 
     yield page
     context.close()
     assert wrong == [path.as_uri()]
+
+
+@pytest.mark.parametrize("points", [101, 400_000])
+def test_a_chart_of_any_length_is_zoomed_and_read(
+    browser: Browser, tmp_path: Path, points: int
+) -> None:
+    """Too many arguments of a function ended the zoom half-way."""
+    time = np.linspace(0.0, 10.0, points)
+    line = ChartLine("wave", time, np.where(time < 7.0, time, 70.0), "encoder")
+    chart = Chart("Wave", "A wave.", "height", "mm", (line,), (0.0, 10.0))
+    path = tmp_path / "page.html"
+    path.write_text(html_page("Charts", charts(chart, chart), scripts=("charts.js",)))
+    page, wrong = browser.new_page(), list[str]()
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.goto(path.as_uri())
+    area = page.locator(".plot svg[role=img]").first.bounding_box()
+    assert area is not None
+    middle = area["y"] + area["height"] / 2.0
+    for share in (0.2, 0.6):
+        page.mouse.move(area["x"] + share * area["width"], middle)
+        page.mouse.down() if share == 0.2 else page.mouse.up()
+    expect(page.locator(".plot.zoomed")).to_have_count(2)
+    page.mouse.move(area["x"] + 0.5 * area["width"], middle)
+    expect(page.locator(".readout").first).to_contain_text("4.0")
+    highest = page.locator(".plot").first.locator("text.y").last.text_content()
+    assert float(highest or "nan") <= 7.0
+    page.close()
+    assert wrong == []
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -26,6 +26,7 @@ from cdpr.console.view import RobotNow, RobotView
 from executor.recording.run_folder import RIG, RunFolder
 from executor.remote.client import (
     Answer,
+    cable_tension,
     camera_line,
     follow_run,
     next_stop_line,
@@ -281,15 +282,18 @@ def _drives(status: dict[str, Any], limits: tuple[float, float] | None) -> Table
     if limits is not None:
         drives.add_column(f"{limits[0]:.0f} to {limits[1]:.0f} N", no_wrap=True)
     for drive in status["drives"]:
-        tension = drive["tension_n"]
-        beyond = limits is not None and not limits[0] <= tension <= limits[1]
+        tension, text, bar = cable_tension(drive), Text("–"), Text("")
+        if tension is not None:
+            beyond = limits is not None and not limits[0] <= tension <= limits[1]
+            text = Text(f"{tension:.2f}", style="bold red" if beyond else "")
+            bar = bar if limits is None else _bar(tension, *limits)
         drives.add_row(
             str(drive["node"]),
             drive["state"],
             str(drive["position_counts"]),
             f"{drive['position_counts'] - drive['set_counts']:+d}",
-            Text(f"{tension:.2f}", style="bold red" if beyond else ""),
-            *([] if limits is None else [_bar(tension, *limits)]),
+            text,
+            *([] if limits is None else [bar]),
         )
     return drives
 
