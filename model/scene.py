@@ -47,7 +47,7 @@ from model.shapes import (
     Sphere,
     TriangleMesh,
     convex_hull,
-    encloses_convex,
+    enclosed_convex,
     read_only_indices,
 )
 
@@ -287,9 +287,7 @@ def _shape(key: str, document: Document) -> Shape:
         case MeshDocument(points_mm=points, triangles=triangles):
             vertices = read_only(np.asarray(points) / 1000.0)
             numbers = read_only_indices(triangles)
-            if encloses_convex(vertices, numbers):
-                return convex_hull(vertices[np.unique(numbers)])
-            return TriangleMesh(vertices, numbers)
+            return enclosed_convex(vertices, numbers) or TriangleMesh(vertices, numbers)
         case _:
             raise ValueError(f"unknown shape {key!r}")
 

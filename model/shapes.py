@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ Indices = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 _FLAT = 1e-9
 """Heights up to this part of a mesh's size are round-off."""
+_ROUNDED = 2e-6
+"""And those up to this, [m]: coordinates of files are often rounded to a micrometre."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,33 +89,6 @@ def shape_points(shape: Shape) -> Array:
             return vertices
 
 
-def encloses_convex(vertices: Array, triangles: Indices) -> bool:
-    """Whether triangles enclose a convex volume.
-
-    Every side is then shared by two triangles, and every vertex lies behind every triangle.
-
-    Args:
-        vertices: Shape (n, 3), [m].
-        triangles: Indices of their corners, shape (t, 3).
-    """
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    _, counts = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
-    if np.any(counts != 2):
-        return False
-    corners = vertices[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    used = vertices[np.unique(triangles)]
-    size = float(np.ptp(used, axis=0).max())
-    if np.any(lengths <= _FLAT * size**2):
-        return False
-    normals = normals / lengths[:, None]
-    heights = used @ normals.T - np.sum(corners[:, 0] * normals, axis=1)
-    one_side = np.all(heights <= _FLAT * size, axis=0) | np.all(heights >= -_FLAT * size, axis=0)
-    flat = np.all(np.abs(heights) <= _FLAT * size)
-    return bool(np.all(one_side) and not flat)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Obstacle:
     """A named shape at a pose in the world (``pose`` is ``world_from_shape``)."""
@@ -135,13 +111,7 @@ def convex_hull(points: Array) -> ConvexHull:
     Raises:
         ValueError: The points lie in a plane.
     """
-    from scipy.spatial import ConvexHull as Hull
-    from scipy.spatial import QhullError
-
-    try:
-        hull = Hull(points)
-    except QhullError as error:
-        raise ValueError("the points must span a volume") from error
+    hull = _qhull(points)
     number = {int(v): i for i, v in enumerate(hull.vertices)}
     vertices = points[hull.vertices]
     triangles = []
@@ -151,6 +121,53 @@ def convex_hull(points: Array) -> ConvexHull:
         ordered = (a, b, c) if normal @ equation[:3] > 0 else (a, c, b)
         triangles.append([number[i] for i in ordered])
     return ConvexHull(read_only(vertices), read_only_indices(triangles))
+
+
+def _qhull(points: Array) -> Any:
+    """SciPy's hull of points, [m].
+
+    Raises:
+        ValueError: The points lie in a plane.
+    """
+    from scipy.spatial import ConvexHull as Hull
+    from scipy.spatial import QhullError
+
+    try:
+        return Hull(points)
+    except QhullError as error:
+        raise ValueError("the points must span a volume") from error
+
+
+def enclosed_convex(vertices: Array, triangles: Indices) -> ConvexHull | None:
+    """The convex volume that triangles enclose; None if they do not.
+
+    They do if every side is shared by two of them, and all lie on the hull of their corners. The
+    hull contains them: where rounded coordinates leave dents, it is the larger body.
+
+    Args:
+        vertices: Shape (n, 3), [m]; equal ones are one, as in an STL file every triangle has its
+            own.
+        triangles: Indices of their corners, shape (t, 3).
+    """
+    used, numbers = np.unique(vertices[triangles].reshape(-1, 3), axis=0, return_inverse=True)
+    sides = np.sort(numbers.reshape(-1, 3)[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
+    sides = sides[(sides[..., 0] != sides[..., 1]).all(axis=1)].reshape(-1, 2)
+    _, counts = np.unique(sides, axis=0, return_counts=True)
+    if np.any(counts != 2):
+        return None
+    try:
+        hull = _qhull(used)
+    except ValueError:
+        return None
+    rounded = max(_FLAT * float(np.ptp(used, axis=0).max()), _ROUNDED)
+    if hull.volume <= rounded * hull.area / 2.0:  # a sheet
+        return None
+    middles = np.column_stack([vertices[triangles].mean(axis=1), np.ones(len(triangles))])
+    planes = np.unique(hull.equations, axis=0).T
+    for block in np.array_split(middles, len(middles) // 256 + 1):
+        if (block @ planes).max(axis=1).min() < -rounded:
+            return None
+    return convex_hull(vertices[np.unique(triangles)])
 
 
 # Obstacles as polygons, for images and logs; never for distances.

@@ -25,7 +25,7 @@ from model.clearance import ClearanceModel, Nearest
 from model.errors import BadInput
 from model.kinematics import axis_distances, cables_at, structure_matrix
 from model.plan import Plan
-from model.pose import Array, Pose, interpolate, largest_rotations
+from model.pose import Array, Pose, interpolate
 from model.rig import Rig
 from model.scene import Scene, legs_of
 from model.statics.feasibility import WrenchBox, capacity_margin
@@ -58,6 +58,9 @@ SELF_CLEARANCE_SHARE = 0.01
 many robots it is the same along most of a path."""
 MARGIN_TOLERANCE = 0.02
 """Tolerance of the smallest capacity margin, as part of the largest tension."""
+LARGEST_ROTATION = np.pi - 1e-6
+"""Of a move, [rad]: beyond, round-off decides its direction."""
+HALF_TURN = "the platform rotates by a half turn in one move, in an undefined direction"
 END_TOLERANCE = 1e-6
 """How far a path may pass from the scene's start, stops and goal, [m] and [rad]."""
 
@@ -230,18 +233,20 @@ class _Check:
                 self._violation(what, rotated, END_TOLERANCE, "°", pose.position)
 
     def _check_rotations(self) -> None:
-        """The scene's limits along every move, in closed form."""
+        """The scene's limits along every move, in closed form; a half turn has no direction."""
+        angles, poses = self.path.angles, self.path.poses
+        for k in np.flatnonzero(angles > LARGEST_ROTATION).tolist():
+            self._violation(HALF_TURN, angles[k], LARGEST_ROTATION, "°", poses[k].position)
         limits = self.scene.rotation_limits
         if limits is None:
             return
-        for start, end in pairwise(self.path.poses):
+        for start, end in pairwise(poses):
             excess = limits.excess(start, end)
             if excess is not None:
                 what = f"the platform is {excess.how} too far"
-                kind = 0 if excess.how == "tilted" else 1
-                poses = [interpolate(start, end, share) for share in np.linspace(0.0, 1.0, 101)]
-                angles = [largest_rotations(p.quaternion, p.quaternion)[kind] for p in poses]
-                position = poses[int(np.argmax(angles))].position
+                between = [interpolate(start, end, share) for share in np.linspace(0.0, 1.0, 101)]
+                most = [p.tilt if excess.how == "tilted" else abs(p.turn) for p in between]
+                position = between[int(np.argmax(most))].position
                 self._violation(what, excess.measured, excess.limit, "°", position)
                 return
 
@@ -359,8 +364,7 @@ class _Check:
             poses = [self._pose(p) for p in positions.tolist()]
             matrices = np.array([structure_matrix(self.rig, pose) for pose in poses])
             weights = np.array([weight_wrench(self.rig, pose, load) for pose in poses])
-            spread = np.broadcast_to(disturbance, weights.shape)
-            box = WrenchBox(weights, spread)
+            box = WrenchBox(weights, np.broadcast_to(disturbance, weights.shape))
             return capacity_margin(
                 matrices, self.rig.min_tension, self.rig.max_tension, box, self.length_unit
             )

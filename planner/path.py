@@ -122,6 +122,7 @@ class PosePath:
         poses: The poses, at least one.
         marks: The motion from the first to each pose, shape (k,), [m].
         length: Distance travelled by the platform's origin, [m].
+        angles: Of the rotation in each move, shape (k - 1,), [rad].
         turns: Whether the orientation changes.
     """
 
@@ -139,15 +140,15 @@ class PosePath:
         self._lengths = np.linalg.norm(np.diff(self._positions, axis=0), axis=1)
         rotations = np.array([pose.rotation for pose in self.poses])
         moved = np.any(rotations[1:] != rotations[:-1], axis=(1, 2))
-        self._angles = np.zeros(len(self._lengths))
+        self.angles = np.zeros(len(self._lengths))
         for k in np.flatnonzero(moved).tolist():
-            self._angles[k] = self.poses[k].angle_to(self.poses[k + 1])
-        self.turns = bool(self._angles.any())
+            self.angles[k] = self.poses[k].angle_to(self.poses[k + 1])
+        self.turns = bool(self.angles.any())
         self.length = float(self._lengths.sum())
         self.marks = self._sums(1.0, self.radius)
 
     def _sums(self, per_metre: float, per_radian: float | Array) -> Array:
-        steps = per_metre * self._lengths + per_radian * self._angles
+        steps = per_metre * self._lengths + per_radian * self.angles
         sums: Array = np.append(0.0, np.cumsum(steps))
         return sums
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.spatial
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.errors import BadInput, InvalidFile
-from model.pose import Pose
+from model.pose import Pose, matrix_from_rotation_vector
 from model.scene import load_scene
 from model.shapes import (
     Box,
@@ -24,6 +25,7 @@ from model.shapes import (
     Sphere,
     TriangleMesh,
     convex_hull,
+    enclosed_convex,
     shape_points,
 )
 from tests.model.rig_builds import CONFIGS, scene_data, scene_of
@@ -210,6 +212,47 @@ def test_a_mesh_around_a_convex_volume_is_solid(faces: list[list[int]], kind: ty
     [obstacle] = scene_of(data).obstacles
     assert isinstance(obstacle.shape, kind)
     assert len(obstacle.shape.vertices) == (4 if kind is ConvexHull else 5)
+
+
+def drum(sides: int, length_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """A prism of 100 mm across, its ends as fans of thin triangles: points, triangles."""
+    angles = 2.0 * np.pi * np.arange(sides) / sides
+    ring = 50.0 * np.column_stack([np.cos(angles), np.sin(angles)])
+    points = np.vstack([np.column_stack([ring, np.full(sides, z)]) for z in (0.0, length_mm)])
+    low, after = np.arange(sides), np.roll(np.arange(sides), -1)
+    fan = np.column_stack([np.zeros(sides - 2, dtype=int), low[1:-1], low[2:]])
+    walls = [np.column_stack([low, after, after + sides])]
+    walls += [np.column_stack([low, after + sides, low + sides])]
+    return points, np.vstack([fan[:, ::-1], fan + sides, *walls])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([3, 4, 17, 64]), st.sampled_from([5.0, 1000.0]))
+def test_a_mesh_of_an_stl_file_is_solid(seed: int, sides: int, length_mm: float) -> None:
+    """Every triangle has corners of its own there, often rounded to a micrometre."""
+    rng = np.random.default_rng(seed)
+    points, triangles = drum(sides, length_mm)
+    turn = matrix_from_rotation_vector(rng.normal(size=3))
+    corners = np.round(points @ turn.T + rng.uniform(-1e3, 1e3, 3), 3)[triangles] / 1e3
+    numbers = np.arange(3 * len(triangles)).reshape(-1, 3)
+    vertices = corners.reshape(-1, 3)
+    hull = enclosed_convex(vertices, numbers)
+    assert hull is not None
+    planes = scipy.spatial.ConvexHull(hull.vertices).equations
+    assert (vertices @ planes[:, :3].T + planes[:, 3]).max() < 1e-9
+    missing = int(rng.integers(len(numbers)))
+    assert enclosed_convex(vertices, np.delete(numbers, missing, axis=0)) is None
+    dented = np.vstack([points, points[triangles[-1]].mean(axis=0) * [0.999, 0.999, 1.0]])
+    a, b, c = triangles[-1]
+    cone = [[a, b, len(points)], [b, c, len(points)], [c, a, len(points)]]
+    assert enclosed_convex(dented / 1e3, np.vstack([triangles[:-1], cone])) is None
+
+
+def test_a_sheet_is_not_solid_however_often_it_is_covered() -> None:
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    layers = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 3], [1, 2, 3]])
+    assert enclosed_convex(square, layers) is None
+    assert enclosed_convex(square + [[0.0, 0, 0], [0, 0, 1e-6]] * 2, layers) is None
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(4, 30))

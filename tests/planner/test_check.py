@@ -225,6 +225,34 @@ def test_a_rotation_violation_states_where_the_rotation_is_largest(gachon, scene
     assert violation.position == pytest.approx(goal.position)
 
 
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), miss=st.sampled_from([-0.01, -2e-6, 0.0, 1e-8, 2e-6, 0.01]))
+def test_a_half_turn_in_one_move_is_refused_whatever_the_limits(
+    gachon, scene_with, seed, miss
+) -> None:
+    """Which way it goes is round-off: the limits were proved for the other way."""
+    rng = np.random.default_rng(seed)
+    start = Rotation.from_rotvec(rng.uniform(-1.0, 1.0, 3))
+    goal = start * Rotation.from_rotvec((np.pi + miss) * unit(rng))
+    ends = [Pose(gachon.home.position, rotation.as_matrix()) for rotation in (start, goal)]
+    for limits in ({}, {"rotation_limits": {"tilt_deg": 90.0, "turn_deg": 180.0}}):
+        report = check_path(gachon, scene_with(**limits), ends, ends=False)
+        assert ("half turn" in kinds(report)) == (abs(miss) < 1e-6)
+
+
+def test_from_one_side_to_the_other_through_the_back_is_not_proved_through_the_front(
+    gachon, scene_with
+) -> None:
+    half = math.sqrt(0.5)
+    start, goal = (
+        Pose.from_quaternion(gachon.home.position, [half, 0.0, 0.0, side * half])
+        for side in (-1, 1)
+    )
+    scene = scene_with(rotation_limits={"tilt_deg": 10.0, "turn_deg": 90.0})
+    report = check_path(gachon, scene, [start, goal], ends=False)
+    assert "half turn in one move" in kinds(report)
+
+
 def test_a_speed_violation_and_the_report_state_the_fastest_sample(gachon, scene_with) -> None:
     """Slow at first, as the cable is nearly at right angles to the path, then faster."""
     document = gachon.document
