@@ -161,7 +161,6 @@ class RigCalibration:
         fit: Best fit; unidentifiable directions are left as in the rig file.
         observability: Directions that the data determine.
         uncertainty: Of the unknowns.
-        held_out: Cross-validation errors.
         length_deviation: Of a cable's length from the encoder, with measured tension, [m].
         pose_scales: Ratios of the deviations of measured positions and rotations to the stated
             ones, shape (2,).
@@ -172,7 +171,6 @@ class RigCalibration:
     fit: RigFit
     observability: Observability
     uncertainty: RigUncertainty
-    held_out: HeldOut
     length_deviation: float
     pose_scales: Array
 
@@ -185,6 +183,15 @@ class RigCalibration:
     def geometry(self) -> RigGeometry:
         """The estimated parameters."""
         return self.parameters.geometry(self.fit.values)
+
+    @cached_property
+    def held_out(self) -> HeldOut:
+        """Cross-validation errors, from five fits without some of the samples.
+
+        Raises:
+            Fault: A part of the measurements cannot be fitted.
+        """
+        return held_out(self.parameters, self.measured, self.length_deviation)
 
     @cached_property
     def at_home_counts(self) -> Array:
@@ -340,7 +347,6 @@ def fit_rig(
         fit,
         observability,
         uncertainty_of_rig(parameters, measured, fit, observability),
-        held_out(parameters, measured, length_deviation),
         length_deviation,
         read_only(scales),
     )

@@ -327,15 +327,19 @@ def _nearest_poses(
 ) -> tuple[Array, Array]:
     """Damped least squares from given poses, each damped by itself; see `_pose_systems`."""
     damping = np.full(len(lengths), 1e-3)
+    here = _pose_systems(rig, lengths, data, turn, poses)
+    squares, system = here[0], here[1:]
     for _ in range(MOST_STEPS):
-        squares, normal, slopes = _pose_systems(rig, lengths, data, turn, poses)
+        slopes, normal = system
         damped = normal + damping[:, None, None] * normal * np.eye(6)
         twists = np.asarray(-np.linalg.solve(damped, slopes[..., None]))[..., 0]
         trial = (poses[0] + twists[:, :3], _rotated(poses[1], twists[:, 3:]))
         exists = cables_exist(rig, _anchors(rig, trial))
         trial = _chosen(exists, trial, poses)
-        better = exists & (_pose_systems(rig, lengths, data, turn, trial)[0] <= squares)
-        poses = _chosen(better, trial, poses)
+        there = _pose_systems(rig, lengths, data, turn, trial)
+        better = exists & (there[0] <= squares)
+        poses, system = _chosen(better, trial, poses), _chosen(better, there[1:], system)
+        squares = np.where(better, there[0], squares)
         damping = np.clip(damping * np.where(better, 0.1, 10.0), LEAST_DAMPING, MOST_DAMPING)
         if np.abs(twists).max() < START_TOLERANCE:
             break
@@ -355,7 +359,8 @@ def _pose_systems(
         poses: Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3).
 
     Returns:
-        Sums of squares, shape (n,), and their normal equations, shapes (n, 6, 6) and (n, 6).
+        Sums of squares, shape (n,), and their normal equations: half the gradient, shape (n, 6),
+        and its slopes, shape (n, 6, 6).
     """
     positions, rotations = poses
     cables = cables_to(rig, _anchors(rig, poses))
@@ -371,7 +376,7 @@ def _pose_systems(
     normal = by_twist @ np.swapaxes(by_twist, 1, 2) + information
     normal[:, 3:, 3:] += np.eye(3) / turn**2
     slopes = (by_twist @ off[..., None])[..., 0] + pulls + rotated / turn
-    return squares, normal, slopes
+    return squares, slopes, normal
 
 
 def _anchors(rig: Rig, poses: tuple[Array, Array]) -> Array:
@@ -383,7 +388,7 @@ def _anchors(rig: Rig, poses: tuple[Array, Array]) -> Array:
 def _chosen(
     first: NDArray[np.bool_], one: tuple[Array, Array], other: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Poses of one of two sets; ``first`` shape (n,)."""
+    """A vector and a matrix per sample, each of one of two sets; ``first`` shape (n,)."""
     return (
         np.where(first[:, None], one[0], other[0]),
         np.where(first[:, None, None], one[1], other[1]),

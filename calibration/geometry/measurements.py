@@ -137,10 +137,13 @@ class RigMeasurements:
         information = np.zeros((len(self), 6, 6))
         whole = self.has_position & self.has_rotation
         information[whole] = np.linalg.inv(self.covariances[whole])
-        for k in np.flatnonzero(self.has_position & ~self.has_rotation):
-            by_twist = np.hstack([np.eye(3), -skew(rotations[k] @ self.reflector)])
-            own = np.linalg.inv(self.covariances[k, :3, :3])
-            information[k] = by_twist.T @ own @ by_twist
+        point = self.has_position & ~self.has_rotation
+        arms = rotations[point] @ self.reflector
+        by_twist = np.zeros((len(arms), 3, 6))
+        by_twist[:, :, :3] = np.eye(3)
+        by_twist[:, :, 3:] = np.cross(arms[:, None], np.eye(3))
+        own = np.linalg.inv(self.covariances[point, :3, :3])
+        information[point] = np.swapaxes(by_twist, 1, 2) @ own @ by_twist
         return information
 
     def first_rotations(self, rig: Rig) -> Array:

@@ -241,8 +241,7 @@ class SyntheticCamera:
         self.rig, self.camera, self.seed = rig, camera, seed
         self.optics = optics or Optics()
         self._camera_from_world = camera.world_from_camera.inverse()
-        self._background = Canvas.blank(camera, sample_rays(camera), ROOM)
-        draw_background(self._background, rig, scene, self._camera_from_world)
+        self._background = _background(rig, scene, camera)
         self._light, self._veil = light_of(camera, self.optics), veil_of(camera, self.optics)
         self._still = self._exposed(self._background, self._light, self._veil)
         self._depth = self._background.depth[1::SAMPLES, 1::SAMPLES].copy()
@@ -377,6 +376,15 @@ class SyntheticCamera:
         noisy = np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), dtype=np.uint8)
         np.copyto(noisy, 255, where=picture == 255)  # a saturated pixel stays white
         return noisy
+
+
+@lru_cache(maxsize=2)
+def _background(rig: Rig, scene: Scene, camera: Camera) -> Canvas:
+    """Everything but the platform; cameras of other optics or noise share it, read-only."""
+    canvas = Canvas.blank(camera, sample_rays(camera), ROOM)
+    draw_background(canvas, rig, scene, camera.world_from_camera.inverse())
+    canvas.brightness.flags.writeable = canvas.depth.flags.writeable = False
+    return canvas
 
 
 def _faces(rig: Rig) -> list[tuple[Pose, tuple[float, float]]]:

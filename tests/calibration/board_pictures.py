@@ -56,19 +56,39 @@ def picture_of(
         pose: Of the board's frame, whose x and y run along the print's, in the camera's.
         distortion: Of the lens.
     """
-    rays = sample_rays(distortion) @ pose.rotation
+    rows, columns = _around(print_.shape, pixel, origin, pose, distortion)
+    rays = sample_rays(distortion).reshape(SIZE[1] * _SUB, -1, 3)[rows, columns] @ pose.rotation
     eye = -pose.rotation.T @ pose.position
-    on_board = (eye + (-eye[2] / rays[:, 2])[:, None] * rays)[:, :2]
+    on_board = eye[:2] + (-eye[2] / rays[..., 2])[..., None] * rays[..., :2]
     found = ((on_board + origin) / pixel - 0.5).astype(np.float32)
-    shape = (SIZE[1] * _SUB, SIZE[0] * _SUB)
-    fine = cv2.remap(
+    fine = np.full((SIZE[1] * _SUB, SIZE[0] * _SUB), 150.0, np.float32)
+    fine[rows, columns] = cv2.remap(
         print_.astype(np.float32),
-        found[:, 0].reshape(shape),
-        found[:, 1].reshape(shape),
+        found[..., 0],
+        found[..., 1],
         cv2.INTER_LINEAR,
         borderValue=150.0,
     )
     return np.round(cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)).astype(np.uint8)
+
+
+def _around(
+    shape: tuple[int, ...],
+    pixel: float,
+    origin: Array,
+    pose: Pose,
+    distortion: tuple[float, ...],
+) -> tuple[slice, slice]:
+    """Rows and columns of the samples that may show a print; see `picture_of`."""
+    y, x = (np.linspace(-1.0, size + 1.0, 30) * pixel for size in shape[:2])
+    rim = [(a, b) for a in x for b in y if a in x[[0, -1]] or b in y[[0, -1]]]
+    points = np.column_stack([np.array(rim) - origin, np.zeros(len(rim))])
+    zero = np.zeros(3)
+    pixels = cv2.projectPoints(pose.apply(points), zero, zero, MATRIX, np.array(distortion))[0]
+    low, high = pixels.reshape(-1, 2).min(axis=0), pixels.reshape(-1, 2).max(axis=0)
+    first = np.clip(np.floor(low - 4.0) * _SUB, 0, np.array(SIZE) * _SUB).astype(int)
+    last = np.clip(np.ceil(high + 4.0) * _SUB, 0, np.array(SIZE) * _SUB).astype(int)
+    return slice(first[1], last[1]), slice(first[0], last[0])
 
 
 def with_noise(image: np.ndarray, seed: int) -> np.ndarray:

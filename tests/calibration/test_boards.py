@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from itertools import islice
 
 import cv2
 import numpy as np
@@ -18,7 +16,7 @@ from calibration.intrinsics.calibrate import fit_camera
 from calibration.pictures import ImageSet
 from calibration.procedures import calibrate_camera
 from calibration.statistics import EvenSample
-from calibration.targets.boards import Charuco, Chessboard, is_mirrored
+from calibration.targets.boards import Charuco, Chessboard, DetectedBoard, is_mirrored
 from calibration.targets.grids import CircleGrid, TagGrid
 from model.cameras import generic_camera
 from model.errors import BadInput
@@ -106,13 +104,15 @@ def grid_pictures(board: CircleGrid | TagGrid) -> list[tuple[np.ndarray, Pose]]:
     return [(with_noise(picture_of(sheet, PIXEL, origin, p), k), p) for k, p in enumerate(poses)]
 
 
+def errors_of(seen: DetectedBoard, pose: Pose) -> np.ndarray:
+    rotation = cv2.Rodrigues(pose.rotation)[0]
+    truth = cv2.projectPoints(seen.points, rotation, pose.position, MATRIX, DISTORTION)[0]
+    return seen.corners - truth.reshape(-1, 2)
+
+
 def off(board, pictures) -> np.ndarray:
-    errors = []
-    for image, pose in pictures:
-        if (seen := board.find(image)) is not None:
-            rotation = cv2.Rodrigues(pose.rotation)[0]
-            truth = cv2.projectPoints(seen.points, rotation, pose.position, MATRIX, DISTORTION)[0]
-            errors.append(seen.corners - truth.reshape(-1, 2))
+    found = ((board.find(image), pose) for image, pose in pictures)
+    errors = [errors_of(seen, pose) for seen, pose in found if seen is not None]
     return np.concatenate(errors) if errors else np.zeros((0, 2))
 
 
@@ -121,7 +121,7 @@ def off(board, pictures) -> np.ndarray:
 )
 def test_centres_and_saddles_are_found_where_they_are(board, points: int, limit: float) -> None:
     """Centres of ellipses would be off by 0.1 px and more for oblique circles."""
-    errors = off(board, grid_pictures(board))
+    errors = np.concatenate([errors_of(seen, pose) for _, pose, seen in found_in(board)])
     assert len(errors) > points
     assert np.sqrt(np.mean(errors**2)) < limit
     assert np.abs(errors.mean(axis=0)).max() < 0.02
@@ -148,25 +148,25 @@ def test_small_tags_of_kalibr_are_refined_or_left_out() -> None:
     assert errors.max() < 0.8
 
 
-def first(
-    count: int, pictures: list[tuple[np.ndarray, Pose]], fits: Callable[[np.ndarray], bool]
-) -> list[tuple[np.ndarray, Pose]]:
-    """The first suitable images; detecting a board takes long."""
-    return list(islice(((image, pose) for image, pose in pictures if fits(image)), count))
+@cache
+def found_in(board: CircleGrid | TagGrid | Charuco) -> list[tuple[np.ndarray, Pose, DetectedBoard]]:
+    """The images in which a board is found; detecting it takes long."""
+    rendered = pictures(board) if board in (TAGS, CHARUCO) else grid_pictures(board)
+    seen = [(image, pose, board.find(image)) for image, pose in rendered]
+    return [(image, pose, one) for image, pose, one in seen if one is not None]
 
 
 @pytest.mark.parametrize("board", [CIRCLES, SHIFTED, KALIBR, TAGS, CHARUCO])
 def test_boards_with_black_and_white_exchanged_are_found(board) -> None:
-    own = grid_pictures(board) if board in (CIRCLES, SHIFTED, KALIBR) else pictures(board)
-    shown = first(3, own, lambda image: board.find(image) is not None)
+    shown = found_in(board)[:3]
     assert len(shown) == 3
-    inverted = off(board, [(255 - image, pose) for image, pose in shown])
-    assert len(inverted) == len(off(board, shown))
+    inverted = off(board, [(255 - image, pose) for image, pose, _ in shown])
+    assert len(inverted) == sum(len(seen.points) for _, _, seen in shown)
     assert np.sqrt(np.mean(inverted**2)) < 0.12
 
 
 def test_the_order_of_kalibr_is_named_where_the_numbers_contradict_the_rows() -> None:
-    shown = [i for i, _ in first(4, grid_pictures(KALIBR), lambda i: KALIBR.find(i) is not None)]
+    shown = [image for image, _, _ in found_in(KALIBR)[:4]]
     rows = replace(KALIBR, order="rows")
     with pytest.raises(BadInput) as caught:
         fit_camera([(f"{k}", image) for k, image in enumerate(shown)], rows)
@@ -175,14 +175,9 @@ def test_the_order_of_kalibr_is_named_where_the_numbers_contradict_the_rows() ->
 
 def test_own_tags_in_the_order_of_kalibr_are_rejected() -> None:
     other = replace(TAGS, order="kalibr")
-
-    def is_whole(image: np.ndarray) -> bool:
-        seen = TAGS.find(image)
-        return seen is not None and len(seen.points) > 60
-
-    whole = first(3, pictures(TAGS), is_whole)
+    whole = whole_pictures(TAGS, 61)[:3]
     assert whole
-    for image, _ in whole:
+    for _, image in whole:
         assert other.find(image) is None
         assert "--order rows" in other.describe_other(image)
 
@@ -210,19 +205,10 @@ def pictures(board: Charuco | TagGrid) -> list[tuple[np.ndarray, Pose]]:
 
 @pytest.mark.parametrize(("board", "limit"), [(CHARUCO, 0.03), (TAGS, 0.06)])
 def test_points_are_found_where_they_are(board: Charuco | TagGrid, limit: float) -> None:
-    errors, points = [], 0
-    for image, pose in pictures(board)[:8]:
-        seen = board.find(image)
-        if seen is None:
-            continue
-        rotation = cv2.Rodrigues(pose.rotation)[0]
-        truth = cv2.projectPoints(seen.points, rotation, pose.position, MATRIX, DISTORTION)[0]
-        errors.append(seen.corners - truth.reshape(-1, 2))
-        points += len(seen.points)
-    assert points > 120
-    off = np.concatenate(errors)
-    assert np.sqrt(np.mean(off**2)) < limit
-    assert np.abs(off.mean(axis=0)).max() < 0.03  # no bias
+    errors = np.concatenate([errors_of(seen, pose) for _, pose, seen in found_in(board)])
+    assert len(errors) > 120
+    assert np.sqrt(np.mean(errors**2)) < limit
+    assert np.abs(errors.mean(axis=0)).max() < 0.03  # no bias
 
 
 @pytest.mark.parametrize(
@@ -258,8 +244,7 @@ def test_saddles_of_charuco_boards_are_not_biased_by_markers_or_blur(
 
 def test_corners_of_charuco_boards_without_a_saddle_are_left_out() -> None:
     """Such as below glare: OpenCV returns where they would be by the markers."""
-    image, pose = next((i, p) for i, p in pictures(CHARUCO) if CHARUCO.find(i) is not None)
-    plain = CHARUCO.find(image)
+    image, pose, plain = found_in(CHARUCO)[0]
     x, y = np.round(plain.corners[len(plain.corners) // 2]).astype(int)
     cv2.circle(image := image.copy(), (int(x), int(y)), 6, 255, -1)
     assert len(CHARUCO.find(image).points) == len(plain.points) - 1
@@ -279,16 +264,15 @@ def test_the_camera_comes_back_from_parts_of_a_board(board: Charuco | TagGrid) -
 @pytest.mark.parametrize("board", [CHARUCO, TAGS])
 def test_copies_with_fewer_corners_count_once(board: Charuco | TagGrid) -> None:
     """In the first, a corner is below glare; in the second, half of the board is covered."""
-    whole = [(f"{k}.png", image) for k, (image, _) in enumerate(pictures(board))]
-    corners = {name: seen.corners for name, image in whole if (seen := board.find(image))}
-    copies = []
-    for k, (name, image) in enumerate((n, i) for n, i in whole if n in corners):
-        image, (x, y) = image.copy(), np.round(corners[name][0]).astype(int).tolist()
+    whole, copies = [], []
+    for k, (image, _, seen) in enumerate(found_in(board)):
+        whole.append((f"{k}.png", image))
+        image, (x, y) = image.copy(), np.round(seen.corners[0]).astype(int).tolist()
         if k % 2:
-            image[:, : int(np.median(corners[name][:, 0]))] = 255
+            image[:, : int(np.median(seen.corners[:, 0]))] = 255
         else:
             cv2.circle(image, (x, y), 12, 255, -1)
-        copies.append((f"copy of {name}", image))
+        copies.append((f"copy of {k}.png", image))
     found, plain = fit_camera([*copies, *whole], board), fit_camera(whole, board)
     assert found.views.keys() == plain.views.keys()
     np.testing.assert_allclose(
@@ -346,7 +330,7 @@ def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid
     ],
 )
 def test_the_message_names_what_images_show_instead(board, wrong, named: str) -> None:
-    image = next(image for image, _ in pictures(board) if board.find(image) is not None)
+    image = found_in(board)[0][0]
     with pytest.raises(BadInput) as caught:
         fit_camera([("a", image), ("b", np.full_like(image, 128))], wrong)
     assert "was found in 0 of 2 images" in caught.value.what
@@ -356,10 +340,7 @@ def test_the_message_names_what_images_show_instead(board, wrong, named: str) ->
 
 def test_the_message_names_what_most_images_show_instead() -> None:
     """One image of another board among six."""
-    image, stray = (
-        next(image for image, _ in pictures(board) if board.find(image) is not None)
-        for board in (TAGS, CHARUCO)
-    )
+    image, stray = (found_in(board)[0][0] for board in (TAGS, CHARUCO))
     named = [("0.png", stray), *((f"{k}.png", image) for k in range(1, 7))]
     with pytest.raises(BadInput) as caught:
         fit_camera(named, TagGrid(5, 4, 0.040, 0.012, "tag25h9"))
@@ -371,8 +352,7 @@ def test_the_message_names_what_most_images_show_instead() -> None:
 
 def whole_pictures(board: Charuco | TagGrid, least: int) -> list[tuple[str, np.ndarray]]:
     """Named images that show at least so many points of a board."""
-    found = ((image, board.find(image)) for image, _ in pictures(board))
-    whole = [image for image, seen in found if seen is not None and len(seen.points) >= least]
+    whole = [image for image, _, seen in found_in(board) if len(seen.points) >= least]
     return [(f"{k}.png", image) for k, image in enumerate(whole)]
 
 
@@ -479,11 +459,10 @@ def test_images_that_can_be_read_only_once_are_refused() -> None:
 @pytest.mark.parametrize("board", [TAGS, CIRCLES])
 def test_boards_where_a_lens_has_no_rays_are_found_as_without_it(board) -> None:
     """As by a fisheye more than 90° off its axis, which straight lines do not describe."""
-    own = pictures(board) if board is TAGS else grid_pictures(board)
-    image = next(image for image, _ in own if board.find(image) is not None)
+    image, _, plain = found_in(board)[0]
     matrix = np.array([[60.0, 0.0, -40.0], [0.0, 60.0, -40.0], [0.0, 0.0, 1.0]])
     wide = replace(generic_camera(SIZE), matrix=matrix, distortion=np.zeros(4), lens="fisheye")
-    plain, seen = board.find(image), board.find(image, wide)
+    seen = board.find(image, wide)
     far = ~has_rays(wide, plain.corners)
     assert far.sum() > 16
     np.testing.assert_array_equal(seen.points, plain.points)
@@ -506,15 +485,13 @@ def test_a_few_of_many_are_spread_over_all(count: int, wanted: int) -> None:
 
 @pytest.mark.parametrize(("board", "number"), [(CHARUCO, 8), (TAGS, 27)])
 def test_a_number_that_is_seen_twice_is_left_out_by_name(board, number: int) -> None:
-    image = next(
-        image for image, _ in pictures(board) if (s := board.find(image)) and len(s.points) > 20
-    )
+    image, plain = next((i, seen) for i, _, seen in found_in(board) if len(seen.points) > 20)
     family = cv2.aruco.DICT_4X4_50 if board is CHARUCO else cv2.aruco.DICT_APRILTAG_36H11
     decoy = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(family), number, 60)
     doubled = image.copy()
     doubled[:80, :80] = 255
     doubled[10:70, 10:70] = decoy
-    seen, plain = board.find(doubled), board.find(image)
+    seen = board.find(doubled)
     assert seen is not None
     assert seen.twice == (number,)
     assert plain.twice == ()

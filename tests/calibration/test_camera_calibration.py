@@ -190,8 +190,8 @@ def test_the_result_file_is_dated_and_has_the_keys_of_the_rig_file(tmp_path: Pat
 
 
 def test_other_data_have_another_hash() -> None:
-    first = calibrate_from_views(views(8, 0.0), SIZE)
-    second = calibrate_from_views(views(8, 0.01), SIZE)
+    first = calibrate_from_views(views(8, 0.0), SIZE, lens="five")
+    second = calibrate_from_views(views(8, 0.01), SIZE, lens="five")
     assert first.data_hash != second.data_hash
     assert first.data_hash.startswith("sha256:")
 
@@ -220,10 +220,10 @@ def test_a_bowed_board_is_named_with_its_bow() -> None:
 def test_no_advice_contradicts_what_is_there_already() -> None:
     """Neither more images if there are enough, nor 90 % coverage if it is 90 %."""
     many = views(42, 2.0)
-    verdict = judge_camera(calibrate_from_views(many, SIZE), 1e-4).verdict
+    verdict = judge_camera(calibrate_from_views(many, SIZE, lens="five"), 1e-4).verdict
     assert not verdict.good
     assert not any("40 are good" in step for step in verdict.next_steps)
-    few = judge_camera(calibrate_from_views(views(13, 2.0), SIZE), 1e-4).verdict
+    few = judge_camera(calibrate_from_views(views(13, 2.0), SIZE, lens="five"), 1e-4).verdict
     assert "take more images: 40 are recommended" in few.next_steps
     assert not is_below(0.896, 0.9)
     assert is_below(0.894, 0.9)

@@ -42,7 +42,7 @@ def random_case(gachon, scene_with, seed):
 def test_the_smallest_clearance_is_that_of_the_bound_by_motion(gachon, scene_with, seed) -> None:
     """Overlaps are left out: how deep they are is a bound, not a distance."""
     model, path, _ = random_case(gachon, scene_with, seed)
-    samples = path.samples(0.005)
+    samples = path.samples(0.01)
 
     def evaluate(at):
         return np.array([model.smallest(path.pose(p)).distance for p in at.tolist()])

@@ -71,7 +71,7 @@ def test_a_loose_print_on_the_floor_gives_no_pose(
 ) -> None:
     """The platform is out of view; its pose would be below the floor or rotated by 90° or more."""
     rng = np.random.default_rng(number)
-    for yaw in np.radians([0.0, 60.0, 120.0, 200.0]):
+    for yaw in np.radians([0.0, 60.0, 120.0, 200.0][number % 2 :: 2]):
         where = Pose(
             np.append(rng.uniform(-0.25, 0.25, size=2), 0.005),
             matrix_from_rotation_vector(np.array([0.0, 0.0, yaw])),
@@ -270,14 +270,13 @@ def test_two_tags_that_contradict_each_other_give_no_pose(
 def test_the_stated_error_of_tags_widens_the_limit_of_their_residuals(
     rig: Rig, scene: Scene
 ) -> None:
-    """As it does in pixels: in an image of twice as many pixels, twice as far."""
+    """As it does in pixels: in the middle of an image of twice as many pixels, twice as far."""
     draw = np.random.default_rng(2)
-    camera = replace(
-        rig.cameras[0],
-        width=2 * rig.cameras[0].width,
-        height=2 * rig.cameras[0].height,
-        matrix=rig.cameras[0].matrix * np.array([[2.0], [2.0], [1.0]]),
-    )
+    camera = rig.cameras[0]
+    middle = np.array([camera.width, camera.height, 0.0]) / 2.0
+    matrix = camera.matrix * np.array([[2.0], [2.0], [1.0]])
+    matrix[:, 2] -= middle
+    camera = replace(camera, matrix=matrix)
     off = tuple(
         replace(tag, pose=Pose(tag.pose.position + draw.normal(0.0, 1e-3, 3), tag.pose.rotation))
         for tag in rig.platform_tags
@@ -298,7 +297,7 @@ def restated(rig: Rig, sizes: dict[int, float]) -> Rig:
 
 @pytest.fixture(scope="module")
 def sharp(rig: Rig, camera: Camera, empty: Scene) -> list[tuple[Image, Pose]]:
-    """Images of poses at which the camera sees two or three tags."""
+    """Images of poses at which the camera sees two or three tags; every third has each blur."""
     rng, images = np.random.default_rng(1), []
     for number in range(12):
         turn = matrix_from_rotation_vector(rng.normal(size=3) * 0.1)
@@ -315,7 +314,8 @@ def test_tags_of_another_size_than_stated_give_no_pose(
 ) -> None:
     """As prints scaled to the page are; a single tag would be measured at another distance."""
     wrong = restated(rig, {tag.id: stated_mm / 1e3 for tag in rig.platform_tags})
-    for image, _ in sharp:
+    hardest = abs(stated_mm - 96) == 1
+    for image, _ in sharp if hardest else sharp[stated_mm % 3 :: 3]:
         found = Tracker(wrong, camera).observe(image, 0.0)
         assert isinstance(found, NoPose)
         assert "compare size_mm" in found.reason
@@ -327,7 +327,7 @@ def test_one_tag_of_another_size_is_left_out_or_gives_no_pose(
     rig: Rig, camera: Camera, sharp: list[tuple[Image, Pose]], number: int, stated_mm: float
 ) -> None:
     wrong = restated(rig, {number: stated_mm / 1e3})
-    for image, truth in sharp:
+    for image, truth in sharp[number % 3 :: 3]:
         found = Tracker(wrong, camera).observe(image, 0.0)
         if isinstance(found, PoseMeasurement):
             error = error_of(found, truth)
@@ -342,7 +342,7 @@ def test_tags_whose_numbers_are_swapped_give_no_pose(
 ) -> None:
     other = dict([swapped, swapped[::-1]])
     tags = tuple(replace(tag, id=other.get(tag.id, tag.id)) for tag in rig.platform_tags)
-    for image, _ in sharp:
+    for image, _ in sharp[sum(swapped) % 3 :: 3]:
         found = Tracker(replace(rig, platform_tags=tags), camera).observe(image, 0.0)
         assert isinstance(found, NoPose)
         assert re.search("contradict each other|inconsistent|fits", found.reason)

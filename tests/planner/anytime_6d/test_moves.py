@@ -94,9 +94,10 @@ def test_no_move_is_allowed_that_an_independent_judge_refuses(
         elif tallies[ROTATION] == 0:
             refused += 1
             poses = [interpolate(start, end, float(s)) for s in np.linspace(0.0, 1.0, 25)]
-            roomy = min(judge.room(pose) for pose in poses) > 2e-3
-            strong = min(judge.margin(pose) for pose in poses) > 0.02 * rig.max_tension
-            wrongly_refused += roomy and strong
+            wrongly_refused += all(
+                judge.margin(pose) > 0.02 * rig.max_tension and judge.room(pose) > 2e-3
+                for pose in poses
+            )
         tallies[:] = 0
     assert allowed >= 10
     assert wrongly_refused <= refused // 20

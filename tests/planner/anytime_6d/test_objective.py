@@ -96,7 +96,7 @@ def test_moves_are_worth_what_dense_poses_say(rig: Rig, name: str) -> None:
         length = float(move_length(row(start), row(end), objective.radian))
         only_length = problem_of(rig, scene).objective
         assert move_sum(world, load, only_length, row(start), row(end)) == pytest.approx(length)
-        dense = _dense(start, end, 200)
+        dense = _dense(start, end, 101)
         mean = float(np.mean([max(0.0, kinematic.mean_along_poses([p])) for p in dense]))
         total = move_sum(world, load, objective, row(start), row(end))
         assert total == pytest.approx((0.4 + 0.7 * mean) * length, rel=0.02)

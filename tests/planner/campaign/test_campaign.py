@@ -91,6 +91,15 @@ def results(work) -> Results:
     return Results(trials)
 
 
+@pytest.fixture(scope="module")
+def images(results, tmp_path_factory) -> dict[str, bytes]:
+    """All images of these results, by file name."""
+    names = save_figures(results, folder := tmp_path_factory.mktemp("images"))
+    saved = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert saved.keys() == {f"{name}.{end}" for name in names for end in ("svg", "png")}
+    return saved
+
+
 def numbers(trials: list[Trial]) -> list[str]:
     """Trials without their times, which no two runs share; NaN never equals itself."""
     return [repr(replace(trial, time_ms=0.0)) for trial in trials]
@@ -266,16 +275,13 @@ class Reader(HTMLParser):
         self.text += data
 
 
-def test_the_page_has_every_claim_with_its_verdict_and_every_picture(results, tmp_path) -> None:
+def test_the_page_has_every_claim_with_its_verdict_and_every_picture(results, images) -> None:
     about = {"seeds": SEEDS, "boxes": {OWN: "its own", WIDE: "wider"}, "rig": "gachon <8 & 6>"}
-    names = save_figures(results, tmp_path)
     reader = Reader()
     reader.feed(page(results, about))
     assert reader.open == []
-    assert {f"{name}.svg" for name in names} == set(reader.pictures)
-    assert all(
-        (tmp_path / f"{n}.{end}").stat().st_size > 1000 for n in names for end in ("svg", "png")
-    )
+    assert {name for name in images if name.endswith(".svg")} == set(reader.pictures)
+    assert all(len(image) > 1000 for image in images.values())
     for finding in findings(results):
         assert finding.claim in reader.text
         assert finding.verdict in reader.text
@@ -284,10 +290,9 @@ def test_the_page_has_every_claim_with_its_verdict_and_every_picture(results, tm
     assert len(reported["findings"]) == len(findings(results))
 
 
-def test_images_need_no_settings_of_the_user_and_are_whole(results, tmp_path) -> None:
-    for name in ("plain", "own", "full"):
+def test_images_need_no_settings_of_the_user_and_are_whole(results, images, tmp_path) -> None:
+    for name in ("own", "full"):
         (tmp_path / name).mkdir()
-    save_figures(results, tmp_path / "plain")
     with mpl.rc_context({"text.usetex": True, "axes.facecolor": "red"}):
         save_figures(results, tmp_path / "own")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -297,12 +302,12 @@ def test_images_need_no_settings_of_the_user_and_are_whole(results, tmp_path) ->
             save_figures(results, tmp_path / "full")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    plain, own, full = (
+    own, full = (
         {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()}
-        for name in ("plain", "own", "full")
+        for name in ("own", "full")
     )
-    assert own == plain
-    assert full.items() < plain.items()
+    assert own == images
+    assert full.items() < images.items()
 
 
 @pytest.mark.parametrize("paths", [0, 1])

@@ -32,8 +32,9 @@ def test_an_anchor_is_behind_a_core_exactly_where_its_cable_meets_the_box(kind: 
         planes, core = cable_core(piece, eye, arm, 0.01), core_of(piece, 0.01)
         assert core is not None
         at = rng.uniform(GACHON.workspace_lower, GACHON.workspace_upper, (50, 3))
-        for position in at:
-            ends = [core.pose.inverse().apply(p[None])[0] for p in (eye, position + arm)]
+        eye_in_core, *anchors = core.pose.inverse().apply(np.vstack([eye, at + arm]))
+        for position, anchor in zip(at, anchors, strict=True):
+            ends = (eye_in_core, anchor)
             found = bool(np.all(planes[:, :3] @ position >= planes[:, 3]))
             if found:
                 assert segment_box_definition(*ends, core.half) < 1e-9

@@ -20,14 +20,12 @@ def segment_box_definition(start: Points, end: Points, half: Points) -> float:
         half: Half extents of the box, shape (3,), [m].
     """
     delta = end - start
-    shares = [0.0, 1.0]
-    for region in np.ndindex(3, 3, 3):
-        side = np.array(region) - 1
-        slope = np.where(side != 0, delta, 0.0)
-        offset = np.where(side != 0, start - side * half, 0.0)
-        if slope @ slope > 0.0:
-            shares.append(float(np.clip(-(offset @ slope) / (slope @ slope), 0.0, 1.0)))
-    points = start + np.array(shares)[:, None] * delta
+    sides = np.array(list(np.ndindex(3, 3, 3))) - 1
+    slopes = np.where(sides != 0, delta, 0.0)
+    offsets = np.where(sides != 0, start - sides * half, 0.0)
+    squares, falls = np.sum(slopes**2, axis=1), -np.sum(offsets * slopes, axis=1)
+    within = np.clip(falls[squares > 0.0] / squares[squares > 0.0], 0.0, 1.0)
+    points = start + np.array([0.0, 1.0, *within])[:, None] * delta
     return float(np.min(np.linalg.norm(points - np.clip(points, -half, half), axis=1)))
 
 

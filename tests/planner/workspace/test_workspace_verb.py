@@ -85,28 +85,31 @@ def written(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def test_images_are_the_same_whatever_the_user_s_matplotlibrc_is(slice_maps, tmp_path):
-    for name, own in (("plain", {}), ("own", {"text.usetex": True, "axes.facecolor": "red"})):
-        (tmp_path / name).mkdir()
-        with mpl.rc_context(own):
-            write_maps(tmp_path / name, *slice_maps)
-            assert all(mpl.rcParams[key] == value for key, value in own.items())
-    assert written(tmp_path / "own") == written(tmp_path / "plain")
+@pytest.fixture(scope="module")
+def whole(slice_maps, tmp_path_factory) -> dict[str, bytes]:
+    """All files of a slice."""
+    write_maps(folder := tmp_path_factory.mktemp("whole"), *slice_maps)
+    return written(folder)
+
+
+def test_images_are_the_same_whatever_the_user_s_matplotlibrc_is(slice_maps, whole, tmp_path):
+    own = {"text.usetex": True, "axes.facecolor": "red"}
+    with mpl.rc_context(own):
+        write_maps(tmp_path, *slice_maps)
+        assert all(mpl.rcParams[key] == value for key, value in own.items())
+    assert written(tmp_path) == whole
 
 
 @pytest.mark.parametrize("limit", [1000, 12_000, 40_000])
-def test_a_full_disk_leaves_whole_files_only(slice_maps, tmp_path, limit):
-    for name in ("whole", "full"):
-        (tmp_path / name).mkdir()
-    write_maps(tmp_path / "whole", *slice_maps)
+def test_a_full_disk_leaves_whole_files_only(slice_maps, whole, tmp_path, limit):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
     try:
         with pytest.raises(BadInput, match="cannot be written"):
-            write_maps(tmp_path / "full", *slice_maps)
+            write_maps(tmp_path, *slice_maps)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert written(tmp_path / "full").items() < written(tmp_path / "whole").items()
+    assert written(tmp_path).items() < whole.items()
 
 
 def test_table_and_arrays_hold_the_same_numbers(folder):
