@@ -21,7 +21,7 @@ START_MM, GOAL_MM = (0.0, 0.0, 445.0), (0.0, 30.0, 495.0)
 
 
 def rig_for_long_runs(folder: Path) -> Path:
-    """The paper's rig, three times as fast and with two images a second: fewer of both to compute."""
+    """The paper's rig, three times as fast and with two images a second, to compute less."""
     rig = folder / "rig.yaml"
     text = RIG.read_text()
     for as_shipped, here in (
