@@ -17,7 +17,7 @@ from math import ceil
 
 import can
 
-from drivers.can_bus import echoes_own_frames, receive_frame, transmit
+from drivers.can_bus import SentFrame, echoes_own_frames, receive_frame, transmit
 from drivers.can_errors import (
     SETTING_UP,
     DriveRestarted,
@@ -142,7 +142,7 @@ class SetupNetwork:
     def send(self, can_id: int, data: bytes) -> None:
         """Sends a frame, and expects its echo."""
         self._own.sent(can_id)
-        transmit(self._bus, can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        transmit(self._bus, SentFrame(can_id, data))
 
     def silent_nodes(self, nodes: Iterable[int]) -> list[int]:
         """Requests the device type (1000h) from all nodes at once; returns those without an answer.
