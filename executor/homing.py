@@ -42,7 +42,7 @@ from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from model.statics.gravity import working_tensions
 from planner.settings import whole_number
-from tracking.shared_errors import require_stated_errors
+from tracking.clearance import require_stated_errors
 
 #: Largest reach, [m], and speed, [m/s], of winding in.
 FURTHEST, FASTEST = 0.200, 0.010

@@ -59,7 +59,7 @@ from model.plan import Plan, require_same_rig
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
-from tracking.shared_errors import require_stated_errors
+from tracking.clearance import require_stated_errors
 
 __all__ = ["RunOptions", "RunResult", "run", "run_prepared"]
 

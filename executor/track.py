@@ -34,10 +34,9 @@ from model.scene import Scene
 from planner.check import verify
 from simulation.camera.camera import ImageSequence
 from simulation.factory import make_synthetic_camera
-from tracking.measurement import PoseMeasurement
+from tracking.measurement import FrameRate, PoseMeasurement
 from tracking.pose_log import LoggedPicture, write_pose_log
 from tracking.track import (
-    FrameRate,
     MultiCameraCount,
     Picture,
     TrackCount,

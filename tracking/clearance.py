@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from model.clearance import ClearanceModel, Nearest, cable_name
 from model.errors import BadInput
 from model.kinematics import Cables, cables_at
 from model.pose import Array, Pose, read_only, skew
-from model.rig import Rig
+from model.rig import Camera, Rig
 from tracking.measurement import PoseMeasurement, largest_deviations
 
 COVERAGE = 0.95
@@ -162,3 +163,46 @@ def _variance(
         return own + float(np.linalg.eigvalsh(covariance)[-1])
     direction = line / length
     return own + float(direction @ covariance @ direction)
+
+
+def missing_errors(rig: Rig, camera: Camera) -> tuple[str, ...]:
+    """Parts of the chain from lens to cables whose errors are not stated.
+
+    Returns:
+        Keys of the rig file, and the verbs that calibrate them; empty if all are stated.
+    """
+    stated = {
+        "lens_covariance (`cdpr calibrate camera`)": camera.lens_covariance,
+        "pose_covariance (`cdpr calibrate extrinsics`)": camera.pose_covariance,
+        "tags: error_mm (`cdpr calibrate tags`)": rig.tag_error,
+        "outlets_error_mm (`cdpr calibrate rig`)": rig.outlet_error,
+        "anchors_error_mm (`cdpr calibrate rig`)": rig.anchor_error,
+    }
+    return tuple(key for key, value in stated.items() if value is None)
+
+
+def require_stated_errors(
+    rig: Rig, cameras: Sequence[Camera], use: str = "measure clearance", then: str = ""
+) -> None:
+    """Refuses to measure with unknown errors.
+
+    Args:
+        rig: Its tags.
+        cameras: That measure.
+        use: What they are to do.
+        then: The step after a change of the rig file.
+
+    Raises:
+        BadInput: For a camera with unknown errors; it asks for one number.
+    """
+    for camera in cameras:
+        missing = missing_errors(rig, camera)
+        if missing and camera.error is None:
+            raise BadInput(
+                f"the measuring error of camera {camera.name!r} is unknown, so it cannot {use}",
+                where=f"rig {rig.name}",
+                why=f"calibrations have not stated {', '.join(missing)}",
+                next_step=f"add `error_mm` to camera {camera.name!r} in the rig file: the error of"
+                f" the measured platform and cables, 95 %; or run these calibrations{then}",
+                values={"camera": camera.name},
+            )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -145,3 +146,45 @@ def rates(pictures_per_second: float | None, measuring_ms: float | None, tags: i
     fast = "–" if pictures_per_second is None else f"{pictures_per_second:.1f}"
     long = "–" if measuring_ms is None else f"{measuring_ms:.1f}"
     return f"{fast} images/s, {long} ms, {tags} tag{'' if tags == 1 else 's'}"
+
+
+# Frame rate and measuring time.
+
+
+#: Number of the newest images for live figures.
+NEWEST = 10
+
+
+class FrameRate:
+    """Frame rate and measuring time of the newest images."""
+
+    def __init__(self) -> None:
+        """Starts without images."""
+        self._times: deque[float] = deque(maxlen=NEWEST)
+        self._seconds: deque[float] = deque(maxlen=NEWEST)
+
+    def take(self, time: float, seconds: float) -> None:
+        """Adds an image.
+
+        Args:
+            time: On a monotonic clock, [s].
+            seconds: Measuring time, [s]; NaN if nothing was measured.
+        """
+        self._times.append(time)
+        self._seconds.append(seconds)
+
+    @property
+    def pictures_per_second(self) -> float | None:
+        """Frame rate, [Hz]; None before there are two images."""
+        took = self._times[-1] - self._times[0] if self._times else 0.0
+        return round((len(self._times) - 1) / took, 1) if took > 0.0 else None
+
+    @property
+    def measuring_ms(self) -> float | None:
+        """Median measuring time, [ms]; None if nothing was measured."""
+        known = [one for one in self._seconds if np.isfinite(one)]
+        return round(float(np.median(known)) * 1e3, 2) if known else None
+
+    def text(self, tags: int) -> str:
+        """As in `rates`."""
+        return rates(self.pictures_per_second, self.measuring_ms, tags)

@@ -14,58 +14,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.cameras import Z_95
-from model.errors import BadInput, Fault
+from model.errors import Fault
 from model.pose import Array, Pose, lever_arm_matrix, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import project_undistorted, ray_slopes, rays_of, undistorted_slopes
+from tracking.clearance import missing_errors
 from tracking.detection.tags import mounted_rotated, tag_corners
 from tracking.pnp import BundlePose, TagView, expected_cost, moved_by_pixels, solve_pnp
 
 _GRID = 7
 """Points along each side of the image at which a rotation is fitted to lens errors."""
-
-
-def missing_errors(rig: Rig, camera: Camera) -> tuple[str, ...]:
-    """Parts of the chain from lens to cables whose errors are not stated.
-
-    Returns:
-        Keys of the rig file, and the verbs that calibrate them; empty if all are stated.
-    """
-    stated = {
-        "lens_covariance (`cdpr calibrate camera`)": camera.lens_covariance,
-        "pose_covariance (`cdpr calibrate extrinsics`)": camera.pose_covariance,
-        "tags: error_mm (`cdpr calibrate tags`)": rig.tag_error,
-        "outlets_error_mm (`cdpr calibrate rig`)": rig.outlet_error,
-        "anchors_error_mm (`cdpr calibrate rig`)": rig.anchor_error,
-    }
-    return tuple(key for key, value in stated.items() if value is None)
-
-
-def require_stated_errors(
-    rig: Rig, cameras: Sequence[Camera], use: str = "measure clearance", then: str = ""
-) -> None:
-    """Refuses to measure with unknown errors.
-
-    Args:
-        rig: Its tags.
-        cameras: That measure.
-        use: What they are to do.
-        then: The step after a change of the rig file.
-
-    Raises:
-        BadInput: For a camera with unknown errors; it asks for one number.
-    """
-    for camera in cameras:
-        missing = missing_errors(rig, camera)
-        if missing and camera.error is None:
-            raise BadInput(
-                f"the measuring error of camera {camera.name!r} is unknown, so it cannot {use}",
-                where=f"rig {rig.name}",
-                why=f"calibrations have not stated {', '.join(missing)}",
-                next_step=f"add `error_mm` to camera {camera.name!r} in the rig file: the error of"
-                f" the measured platform and cables, 95 %; or run these calibrations{then}",
-                values={"camera": camera.name},
-            )
 
 
 class SharedErrors:

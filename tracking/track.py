@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -19,14 +19,14 @@ from model.errors import BadInput
 from model.pose import Array, Pose
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, pixels_of
-from tracking.clearance import MeasuredClearance, clearance_of
+from tracking.clearance import MeasuredClearance, clearance_of, require_stated_errors
 from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
 from tracking.detection.tags import mounted_rotated, tag_corners
 from tracking.estimator import UNCERTAIN, UNSHARP
 from tracking.fusion import DISAGREE, MultiCameraFusion, synchronize_frames
-from tracking.measurement import Observation, PoseMeasurement, rates
+from tracking.measurement import Observation, PoseMeasurement
 from tracking.pose_log import LoggedPicture
-from tracking.shared_errors import PERHAPS_MOVED, require_stated_errors
+from tracking.shared_errors import PERHAPS_MOVED
 from tracking.tracker import Tracker
 
 
@@ -272,48 +272,6 @@ def _ignoring_no_platform(stream: Iterator[LoggedPicture]) -> Iterator[LoggedPic
         yield from stream
     except NoPlatformSeen:
         return
-
-
-# Frame rate and measuring time.
-
-
-#: Number of the newest images for live figures.
-NEWEST = 10
-
-
-class FrameRate:
-    """Frame rate and measuring time of the newest images."""
-
-    def __init__(self) -> None:
-        """Starts without images."""
-        self._times: deque[float] = deque(maxlen=NEWEST)
-        self._seconds: deque[float] = deque(maxlen=NEWEST)
-
-    def take(self, time: float, seconds: float) -> None:
-        """Adds an image.
-
-        Args:
-            time: On a monotonic clock, [s].
-            seconds: Measuring time, [s]; NaN if nothing was measured.
-        """
-        self._times.append(time)
-        self._seconds.append(seconds)
-
-    @property
-    def pictures_per_second(self) -> float | None:
-        """Frame rate, [Hz]; None before there are two images."""
-        took = self._times[-1] - self._times[0] if self._times else 0.0
-        return round((len(self._times) - 1) / took, 1) if took > 0.0 else None
-
-    @property
-    def measuring_ms(self) -> float | None:
-        """Median measuring time, [ms]; None if nothing was measured."""
-        known = [one for one in self._seconds if np.isfinite(one)]
-        return round(float(np.median(known)) * 1e3, 2) if known else None
-
-    def text(self, tags: int) -> str:
-        """As in `rates`."""
-        return rates(self.pictures_per_second, self.measuring_ms, tags)
 
 
 # Drawing of measurements into images.

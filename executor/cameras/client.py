@@ -15,8 +15,7 @@ from model.errors import CdprError, Fault, Refused, without_passwords
 from model.kinematics import cable_lengths, structure_matrix
 from model.pose import Pose, moved, step_between
 from model.rig import Rig
-from tracking.measurement import Observation, PoseMeasurement, largest_deviations
-from tracking.track import FrameRate
+from tracking.measurement import FrameRate, Observation, PoseMeasurement, largest_deviations
 
 # Health of a camera: whether it still measures the platform.
 

@@ -27,7 +27,6 @@ from model.pose import Pose
 from model.rig import Camera, Rig
 from tracking.clearance import MeasuredClearance
 from tracking.measurement import NoPose, Observation
-from tracking.tracker import EncoderExtrapolator, Tracker
 
 # The camera worker: takes an image on request and measures the pose in it.
 
@@ -125,6 +124,9 @@ class CameraWorker:
         self._source, self._folder, self._keep_every = source, folder, keep_every
         self._kept = 0
         self._name = camera.name if named else ""
+        # The supervisor of cameras loads no tracker, which takes as long as all else that it loads.
+        from tracking.tracker import EncoderExtrapolator, Tracker
+
         self._tracker, self._drives = Tracker(rig, camera), EncoderExtrapolator()
         self._live, self._newest = live, _NOTHING
 

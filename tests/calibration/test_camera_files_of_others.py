@@ -15,7 +15,7 @@ from model.errors import BadInput
 from model.files.camera_file import CameraDocument
 from model.progress import Listener
 from model.rig import Rig, load_rig
-from tracking.shared_errors import require_stated_errors
+from tracking.clearance import require_stated_errors
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

@@ -23,7 +23,7 @@ from model.errors import BadInput
 from model.rig import Rig, load_rig, rig_from_document
 from tests.calibration.results import camera_result_of
 from tests.calibration.test_camera_files_of_others import Remarks
-from tracking.shared_errors import require_stated_errors
+from tracking.clearance import require_stated_errors
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

@@ -20,12 +20,17 @@ HALL = CONFIGS / "hall_10_6.yaml"
 START_MM, GOAL_MM = (0.0, 0.0, 445.0), (0.0, 30.0, 495.0)
 
 
-def rig_with_two_pictures_a_second(folder: Path) -> Path:
-    """The paper's rig for long runs, with few images, as rendering takes most of the time."""
+def rig_for_long_runs(folder: Path) -> Path:
+    """The paper's rig, three times as fast and with two images a second, to compute less."""
     rig = folder / "rig.yaml"
     text = RIG.read_text()
-    assert "rate_hz: 10" in text
-    rig.write_text(text.replace("rate_hz: 10", "rate_hz: 2"))
+    for as_shipped, here in (
+        ("rate_hz: 10", "rate_hz: 2"),
+        ("  speed_mm_s: 20", "  speed_mm_s: 60"),
+    ):
+        assert as_shipped in text
+        text = text.replace(as_shipped, here)
+    rig.write_text(text)
     return rig
 
 

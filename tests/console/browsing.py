@@ -243,9 +243,7 @@ def fake_server() -> Iterator[Fake]:
 
 
 @contextlib.contextmanager
-def visit(
-    browser: Browser, fake: Fake, size: str = "desk", scheme: str = "light", script: str = ""
-) -> Iterator[Visit]:
+def visit(browser: Browser, fake: Fake, size: str = "desk", script: str = "") -> Iterator[Visit]:
     """A page at a server that is new; fails when the page logged an error.
 
     `script` runs before the page's own. Without one, a browser's next visit has the same page, with
@@ -261,7 +259,7 @@ def visit(
         context.add_init_script(script)
         page = context.new_page()
     page.set_viewport_size({"width": width, "height": height})
-    page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
+    page.emulate_media(color_scheme="light")
     found = Visit(page, fake)
     with contextlib.ExitStack() as whole:
         whole.callback(page.context.close)

@@ -62,26 +62,17 @@ def test_a_list_of_files_that_is_not_complete_says_so(desk: Visit) -> None:
     desk.errors.clear()
 
 
-@pytest.mark.parametrize(
-    ("button", "reason"),
-    [
-        ("load-plan", "Select a plan file first"),
-        ("compare-plan", "Select a plan file first"),
-        ("make-plan", "Select a scene file first"),
-    ],
-)
-def test_without_a_selected_file_its_buttons_are_inactive_and_say_why(
-    desk: Visit, button: str, reason: str
-) -> None:
+def test_without_a_selected_file_its_buttons_are_inactive_and_say_why(desk: Visit) -> None:
     desk.fake.ask(set={"plan": "plans/circle.json"})
     desk.take_control()
     desk.page.locator("summary", has_text="Make a plan").click()
-    inactive = desk.page.locator(f"#{button}")
-    expect(inactive).to_have_attribute("aria-disabled", "true")
-    expect(inactive).to_have_attribute("title", reason)
-    group = "scene-file" if button == "make-plan" else "plan-file"
-    desk.page.locator(f"input[name={group}]").first.check(force=True)
-    expect(inactive).not_to_have_attribute("aria-disabled", "true")
+    for kind, buttons in (("plan", ("load-plan", "compare-plan")), ("scene", ("make-plan",))):
+        for inactive in (desk.page.locator(f"#{button}") for button in buttons):
+            expect(inactive).to_have_attribute("aria-disabled", "true")
+            expect(inactive).to_have_attribute("title", f"Select a {kind} file first")
+        desk.page.locator(f"input[name={kind}-file]").first.check(force=True)
+        for active in (desk.page.locator(f"#{button}") for button in buttons):
+            expect(active).not_to_have_attribute("aria-disabled", "true")
 
 
 # Paths.

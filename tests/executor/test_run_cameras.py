@@ -42,8 +42,7 @@ from model.pose import Pose
 from model.rig import load_rig
 from tests.cli.plans import RIG, free_scene
 from tracking.clearance import MeasuredClearance, clearance_of
-from tracking.measurement import PoseMeasurement
-from tracking.track import FrameRate
+from tracking.measurement import FrameRate, PoseMeasurement
 
 RATE = 10.0
 HERE = Pose.level([0.0, 0.0, 0.445])

@@ -115,3 +115,9 @@ def test_the_real_time_process_of_a_real_bus_loads_no_compiler_and_no_camera() -
     """It loads everything before the drives are set up, while the operator waits."""
     code = "import executor.realtime.child, executor.control.path_runs, executor.drives"
     assert not loaded_by(code) & {"numba", "cv2", "matplotlib", "mcap"}
+
+
+def test_the_supervisor_of_a_run_loads_no_tracker() -> None:
+    """Only the processes of cameras track."""
+    code = "import executor.runner, executor.homing, executor.winch_runs"
+    assert not loaded_by(code) & {"numba", "scipy", "matplotlib"}

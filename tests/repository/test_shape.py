@@ -23,6 +23,7 @@ INNER_IMPORTS: dict[str, set[str]] = {
     "a heavy library is loaded by the few calls that need it": {
         "cdpr/cli/app.py",
         "cdpr/console/watch.py",
+        "executor/cameras/process.py",
         "executor/recording/run_folder.py",
         "executor/report/figures.py",
         "executor/report/tiles.py",

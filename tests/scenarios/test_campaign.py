@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from benchmarks import campaign as benchmark
 from benchmarks.campaign import PlanResult, RunResult, campaign, failures, table
+from model.rig import load_rig
+from tests.cli.plans import rig_for_long_runs
 
 GOOD_PLAN = PlanResult(1, 10.0, 0, "", True, 10.5, 0.0, 700.0, 3.0, 1.0)
 GOOD_RUN = RunResult(1, 10.0, 0, True, "PASSED", 0.01, 0.1, -0.05, 9.0)
@@ -14,8 +18,12 @@ GOOD_RUN = RunResult(1, 10.0, 0, True, "PASSED", 0.01, 0.1, -0.05, 9.0)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", [1, 2, 3])
-def test_a_seed_of_an_environment_holds_all_that_is_asked(environment: int) -> None:
+def test_a_seed_of_an_environment_holds_all_that_is_asked(
+    environment: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without the camera, which other scenarios have."""
+    rig = load_rig(rig_for_long_runs(tmp_path))
+    monkeypatch.setattr(benchmark, "load_rig", lambda _path: rig)
     results = campaign([environment], [3], [10.0, 20.0], 1, 0, lambda _result: None)
     assert failures(results) == []
     assert len(results) == 3

@@ -10,7 +10,7 @@ import pytest
 from executor.recording.run_folder import RunFolder
 from model.plan import load_plan
 from model.rig import load_rig
-from tests.cli.plans import CONFIGS, rig_with_two_pictures_a_second
+from tests.cli.plans import CONFIGS, rig_for_long_runs
 from tests.cli.program import call
 
 SCENE = CONFIGS / "pick_and_place.yaml"
@@ -21,7 +21,7 @@ CARRIED = [0.0, 1.2, 1.2, 0.0, 0.5, 0.0]
 @pytest.mark.slow
 def test_the_ready_scene_is_planned_checked_and_run_with_the_camera(tmp_path: Path) -> None:
     plan, run = tmp_path / "plan.json", tmp_path / "run"
-    rig_file = rig_with_two_pictures_a_second(tmp_path)
+    rig_file = rig_for_long_runs(tmp_path)
     planned = call("plan", rig_file, SCENE, "-o", plan, "--rounds", "20")
     assert planned.code == 0, planned
     assert "tray (pick 2 s, then 1.2 kg), over the wall (pass), shelf" in planned.said

@@ -9,7 +9,7 @@ import pytest
 
 from executor.recording.run_folder import RunFolder
 from model.plan import load_plan
-from tests.cli.plans import CONFIGS, rig_with_two_pictures_a_second
+from tests.cli.plans import CONFIGS, rig_for_long_runs
 from tests.cli.program import Answer, call
 
 
@@ -22,7 +22,7 @@ def done(*words: str | Path) -> Answer:
 @pytest.mark.slow
 def test_the_platform_is_put_down_on_the_ramp(tmp_path: Path) -> None:
     plan, folder = tmp_path / "plan.json", tmp_path / "run"
-    rig_file = rig_with_two_pictures_a_second(tmp_path)
+    rig_file = rig_for_long_runs(tmp_path)
     done("plan", rig_file, CONFIGS / "turn.yaml", "-o", plan, "--free-rotation", "--rounds", "60")
     waypoints = load_plan(plan).waypoints
     assert np.degrees(waypoints[0].angle_to(waypoints[-1])) == pytest.approx(6.0)

@@ -21,7 +21,7 @@ from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene, load_scene, scene_from_document
 from simulation.camera.camera import SyntheticCamera
 from tracking.camera_model import distort_pixels, project_undistorted, undistort_pixels
-from tracking.clearance import MeasuredClearance, clearance_of
+from tracking.clearance import MeasuredClearance, clearance_of, require_stated_errors
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.fusion import fuse_poses
@@ -30,7 +30,6 @@ from tracking.pnp import TagView, moved, solve_pnp
 from tracking.shared_errors import (
     SharedErrors,
     implied_rotation,
-    require_stated_errors,
     tag_error_slopes,
 )
 from tracking.tracker import Tracker
