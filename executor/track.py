@@ -86,10 +86,8 @@ class TrackResult(FactsDisplay):
 
     def facts(self) -> list[tuple[str, str]]:
         """The summary as text."""
-        known = {
-            name: "–" if value is None else str(value) for name, value in self.summary().items()
-        }
-        return [(name.replace("_", " "), text) for name, text in known.items()]
+        known = self.summary().items()
+        return [(name.replace("_", " "), "–" if v is None else str(v)) for name, v in known]
 
     def summary(self) -> dict[str, int | float | None]:
         """Key figures, with units in their names; None where there is no pose or no image."""
@@ -236,6 +234,7 @@ def track_sources(
         streams: dict[str, Iterator[LoggedPicture]] = {}
         for camera, (frames, length) in zip(sources, opened, strict=True):
             target = own_drawing(overlay, camera.name) if overlay and several else overlay
+            rate = frames.rate if isinstance(frames, VideoFile) else camera.rate
             streams[camera.name] = track(
                 takewhile(lambda _: not stopped(), islice(frames, pictures)),
                 Tracker(rig, camera),
@@ -243,7 +242,7 @@ def track_sources(
                 give_up_after=PATIENCE if length is None and not several else None,
                 model=model,
                 on_picture=drawing.enter_context(
-                    _overlay(target, rig, camera, _rate(frames, camera), replace_overlay)
+                    _overlay(target, rig, camera, rate, replace_overlay)
                 ),
             )
         try:
@@ -282,7 +281,10 @@ def _simultaneous(
             " are wrong"
         )
     if times:
-        return [(_dated(one, times), len(one)) for one in folders.values()], 0.0
+        return [
+            ((replace(frame, time=times[frame.name]) for frame in folder), len(folder))
+            for folder in folders.values()
+        ], 0.0
     _report_different_videos(videos, listener)
     # The fastest camera defines the time window of simultaneous images.
     return opened, 0.5 / max(camera.rate for camera in cameras)
@@ -343,11 +345,6 @@ def _report_different_videos(videos: Mapping[str, VideoFile], listener: Listener
         )
 
 
-def _dated(folder: ImageFolder, times: Mapping[str, float]) -> Iterator[Frame]:
-    """Images of a folder with the times of their names, [s]."""
-    return (replace(frame, time=times[frame.name]) for frame in folder)
-
-
 def _measure(
     measured: Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]],
     result: TrackResult,
@@ -394,17 +391,10 @@ def _overlay(
     with PictureOutput(target, rate, replace) as out:
 
         def draw(picture: Picture, logged: LoggedPicture) -> None:
-            found = logged.observation
-            out.write(
-                draw_measurement(picture.image, rig, camera, found, logged.clearance), picture.name
-            )
+            found, clearance = logged.observation, logged.clearance
+            out.write(draw_measurement(picture.image, rig, camera, found, clearance), picture.name)
 
         yield draw
-
-
-def _rate(frames: Iterable[Picture], camera: Camera) -> float:
-    """Images per second of a source, for a video of them, [Hz]."""
-    return frames.rate if isinstance(frames, VideoFile) else camera.rate
 
 
 def _opened(

@@ -21,7 +21,7 @@ from tracking.detection.detector import Detection
 from tracking.detection.diagnostics import edge_faults
 from tracking.detection.tags import carries_tag, modules_across, tag_corners, view_angle
 from tracking.edges.refine import refine
-from tracking.measurement import NoPose, Observation, PoseMeasurement, largest_deviations
+from tracking.measurement import MOST_TURN, NoPose, Observation, PoseMeasurement, largest_deviations
 from tracking.pnp import BundlePose, TagView, displaced_tag, fit_inliers, solve_pnp, square_poses
 from tracking.rolling_shutter import FitByRows, RecentMotion, RollingShutter
 from tracking.shared_errors import SharedErrors
@@ -39,7 +39,7 @@ class TrackerSettings:
         jump: Largest distance from the last pose beyond what `speed` allows, [m].
         jump_angle: Largest rotation from the last pose, [rad].
         speed: Largest expected speed of the platform, [m/s].
-        turn: Largest rotation from the home pose, [rad]; wrong poses are mostly beyond it.
+        turn: Largest rotation from the home pose, [rad].
         single_tag_margin: Required cost difference of a single tag's pose to its mirror pose, in
             variances.
         contradiction: Largest misfit of the edges: their mean squared error, in variances of edges
@@ -57,7 +57,7 @@ class TrackerSettings:
     jump: float = 0.03
     jump_angle: float = 0.25
     speed: float = 0.2
-    turn: float = float(np.radians(80.0))
+    turn: float = MOST_TURN
     single_tag_margin: float = 30.0
     contradiction: float = 7.0
     doubt: float = 2.0

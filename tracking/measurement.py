@@ -16,6 +16,9 @@ from model.pose import (
     rotation_vector_from_matrix,
 )
 
+MOST_TURN = math.radians(80.0)
+"""Largest rotation from the home pose that is measured; wrong poses are mostly beyond it."""
+
 
 def largest_deviations(covariance: Array) -> tuple[float, float]:
     """Standard deviations of position [m] and rotation [rad] along their worst directions.

@@ -35,8 +35,7 @@ from model.pose import Array, Pose, interpolate
 from model.progress import Listener
 from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene, empty_scene, scene_from_document
-from tracking.estimator import TrackerSettings
-from tracking.measurement import Observation
+from tracking.measurement import MOST_TURN, Observation
 
 if TYPE_CHECKING:  # a real camera loads no simulator, and its process no planner
     from executor.trajectory.setpoints import PreparedRun
@@ -115,7 +114,7 @@ def report_unmeasured_rotation(rig: Rig, rotations: Array, listener: Listener) -
         listener: Receives the remark.
     """
     cosine = (np.einsum("nij,ij->n", rotations, rig.home.rotation).min() - 1.0) / 2.0
-    angle, limit = np.degrees([np.arccos(np.clip(cosine, -1.0, 1.0)), TrackerSettings().turn])
+    angle, limit = np.degrees([np.arccos(np.clip(cosine, -1.0, 1.0)), MOST_TURN])
     if angle >= limit:
         listener.remark(
             f"the plan rotates the platform by up to {angle:.4g}° from its home pose; cameras"
