@@ -51,7 +51,7 @@ def test_the_smallest_clearance_is_that_of_the_bound_by_motion(gachon, scene_wit
     found = smallest_over_intervals(model, path, required, TOLERANCE)
     other = smallest_along(samples, evaluate, lambda motion: motion, required, TOLERANCE)
     if other.proved <= 0.0:
-        assert found.proved <= 1e-9
+        assert found.proved <= max(other.value, 0.0) + 1e-9
         return
     assert found.proved <= other.value + 1e-9
     assert other.proved <= found.value + 1e-9
@@ -61,12 +61,13 @@ def test_the_smallest_clearance_is_that_of_the_bound_by_motion(gachon, scene_wit
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_no_pose_of_a_path_is_nearer_than_is_proved(gachon, scene_with, seed) -> None:
+    """Nor free, where it overlaps."""
     model, path, poses = random_case(gachon, scene_with, seed)
     found = smallest_over_intervals(model, path, 0.0, TOLERANCE)
     moves = pairwise(poses)
     sampled = [interpolate(a, b, t) for a, b in moves for t in np.linspace(0.0, 1.0, 40)]
     smallest = min(model.smallest(pose).distance for pose in sampled)
-    assert found.proved <= smallest + 1e-9
+    assert found.proved <= max(smallest, 0.0) + 1e-9
     if found.value > 0.0:
         assert found.value == pytest.approx(model.smallest(path.pose(found.at)).distance, abs=1e-9)
 
