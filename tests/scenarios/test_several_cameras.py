@@ -47,8 +47,8 @@ def with_two_cameras(path: Path, looks_away: bool = False) -> Path:
         "rotation_wxyz": [1.0, 0.0, 0.0, 0.0] if looks_away else side.quaternion.tolist(),
     }
     data["cameras"].append({**data["cameras"][0], "name": "side", "world_from_camera": where})
-    if looks_away:  # an image without the platform is searched all over
-        data["cameras"] = [camera | {"rate_hz": 5} for camera in data["cameras"]]
+    # Most of the time goes into images; those without the platform are searched all over.
+    data["cameras"] = [camera | {"rate_hz": 5} for camera in data["cameras"]]
     path.write_text(yaml.safe_dump(data))
     return path
 
