@@ -41,7 +41,12 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "$(PYTHON) has no venv module. Next, on Debian or Ubuntu: sudo apt-get install python3-venv" >&2; exit 1; }; \
 	echo "Installing into $(VENV) (once; needs the network) ..."; \
-	case "$$stamp" in "$$place, "*) ;; *) rm -rf "$(VENV)" ;; esac; \
+	case "$$stamp" in \
+	  "$$place, "*) ;; \
+	  "") if [ -e "$(VENV)" ] && [ "$$("$(BIN)/python" -V 2>&1)" != "$$("$(PYTHON)" -V 2>&1)" ]; then \
+	    echo "$(VENV) is not one of these installations, and not of this Python. Next: remove it, or name another:" \
+	      "make VENV=.venv-cdpr $(MAKECMDGOALS)" >&2; exit 1; fi ;; \
+	  *) rm -rf "$(VENV)" ;; esac; \
 	"$(PYTHON)" -m venv "$(VENV)" && \
 	echo "$$place, unfinished" > "$(STAMP)" && \
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: -c constraints.txt hatchling && \

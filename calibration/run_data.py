@@ -47,19 +47,19 @@ def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
             next_step=f"name one of its cameras with --camera: {', '.join(names)}",
         )
     samples = alone[camera] if alone else run.poses()
-    times = cycles.time
+    times, known = cycles.time, cycles.has_encoder_pose
     poses = {}
     for time, picture in zip(samples.time, samples.picture, strict=True):
         after = int(np.searchsorted(times, time))
-        if not picture or not 0 < after < len(times):
+        beside = [after - 1, after]
+        if not picture or not 0 < after < len(times) or not known[beside].all():
             continue
         ends = [
             Pose.from_quaternion(cycles.encoder[row], cycles.encoder_rotation[row])
-            for row in (after - 1, after)
+            for row in beside
         ]
         share = float((time - times[after - 1]) / (times[after] - times[after - 1]))
-        if all(np.isfinite(end.matrix()).all() for end in ends):
-            poses[Path(picture).name] = interpolate(ends[0], ends[1], share)
+        poses[Path(picture).name] = interpolate(ends[0], ends[1], share)
     return poses
 
 

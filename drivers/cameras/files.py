@@ -291,10 +291,15 @@ def natural_order(name: str) -> tuple[list[tuple[int, int, str]], str]:
     return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts], name
 
 
+#: HHMMSS or HHMMSSmmm, perhaps after a date.
+_TIME_OF_DAY = re.compile(r"(?:\d{8})?([01]\d|2[0-3])([0-5]\d)([0-5]\d)(\d{3})?")
+
+
 def first_gap(names: Sequence[str]) -> tuple[str, str] | None:
     """The first names between which images seem to be missing, by the last number of each.
 
     The numbers increase, and most by about the same step, which is 1, 10 or that of time stamps.
+    Those that can all be times of day are taken as such.
 
     Args:
         names: In natural order.
@@ -302,7 +307,12 @@ def first_gap(names: Sequence[str]) -> tuple[str, str] | None:
     found = [re.findall(r"\d+", Path(name).stem) for name in names]
     if len(found) < 3 or not all(found):
         return None
-    steps = [int(after[-1]) - int(before[-1]) for before, after in pairwise(found)]
+    times = [_TIME_OF_DAY.fullmatch(numbers[-1]) for numbers in found]
+    parts = [[int(part or 0) for part in time.groups()] for time in times if time is not None]
+    counts = [int(numbers[-1]) for numbers in found]
+    if len(parts) == len(found):
+        counts = [((h * 60 + m) * 60 + s) * 1000 + ms for h, m, s, ms in parts]
+    steps = [after - before for before, after in pairwise(counts)]
     usual = sorted(steps)[(len(steps) - 1) // 2]
     gaps = (k for k, step in enumerate(steps) if step > 1.5 * usual and min(steps) > 0)
     return next(((names[k], names[k + 1]) for k in gaps), None)
@@ -318,7 +328,7 @@ VIDEO_CODES = {".mp4": "mp4v", ".avi": "MJPG"}
 class PictureOutput:
     """Context manager that writes colour images to a folder or a video.
 
-    What was written before a user-visible error or Ctrl-C is kept, as are the poses until then.
+    What was written before a user-visible error or Ctrl-C is kept.
 
     Args:
         path: A folder to create, or a video file, by its suffix.

@@ -35,8 +35,8 @@ from model.rig import Camera
 #: Consecutive failed reads after which a camera counts as lost.
 LOST_PICTURES = 5
 #: The same after copies of one image for this long, [s]. A video codec may repeat an image of a
-#: platform at rest up to its next complete one.
-FROZEN = 10.0
+#: platform at rest up to its next complete one, for 10 s and more.
+FROZEN = 60.0
 #: Longest wait for the reading thread when closing, and interval of checks for a stop, [s].
 END_TIMEOUT, ROUND = 2.0, 0.1
 NOT_OPENED = "cannot be opened"

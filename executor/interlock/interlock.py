@@ -13,6 +13,7 @@ from drivers.can_bus import IN_PROCESS, BusSettings
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.reference import (
     AGAIN,
+    AS_IN_THE_FILE,
     RESTARTED,
     HomingReference,
     ReferenceFile,
@@ -392,10 +393,15 @@ class MotionInterlock:
 
     def _lost_refusal(self, reference: HomingReference) -> Refused:
         homed = f"homed {reference.made}" if reference.made else "the drives were never homed"
-        return self._refusal("the homing reference is lost", f"{reference.lost}; {homed}")
+        absolute = all(winch.absolute for winch in self._rig.winches)
+        return self._refusal(
+            "the homing reference is lost",
+            f"{reference.lost}; {homed}",
+            f"{AGAIN}; {AS_IN_THE_FILE}" if absolute else AGAIN,
+        )
 
-    def _refusal(self, what: str, why: str) -> Refused:
-        return Refused(what, where=f"reference {self.file.path}", why=why, next_step=AGAIN)
+    def _refusal(self, what: str, why: str, next_step: str = AGAIN) -> Refused:
+        return Refused(what, where=f"reference {self.file.path}", why=why, next_step=next_step)
 
 
 # Status of a bus's reference.

@@ -32,6 +32,9 @@ from model.winches import WinchMap
 
 AGAIN = f"home the drives: {HOME}; nothing was moved"
 
+#: Besides, for absolute encoders.
+AS_IN_THE_FILE = "if they count as in the rig file, `cdpr home RIG --as-rig-file` instead"
+
 #: Why a drive lost its configuration, and with it the reference of an incremental encoder.
 RESTARTED = "power-cycled, or `bus.cycle_ms` was changed"
 

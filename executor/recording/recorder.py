@@ -29,13 +29,11 @@ from model.scene import Scene
 
 # Log of a run's cycles in memory, and their table.
 
-
 #: Cycles that are allocated at a time: 40 s at 10 ms.
 _CHUNK = 4096
 _STATES = tuple(State)
 
 Cycles = NDArray[np.void]
-
 
 #: Size of a row of ``cycles.csv`` in a run of hours: of all cables together, and of each, [bytes].
 ROW, ROW_PER_CABLE = 230, 45
@@ -118,13 +116,13 @@ class RunLog:
         """Platform pose from the encoders in a cycle; None if the positions fit no pose."""
         planned, row = self._checked.table, round(record.index)
         cycle = np.array([self._packed(record)], self._format)
-        lengths, _ = self._lengths(cycle, np.array([row]))
+        lengths, _, most_off = self._lengths(cycle, np.array([row]))
         try:
             guess = Pose(planned.positions[row], planned.rotations[row])
             found = forward_kinematics(self._rig, lengths[0], guess)
         except Fault:
             return None
-        return found.pose if found.worst <= self._fits_within else None
+        return found.pose if found.worst <= most_off[0] else None
 
     def table(self, first: int = 0, end: int | None = None) -> CycleTable:
         """The table of the run's cycles, or of those from ``first`` up to ``end``.
@@ -136,11 +134,11 @@ class RunLog:
         began = self._chunks[0]["at"][0] if len(cycles) else 0.0
         index = self._reported_index(cycles, first)
         rows = np.rint(index).astype(np.int64)
-        lengths, tensions = self._lengths(cycles, rows)
+        lengths, tensions, most_off = self._lengths(cycles, rows)
         encoder, rotations, off = poses_near(
             rig, lengths, planned.positions[rows], planned.rotations[rows]
         )
-        fits = off <= self._fits_within  # else a cable is slack, slipped, or was wound in alone
+        fits = off <= most_off  # else a cable is slack, slipped, or was wound in alone
         return CycleTable(
             time=cycles["at"] - began,
             state=tuple(_STATES[k].value for k in cycles["state"].tolist()),
@@ -171,8 +169,11 @@ class RunLog:
         before = self._cycles(first - 1, first)["index"] if first else [0.0]
         return np.concatenate([before, cycles["index"][:-1]])[: len(cycles)]
 
-    def _lengths(self, cycles: Cycles, rows: Integers) -> tuple[Array, Array]:
-        """Cable lengths [m] from the encoders, and tensions [N] where torques give them.
+    def _lengths(self, cycles: Cycles, rows: Integers) -> tuple[Array, Array, Array]:
+        """Cable lengths, tensions where torques give them, and how far lengths may be off a pose.
+
+        Shapes (n, m), [m]; (n, m), [N]; and (n,), [m]. Tensions unlike the planned ones stretch the
+        cables in ways that no pose has.
 
         Args:
             cycles: n cycles.
@@ -181,12 +182,11 @@ class RunLog:
         tensions = self._rig.tensions_by(cycles["torques"])
         # Only the torques of drives that follow their set-points give cable tensions.
         taut = np.isfinite(cycles["following_error"])[:, None]
-        stretch = np.where(taut, tensions, self._checked.table.tensions[rows])
-        winches = self._checked.winches
-        lengths = winches.strained(
-            winches.unstrained_from_counts(cycles["actual"].astype(np.float64)), stretch
-        )
-        return lengths, np.where(taut, tensions, np.nan)
+        planned, winches = self._checked.table.tensions[rows], self._checked.winches
+        unstrained = winches.unstrained_from_counts(cycles["actual"].astype(np.float64))
+        lengths = winches.strained(unstrained, np.where(taut, tensions, planned))
+        more_stretch = np.linalg.norm(lengths - winches.strained(unstrained, planned), axis=1)
+        return lengths, np.where(taut, tensions, np.nan), self._fits_within + more_stretch
 
     def _stop_at(self, row: int) -> str:
         """Name of the stop at which the platform dwells; empty between stops."""

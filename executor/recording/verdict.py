@@ -113,6 +113,7 @@ def judge(
         replies(cycles, simulated, silent),
         *tensions(cycles, rig),
         *distances(clearance, scene.obstacle_clearance, cameras, cycles.path_began),
+        *encoder_pose(cycles),
         *camera(poses, cameras, cycles.path_began),
         *(Check("drive_warning", True, f"Warning: {warning}.") for warning in warnings),
         *(Check("record", False, f"{trouble}.") for trouble in troubles),
@@ -318,6 +319,21 @@ def _against_plan(rows: ClearanceTable) -> Check:
         f" planned {rows.planned_distance[worst] * 1e3:.2f} mm."
     )
     return Check("clearance_plan", passed, text)
+
+
+def encoder_pose(cycles: CycleTable) -> list[Check]:
+    """A failed check where no pose of the platform fits the drives on the path; else none.
+
+    Clearances by the encoders are unknown there.
+    """
+    lost = np.isin(cycles.state, list(_ON_PATH)) & ~cycles.has_encoder_pose
+    if not lost.any():
+        return []
+    text = (
+        f"No pose of the platform fits the positions of the drives in {int(lost.sum())} cycles on"
+        f" the path, first at {cycles.time[np.argmax(lost)]:.2f} s: a cable is slack or slipped."
+    )
+    return [Check("encoder_pose", False, text)]
 
 
 def camera(

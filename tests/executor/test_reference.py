@@ -630,6 +630,18 @@ def test_drives_that_were_never_homed_count_as_in_the_rig_file_whatever_it_was_b
             ask()
 
 
+def test_a_loss_of_drives_never_homed_names_the_way_out_for_absolute_encoders() -> None:
+    """The rig file said at first that they count from where they are switched on."""
+    MotionInterlock(rig_with("incremental")).found_restarted(load_rig(RIG).drive_names)
+    for encoder in ("incremental", "absolute"):
+        interlock = MotionInterlock(rig_with(encoder))
+        with pytest.raises(Refused, match="is lost") as refused:
+            interlock.reference()
+        assert ("--as-rig-file" in refused.value.next_step) is (encoder == "absolute")
+    interlock.use_rig_file_counts()
+    assert interlock.reference() is None
+
+
 @pytest.fixture
 def share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Path]:
     """Creates the folder for all users, as `docs/commissioning.md` advises it."""

@@ -266,6 +266,18 @@ def test_a_slack_or_overloaded_cable_fails_and_is_named(
     assert passed or f"Cable 5 {'went slack' if tension < 5 else 'pulled'}" in check.text
 
 
+def test_drives_whose_positions_fit_no_pose_on_the_path_fail_the_run(run: fake_run.FakeRun) -> None:
+    """The encoders give no clearance there, and no camera may have measured one."""
+    assert not [check for check in run.summary["checks"] if check["name"] == "encoder_pose"]
+    rows = np.flatnonzero(run.cycles.time >= run.cycles.path_began)[[40, 70]]
+    encoder = run.cycles.encoder.copy()
+    encoder[rows] = np.nan
+    made = replace(run, cycles=replace(run.cycles, encoder=encoder)).summary
+    assert made["verdict"] == "FAILED"
+    (reason,) = made["reasons"]
+    assert f"in 2 cycles on the path, first at {run.cycles.time[rows[0]]:.2f} s" in reason
+
+
 def test_drives_without_torque_are_not_judged_by_it(run: fake_run.FakeRun) -> None:
     unknown = replace(run.cycles, tensions=np.full_like(run.cycles.tensions, np.nan))
     assert tensions(unknown, run.context.rig) == []

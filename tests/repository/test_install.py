@@ -52,11 +52,24 @@ def installed(folder: Path) -> tuple[str, str]:
     return shown.stdout.split()[1], (folder / ".venv/installed").read_text().split()[1]
 
 
-def test_an_environment_of_another_python_is_replaced(folder: Path) -> None:
+def test_an_installation_on_another_python_is_replaced(folder: Path) -> None:
     """`venv` itself keeps the Python of an environment that exists."""
-    subprocess.run([python(folder, "3.11.2"), "-m", "venv", ".venv"], cwd=folder, check=True)
+    assert make("install", python(folder, "3.11.2"))
     assert make("install", python(folder, "3.12.1"))
     assert installed(folder) == ("3.12.1", "3.12.1")
+
+
+def test_an_environment_of_the_user_s_own_is_kept(folder: Path) -> None:
+    """An editor may have made it; on the same Python it is installed into."""
+    old, new = python(folder, "3.11.2"), python(folder, "3.12.1")
+    subprocess.run([old, "-m", "venv", ".venv"], cwd=folder, check=True)
+    own = folder / ".venv/own"
+    own.touch()
+    assert not make("install", new)
+    assert own.exists()
+    assert make("install", old)
+    assert own.exists()
+    assert installed(folder) == ("3.11.2", "3.11.2")
 
 
 def test_an_interrupted_installation_continues_on_its_own_python_only(folder: Path) -> None:

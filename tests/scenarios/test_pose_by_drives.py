@@ -9,9 +9,12 @@ import numpy as np
 
 from executor.cameras.multi_camera import CameraRecords
 from executor.evaluation import _clearance
+from executor.recording.recorder import RunLog
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
+from model.kinematics import cable_lengths
 from model.pose import Pose
+from model.winches import WinchMap
 from tests.scenarios.stage import staged
 
 
@@ -41,6 +44,36 @@ def test_each_image_comes_with_the_drives_pose_of_its_own_time(
         if beside.min() > 1e-4:  # it moves: another cycle's pose would be seen
             before = np.linalg.norm(pose.position - cycles.encoder[row - 1])
             assert before > 5e-5
+
+
+def test_soft_cables_tighter_than_planned_still_give_a_pose(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """All drives are where they should be: the cables stretch in ways that no pose has."""
+    with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
+        log = stage.run().log
+    record = log.last
+    assert record is not None
+    rig, table = prepared.rig, prepared.checked.table
+    soft, row = WinchMap(rig, np.full(rig.cable_count, 3000.0)), round(record.index)
+    lengths = cable_lengths(rig, table.poses()[row])
+    counts = np.rint(soft.counts(soft.unstrained(lengths, table.tensions[row]))).astype(int)
+    tight = RunLog(rig, stage.prepared.scene, replace(prepared.checked, winches=soft))
+    torques = np.rint(rig.torques_by(3.0 * table.tensions[row])).astype(int)
+    for more, drives_fit in ((0, True), (round(0.3 * soft.counts_per_metre[2]), False)):
+        counts[2] += more
+        one = replace(
+            record,
+            state=State.MOVING,
+            actual=tuple(counts.tolist()),
+            torques=tuple(torques.tolist()),
+            following_error=0.0,
+        )
+        tight.add(one)
+        assert (tight.encoder_pose(one) is not None) is drives_fit
+    stretched = soft.strained(soft.unstrained_from_counts(counts), 3.0 * table.tensions[row])
+    assert np.abs(stretched - lengths).max() > 0.005
+    assert tight.table().has_encoder_pose.tolist() == [True, False]
 
 
 def test_positions_that_fit_no_pose_give_neither_a_pose_nor_a_clearance(

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +134,20 @@ def test_the_kept_images_of_each_camera_have_the_drives_poses(
     with pytest.raises(BadInput, match="camera 'back' took no images") as reported:
         poses_of_run(folder.path, "back")
     assert "front, side" in reported.value.next_step
+
+
+def test_an_image_at_a_time_without_a_pose_of_the_drives_is_left_out(
+    answer_and_folder: tuple[Answer, RunFolder], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, folder = answer_and_folder
+    poses, cycles = poses_of_run(folder.path, "side"), folder.cycles()
+    name, *others = sorted(poses)
+    samples = folder.poses_by_camera()["side"]
+    at = next(t for t, p in zip(samples.time, samples.picture, strict=True) if p.endswith(name))
+    encoder = cycles.encoder.copy()
+    encoder[np.searchsorted(cycles.time, at)] = np.nan
+    monkeypatch.setattr(RunFolder, "cycles", lambda _folder: replace(cycles, encoder=encoder))
+    assert sorted(poses_of_run(folder.path, "side")) == others
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,6 @@ def _braked() -> Rig:
 @contextmanager
 def held(
     *,
-    set_up_where_they_are: bool = True,
     braked: bool = False,
     in_fault: tuple[int, DriveState] | None = None,
 ) -> Iterator[Held]:
@@ -83,9 +82,8 @@ def held(
         if in_fault is not None:
             rehearsal.drives[in_fault[0]].state = in_fault[1]
             rehearsal.drives[in_fault[0]]._move = lambda _elapsed: None  # type: ignore[method-assign]
-        if set_up_where_they_are:
-            seen: DriveSnapshot = read_drives(rig, near, rehearsal.pump)
-            rig = set_up_here(rig, seen)[0]
+        seen: DriveSnapshot = read_drives(rig, near, rehearsal.pump)
+        rig = set_up_here(rig, seen)[0]
         group = make_drive_group(rig, near, rehearsal.pump)
         group.configure(to_reset=True)
         yield Held(rehearsal, group)
@@ -192,7 +190,10 @@ def test_a_second_drive_that_fails_during_such_a_release_stops_the_others(
 
 
 def test_drives_beyond_their_limits_are_not_enabled() -> None:
-    with held(set_up_where_they_are=False) as bench:
+    """One moved after the set-up, which takes the limits around where each is."""
+    with held() as bench:
+        motor = bench.drives[3].motor
+        motor.position, motor.demand = motor.position + 1e8, motor.demand + 1e8
         with pytest.raises(Refused, match="outside its position limits"):
             bench.do(Release)
         assert bench.states == {HOLDING}

@@ -174,8 +174,11 @@ def test_a_camera_without_images_can_be_stopped(
     """Before its first image, and afterwards; it hangs in neither case for the operator."""
     monkeypatch.setattr(drivers.cameras.live, "ROUND", 1e-3)
     monkeypatch.setattr(drivers.cameras.live, "END_TIMEOUT", 0.0)  # it hangs
+    hanging = Queue(camera)
+    monkeypatch.setattr(drivers.cameras.live, "_opened", {0: queue, 1: hanging}.__getitem__)
     with pytest.raises(StoppedByOperator, match="stopped before"):
-        LiveCamera("0", camera, queue.clock, stopped=lambda: True)
+        LiveCamera("1", camera, hanging.clock, stopped=lambda: True)
+    hanging.unplug()
     queue.take(1)
     request = threading.Event()
     with LiveCamera("0", camera, queue.clock, stopped=request.is_set) as live:

@@ -71,6 +71,9 @@ def test_a_gap_in_the_numbers_of_names_is_found(
         ["a.png", "b.png", "d.png"],
         ["start.png", "1.png", "2.png", "5.png"],
         ["12-00-58.png", "12-00-59.png", "12-01-00.png", "12-01-01.png"],
+        ["IMG_20261127_175958.jpg", "IMG_20261127_175959.jpg", "IMG_20261127_180000.jpg"],
+        [f"PXL_20261127_{time}.jpg" for time in (175959640, 175959970, 180000300, 180000630)],
+        ["20261127175957.png", "20261127175959.png", "20261127180001.png"],
         ["left_1.png", "left_2.png", "right_1.png", "right_2.png"],
     ],
 )
