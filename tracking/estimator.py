@@ -148,6 +148,8 @@ UNCERTAIN = "the position's uncertainty is"
 """Message about a pose from edges that are too soft, too few or too far away."""
 UNSHARP = "are too blurred to be measured"
 """Message about tags that are decoded, but whose edges are not found."""
+ROTATED = "from the home pose, the limit is"
+"""Message about a platform that is rotated too far to be measured."""
 CONTRADICT = "its tags contradict each other"
 """Message about tags that are not where the rig file has them."""
 CAUSE = (
@@ -192,10 +194,8 @@ def rejection_reason(
             f" {CAUSE}"
         )
     if bundle.reprojection > limits.reprojection_px:
-        return (
-            f"the reprojection error is {bundle.reprojection:.2f} px,"
-            f" the limit is {limits.reprojection_px:g} px"
-        )
+        limit = f"the limit is {limits.reprojection_px:g} px"
+        return f"the reprojection error is {bundle.reprojection:.2f} px, {limit}"
     is_single = len(views) == 1 and bundle.second_best_cost - bundle.cost < limits.single_tag_margin
     if is_single and (prior is None or not prior.angle_to(bundle.camera_from_body) < 0.1):
         return f"only tag {used} is detected, and it allows two poses"
@@ -329,7 +329,7 @@ class PlatformEstimator:
         fits = f"the pose that fits tags {', '.join(str(view.tag.id) for view in views)} is"
         turn, limit = np.degrees([pose.angle_to(self._rig.home), self._settings.turn])
         if not turn < limit:
-            return f"{fits} {turn:.0f}° from the home pose, the limit is {limit:g}°"
+            return f"{fits} {turn:.0f}° {ROTATED} {limit:g}°"
         if self._is_reached(camera_from_platform):
             return ""
         x, y, z = pose.position * 1e3

@@ -22,7 +22,7 @@ from tracking.camera_model import Image, pixels_of
 from tracking.clearance import MeasuredClearance, clearance_of, require_stated_errors
 from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
 from tracking.detection.tags import mounted_rotated, tag_corners
-from tracking.estimator import UNCERTAIN, UNSHARP
+from tracking.estimator import ROTATED, UNCERTAIN, UNSHARP
 from tracking.fusion import DISAGREE, MultiCameraFusion, synchronize_frames
 from tracking.measurement import Observation, PoseMeasurement
 from tracking.pose_log import LoggedPicture
@@ -163,6 +163,11 @@ def _nothing_seen(
         next_step = "take more images; if the camera moved, restore it or calibrate its pose again"
     elif UNSHARP in reason or soft:
         next_step = "focus the camera on the platform, and add light to shorten the exposure"
+    elif ROTATED in reason:
+        next_step = (
+            "rotate the platform back; if it is not rotated so far, check rotation_wxyz of"
+            " tags.platform and platform.home in the rig file"
+        )
     elif len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
         rotated = _rotated_tags(tracker, last)

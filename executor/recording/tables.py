@@ -381,7 +381,7 @@ def no_poses() -> PoseTable:
     )
 
 
-# Poses fused from encoders and cameras: one row per cycle, from the first image on.
+# Fused poses: one row per cycle with an encoder pose, from the first image on.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -423,8 +423,11 @@ class FusedTable:
 
 
 def fused_table(cycles: CycleTable, poses: PoseTable) -> FusedTable:
-    """The encoder poses of a run, corrected by its images."""
+    """The encoder poses of a run, corrected by its images between two of them."""
     known = cycles.has_encoder_pose
+    after = np.searchsorted(cycles.time, poses.time)
+    padded = np.pad(known, 1, mode="edge") if len(known) else np.zeros(2, dtype=bool)
+    between = padded[after] & padded[after + 1]
     pairs = zip(cycles.encoder[known], cycles.encoder_rotation[known], strict=True)
     by_drives = [Pose.from_quaternion(position, rotation) for position, rotation in pairs]
     measured = [
@@ -433,7 +436,7 @@ def fused_table(cycles: CycleTable, poses: PoseTable) -> FusedTable:
             Pose.from_quaternion(poses.position[i], poses.rotation[i]),
             poses.covariance[i],
         )
-        for i in np.flatnonzero(poses.ok)
+        for i in np.flatnonzero(poses.ok & between)
     ]
     rows = list(fuse_with_encoders(cycles.time[known].tolist(), by_drives, measured))
     covariances = np.array([row.covariance for row in rows]).reshape(-1, 6, 6)

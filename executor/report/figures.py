@@ -50,6 +50,13 @@ def _line(
     return ChartLine(name, *thinned(time, values, most), role, dash=dash)
 
 
+def _drives(run: RunData, values: Array) -> ChartLine:
+    """A line through values of the encoder poses, [m]."""
+    known = run.cycles.has_encoder_pose
+    time, values = with_gaps(run.cycles.time[known], values[known] * 1e3)
+    return ChartLine("drives", time, values, "encoder")
+
+
 def _level(name: str, value: float, run: RunData, *, fits: bool = True) -> ChartLine:
     """A horizontal line at a limit."""
     ends = np.array(_whole(run))
@@ -89,7 +96,7 @@ def nearest_obstacles(clearance: ClearanceTable, most: int) -> list[int]:
 
 
 def _sources(clearance: ClearanceTable) -> list[ClearanceTable]:
-    """The rows of each source, the best first; the last one has rows of the whole run."""
+    """The rows of each source, the best first; the last one has rows of all encoder poses."""
     return [rows for rows in map(clearance.of, ("tag", "encoder")) if len(rows)]
 
 
@@ -322,7 +329,7 @@ def _coordinate(run: RunData, i: int) -> Chart:
     if poses.ok.any():
         time, position = with_gaps(poses.time[poses.ok], poses.position[poses.ok, i] * 1e3)
         lines.append(ChartLine("camera", time, position, "tag", 4.5, opacity=0.45))
-    lines.append(_line("drives", cycles.time, cycles.encoder[:, i] * 1e3, "encoder"))
+    lines.append(_drives(run, cycles.encoder[:, i]))
     planned = cycles.planned[:, i] * 1e3
     lines.append(_line("planned", cycles.time, planned, "ink", dash=DOTTED))
     text = (
@@ -352,7 +359,7 @@ def _error(run: RunData) -> Chart:
         label = "cameras together" if run.alone else "camera"
         time, error = with_gaps(poses.time[poses.ok], poses.error[poses.ok] * 1e3)
         lines.append(ChartLine(label, time, error, "tag", 1.2))
-    lines.append(_line("drives", cycles.time, cycles.encoder_error * 1e3, "encoder"))
+    lines.append(_drives(run, cycles.encoder_error))
     return Chart(
         "Distance from the planned position",
         _error_text(run),

@@ -284,3 +284,20 @@ def test_a_full_disk_leaves_no_broken_log(
             {},
         )
     assert not folder.mcap.exists()
+
+
+def test_an_image_in_a_gap_of_the_encoder_poses_corrects_none(run: fake_run.FakeRun) -> None:
+    """The poses around the gap say nothing about where the platform was in between."""
+    cycles, poses = run.cycles, run.poses
+    rows = np.flatnonzero(poses.ok)
+    first, last = poses.time[rows[len(rows) // 3]], poses.time[rows[len(rows) // 2]]
+    encoder = cycles.encoder.copy()
+    encoder[(cycles.time > first) & (cycles.time < last)] = np.nan
+    gap = replace(cycles, encoder=encoder)
+    inside = (poses.time > first) & (poses.time < last)
+    assert inside.sum() > 2
+    pairs = zip(inside, poses.status, strict=True)
+    without = replace(poses, status=tuple("covered" if bad else text for bad, text in pairs))
+    found, expected = fused_table(gap, poses), fused_table(gap, without)
+    assert len(found) == len(expected) < len(fused_table(cycles, poses))
+    np.testing.assert_array_equal(found.position, expected.position)

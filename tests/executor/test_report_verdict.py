@@ -16,7 +16,7 @@ from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunEvent
 from executor.recording.summary import _clearance, summarize
 from executor.recording.tables import CycleTable, no_poses
-from executor.recording.verdict import distances, following, replies, tensions
+from executor.recording.verdict import distances, encoder_pose, following, replies, tensions
 from executor.report.tiles import chips
 from executor.trajectory.path import rounded
 from model.files.scene_file import StopDocument
@@ -276,6 +276,9 @@ def test_drives_whose_positions_fit_no_pose_on_the_path_fail_the_run(run: fake_r
     assert made["verdict"] == "FAILED"
     (reason,) = made["reasons"]
     assert f"in 2 cycles on the path, first at {run.cycles.time[rows[0]]:.2f} s" in reason
+    missing = run.cycles.missing.copy()
+    missing[rows] = 1
+    assert not encoder_pose(replace(run.cycles, encoder=encoder, missing=missing))
 
 
 def test_drives_without_torque_are_not_judged_by_it(run: fake_run.FakeRun) -> None:

@@ -16,6 +16,7 @@ from planner.bounds import smallest_along, smallest_over_intervals
 from planner.path import PosePath
 
 TOLERANCE = 0.1e-3
+OVERLAP = 1e-6
 SHAPES = (
     {"box": {"size_mm": [90.0, 60.0, 200.0]}},
     {"sphere": {"radius_mm": 50.0}},
@@ -52,6 +53,7 @@ def test_the_smallest_clearance_is_that_of_the_bound_by_motion(gachon, scene_wit
     other = smallest_along(samples, evaluate, lambda motion: motion, required, TOLERANCE)
     if other.proved <= 0.0:
         assert found.proved <= max(other.value, 0.0) + 1e-9
+        assert other.value > -OVERLAP or found.proved < 0.0
         return
     assert found.proved <= other.value + 1e-9
     assert other.proved <= found.value + 1e-9
@@ -68,6 +70,7 @@ def test_no_pose_of_a_path_is_nearer_than_is_proved(gachon, scene_with, seed) ->
     sampled = [interpolate(a, b, t) for a, b in moves for t in np.linspace(0.0, 1.0, 40)]
     smallest = min(model.smallest(pose).distance for pose in sampled)
     assert found.proved <= max(smallest, 0.0) + 1e-9
+    assert smallest > -OVERLAP or found.proved < 0.0
     if found.value > 0.0:
         assert found.value == pytest.approx(model.smallest(path.pose(found.at)).distance, abs=1e-9)
 

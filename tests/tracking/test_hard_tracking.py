@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from drivers.cameras.live import Frame
 from model.pose import PlatformMotion, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, Tag
 from model.scene import Scene
@@ -18,6 +19,7 @@ from tracking.camera_model import Image
 from tracking.estimator import TrackerSettings, find_consensus
 from tracking.measurement import NoPose, PoseMeasurement, predict
 from tracking.pnp import TagView
+from tracking.track import NoPlatformSeen, track
 from tracking.tracker import Tracker
 
 HERE = Pose.level([0.1, 0.1, 0.4])
@@ -90,9 +92,13 @@ def test_a_platform_rotated_too_far_is_named_with_its_angle_and_the_limit(
     """Its tags are as the rig file has them; to check those would lead nowhere."""
     turn = matrix_from_rotation_vector(np.radians(degrees) * np.eye(3)[axis])
     pose = Pose(np.array([0.05, 0.1, 0.4]), turn @ rig.home.rotation)
-    found = Tracker(rig, camera).observe(SyntheticCamera(rig, empty, camera).render(pose, 1), 0.0)
+    image = SyntheticCamera(rig, empty, camera).render(pose, 1)
+    found = Tracker(rig, camera).observe(image, 0.0)
     assert isinstance(found, NoPose)
     assert f"{degrees}° from the home pose, the limit is 80°" in found.reason
+    with pytest.raises(NoPlatformSeen) as caught:
+        list(track([Frame(0.0, image, "rotated")], Tracker(rig, camera)))
+    assert caught.value.next_step.startswith("rotate the platform back")
 
 
 @pytest.mark.parametrize("height", [0.30, 0.34, 0.37])
