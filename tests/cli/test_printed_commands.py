@@ -88,6 +88,7 @@ NOT_RUN = {
 }
 NOT_RUN_WITH = {
     ("doctor", "--camera"): "needs a camera",
+    ("home", "--as-rig-file"): "needs drives on a bus: tests/executor/test_reference.py",
     ("run", "--camera"): "needs a camera",
     ("run", "--interface"): "needs drives on a bus: tests/scenarios/test_processes.py",
     ("sim", "--interface"): "runs until Ctrl-C: tests/scenarios/test_processes.py",
