@@ -73,7 +73,8 @@ def plan(
         rig: The robot.
         scene: Obstacles, clearances, load, start, stops and goal.
         planner: ``optimal``, or the paper's ``adaptive`` and ``goal-bias``.
-        cost: Objective: ``length`` (default), ``kinematic``, ``clearance``, ``capacity``.
+        cost: Objective: ``length``, ``kinematic``, ``clearance``, ``capacity`` (default:
+            ``length``; the paper's planners, which take only the first two: ``kinematic``).
         weights: Instead of a cost: weights of a weighted sum, by objective.
         budget: Time for search and improvement, [s] (default: 0.05; 0.5 with `free_rotation`).
             The result depends on the computer's speed.
