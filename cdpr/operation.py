@@ -73,7 +73,8 @@ def plan(
         rig: The robot.
         scene: Obstacles, clearances, load, start, stops and goal.
         planner: ``optimal``, or the paper's ``adaptive`` and ``goal-bias``.
-        cost: Objective: ``length`` (default), ``kinematic``, ``clearance``, ``capacity``.
+        cost: Objective: ``length``, ``kinematic``, ``clearance``, ``capacity`` (default:
+            ``length``; the paper's planners, which take only the first two: ``kinematic``).
         weights: Instead of a cost: weights of a weighted sum, by objective.
         budget: Time for search and improvement, [s] (default: 0.05; 0.5 with `free_rotation`).
             The result depends on the computer's speed.
@@ -179,7 +180,7 @@ def workspace_map(
         upper: The opposite corner.
         rotation: Of the platform, shape (3, 3) (default: the scene's start, else home).
         characteristic_length: Divides moments in the condition number, [m] (default: the anchors'
-            root mean square radius).
+            root mean square radius, with which alone the costs are the planner's).
         workers: Number of processes, at least 1 (default: one per core).
         listener: Receives the progress.
 

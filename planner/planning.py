@@ -31,7 +31,6 @@ from planner.endpoints import (
 )
 from planner.kernels.jit import planner_compilation
 from planner.path import Progress, Route
-from planner.rrt.variants import AlgorithmVariant
 from planner.settings import (
     AnytimeSettings,
     OptimalSettings,
@@ -389,7 +388,7 @@ def _planner(settings: Settings, path: MultiSegmentPath) -> dict[str, Any]:
         "neighbour_radius_mm": settings.neighbour_radius * 1000.0,
         "goal_radius_mm": settings.goal_radius * 1000.0,
         "max_iterations": settings.max_iterations,
-        "readings": _readings(settings.readings),
+        "readings": _readings(settings),
     }
 
 
@@ -410,12 +409,13 @@ def _anytime_planner(settings: AnytimeSettings, path: MultiSegmentPath) -> dict[
     }
 
 
-def _readings(readings: AlgorithmVariant) -> dict[str, Any]:
+def _readings(settings: PlannerSettings) -> dict[str, Any]:
+    readings = settings.readings
     return {
         "failure_rate": readings.failure_rate,
         "focus": readings.focus,
         "cone_draw": readings.cone_draw,
-        "steer": readings.steer,
+        "steer": readings.steer if settings.mode == "paper" else "to-sample",  # as RRT* steps
         "spacing_mm": readings.spacing * 1000.0,
         "goal_sight": readings.goal_sight,
     }

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from model.errors import BadInput, NoSolution, real_number
 from model.files.documents import LARGEST, SEED_LARGEST, WHOLE_LARGEST
 from planner.path import Progress
-from planner.rrt.variants import TEXT, AlgorithmVariant, ConeDraw, FailureRate, Focus, Steer
+from planner.rrt.variants import DEFAULT, AlgorithmVariant, ConeDraw, FailureRate, Focus, Steer
 
 SamplerName = Literal["adaptive", "goal-bias"]
 CostName = Literal["kinematic", "length"]
@@ -79,7 +79,7 @@ class PlannerSettings:
     neighbour_radius: float = 0.080
     goal_radius: float = 0.050
     max_iterations: int = 20000
-    readings: AlgorithmVariant = TEXT
+    readings: AlgorithmVariant = DEFAULT
 
     def __post_init__(self) -> None:
         """Refuses unusable settings.

@@ -13,6 +13,7 @@ from model.pages.page import list_table, picture, section, table
 from model.pages.page import page as html_page
 from model.pose import Array
 from planner.campaign.studies import (
+    ADAPTIVE_REJECTS,
     BOXES,
     COMPARISONS,
     CONDITIONS,
@@ -20,7 +21,6 @@ from planner.campaign.studies import (
     COUNTED,
     FIGURE_9,
     MEASURED,
-    NEAREST_TO_THE_CLAIM,
     NODES,
     READINGS,
     SAMPLERS,
@@ -162,7 +162,7 @@ def _boxes(results: Results) -> str:
 
 
 def _reading() -> str:
-    r = NEAREST_TO_THE_CLAIM.adaptive
+    r = ADAPTIVE_REJECTS.adaptive
     return (
         f"e_r = {r.failure_rate} with k failed expansions since the last success, x_c the"
         f" {r.focus} node, r and θ₁ uniform in their ranges, steps no longer than to the sample,"

@@ -24,7 +24,7 @@ from planner.edge_checks import ExactChecks
 from planner.path import PosePath
 from planner.rrt.rrt import exact_checks
 from planner.rrt.search import PaperPlanner, SearchResult
-from planner.rrt.variants import TEXT, AlgorithmVariant
+from planner.rrt.variants import DEFAULT, AlgorithmVariant
 from planner.settings import CLEARANCE_RESERVE, CostName, PlannerSettings, SamplerName
 
 # Random starts and goals as far apart as the scene's own (paper, section 5.3).
@@ -115,7 +115,7 @@ class Arm:
 
     sampler: SamplerName
     cost: CostName = "length"
-    readings: AlgorithmVariant = TEXT
+    readings: AlgorithmVariant = DEFAULT
 
 
 @dataclass(frozen=True, slots=True)

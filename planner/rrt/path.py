@@ -1,7 +1,8 @@
 """From start to goal with the paper's planner: search, then Algorithm 3 and what goes beyond it.
 
 Beyond Algorithm 3, the cheapest path through points of the path is found and its corners are pulled
-tight. Edges keep all their limits, and no step makes a path costlier.
+tight. Edges keep all their limits, and no step makes a path costlier except the last, which saves
+corners for up to 0.3 % of the cost.
 """
 
 from __future__ import annotations

@@ -66,5 +66,5 @@ class AlgorithmVariant:
             raise BadInput(f"the spacing must be 0 mm or more, it is {self.spacing * 1000.0:g} mm")
 
 
-TEXT = AlgorithmVariant()
-"""The text as written; where it is ambiguous, the reading that gave the smallest trees."""
+DEFAULT = AlgorithmVariant()
+"""Equations as written; e_r and x_c by measurement, as the text has several readings of both."""

@@ -70,9 +70,9 @@ def _lead(question: Question) -> str:
     rotated = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform rotated"
     return (
         f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
-        f" {question.length * 1e3:.1f} mm in the condition number{rotated}. At start, stops and"
-        f" goal `cdpr plan` keeps {CLEARANCE_RESERVE * 1e3:g} mm and a capacity margin of"
-        f" {MARGIN_RESERVE * rig.max_tension:.3g} N beyond what is mapped as allowed."
+        f" {question.length * 1e3:.1f} mm in condition number and dexterity cost{rotated}. At"
+        f" start, stops and goal `cdpr plan` keeps {CLEARANCE_RESERVE * 1e3:g} mm and a capacity"
+        f" margin of {MARGIN_RESERVE * rig.max_tension:.3g} N beyond what is mapped as allowed."
     )
 
 

@@ -41,7 +41,7 @@ class Question:
         rig: The robot.
         scene: Its obstacles, clearances and load; without one only the robot's own weight acts.
         rotation: Orientation of the platform, ``world_from_platform``, shape (3, 3).
-        length: Divides the moments in the condition number, [m].
+        length: Divides the moments in the condition number and so in the dexterity cost, [m].
         quantities: Names of those mapped, from `OF_THE_ROBOT` and `OBSTACLE_CLEARANCE`.
     """
 
@@ -198,7 +198,7 @@ class Extremes:
 
     @classmethod
     def over_workspace(cls, question: Question) -> Extremes:
-        """Those on the planner's lattice, so that maps and plans use the same cost."""
+        """Those on the planner's lattice; the cost is the planner's at the default length."""
         rig = question.rig
         lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
         points = lattice.points(np.arange(lattice.count))

@@ -93,6 +93,21 @@ def test_the_same_seed_gives_the_same_plan_and_another_seed_another(gachon, read
     assert plans[0].waypoints != plans[2].waypoints
 
 
+@pytest.mark.parametrize(("mode", "steer"), [("paper", "full-step"), ("rewire", "to-sample")])
+def test_a_plan_states_the_steps_its_search_took(gachon, ready_scene, mode, steer) -> None:
+    settings = PlannerSettings(mode=mode, cost="length")
+    document = make_plan(gachon, ready_scene("environment_1"), settings)
+    assert document.planner.readings.steer == steer
+    nodes = np.array(document.tree.positions_mm)
+    away_from_goal = np.linalg.norm(nodes - document.waypoints[-1].position_mm, axis=1) > 0.01
+    nodes = nodes[away_from_goal]  # the goal is joined from within its radius
+    off = [
+        np.abs(np.linalg.norm(nodes[:k] - nodes[k], axis=1) - settings.step * 1e3).min()
+        for k in range(1, len(nodes))
+    ]
+    assert (max(off) < 0.01) == (steer == "full-step")
+
+
 def test_the_tree_of_a_plan_holds_its_raw_path(gachon, ready_scene) -> None:
     document = make_plan(gachon, ready_scene("environment_2"), QUICK)
     tree = document.tree
