@@ -106,14 +106,17 @@ class CycleTable:
 
         Before it the platform may be beside the start, by the tolerance.
         """
-        on_path = np.isin(self.state, _ON_PATH)
-        return float(self.time[np.argmax(on_path)]) if on_path.any() else np.inf
+        return float(self.time[self.on_path].min(initial=np.inf))
+
+    @property
+    def on_path(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """Whether the platform was on its path, moving, on hold or stopping, shape (n,)."""
+        return np.isin(self.state, _ON_PATH)
 
     @property
     def has_encoder_pose(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Whether the encoders give a pose, shape (n,)."""
-        pose = np.hstack([self.encoder, self.encoder_rotation])
-        return np.asarray(np.isfinite(pose).all(axis=1), dtype=bool)
+        return np.asarray(np.isfinite(np.hstack([self.encoder, self.encoder_rotation])).all(axis=1))
 
     @property
     def encoder_error(self) -> Array:
@@ -424,12 +427,10 @@ class FusedTable:
 
 def fused_table(cycles: CycleTable, poses: PoseTable) -> FusedTable:
     """The encoder poses of a run, corrected by its images between two of them."""
-    known = cycles.has_encoder_pose
-    after = np.searchsorted(cycles.time, poses.time)
+    known, after = cycles.has_encoder_pose, np.searchsorted(cycles.time, poses.time)
     padded = np.pad(known, 1, mode="edge") if len(known) else np.zeros(2, dtype=bool)
     between = padded[after] & padded[after + 1]
-    pairs = zip(cycles.encoder[known], cycles.encoder_rotation[known], strict=True)
-    by_drives = [Pose.from_quaternion(position, rotation) for position, rotation in pairs]
+    driven = list(map(Pose.from_quaternion, cycles.encoder[known], cycles.encoder_rotation[known]))
     measured = [
         Measured(
             float(poses.time[i]),
@@ -438,7 +439,7 @@ def fused_table(cycles: CycleTable, poses: PoseTable) -> FusedTable:
         )
         for i in np.flatnonzero(poses.ok & between)
     ]
-    rows = list(fuse_with_encoders(cycles.time[known].tolist(), by_drives, measured))
+    rows = list(fuse_with_encoders(cycles.time[known].tolist(), driven, measured))
     covariances = np.array([row.covariance for row in rows]).reshape(-1, 6, 6)
     return FusedTable(
         time=np.array([row.time for row in rows]),

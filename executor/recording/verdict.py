@@ -16,7 +16,7 @@ from executor.recording.clearance import ClearanceTable, camera_of, source_of
 from executor.recording.record_files import CameraRecord
 from executor.recording.tables import CycleTable, PoseTable
 from executor.safety.limits import tension_limits
-from executor.state_machine import ON_PATH, REMARK, SIMULATED, State
+from executor.state_machine import REMARK, SIMULATED, State
 from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig
@@ -26,7 +26,6 @@ from tracking.clearance import INTERVAL
 PASSED, FAILED, STOPPED = "PASSED", "FAILED", "STOPPED"
 #: Final state of a run without a recorded end: its program was killed, or the disk was full.
 NOT_ENDED = "not_ended"
-_ON_PATH = {state.value for state in ON_PATH}
 _AFTER_MOTION = [state.value for state in (State.SECURING, State.LATCHED)]
 #: Tolerance for the rounding of the tables, [m].
 ROUNDING = 2e-9
@@ -188,7 +187,7 @@ def _travelled(cycles: CycleTable) -> str:
 def following(cycles: CycleTable, limit: float) -> Check:
     """Check that every cable was within ``limit`` [m] of its set-point in every cycle."""
     known = np.flatnonzero(np.isfinite(cycles.following_error))
-    if not known.size and not _ON_PATH & {*cycles.state}:
+    if not known.size and not cycles.on_path.any():
         text = "The platform did not move along the path, so no following error was measured."
         return Check("following_error", True, text)
     if not known.size:
@@ -326,8 +325,7 @@ def encoder_pose(cycles: CycleTable) -> list[Check]:
 
     Clearances by the encoders are unknown there. After a lost reply a position is an older one.
     """
-    on_path = np.isin(cycles.state, list(_ON_PATH))
-    lost = on_path & ~cycles.has_encoder_pose & (cycles.missing == 0)
+    lost = cycles.on_path & ~cycles.has_encoder_pose & (cycles.missing == 0)
     if not lost.any():
         return []
     text = (
