@@ -218,7 +218,7 @@ def _require_jog(length_mm: float, turn_deg: float) -> None:
             f" {MOST_DEG:g}°",
             where="cdpr jog",
             why="longer motions need a plan that avoids obstacles",
-            next_step="jog less far, or plan a path from here with `cdpr plan --start-mm`",
+            next_step="jog a shorter distance, or plan a path from here: `cdpr plan --start-mm`",
         )
 
 

@@ -64,8 +64,8 @@ def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal)
         raise BadInput(
             f"confirm must return True or False, it returned {answer!r:.60}",
             where=proposal.title,
-            why=f"any other answer may be a no; {proposal.otherwise}",
-            next_step="return True to go on, or False to cancel",
+            why=f"any other answer could mean no; {proposal.otherwise}",
+            next_step="return True to continue, or False to cancel",
         )
     if not answer:
         raise StoppedByOperator(proposal.otherwise, next_step="run it again and confirm")

@@ -76,7 +76,7 @@ class StatusResult(FactsDisplay):
         being_set_up: Another program configures or reads the drives.
         reference: Homing reference of the drives.
         drives: The drives that answered, in the order of the rig file.
-        pose: By the drives, without a load, ``world_from_platform``.
+        pose: From the encoders, without a load, ``world_from_platform``.
         why_no_pose: Why there is no pose, though the drives were read.
         missing: Why drives could not be read; the reference is unknown then, unless it is lost.
         silent: Nodes of the drives that did not answer.

@@ -157,7 +157,7 @@ class CableLoop(Loop):
         self._law = make(
             self._rig, here, cable=cable, length=travel, limit=limit, speed=speed, reserve=reserve
         )
-        # A step speeds up and slows down by itself.
+        # A step speeds up and slows down on its own.
         self._feed = self._feed_at(0.0 if held.step is None else held.share)
         self._sender.allow(np.array(self._law.reach, dtype=np.int32))
         self._press, self._cable, self._from = held.press, cable, here[cable]

@@ -146,7 +146,7 @@ class FaultLatch:
             raise Refused(
                 f"the fault is of rig {shown.rig!r}, not of {rig!r}",
                 where=f"bus {self._bus}",
-                why="its drives are not all known here, and would not be looked at",
+                why="its drives are not all known here, and would not be checked",
                 next_step=f"run `cdpr reset` with the rig file of {shown.rig!r}; if it was"
                 " renamed, write its former name there for the reset",
             )
@@ -155,7 +155,7 @@ class FaultLatch:
                 f"the fault is also of drives that are not in the rig file: node"
                 f" {', '.join(map(str, unknown))}",
                 where=f"bus {self._bus}",
-                why="they would not be looked at",
+                why="they would not be checked",
                 next_step="run `cdpr reset` with the rig file it happened with; a drive that was"
                 " replaced needs its former node id for the reset",
             )

@@ -256,8 +256,8 @@ class SetUpLock:
 # has no other user.
 
 
-#: The holder looks this often whether another console asks for control, [s].
-LOOKS_WITHIN = 1.0
+#: The holder checks this often whether another console asks for control, [s].
+POLLED_WITHIN = 1.0
 #: Readers release the lock within this time, [s].
 _READ_WITHIN = 0.2
 _LONGEST_NAME = 400
@@ -307,7 +307,7 @@ class ControlLock:
                         return holder
                     if not locked_within(wish, _READ_WITHIN):
                         return "another console asks for control, too: try again"
-                    if not locked_within(handle, LOOKS_WITHIN):
+                    if not locked_within(handle, POLLED_WITHIN):
                         return f"{holder}: the robot moves, or that console does not answer"
                 os.truncate(handle, 0)
                 os.pwrite(handle, name.encode()[:_LONGEST_NAME], 0)

@@ -193,7 +193,7 @@ def test_a_latch_outlives_the_change_to_a_folder_for_all_users(
 
 
 def test_a_fault_is_not_reset_with_the_file_of_another_rig(tmp_path: Path) -> None:
-    """Of fewer drives, say: the one in fault would not be looked at."""
+    """Of fewer drives, say: the one in fault would not be checked."""
     latch = FaultLatch(BUS)
     latch.engage("eight cables", tmp_path, "drive 8 is in fault")
     with (
@@ -218,7 +218,7 @@ def engaged_by(nodes: tuple[int, ...], folder: Path) -> LatchedFault:
 def test_a_fault_is_not_reset_with_a_file_of_its_name_that_lacks_drives(
     tmp_path: Path, others: tuple[int, ...]
 ) -> None:
-    """A copy for four of eight cables, say: drive 8, in fault, would not be looked at."""
+    """A copy for four of eight cables, say: drive 8, in fault, would not be checked."""
     shown, other = engaged_by(tuple(range(1, 9)), tmp_path), FaultLatch(BUS, others)
     assert not other.is_of(shown, "rig")
     with (

@@ -89,7 +89,7 @@ def run(
         raise BadInput(
             "the plan's file was replaced after it was shown",
             where=str(plan),
-            next_step="load it again, look at it, then run it",
+            next_step="reload and review it, then run it",
         )
     if rig is None:
         the_rig = calibrated_rig(_simulated(the_plan.rig, interface, channel), calibration)
