@@ -237,8 +237,9 @@ def test_a_set_up_that_releases_a_cable_loses_it(
 def test_homing_that_does_not_come_to_its_end_leaves_no_reference(ended: State) -> None:
     rig = rig_with("incremental")
     interlock = MotionInterlock(rig)
-    interlock.file.write(reference_of(rig))
-    interlock.begin(Path("run"), reference_of(rig), rehome=True)
+    reference = reference_of(rig)
+    interlock.file.write(reference)
+    interlock.begin(Path("run"), reference, rehome=True)
     interlock.end(ended, "stopped", Path("run"), holding=True, positions=range(8))
     interlock.cancel()
     with pytest.raises(Refused, match="homing reference is lost") as caught:
@@ -251,8 +252,9 @@ def test_an_end_that_cannot_be_kept_leaves_the_bus_latched(
 ) -> None:
     rig = rig_with("incremental")
     interlock = MotionInterlock(rig)
-    interlock.file.write(reference_of(rig))
-    interlock.begin(Path("run"), reference_of(rig))
+    reference = reference_of(rig)
+    interlock.file.write(reference)
+    interlock.begin(Path("run"), reference)
 
     def full(_reference: object) -> None:
         raise Refused("the homing reference cannot be written")
