@@ -83,7 +83,7 @@ def open_lock(path: Path, *, create: bool = False) -> int:
     """
     try:
         lock = open_state_file(path, os.O_RDWR | (os.O_CREAT if create else 0))
-    except PermissionError:  # another user's, of an earlier version
+    except PermissionError:  # of a user who may only read the folder
         return open_state_file(path)
     if create and os.fstat(lock).st_uid == os.geteuid():
         os.fchmod(lock, 0o664)  # whatever the umask

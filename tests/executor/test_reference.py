@@ -25,7 +25,7 @@ from executor.homing import use_rig_file_counts
 from executor.interlock import locks as state_folder
 from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.interlock.reference import HomingReference, as_in_the_file, reference_at
-from executor.proposals import ForgetProposal
+from executor.proposals import Proposal
 from executor.realtime.child import Armed, Ended, Records
 from executor.realtime.process import RealTimeProcess
 from executor.state_machine import State
@@ -91,7 +91,7 @@ def test_the_next_step_without_one_names_the_ways_to_state_the_pose() -> None:
 def test_a_reference_is_not_announced_as_discarded_where_none_will_be() -> None:
     asked: list[str] = []
 
-    def confirm(proposal: ForgetProposal) -> bool:
+    def confirm(proposal: Proposal) -> bool:
         asked.append(proposal.title)
         return True
 

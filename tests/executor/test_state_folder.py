@@ -243,7 +243,7 @@ def test_a_fault_is_reset_with_a_file_of_its_name_and_drives(
     latch.require_disengaged()
 
 
-def test_a_fault_of_an_earlier_version_which_noted_no_drives_is_reset(tmp_path: Path) -> None:
+def test_a_fault_without_its_drives_counts_as_engaged_and_is_reset(tmp_path: Path) -> None:
     engaged_by((1, 2), tmp_path)
     latch = FaultLatch(BUS, (1, 2))
     content = json.loads(latch.path.read_text())
@@ -251,7 +251,8 @@ def test_a_fault_of_an_earlier_version_which_noted_no_drives_is_reset(tmp_path: 
     latch.path.write_text(json.dumps(content))
     shown = latch.read()
     assert shown is not None
-    assert (shown.cause, shown.nodes) == ("drive 8 is in fault", ())
+    assert "cannot be read" in shown.cause
+    assert "nodes" in shown.cause
     with latch.held_for_reset("rig", shown):
         pass
     latch.require_disengaged()

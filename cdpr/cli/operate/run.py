@@ -30,7 +30,7 @@ from drivers.can_bus import IN_PROCESS
 from executor import runner
 from executor.drives import is_simulated
 from executor.evaluation import rewrite_report
-from executor.proposals import MotionProposal
+from executor.proposals import Proposal
 from executor.recording.run_folder import RunFolder
 from executor.report.run_data import missing_images
 from executor.runner import RunResult
@@ -127,7 +127,7 @@ def supervise(
     ask = confirmation(asks=not (is_simulated(rig) or yes), as_json=as_json)
     with RunSupervisor(lambda result: show(result, as_json)) as supervisor:
 
-        def confirm(proposal: MotionProposal) -> bool:
+        def confirm(proposal: Proposal) -> bool:
             agreed = ask(proposal)
             if agreed:
                 supervisor.take_over()
