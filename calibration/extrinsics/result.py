@@ -284,6 +284,8 @@ def _basis(rig: RigDocument, name: str, by: str, reference: str | None) -> dict[
     """
     camera = camera_named(rig, name).model_dump(mode="json")
     of_camera = {k: v for k, v in camera.items() if k not in _NOT_OF_THE_LENS}
+    if of_camera["lens"] == "pinhole":  # the default is no part of a basis
+        del of_camera["lens"]
     if reference is not None:
         other = camera_named(rig, reference).model_dump(mode="json")
         return {"camera": of_camera, "others": [{k: other[k] for k in _OF_ANOTHER_CAMERA}]}
