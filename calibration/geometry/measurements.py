@@ -253,14 +253,19 @@ class Recording:
 def at_rest(name: str, run: Recording) -> RigMeasurements:
     """Samples of a run with the platform at rest, each with the means of its measurements.
 
-    Images of one sample share their errors: the mean is no more certain than a single one.
+    Images of one sample share their errors: the mean is no more certain than a single one. Drives
+    that are off at the end of a run measure no tensions: if there are rests with tensions, only
+    their time with tensions counts.
 
     Args:
         name: Of the run, for the names of the samples.
         run: The recording.
     """
     names, rows, unused = [], [], {}
-    for number, (begin, end) in enumerate(_rests(run), start=1):
+    still = np.all(np.diff(run.setpoints, axis=0) == 0.0, axis=1)
+    taut = np.asarray(np.isfinite(run.tensions).any(axis=1))
+    rests = _rests(run.time, still & taut[:-1] & taut[1:]) or _rests(run.time, still)
+    for number, (begin, end) in enumerate(rests, start=1):
         sample = f"{name}, rest {number}"
         cycles = (run.time >= begin) & (run.time <= end)
         pictures = (run.pose_times >= begin) & (run.pose_times <= end)
@@ -279,11 +284,10 @@ def at_rest(name: str, run: Recording) -> RigMeasurements:
     return RigMeasurements(names=tuple(names), unused=unused, **arrays)
 
 
-def _rests(run: Recording) -> list[tuple[float, float]]:
-    """Intervals of commanded rest, without the settling time."""
-    still = np.all(np.diff(run.setpoints, axis=0) == 0.0, axis=1)
+def _rests(time: Array, still: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """Intervals of rest without the settling time; ``still``, shape (n - 1,), is from n cycles."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
-    found = [(run.time[a], run.time[b]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    found = [(time[a], time[b]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return [(a + SETTLING, b) for a, b in found if b - a >= SHORTEST_REST]
 
 

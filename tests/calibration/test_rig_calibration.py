@@ -556,6 +556,25 @@ def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
     assert len(joined([found, blind])) == 3
 
 
+def test_a_rest_lasts_while_tensions_are_measured() -> None:
+    """Drives off for 0.3 s; a dwell; a goal with the drives off after 0.1 s."""
+    time = np.arange(0.0, 4.0, 0.01)
+    counts = np.rint(1e3 * np.clip(np.stack([time - 1.5, 1.5 - time], axis=1), -0.5, 0.5))
+    following = (time > 0.305) & (time < 2.095)
+    torques = np.where(following, 20.0 + time, np.nan)
+    tensions = np.stack([torques, torques + 1.0], axis=1)
+    none = np.empty(0)
+    seen = (none, none.reshape(0, 3), none.reshape(0, 3, 3), none.reshape(0, 6, 6))
+    run = Recording(time, counts, counts, tensions, *seen)
+    found = at_rest("run", run)
+    assert found.names == ("run, rest 1",)
+    assert found.counts == pytest.approx(np.array([[-500.0, 500.0]]))
+    assert found.tensions == pytest.approx(np.array([[20.755, 21.755]]), abs=0.01)
+    unknown = at_rest("run", replace(run, tensions=np.full_like(tensions, np.nan)))
+    assert unknown.names == ("run, rest 1", "run, rest 2")
+    assert np.isnan(unknown.tensions).all()
+
+
 def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, tilted: Truth) -> None:
     """Winches 1 and 2 swapped, or a stated drum deviation far below the true error."""
     counts = tilted.measured.counts.copy()
