@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.geometry.calibrate import RigCalibration, fit_rig
+from calibration.geometry.calibrate import RigCalibration, _require_within, fit_rig
 from calibration.geometry.fit import RigFitter
 from calibration.geometry.identifiability import (
     Observability,
@@ -622,6 +622,30 @@ def test_the_estimated_stiffness_is_the_same_for_every_rig_file(
 ) -> None:
     drawn = with_nominal_stiffness(rig, stiffness)
     result = fit_rig(drawn, tilted.measured, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+def test_poses_at_the_edge_of_a_suspended_rig_may_be_a_little_outside(
+    rig: Rig, tilted: Truth
+) -> None:
+    """All outlets are above the workspace, and the reflector is below the platform."""
+    high = rig.document.model_copy(
+        update={"outlets_mm": [[x, y, 900.0] for x, y, _ in rig.document.outlets_mm]}
+    )
+    suspended = rig_from_document(high)
+    positions = tilted.measured.positions.copy()
+    positions[7, 2] = rig.workspace_lower[2] - 4e-3
+    _require_within(suspended, replace(tilted.measured, positions=positions))
+    below = replace(
+        tilted.measured,
+        positions=positions - [0.0, 0.0, 0.2],
+        rotations=np.full_like(tilted.measured.rotations, np.nan),
+        reflector=np.array([0.0, 0.0, -0.2]),
+    )
+    _require_within(suspended, below)
+    for scale in (1e3, 25.4, 10.0, 1.0 / 25.4, 1e-3):
+        for data in (tilted.measured, below):
+            with pytest.raises(BadInput, match="outside the rig"):
+                _require_within(suspended, replace(data, positions=data.positions / scale))
+
+
     compliance, differences = estimate_compliance(result), estimate_cable_compliances(result)
     assert compliance is not None
     assert differences is not None
