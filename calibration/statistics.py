@@ -44,15 +44,16 @@ class Interval:
     skew: float = 0.0
 
     @classmethod
-    def between(cls, low: float, high: float) -> Interval:
-        """The interval with these bounds."""
-        return cls((low + high) / 2.0, (high - low) / 2.0)
+    def between(cls, low: float, high: float, value: float | None = None) -> Interval:
+        """The interval with these bounds; the estimate is its middle when left out."""
+        middle = (low + high) / 2.0
+        value = middle if value is None else value
+        return cls(value, (high - low) / 2.0, middle - value)
 
     @classmethod
     def by_factor(cls, value: float, factor: float) -> Interval:
         """The interval from the estimate divided by a factor to the estimate times it."""
-        around = cls.between(value / factor, value * factor)
-        return cls(value, around.half_width, around.value - value)
+        return cls.between(value / factor, value * factor, value)
 
     @property
     def bounds(self) -> list[float]:
@@ -68,12 +69,15 @@ class Interval:
 
     @property
     def half_width_text(self) -> str:
-        """The half width alone, for values that are 0 by definition."""
+        """The half width alone, for values that are 0 by definition; both, where they differ."""
         if not 0.0 < self.half_width < math.inf:
             return f"± {self.half_width:g}"
         return f"± {self.half_width:.{self._decimals}f}"
 
     @property
+        if self.skew:
+            above, below = self.half_width + self.skew, self.half_width - self.skew
+            return f"+{above:.{self._decimals}f} -{below:.{self._decimals}f}"
     def _decimals(self) -> int:
         return max(0, 1 - math.floor(math.log10(self.half_width)))
 

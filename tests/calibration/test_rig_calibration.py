@@ -211,6 +211,13 @@ def test_a_stiffness_that_is_found_is_applied(rig: Rig, tilted: Truth) -> None:
     assert document.stiffness_n == pytest.approx(result.geometry.stiffness)
     low, high = document.intervals["stiffness_n"]
     assert low * high == pytest.approx(document.stiffness_n**2)
+    estimate = document.stated["stiffness_n"]
+    assert estimate.value == document.stiffness_n
+    assert estimate.bounds == pytest.approx([low, high])
+    assert dict(document.in_words())["stiffness_n"] == str(result.intervals["stiffness_n"])
+    scaled = {name: [1.5 * end for end in ends] for name, ends in document.intervals.items()}
+    stiffer = document.model_copy(update={"stiffness_n": 1.5 * estimate.value, "intervals": scaled})
+    assert document.changes_to(stiffer)["stiffness_n"] == pytest.approx(0.5 * estimate.value)
     others = samples(rig, 20, tilt=0.1, seed=4)
     assert rms(errors_of(corrected, others)) < 0.3e-3
 
