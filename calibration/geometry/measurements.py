@@ -113,6 +113,10 @@ class RigMeasurements:
         arms = np.where(self.has_rotation[:, None], 0.0, rotations @ self.reflector)
         return np.asarray(positions + arms)
 
+    def origins(self, rotations: Array) -> Array:
+        """Measured positions of the platform's origin with given rotations, shape (n, 3), [m]."""
+        return self.positions - self.measured_points(np.zeros_like(self.positions), rotations)
+
     def pose_errors(self, positions: Array, rotations: Array) -> Array:
         """Given minus measured poses, shape (n, 6), [m, rad]; 0 where not measured.
 
@@ -435,8 +439,9 @@ def nominal_tensions(rig: Rig, measured: RigMeasurements) -> Array:
     """
     known = np.isfinite(measured.tensions)
     likely = np.tile(working_tensions(rig, rig.home).tensions, (len(measured), 1))
+    rotations = measured.first_rotations(rig)
+    positions = measured.origins(rotations)
     for k in np.flatnonzero(measured.has_position & ~known.all(axis=1)):
         with suppress(TensionInfeasible):
-            pose = Pose(measured.positions[k], measured.first_rotations(rig)[k])
-            likely[k] = working_tensions(rig, pose).tensions
+            likely[k] = working_tensions(rig, Pose(positions[k], rotations[k])).tensions
     return np.where(known, measured.tensions, likely)
