@@ -214,7 +214,7 @@ def compare(first: ResultDocument, second: ResultDocument) -> Comparison:
         )
     mine, others = first.stated, second.stated
     changes = [
-        ParameterChange(name, mine[name], others[name], by, _apart(mine[name], others[name]))
+        ParameterChange(name, mine[name], others[name], by, _apart(mine[name], others[name], by))
         for name, by in first.changes_to(second).items()
     ]
     return Comparison(
@@ -225,5 +225,7 @@ def compare(first: ResultDocument, second: ResultDocument) -> Comparison:
     )
 
 
-def _apart(one: Interval, other: Interval) -> float:
-    return math.hypot(one.half_width, other.half_width)
+def _apart(one: Interval, other: Interval, by: float) -> float:
+    """Change of an estimate that both intervals allow in its direction, 95 %."""
+    sign = math.copysign(1.0, by)
+    return math.hypot(one.half_width + sign * one.skew, other.half_width - sign * other.skew)

@@ -16,6 +16,9 @@ CONFIDENCE = 0.95
 """Confidence of every interval that a calibration states."""
 
 
+_MOST_APART = 1e13
+"""Ratio of eigenvalues from which a matrix scaled to a diagonal of 1 is singular."""
+
 # Bounds of two distributions; `scipy.stats` has them, too, and takes half a second to import.
 
 
@@ -44,15 +47,16 @@ class Interval:
     skew: float = 0.0
 
     @classmethod
-    def between(cls, low: float, high: float) -> Interval:
-        """The interval with these bounds."""
-        return cls((low + high) / 2.0, (high - low) / 2.0)
+    def between(cls, low: float, high: float, value: float | None = None) -> Interval:
+        """The interval with these bounds; the estimate is its middle when left out."""
+        middle = (low + high) / 2.0
+        value = middle if value is None else value
+        return cls(value, (high - low) / 2.0, middle - value)
 
     @classmethod
     def by_factor(cls, value: float, factor: float) -> Interval:
         """The interval from the estimate divided by a factor to the estimate times it."""
-        around = cls.between(value / factor, value * factor)
-        return cls(value, around.half_width, around.value - value)
+        return cls.between(value / factor, value * factor, value)
 
     @property
     def bounds(self) -> list[float]:
@@ -68,14 +72,32 @@ class Interval:
 
     @property
     def half_width_text(self) -> str:
-        """The half width alone, for values that are 0 by definition."""
+        """The half width alone, for values that are 0 by definition; both, where they differ."""
         if not 0.0 < self.half_width < math.inf:
             return f"± {self.half_width:g}"
+        if self.skew:
+            above, below = self.half_width + self.skew, self.half_width - self.skew
+            return f"+{above:.{self._decimals}f} -{below:.{self._decimals}f}"
         return f"± {self.half_width:.{self._decimals}f}"
 
     @property
     def _decimals(self) -> int:
         return max(0, 1 - math.floor(math.log10(self.half_width)))
+
+
+def covariance_of(information: Array) -> Array | None:
+    """The inverse of an information matrix, shape (n, n); None if it is singular.
+
+    It is symmetric and positive also where the matrix is nearly singular.
+    """
+    scale = np.sqrt(np.diag(information))
+    if not (scale > 0.0).all():
+        return None
+    values, directions = np.linalg.eigh(information / np.outer(scale, scale))
+    if not values[0] * _MOST_APART > values[-1]:
+        return None
+    root = directions / np.sqrt(values) / scale[:, None]
+    return np.asarray(root @ root.T)
 
 
 # Jackknife: leaving out parts of the data shows scatter that the noise model misses.

@@ -275,7 +275,7 @@ def _simultaneous(
     folders = {name: one for name, one in named.items() if isinstance(one, ImageFolder)}
     videos = {name: one for name, one in named.items() if isinstance(one, VideoFile)}
     times = _times_by_name(folders, listener) if len(folders) > 1 else {}
-    names = list(times) or [path.name for folder in folders.values() for path in folder.files]
+    names = list(times) or [name for folder in folders.values() for name in folder.names]
     if gap := first_gap(names):
         listener.remark(
             f"images seem to be missing between {' and '.join(gap)}: times are those of consecutive"
@@ -309,7 +309,7 @@ def _times_by_name(folders: Mapping[str, ImageFolder], listener: Listener) -> di
         BadInput: Of a camera's images, or of the most that another camera has if these are fewer,
             less than half have a namesake.
     """
-    names = {camera: [path.name for path in folder.files] for camera, folder in folders.items()}
+    names = {camera: folder.names for camera, folder in folders.items()}
     count = Counter(name for own in names.values() for name in own)
     for camera, own in names.items():
         possible = min(len(own), max(len(one) for other, one in names.items() if other != camera))

@@ -136,8 +136,7 @@ def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, po
         apart = model.residuals(values, *found)[:, : rig.cable_count]
         return np.asarray(np.sqrt(np.mean(apart**2, axis=1)))
     rotations = measured.first_rotations(rig)
-    arms = measured.measured_points(np.zeros((len(rotations), 3)), rotations)
-    found = poses_near(rig, lengths, measured.positions - arms, rotations, steps=8)[:2]
+    found = poses_near(rig, lengths, measured.origins(rotations), rotations, steps=8)[:2]
     apart = measured.measured_points(*found) - measured.positions
     return np.asarray(np.linalg.norm(apart, axis=1))
 
@@ -147,6 +146,8 @@ FEWEST_SAMPLES = 10
 UNKNOWN_SHARE = 0.5
 """A parameter is unknown if this share of its square lies in unknown directions."""
 DEGREE = math.degrees(1.0)
+CLOSE_TOGETHER = 0.1
+"""Poses are, if they spread over no more than this share of the box around the rig on any axis."""
 MOST_APART = math.radians(45.0)
 """An IMU's vertical farther from that of the pose is in other axes, [rad]."""
 
@@ -355,17 +356,25 @@ def fit_rig(
 def _require_within(rig: Rig, measured: RigMeasurements) -> None:
     """Refuses poses that the platform cannot reach, such as in a wrong unit.
 
+    Until a rig is calibrated, poses at the edge of its workspace are a little outside, and the
+    reflector may be so anyway: both have as much room as the platform and the reflector reach.
+    Poses close together have none: in metres, they would all be near the world's origin.
+
     Raises:
         BadInput: One is outside the box around outlets, home and workspace.
     """
     corners = np.vstack([rig.outlets, rig.workspace_lower, rig.workspace_upper, rig.home.position])
     lower, upper = corners.min(axis=0), corners.max(axis=0)
+    known = measured.positions[measured.has_position]
+    if len(known) and (np.ptp(known, axis=0) > CLOSE_TOGETHER * (upper - lower)).any():
+        room = rig.reach + float(np.linalg.norm(measured.reflector))
+        lower, upper = lower - room, upper + room
     outside = ((measured.positions < lower) | (measured.positions > upper)).any(axis=1)
     if outside.any():
         k = int(np.argmax(outside))
         raise BadInput(
-            f"the pose ({_mm(measured.positions[k])}) is outside the rig, whose outlets and"
-            f" workspace reach from ({_mm(lower)}) to ({_mm(upper)})",
+            f"the pose ({_mm(measured.positions[k])}) is outside the rig, which reaches from"
+            f" ({_mm(lower)}) to ({_mm(upper)})",
             where=measured.names[k],
             why="a wrong unit or frame, or a false pose",
             next_step="check units and axes of x_mm, y_mm, z_mm, or leave out the line",

@@ -113,6 +113,10 @@ class RigMeasurements:
         arms = np.where(self.has_rotation[:, None], 0.0, rotations @ self.reflector)
         return np.asarray(positions + arms)
 
+    def origins(self, rotations: Array) -> Array:
+        """Measured positions of the platform's origin with given rotations, shape (n, 3), [m]."""
+        return self.positions - self.measured_points(np.zeros_like(self.positions), rotations)
+
     def pose_errors(self, positions: Array, rotations: Array) -> Array:
         """Given minus measured poses, shape (n, 6), [m, rad]; 0 where not measured.
 
@@ -253,14 +257,19 @@ class Recording:
 def at_rest(name: str, run: Recording) -> RigMeasurements:
     """Samples of a run with the platform at rest, each with the means of its measurements.
 
-    Images of one sample share their errors: the mean is no more certain than a single one.
+    Images of one sample share their errors: the mean is no more certain than a single one. Drives
+    that are off at the end of a run measure no tensions: if there are rests with tensions, only
+    their time with tensions counts.
 
     Args:
         name: Of the run, for the names of the samples.
         run: The recording.
     """
     names, rows, unused = [], [], {}
-    for number, (begin, end) in enumerate(_rests(run), start=1):
+    still = np.all(np.diff(run.setpoints, axis=0) == 0.0, axis=1)
+    taut = np.asarray(np.isfinite(run.tensions).any(axis=1))
+    rests = _rests(run.time, still & taut[:-1] & taut[1:]) or _rests(run.time, still)
+    for number, (begin, end) in enumerate(rests, start=1):
         sample = f"{name}, rest {number}"
         cycles = (run.time >= begin) & (run.time <= end)
         pictures = (run.pose_times >= begin) & (run.pose_times <= end)
@@ -279,11 +288,10 @@ def at_rest(name: str, run: Recording) -> RigMeasurements:
     return RigMeasurements(names=tuple(names), unused=unused, **arrays)
 
 
-def _rests(run: Recording) -> list[tuple[float, float]]:
-    """Intervals of commanded rest, without the settling time."""
-    still = np.all(np.diff(run.setpoints, axis=0) == 0.0, axis=1)
+def _rests(time: Array, still: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """Intervals of rest without the settling time; ``still``, shape (n - 1,), is from n cycles."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
-    found = [(run.time[a], run.time[b]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    found = [(time[a], time[b]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return [(a + SETTLING, b) for a, b in found if b - a >= SHORTEST_REST]
 
 
@@ -431,8 +439,9 @@ def nominal_tensions(rig: Rig, measured: RigMeasurements) -> Array:
     """
     known = np.isfinite(measured.tensions)
     likely = np.tile(working_tensions(rig, rig.home).tensions, (len(measured), 1))
+    rotations = measured.first_rotations(rig)
+    positions = measured.origins(rotations)
     for k in np.flatnonzero(measured.has_position & ~known.all(axis=1)):
         with suppress(TensionInfeasible):
-            pose = Pose(measured.positions[k], measured.first_rotations(rig)[k])
-            likely[k] = working_tensions(rig, pose).tensions
+            likely[k] = working_tensions(rig, Pose(positions[k], rotations[k])).tensions
     return np.where(known, measured.tensions, likely)

@@ -145,7 +145,7 @@ def number_rows(result: RigCalibration) -> list[tuple[str, str, str, str, str, s
 
 
 def _row(name: str, before: float, found: Interval) -> tuple[str, str, str, str, str, str]:
-    change = found.value - before
+    change, (low, high) = found.value - before, found.bounds
     digits = 0 if name.endswith("_n") else 2
     return (
         name,
@@ -153,7 +153,7 @@ def _row(name: str, before: float, found: Interval) -> tuple[str, str, str, str,
         f"{found.value:.{digits}f}",
         f"{change:+z.{digits}f}",
         found.half_width_text.removeprefix("± "),
-        "yes" if abs(change) > found.half_width else "no",
+        "no" if low <= before <= high else "yes",
     )
 
 

@@ -12,6 +12,7 @@ from pydantic import Field
 from calibration.geometry.calibrate import RigCalibration
 from calibration.geometry.quality import RigQuality, workspace_poses
 from calibration.results import ResultDocument, common_keys
+from calibration.statistics import Interval
 from model.errors import BadInput, Fault
 from model.files.documents import AnyNonNegative, AnyNumber, Finding, Positive, Vector
 from model.files.rig_file import RigDocument
@@ -63,6 +64,17 @@ class RigResult(ResultDocument):
     sensor_residuals_deg: dict[str, AnyNonNegative] = Field(
         default={}, description="RMS of swivel angles and of the IMU's vertical, by name"
     )
+
+    @property
+    def stated(self) -> dict[str, Interval]:
+        """Estimates, by name with unit; a stiffness is not the middle of its interval."""
+        values = {"stiffness_n": self.stiffness_n}
+        each = self.cable_stiffness_n or [self.stiffness_n] * len(self.outlets_mm)
+        values |= {f"stiffness_{i}_n": value for i, value in enumerate(each, start=1)}
+        return {
+            name: Interval.between(low, high, values.get(name))
+            for name, (low, high) in self.intervals.items()
+        }
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Rules of every result, and one entry per cable."""

@@ -23,6 +23,7 @@ from calibration.results import data_hash
 from calibration.statistics import (
     EvenSample,
     Interval,
+    covariance_of,
     duplicate_views,
     jackknife,
     rms_bound,
@@ -106,10 +107,10 @@ def uncertainty_of(
         squares += float(errors @ errors)
         residuals += len(errors) - 6
     information, count = np.sum(parts, axis=0), len(parts)
-    scale = np.sqrt(np.diag(information))
-    if not (scale > 0.0).all() or np.linalg.cond(information / np.outer(scale, scale)) > 1e13:
+    inverse = covariance_of(information)
+    if inverse is None:
         raise _undetermined("other parameters would explain them as well")
-    by_scatter = np.linalg.inv(information) * squares / max(residuals - len(information), 1)
+    by_scatter = inverse * squares / max(residuals - len(information), 1)
     without = np.array([_without(information, h, s) for h, s in zip(parts, scores, strict=True)])
     larger = np.maximum(np.diag(by_scatter), np.diag(jackknife(without)))
     return Uncertainty(

@@ -31,7 +31,7 @@ from model.files.camera_file import CameraDocument, LensCovariance, LensName
 from model.files.documents import AnyNonNegative, AnyNumber, Positive
 from model.files.rig_file import RigDocument
 from model.pose import Array, rotation_vector_from_matrix
-from tracking.camera_model import rays_of
+from tracking.camera_model import project, rays_of
 
 _WIDTH = 560.0
 _MOST_ARROWS = 1500
@@ -250,7 +250,8 @@ class CameraResult(ResultDocument):
     def apart_mm(self, other: Self) -> float:
         """RMS distance over the image between points at the stated distance by both, [mm].
 
-        A rotation between both cameras is removed: the extrinsics compensate for it.
+        Like ``error_mm`` it is from pixels. A rotation between both cameras is removed: the
+        extrinsics compensate for it.
 
         Raises:
             BadInput: The images are of different sizes.
@@ -269,9 +270,12 @@ class CameraResult(ResultDocument):
         rays = [np.column_stack([part, np.ones(len(part))]) for part in flat]
         units = [part / np.linalg.norm(part, axis=1, keepdims=True) for part in rays]
         turn = Rotation.align_vectors(units[0], units[1])[0].as_matrix()
-        rotated = rays[1] @ turn.T
-        squares = np.sum((rotated[:, :2] / rotated[:, 2:] - flat[0]) ** 2, axis=1)
-        return float(np.sqrt(np.mean(squares))) * self.distance_m * 1e3
+        own, others = (
+            project(self.lens, self.matrix, np.array(self.distortion), points)
+            for points in (rays[0], rays[1] @ turn.T)
+        )
+        pixels = np.sqrt(np.mean(np.sum((others - own) ** 2, axis=1)))
+        return float(pixels / np.sqrt(self.fx_px * self.fy_px)) * self.distance_m * 1e3
 
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with this camera's parameters.

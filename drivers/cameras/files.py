@@ -43,6 +43,7 @@ class ImageFolder:
 
     Attributes:
         files: All files with an image suffix.
+        names: Their names.
         rate: Images per second, [Hz].
         unused: Reason by name of each file that is not used.
 
@@ -58,6 +59,7 @@ class ImageFolder:
         on_unused: Callable[[str, str], None] | None = None,
     ) -> None:
         self.files = picture_files(folder)
+        self.names = tuple(picture_name(path) for path in self.files)
         self.unused: dict[str, str] = {}
         self._folder, self._camera = folder, camera
         self.rate = rate or camera.rate
@@ -75,16 +77,16 @@ class ImageFolder:
         self.unused.clear()
         wanted = (self._camera.width, self._camera.height)
         none_read = True
-        for number, path in enumerate(self.files):
+        for number, (name, path) in enumerate(zip(self.names, self.files, strict=True)):
             image = read_picture(path, wanted)
             none_read &= image is None
             if image is not None and _size(image) == wanted:
-                yield Frame(number / self.rate, image, path.name, number)
+                yield Frame(number / self.rate, image, name, number)
                 continue
             why = _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
-            self.unused[path.name] = why
+            self.unused[name] = why
             if self._on_unused is not None:
-                self._on_unused(path.name, why)
+                self._on_unused(name, why)
         if none_read:
             raise _no_picture(self._folder, self.unused)
         if len(self.unused) == len(self.files):
@@ -118,7 +120,7 @@ class SingleCameraImages:
             data = _data(path)
             image = _decoded(data)
             if image is None:
-                self.unused[path.name] = _unreadable(path)
+                self.unused[picture_name(path)] = _unreadable(path)
             else:
                 sizes[path] = _size(image)
                 orientations.append(exif_orientation(data))
@@ -128,18 +130,19 @@ class SingleCameraImages:
         for path, size in sizes.items():
             if size != self.size and _size(read_picture(path, self.size)) != self.size:
                 owner = _CAMERA if wanted else "most have"
-                self.unused[path.name] = _other_size(size, owner, self.size)
-        self._files = [path for path in sizes if path.name not in self.unused]
+                self.unused[picture_name(path)] = _other_size(size, owner, self.size)
+        named = {picture_name(path): path for path in sizes}
+        self._files = {name: path for name, path in named.items() if name not in self.unused}
         if not self._files:
             raise _wrong_sizes(folder, self.unused, self.size)
-        self.names = tuple(path.name for path in self._files)
+        self.names = tuple(self._files)
 
     def __iter__(self) -> Iterator[tuple[str, Image]]:
         """Yields names and grey images."""
-        for path in self._files:
+        for name, path in self._files.items():
             image = read_picture(path, self.size)
             if image is not None and _size(image) == self.size:
-                yield path.name, image
+                yield name, image
 
 
 def picture_files(folder: Path) -> tuple[Path, ...]:
@@ -157,7 +160,12 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
             where=str(folder),
             next_step=f"name a folder with files ending in {', '.join(PICTURE_ENDINGS)}",
         )
-    return tuple(sorted(found, key=lambda path: natural_order(path.name)))
+    return tuple(sorted(found, key=lambda path: natural_order(picture_name(path))))
+
+
+def picture_name(path: Path) -> str:
+    """The name of an image's file; bytes that are not UTF-8 are escaped, as in a log."""
+    return path.name.encode(errors="backslashreplace").decode()
 
 
 def read_picture(path: Path, size: tuple[int, int] | None = None) -> Image | None:

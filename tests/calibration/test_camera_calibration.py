@@ -9,6 +9,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import TypeAdapter
 
 from calibration.intrinsics.calibrate import (
     CameraCalibration,
@@ -19,10 +22,11 @@ from calibration.intrinsics.quality import is_below, judge_camera
 from calibration.intrinsics.result import camera_result
 from calibration.result_files import load_result
 from calibration.results import write_result
-from calibration.statistics import student_factor
+from calibration.statistics import covariance_of, student_factor
 from calibration.targets.boards import Chessboard, DetectedBoard
 from model.cameras import Z_95
 from model.errors import BadInput
+from model.files.camera_file import LensCovariance
 from model.pose import Array, Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import DISTORTION, MATRIX, SIZE, sample_rays
 
@@ -136,6 +140,26 @@ def test_the_change_without_an_image_is_that_of_a_fit_without_it() -> None:
         rest = {other: seen for other, seen in all_views.items() if other != name}
         change = calibrate_from_views(rest, SIZE).matrix[0, 0] - found.matrix[0, 0]
         assert found.uncertainty.without[k, 0] == pytest.approx(change, abs=0.25)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(4, 12), st.floats(0.0, 12.5))
+def test_covariances_are_symmetric_and_positive_down_to_what_is_singular(
+    seed: int, size: int, apart: float
+) -> None:
+    random = np.random.default_rng(seed)
+    turn = np.linalg.qr(random.standard_normal((size, size)))[0]
+    units = 10.0 ** random.uniform(-3.0, 3.0, size)
+    information = (turn * np.logspace(0.0, -apart, size)) @ turn.T * np.outer(units, units)
+    information = (information + information.T) / 2.0
+    covariance = covariance_of(information)
+    if covariance is None:
+        assert apart > 10.0
+        return
+    TypeAdapter(LensCovariance).validate_python(covariance.tolist())
+    np.testing.assert_array_equal(covariance, covariance.T)
+    alike = covariance @ information
+    assert np.abs(alike / np.outer(1.0 / units, units) - np.eye(size)).max() < 10.0 ** (apart - 13)
+    assert covariance_of(np.zeros((size, size))) is None
 
 
 def test_an_image_with_wrong_corners_is_left_out_by_name() -> None:

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from datetime import date
+from itertools import combinations
 
 import pytest
 
-from calibration.result_files import compare
+from calibration.intrinsics.calibrate import calibrate_from_views
+from calibration.intrinsics.quality import judge_camera
+from calibration.intrinsics.result import CameraResult, camera_result
+from calibration.result_files import _apart, compare
+from calibration.statistics import Interval
 from model.errors import BadInput
 from tests.calibration.results import camera_result_of
+from tests.calibration.test_lens_models import SIZE, views
 
 
 def test_a_result_agrees_with_itself() -> None:
@@ -29,6 +37,36 @@ def test_a_change_beyond_the_interval_is_reported() -> None:
     assert not found.agree  # 10 of 905 px at 1.5 m are millimetres
     assert "they differ" in str(found)
     assert not replace(by_name["fx_px"], by=-0.7).beyond
+
+
+@pytest.mark.parametrize("factor", [1.2, 3.0])
+def test_intervals_that_are_not_symmetric_count_in_the_direction_of_the_change(
+    factor: float,
+) -> None:
+    low, high = Interval.by_factor(100.0, factor), Interval.by_factor(140.0, factor)
+    above, below = 100.0 * (factor - 1.0), 140.0 * (1.0 - 1.0 / factor)
+    assert _apart(low, high, 40.0) == pytest.approx(math.hypot(above, below))
+    assert _apart(high, low, -40.0) == pytest.approx(math.hypot(above, below))
+
+
+def test_the_estimate_of_an_interval_that_is_not_symmetric_is_shown() -> None:
+    assert str(Interval.by_factor(6000.0, 2.0)) == "6000 +6000 -3000"
+    assert str(Interval.by_factor(6000.0, 1.0)) == "6000 ± 0"
+
+
+def test_consistent_calibrations_of_a_fisheye_agree_and_others_do_not() -> None:
+    """The error and the distance of both are in the same unit, also 80° off the axis."""
+    results = [fisheye_result(seed) for seed in range(4)]
+    pairs = [compare(one, other) for one, other in combinations(results, 2)]
+    assert sum(pair.agree for pair in pairs) >= 5
+    assert max(pair.apart_mm / pair.stated_mm for pair in pairs) > 0.1
+    refocused = results[0].model_copy(update={"fx_px": 1.01 * results[0].fx_px})
+    assert not compare(results[0], refocused).agree
+
+
+def fisheye_result(seed: int) -> CameraResult:
+    found = calibrate_from_views(views("fisheye", seed=seed), SIZE, lens="fisheye")
+    return camera_result(found, judge_camera(found, 1e-3), "front", date(2026, 3, 1))
 
 
 def test_results_of_different_things_are_refused() -> None:

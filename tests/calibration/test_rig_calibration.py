@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.geometry.calibrate import RigCalibration, fit_rig
+from calibration.geometry.calibrate import RigCalibration, _require_within, fit_rig
 from calibration.geometry.fit import RigFitter
 from calibration.geometry.identifiability import (
     Observability,
@@ -211,6 +211,13 @@ def test_a_stiffness_that_is_found_is_applied(rig: Rig, tilted: Truth) -> None:
     assert document.stiffness_n == pytest.approx(result.geometry.stiffness)
     low, high = document.intervals["stiffness_n"]
     assert low * high == pytest.approx(document.stiffness_n**2)
+    estimate = document.stated["stiffness_n"]
+    assert estimate.value == document.stiffness_n
+    assert estimate.bounds == pytest.approx([low, high])
+    assert dict(document.in_words())["stiffness_n"] == str(result.intervals["stiffness_n"])
+    scaled = {name: [1.5 * end for end in ends] for name, ends in document.intervals.items()}
+    stiffer = document.model_copy(update={"stiffness_n": 1.5 * estimate.value, "intervals": scaled})
+    assert document.changes_to(stiffer)["stiffness_n"] == pytest.approx(0.5 * estimate.value)
     others = samples(rig, 20, tilt=0.1, seed=4)
     assert rms(errors_of(corrected, others)) < 0.3e-3
 
@@ -264,6 +271,20 @@ def test_missing_tensions_are_the_working_ones_of_their_pose(rig: Rig, tilted: T
     assert np.array_equal(np.delete(likely[0], 2), np.delete(tensions[0], 2))
     assert np.array_equal(likely[3:], tensions[3:])
     assert np.abs(likely - tilted.measured.tensions).max() < 3.0 * tension_sigma(rig)
+
+
+def test_missing_tensions_are_those_of_the_platform_not_of_its_reflector(
+    rig: Rig, tilted: Truth
+) -> None:
+    level = replace(
+        tilted.measured,
+        tensions=np.full_like(tilted.measured.tensions, np.nan),
+        rotations=np.full_like(tilted.measured.rotations, np.nan),
+    )
+    reflector = np.array([0.02, -0.03, 0.09])
+    points = level.positions + rig.home.rotation @ reflector
+    followed = replace(level, positions=points, reflector=reflector)
+    np.testing.assert_allclose(nominal_tensions(rig, followed), nominal_tensions(rig, level))
 
 
 def test_the_change_without_a_sample_is_that_of_a_fit_without_it(rig: Rig, tilted: Truth) -> None:
@@ -556,6 +577,25 @@ def test_rests_of_a_run_are_found_and_their_pictures_averaged() -> None:
     assert len(joined([found, blind])) == 3
 
 
+def test_a_rest_lasts_while_tensions_are_measured() -> None:
+    """Drives off for 0.3 s; a dwell; a goal with the drives off after 0.1 s."""
+    time = np.arange(0.0, 4.0, 0.01)
+    counts = np.rint(1e3 * np.clip(np.stack([time - 1.5, 1.5 - time], axis=1), -0.5, 0.5))
+    following = (time > 0.305) & (time < 2.095)
+    torques = np.where(following, 20.0 + time, np.nan)
+    tensions = np.stack([torques, torques + 1.0], axis=1)
+    none = np.empty(0)
+    seen = (none, none.reshape(0, 3), none.reshape(0, 3, 3), none.reshape(0, 6, 6))
+    run = Recording(time, counts, counts, tensions, *seen)
+    found = at_rest("run", run)
+    assert found.names == ("run, rest 1",)
+    assert found.counts == pytest.approx(np.array([[-500.0, 500.0]]))
+    assert found.tensions == pytest.approx(np.array([[20.755, 21.755]]), abs=0.01)
+    unknown = at_rest("run", replace(run, tensions=np.full_like(tensions, np.nan)))
+    assert unknown.names == ("run, rest 1", "run, rest 2")
+    assert np.isnan(unknown.tensions).all()
+
+
 def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, tilted: Truth) -> None:
     """Winches 1 and 2 swapped, or a stated drum deviation far below the true error."""
     counts = tilted.measured.counts.copy()
@@ -580,6 +620,30 @@ def test_a_pose_outside_the_rig_is_refused_by_name(rig: Rig, tilted: Truth) -> N
     with pytest.raises(BadInput, match="outside the rig") as caught:
         fit_rig(rig, metres, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     assert caught.value.where == "sample 0"
+
+
+def test_poses_at_the_edge_of_a_suspended_rig_may_be_a_little_outside(
+    rig: Rig, tilted: Truth
+) -> None:
+    """All outlets are above the workspace, and the reflector is below the platform."""
+    high = rig.document.model_copy(
+        update={"outlets_mm": [[x, y, 900.0] for x, y, _ in rig.document.outlets_mm]}
+    )
+    suspended = rig_from_document(high)
+    positions = tilted.measured.positions.copy()
+    positions[7, 2] = rig.workspace_lower[2] - 4e-3
+    _require_within(suspended, replace(tilted.measured, positions=positions))
+    below = replace(
+        tilted.measured,
+        positions=positions - [0.0, 0.0, 0.2],
+        rotations=np.full_like(tilted.measured.rotations, np.nan),
+        reflector=np.array([0.0, 0.0, -0.2]),
+    )
+    _require_within(suspended, below)
+    for scale in (1e3, 25.4, 10.0, 1.0 / 25.4, 1e-3):
+        for data in (tilted.measured, below):
+            with pytest.raises(BadInput, match="outside the rig"):
+                _require_within(suspended, replace(data, positions=data.positions / scale))
 
 
 @pytest.mark.parametrize("poses", [True, False])

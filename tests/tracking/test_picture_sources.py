@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -79,6 +80,23 @@ def test_a_gap_in_the_numbers_of_names_is_found(
 )
 def test_names_without_consecutive_numbers_have_no_gap(names: list[str]) -> None:
     assert first_gap(names) is None
+
+
+def test_names_that_are_not_utf8_can_be_written_down(tmp_path: Path, camera: Camera) -> None:
+    """As on a disk of another system: in a result, a log or a hash."""
+    camera = replace(camera, width=64, height=48)
+    for name, size in (
+        (b"bild_\xe4.png", (48, 64)),
+        (b"b_\xff.png", (20, 20)),
+        (b"c.png", (48, 64)),
+    ):
+        data = cv2.imencode(".png", np.zeros(size, np.uint8))[1].tobytes()
+        Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name)).write_bytes(data)
+    calibrated, measured = OneCamerasPictures(tmp_path, (64, 48)), ImageFolder(tmp_path, camera)
+    names = ["bild_\\udce4.png", "c.png"]
+    assert [name for name, _ in calibrated] == [*calibrated.names] == names
+    assert [frame.name for frame in measured] == names
+    assert [*calibrated.unused] == [*measured.unused] == ["b_\\udcff.png"]
 
 
 def test_a_broken_file_among_good_ones_is_named_and_skipped(
