@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from datetime import date
-from itertools import combinations
 
 import pytest
 
@@ -56,12 +55,12 @@ def test_the_estimate_of_an_interval_that_is_not_symmetric_is_shown() -> None:
 
 def test_consistent_calibrations_of_a_fisheye_agree_and_others_do_not() -> None:
     """The error and the distance of both are in the same unit, also 80° off the axis."""
-    results = [fisheye_result(seed) for seed in range(4)]
-    pairs = [compare(one, other) for one, other in combinations(results, 2)]
-    assert sum(pair.agree for pair in pairs) >= 5
-    assert max(pair.apart_mm / pair.stated_mm for pair in pairs) > 0.1
-    refocused = results[0].model_copy(update={"fx_px": 1.01 * results[0].fx_px})
-    assert not compare(results[0], refocused).agree
+    one, other = fisheye_result(0), fisheye_result(1)
+    compared = compare(one, other)
+    assert compared.agree
+    assert compared.apart_mm > 0.1 * compared.stated_mm
+    refocused = one.model_copy(update={"fx_px": 1.01 * one.fx_px})
+    assert not compare(one, refocused).agree
 
 
 def fisheye_result(seed: int) -> CameraResult:
