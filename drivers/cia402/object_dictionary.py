@@ -428,21 +428,21 @@ def _limits(
     low, high = position_limits(rig, drive, winch_map)
     why = "longest and shortest cable in the workspace"
     return (
-        _torque_limit(torque, profile),
+        *_torque_limits(torque, profile),
         Setting(SOFTWARE_LIMITS, 1, "<i", low, "min position limit", why),
         Setting(SOFTWARE_LIMITS, 2, "<i", high, "max position limit", why),
     )
 
 
-def _torque_limit(per_mille: int, profile: ProfileDocument) -> Setting:
-    """Setting of 6072h or of the manufacturer's current limit, [per mille of rated torque]."""
+def _torque_limits(per_mille: int, profile: ProfileDocument) -> tuple[Setting, ...]:
+    """Setting of 6072h, and of a manufacturer's current limit; [per mille of rated torque]."""
     why = "largest allowed tension plus a reserve"
-    limit = profile.torque_limit
-    if limit is None:
-        return Setting(0x6072, 0, "<H", per_mille, "max torque", why)
+    standard = Setting(0x6072, 0, "<H", per_mille, "max torque", why)
+    if (limit := profile.torque_limit) is None:
+        return (standard,)
     rated = None if limit.rated is None else object_key(limit.rated)
     where, form = object_key(limit.object), "<H" if limit.bytes == 2 else "<I"
-    return Setting(*where, form, per_mille, CURRENT_LIMIT, why, per_mille_of=rated)
+    return standard, Setting(*where, form, per_mille, CURRENT_LIMIT, why, per_mille_of=rated)
 
 
 def _capped(index: int, name: str, value: float, why: str) -> Setting:

@@ -144,6 +144,26 @@ def test_an_akd_limits_its_current_as_it_has_no_6072h(rig: Rig) -> None:
     assert all((0x6072, 0) not in drive.values for drive in bus.drives.values())
 
 
+@pytest.mark.parametrize("name", ["akd", "epos4"])
+@pytest.mark.parametrize("held", [0, 1199, 1200, 5000])
+def test_a_torque_limit_that_the_profile_denies_must_not_hold_another_value(
+    rig: Rig, name: str, held: int
+) -> None:
+    """A drive whose firmware has 6072h after all would get no limit there, or no torque."""
+    bus, theirs = eight_of(name), with_profile(rig, name)
+    bus.drives[5].objects[0x6072, 0] = bus.drives[5].objects[0x6040, 0]  # another UNSIGNED16
+    bus.drives[5].values[0x6072, 0] = held
+    (row,) = (row for row in examined(theirs, bus).rows if row.object.startswith("6072h"))
+    assert row.verdict == ("ok" if held == 1200 else "wrong")
+    if held == 1200:
+        set_up(theirs, bus)
+        return
+    with pytest.raises(Refused, match=f"absent; the drive has it with {held}, 1200 is") as caught:
+        set_up(theirs, bus)
+    assert caught.value.where == "drive 5, object 6072h:00 max torque"
+    assert not downloads(bus)
+
+
 def test_a_torque_limit_that_is_a_share_of_nothing_is_refused_before_anything_is_written(
     rig: Rig,
 ) -> None:
