@@ -395,7 +395,7 @@ def require_idle(network: SetupNetwork, node: int, to_reset: bool, errors: dict[
 def count_heartbeats(
     network: SetupNetwork, node: int, profile: ProfileDocument, entries: list[int]
 ) -> None:
-    """Appends the drive's number of usable entries of 1016h.
+    """Appends the number of entries of 1016h that the drive states.
 
     Raises:
         Refused: It has none, and the profile requires one.
@@ -404,10 +404,10 @@ def count_heartbeats(
     client = network.client(node)
     read = client.read if needed else client.read_if_there
     data = read(HEARTBEAT_CONSUMERS, 0, name, 1) if profile.has(HEARTBEAT_CONSUMERS, 1) else None
-    count, most = int.from_bytes(data or b"", "little"), profile.heartbeat_entries
+    count = int.from_bytes(data or b"", "little")
     if count < 1 and needed:
         raise wrong_value(node, f"1016h:00 {name}", "0", "1 or more", "watch the master")
-    entries.append(count if most is None else min(count, most))
+    entries.append(count)
 
 
 def found_text(data: bytes, setting: Setting) -> str:

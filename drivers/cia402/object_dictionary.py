@@ -227,23 +227,20 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
     """Heartbeats that the drive monitors: the master's, then its peers', up to its entries.
 
     All entries are cleared first, since a drive refuses a node that another entry has, and stay so
-    if a loss would remove the torque.
+    if a loss would remove the torque. The drive may lack those that its profile leaves out.
 
     Args:
         rig: The robot.
         drive: Index of the winch in the rig file.
-        entries: Number of producers that the drive can monitor (1016h:00).
+        entries: Number of entries that the drive states (1016h:00).
     """
-    name = "consumer heartbeat time"
-    watches = profile_of(rig).watches_heartbeats
-    used = min(entries, rig.cable_count) if watches else 0
-    why = "no other node is monitored" if watches else "a lost heartbeat would remove the torque"
+    name, usable = "consumer heartbeat time", profile_of(rig).usable_heartbeats(entries)
+    used = min(usable, rig.cable_count)
+    why = "no other node is monitored" if used else "a lost heartbeat would remove the torque"
     cleared = tuple(
-        Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why, transient=sub <= used)
+        Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why, sub <= used, 0 < usable < sub)
         for sub in range(1, entries + 1)
     )
-    if not watches:
-        return cleared
     time_ms, peers_ms = math.ceil(1000 * heartbeat_timeout(rig.cycle)), peer_timeout_ms(rig)
     peers = [w.node_id for i, w in enumerate(rig.winches) if i != drive]
     return cleared + tuple(
@@ -255,7 +252,7 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
             name,
             "stop when the master is lost" if node == MASTER_NODE else "stop when a peer is lost",
         )
-        for sub, node in enumerate([MASTER_NODE, *peers][:entries], start=1)
+        for sub, node in enumerate([MASTER_NODE, *peers][:used], start=1)
     )
 
 

@@ -790,6 +790,35 @@ def test_drives_that_let_go_without_a_heartbeat_are_given_none(
         assert [drive.values[0x1016, sub] for sub in range(1, entries + 1)] == [0] * entries
 
 
+ABSENT_SUB, FIXED = 0x06090011, 0x06010002
+
+
+@pytest.mark.parametrize(
+    ("code", "left", "kept"),
+    [(None, 0x050032, 0), (ABSENT_SUB, 0, 0), (FIXED, 0, 0), (FIXED, 0x050032, None)],
+)
+def test_entries_of_another_program_that_are_not_used_are_cleared(
+    tmp_path: Path, rig: Rig, code: int | None, left: int, kept: int | None
+) -> None:
+    """The loss of a node that no longer exists would stop the drive, in a run or after its end."""
+    theirs = with_profile(rig, lab_profile(tmp_path, "heartbeat_entries: 2"))
+    bus = eight_of("cia402")
+    third = bus.drives[3]
+    third.values[0x1016, 0] = 8
+    third.values |= {(0x1016, sub): left for sub in range(1, 9)}
+    if code == FIXED:
+        third.objects[0x1016, 5] = third.objects[0x1000, 0]  # read-only
+    elif code:
+        third.aborts |= {(0x1016, sub): code for sub in range(3, 9)}
+    if kept is None:
+        with pytest.raises(Refused, match="drive 3, object 1016h:05"):
+            set_up(theirs, bus)
+        return
+    assert all("1016h has 2 heartbeat entries" in remark for remark in set_up(theirs, bus))
+    entries = [third.values[0x1016, sub] for sub in range(1, 9)]
+    assert entries == [0x7F0064, 0x010064, *[kept] * 6]
+
+
 def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
     with pytest.raises(BadInput) as caught:
         settings_for(with_profile(rig, "epos5"), 0, WinchMap(rig))
