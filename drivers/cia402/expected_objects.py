@@ -249,14 +249,15 @@ def position_scales(
 ) -> dict[str, float]:
     """Position counts per motor turn that a drive states, by object, the one that counts first.
 
-    A factor group scales positions; where it is not set (1 per turn) the encoder does. Objects
-    that are missing, zero or refused state nothing. Source: CiA 402-2, factor group.
+    A factor group scales positions; where it is not set (a feed of 1 per turn, whatever the gear
+    ratio) the encoder does. Objects that are missing, zero or refused state nothing. Source: CiA
+    402-2, factor group.
 
     Args:
         read: As for `position_range`.
     """
     feed, gear, encoder = (_quotient(read, index) for index in (0x6092, 0x6091, 0x608F))
-    scales = {"6092h/6091h": feed / (gear or 1.0)} if feed else {}
+    scales = {"6092h/6091h": feed / (gear or 1.0)} if feed and feed != 1.0 else {}
     return scales | ({"608Fh": encoder} if encoder else {})
 
 

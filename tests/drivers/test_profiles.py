@@ -601,6 +601,14 @@ def keyed(rig: Rig, tmp_path: Path, key: str) -> Rig:
         ({}, {0x6092: (360_000, 1)}, "states_scale: true", "360000 by 6092h/6091h"),
         ({0x608F: (TURN, 1)}, {0x6092: (360_000, 1)}, "states_scale: false", ""),
         ({0x608F: (TURN, 1)}, {0x608F: (TURN, 1), 0x6092: (1, 1)}, "", ""),  # not set
+        ({0x608F: (TURN, 1)}, {0x608F: (TURN, 1), 0x6092: (7, 7), 0x6091: (10, 1)}, "", ""),
+        ({}, {0x6092: (1, 1), 0x6091: (10, 1)}, "states_scale: true", ""),
+        (
+            {0x6091: (10, 1)},
+            {0x6092: (1, 1), 0x608F: (4096, 1)},
+            "states_scale: true",
+            "4096 by 608Fh",
+        ),
         ({0x608F: (TURN, 1)}, {0x608F: (4096, 1), 0x6092: (TURN, 1)}, "", ""),  # another encoder
     ],
 )
