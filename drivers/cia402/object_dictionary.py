@@ -242,17 +242,12 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
         for sub in range(1, entries + 1)
     )
     time_ms, peers_ms = math.ceil(1000 * heartbeat_timeout(rig.cycle)), peer_timeout_ms(rig)
-    peers = [w.node_id for i, w in enumerate(rig.winches) if i != drive]
+    master = MASTER_NODE, time_ms, "stop when the master is lost"
+    others = (winch.node_id for i, winch in enumerate(rig.winches) if i != drive)
+    monitored = [master, *((node, peers_ms, "stop when a peer is lost") for node in others)][:used]
     return cleared + tuple(
-        Setting(
-            HEARTBEAT_CONSUMERS,
-            sub,
-            "<I",
-            node << 16 | (time_ms if node == MASTER_NODE else peers_ms),
-            name,
-            "stop when the master is lost" if node == MASTER_NODE else "stop when a peer is lost",
-        )
-        for sub, node in enumerate([MASTER_NODE, *peers][:used], start=1)
+        Setting(HEARTBEAT_CONSUMERS, sub, "<I", node << 16 | after, name, reaction)
+        for sub, (node, after, reaction) in enumerate(monitored, start=1)
     )
 
 
@@ -342,7 +337,12 @@ def _produced_ms(cycle: float, profile: ProfileDocument) -> int:
 
 def _mode(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
     ranges = profile.range_of(0x60C2, 1), profile.range_of(0x60C2, 2)
-    value, exponent = interpolation_time(cycle, *ranges)
+    try:
+        value, exponent = interpolation_time(cycle, *ranges)
+    except BadInput:
+        if profile.has(0x60C2, 1) or profile.has(0x60C2, 2):
+            raise
+        value, exponent = 0, 0  # none: a drive that has 60C2h after all is refused
     why = "one set-point per cycle"
     return (
         Setting(0x6060, 0, "<b", CSP_MODE, "modes of operation", "cyclic synchronous position"),

@@ -291,6 +291,29 @@ def test_a_cycle_that_the_drives_cannot_take_is_refused(rig: Rig) -> None:
         set_up(rig_from_document(RigDocument.model_validate(document)), eight_of("nanotec-c5e"))
 
 
+@pytest.mark.parametrize("exponent", [None, 0, -3])
+@pytest.mark.parametrize("cycle_ms", [10.0, 25.6])
+def test_drives_without_an_interpolation_time_take_any_cycle(
+    rig: Rig, tmp_path: Path, cycle_ms: float, exponent: int | None
+) -> None:
+    """60C2h holds 10 ms, not 25.6 ms; a drive that has it after all must hold the cycle."""
+    document = rig.document.model_dump()
+    document["drives"]["profile"] = lab_profile(tmp_path, 'absent: ["60C2h:01", "60C2h:02"]')
+    document["bus"]["cycle_ms"] = cycle_ms
+    theirs, bus = rig_from_document(RigDocument.model_validate(document)), eight_of("cia402")
+    for node, drive in bus.drives.items():
+        if exponent is None or node != 3:
+            drive.aborts |= {(0x60C2, 1): 0x06020000, (0x60C2, 2): 0x06020000}
+        else:
+            drive.values |= {(0x60C2, 1): 10, (0x60C2, 2): exponent}
+    if exponent is None or (cycle_ms, exponent) == (10.0, -3):
+        assert set_up(theirs, bus) == ()
+        return
+    with pytest.raises(Refused, match=r"60C2h:0.*the profile declares it absent"):
+        set_up(theirs, bus)
+    assert not downloads(bus)
+
+
 def test_another_unit_of_position_is_refused_before_anything_is_written(rig: Rig) -> None:
     bus = eight_of("nanotec-c5e")
     bus.drives[4].values[0x60A8, 0] = 0xFF410000  # as it leaves the maker: tenths of a degree
