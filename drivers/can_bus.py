@@ -96,7 +96,7 @@ class BusSettings:
     Attributes:
         interface: python-can's name, such as ``socketcan``, ``udp_multicast`` or ``virtual``.
         channel: Channel of the interface; for ``udp_multicast`` ``group[:port]``.
-        bitrate: [bit/s]; ignored by socketcan, where ``ip link`` sets it.
+        bitrate: [bit/s]; on socketcan ``ip link`` sets it, and another one is refused.
     """
 
     interface: str
@@ -218,7 +218,10 @@ def _is_multicast(group: str) -> bool:
 
 
 def _check_kernel_interface(settings: BusSettings) -> None:
-    """Checks what python-can notices only at the first frame: missing, down, short queue."""
+    """Checks what python-can notices only at the first frame, or never: the bit rate.
+
+    The kernel does not know that of a serial adapter (``slcand``).
+    """
     folder = INTERFACES / settings.channel
     if not settings.channel or not folder.exists():
         present = sorted(p.name for p in INTERFACES.glob("*can*"))
@@ -244,6 +247,23 @@ def _check_kernel_interface(settings: BusSettings) -> None:
             next_step=f"sudo ip link set {settings.channel} txqueuelen 128",
             values={"tx_queue_len": queue},
         )
+    rate = {each.name: each.bitrate for each in can_interfaces()}.get(settings.channel)
+    if rate not in (None, settings.bitrate):
+        raise HardwareMissing(
+            f"{settings.channel} runs at {rate} bit/s; the rig file states {settings.bitrate}",
+            where=f"bus {settings}",
+            why="the bus load is checked at the bit rate of the rig file",
+            next_step=f"correct bus.bitrate, or {set_up_again(settings.channel, settings.bitrate)}",
+            values={"bitrate": rate},
+        )
+
+
+def set_up_again(name: str, bitrate: int) -> str:
+    """The command that sets a bit rate; it can be set only while the interface is down."""
+    return (
+        f"sudo ip link set {name} down && sudo ip link set {name} up txqueuelen 128"
+        f" type can bitrate {bitrate}"
+    )
 
 
 def bring_up(settings: BusSettings) -> str:

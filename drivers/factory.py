@@ -96,6 +96,13 @@ def without_torque(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
     return tuple(winch.node_id for winch, word in rows if state_of(word) not in HOLDS)
 
 
+def shows_no_torque(status_word: int) -> bool:
+    """Whether a CiA 402 drive is certainly not enabled, nor stopped by a fault."""
+    from drivers.cia402.state_machine import WITHOUT_TORQUE, DriveState, state_of
+
+    return state_of(status_word) in {*WITHOUT_TORQUE, DriveState.SWITCHED_ON}
+
+
 def unready_remarks(rig: Rig, status_words: Sequence[int]) -> list[str]:
     """Which drives at rest cannot be enabled, and why; one text per reason.
 

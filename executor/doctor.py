@@ -231,7 +231,7 @@ def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> 
         settings: The rig's bus.
         interfaces: The CAN interfaces of this machine.
     """
-    from drivers.can_bus import bring_up  # needs python-can
+    from drivers.can_bus import bring_up, set_up_again  # needs python-can
 
     name = settings.channel
     kernel = kernel_support()
@@ -244,7 +244,8 @@ def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> 
         return [MachineCheck(f"interface {name}", False, text, bring_up(settings))]
     checks = [_up(found, settings), _queue(found)]
     if found.has_hardware:
-        checks += [_bitrate(found, settings.bitrate), _controller(found, settings.bitrate)]
+        again = set_up_again(name, settings.bitrate)
+        checks += [_bitrate(found, settings.bitrate, again), _controller(found, again)]
     return checks
 
 
@@ -277,28 +278,19 @@ def _queue(found: KernelInterface) -> MachineCheck:
     )
 
 
-def _bitrate(found: KernelInterface, wanted: int) -> MachineCheck:
+def _bitrate(found: KernelInterface, wanted: int, again: str) -> MachineCheck:
     text = f"{found.bitrate} bit/s" if found.bitrate else "not set"
     if found.bitrate != wanted:
         text += f"; the rig file says {wanted}"
-    fix = _set_again(found.name, wanted)
-    return MachineCheck(f"bit rate of {found.name}", found.bitrate == wanted, text, fix)
+    return MachineCheck(f"bit rate of {found.name}", found.bitrate == wanted, text, again)
 
 
-def _controller(found: KernelInterface, bitrate: int) -> MachineCheck:
+def _controller(found: KernelInterface, again: str) -> MachineCheck:
     healthy = found.state in HEALTHY
-    fix = f"check power, cable and termination (60 ohm), then {_set_again(found.name, bitrate)}"
+    fix = f"check power, cable and termination (60 ohm), then {again}"
     text = found.state or "unknown"
     # While down it has no state to report; `_up` reports that.
     return MachineCheck(f"controller of {found.name}", healthy or not found.up, text, fix)
-
-
-def _set_again(name: str, bitrate: int) -> str:
-    """A bit rate can be set only while the interface is down."""
-    return (
-        f"sudo ip link set {name} down && sudo ip link set {name} up txqueuelen 128"
-        f" type can bitrate {bitrate}"
-    )
 
 
 # Real time.

@@ -178,11 +178,10 @@ def configure_drives(
         absent.setdefault(f"{wrong}: {HOW_SCALED}", []).append(nodes[wrong.drive])
     for remark in (*left_out(profile), *limits_out_of_force(profile)):
         absent.setdefault(remark, []).extend(nodes)
-    remarks = (*_absent(absent), *unwatched_peers(profile, nodes, entries))
-    watched = (
-        min(count, rig.cable_count) if profile.watches_heartbeats else 0 for count in entries
-    )
-    return SetUp(remarks, tuple(watched), simulated, network.emergencies, errors)
+    usable = [profile.usable_heartbeats(count) for count in entries]
+    remarks = (*_absent(absent), *unwatched_peers(profile, nodes, usable))
+    watched = tuple(min(count, rig.cable_count) for count in usable)
+    return SetUp(remarks, watched, simulated, network.emergencies, errors)
 
 
 def _write_settings(

@@ -249,14 +249,15 @@ def position_scales(
 ) -> dict[str, float]:
     """Position counts per motor turn that a drive states, by object, the one that counts first.
 
-    A factor group scales positions; where it is not set (1 per turn) the encoder does. Objects
-    that are missing, zero or refused state nothing. Source: CiA 402-2, factor group.
+    A factor group scales positions; where it is not set (a feed of 1 per turn, whatever the gear
+    ratio) the encoder does. Objects that are missing, zero or refused state nothing. Source: CiA
+    402-2, factor group.
 
     Args:
         read: As for `position_range`.
     """
     feed, gear, encoder = (_quotient(read, index) for index in (0x6092, 0x6091, 0x608F))
-    scales = {"6092h/6091h": feed / (gear or 1.0)} if feed else {}
+    scales = {"6092h/6091h": feed / (gear or 1.0)} if feed and feed != 1.0 else {}
     return scales | ({"608Fh": encoder} if encoder else {})
 
 
@@ -395,7 +396,7 @@ def require_idle(network: SetupNetwork, node: int, to_reset: bool, errors: dict[
 def count_heartbeats(
     network: SetupNetwork, node: int, profile: ProfileDocument, entries: list[int]
 ) -> None:
-    """Appends the drive's number of usable entries of 1016h.
+    """Appends the number of entries of 1016h that the drive states.
 
     Raises:
         Refused: It has none, and the profile requires one.
@@ -404,10 +405,10 @@ def count_heartbeats(
     client = network.client(node)
     read = client.read if needed else client.read_if_there
     data = read(HEARTBEAT_CONSUMERS, 0, name, 1) if profile.has(HEARTBEAT_CONSUMERS, 1) else None
-    count, most = int.from_bytes(data or b"", "little"), profile.heartbeat_entries
+    count = int.from_bytes(data or b"", "little")
     if count < 1 and needed:
         raise wrong_value(node, f"1016h:00 {name}", "0", "1 or more", "watch the master")
-    entries.append(count if most is None else min(count, most))
+    entries.append(count)
 
 
 def found_text(data: bytes, setting: Setting) -> str:

@@ -265,7 +265,7 @@ class _Reader:
                 "wrong",
                 "a drive that cannot monitor its master is not safe to run",
             )
-        elif min(count, profile.heartbeat_entries or count) < drives:
+        elif profile.usable_heartbeats(count) < drives:
             row.note(self._node, str(count), "remark", "none required: not every peer is monitored")
         else:
             row.note(self._node, str(count))

@@ -227,35 +227,27 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
     """Heartbeats that the drive monitors: the master's, then its peers', up to its entries.
 
     All entries are cleared first, since a drive refuses a node that another entry has, and stay so
-    if a loss would remove the torque.
+    if a loss would remove the torque. The drive may lack those that its profile leaves out.
 
     Args:
         rig: The robot.
         drive: Index of the winch in the rig file.
-        entries: Number of producers that the drive can monitor (1016h:00).
+        entries: Number of entries that the drive states (1016h:00).
     """
-    name = "consumer heartbeat time"
-    watches = profile_of(rig).watches_heartbeats
-    used = min(entries, rig.cable_count) if watches else 0
-    why = "no other node is monitored" if watches else "a lost heartbeat would remove the torque"
+    name, usable = "consumer heartbeat time", profile_of(rig).usable_heartbeats(entries)
+    used = min(usable, rig.cable_count)
+    why = "no other node is monitored" if used else "a lost heartbeat would remove the torque"
     cleared = tuple(
-        Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why, transient=sub <= used)
+        Setting(HEARTBEAT_CONSUMERS, sub, "<I", 0, name, why, sub <= used, 0 < usable < sub)
         for sub in range(1, entries + 1)
     )
-    if not watches:
-        return cleared
     time_ms, peers_ms = math.ceil(1000 * heartbeat_timeout(rig.cycle)), peer_timeout_ms(rig)
-    peers = [w.node_id for i, w in enumerate(rig.winches) if i != drive]
+    master = MASTER_NODE, time_ms, "stop when the master is lost"
+    others = (winch.node_id for i, winch in enumerate(rig.winches) if i != drive)
+    monitored = [master, *((node, peers_ms, "stop when a peer is lost") for node in others)][:used]
     return cleared + tuple(
-        Setting(
-            HEARTBEAT_CONSUMERS,
-            sub,
-            "<I",
-            node << 16 | (time_ms if node == MASTER_NODE else peers_ms),
-            name,
-            "stop when the master is lost" if node == MASTER_NODE else "stop when a peer is lost",
-        )
-        for sub, node in enumerate([MASTER_NODE, *peers][:entries], start=1)
+        Setting(HEARTBEAT_CONSUMERS, sub, "<I", node << 16 | after, name, reaction)
+        for sub, (node, after, reaction) in enumerate(monitored, start=1)
     )
 
 
@@ -345,7 +337,12 @@ def _produced_ms(cycle: float, profile: ProfileDocument) -> int:
 
 def _mode(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
     ranges = profile.range_of(0x60C2, 1), profile.range_of(0x60C2, 2)
-    value, exponent = interpolation_time(cycle, *ranges)
+    try:
+        value, exponent = interpolation_time(cycle, *ranges)
+    except BadInput:
+        if profile.has(0x60C2, 1) or profile.has(0x60C2, 2):
+            raise
+        value, exponent = 0, 0  # none: a drive that has 60C2h after all is refused
     why = "one set-point per cycle"
     return (
         Setting(0x6060, 0, "<b", CSP_MODE, "modes of operation", "cyclic synchronous position"),
@@ -428,21 +425,21 @@ def _limits(
     low, high = position_limits(rig, drive, winch_map)
     why = "longest and shortest cable in the workspace"
     return (
-        _torque_limit(torque, profile),
+        *_torque_limits(torque, profile),
         Setting(SOFTWARE_LIMITS, 1, "<i", low, "min position limit", why),
         Setting(SOFTWARE_LIMITS, 2, "<i", high, "max position limit", why),
     )
 
 
-def _torque_limit(per_mille: int, profile: ProfileDocument) -> Setting:
-    """Setting of 6072h or of the manufacturer's current limit, [per mille of rated torque]."""
+def _torque_limits(per_mille: int, profile: ProfileDocument) -> tuple[Setting, ...]:
+    """Setting of 6072h, and of a manufacturer's current limit; [per mille of rated torque]."""
     why = "largest allowed tension plus a reserve"
-    limit = profile.torque_limit
-    if limit is None:
-        return Setting(0x6072, 0, "<H", per_mille, "max torque", why)
+    standard = Setting(0x6072, 0, "<H", per_mille, "max torque", why)
+    if (limit := profile.torque_limit) is None:
+        return (standard,)
     rated = None if limit.rated is None else object_key(limit.rated)
     where, form = object_key(limit.object), "<H" if limit.bytes == 2 else "<I"
-    return Setting(*where, form, per_mille, CURRENT_LIMIT, why, per_mille_of=rated)
+    return standard, Setting(*where, form, per_mille, CURRENT_LIMIT, why, per_mille_of=rated)
 
 
 def _capped(index: int, name: str, value: float, why: str) -> Setting:

@@ -191,7 +191,10 @@ def foreign_master_message(can_id: int, data: bytes | bytearray) -> str:
     if can_id == NMT_ID:
         return "another program sends NMT commands on this bus"
     if can_id == HEARTBEAT_BASE + MASTER_NODE:
-        return "another program sends the master's heartbeat on this bus"
+        return (
+            "another program sends the master's heartbeat on this bus, or a device has the node id"
+            f" {MASTER_NODE}, as new drives may: give it another one"
+        )
     if can_id > SDO_REQUEST_BASE:
         does = "writes" if is_command(can_id, data) else "reads"
         return f"another program {does} objects of drive {node}"

@@ -125,8 +125,8 @@ class PressBoard:
         self._press: Press | None = None
         self._heard, self._percent, self._ends = math.nan, 100, False
         self._free_since = -math.inf
-        self.last_heard = now()
-        """Time of the last report of a press, [s]."""
+        self.last_heard = -math.inf
+        """Time of the last report of a press, [s]; -inf before the first."""
         self._write()
 
     def hold(

@@ -6,6 +6,7 @@ no keys and no screen.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, nullcontext
@@ -296,9 +297,13 @@ class _Session:
             stack.callback(presses.close)
             parts = self.kind.parts(board, presses, stack, realtime=self.realtime)
 
+            began = math.inf  # with the first cycle: the drives' set-up may take minutes
+
             def take_cycle(record: CycleRecord) -> None:
+                nonlocal began
+                began = min(began, record.at)
                 parts.take_cycle(record)
-                if record.at - presses.last_heard > IDLE:
+                if record.at - max(began, presses.last_heard) > IDLE:
                     presses.end()
                 parts.on_cycle(record)
 

@@ -209,6 +209,7 @@ class Armed:
         restarted: Nodes found without this program's configuration.
         released: Nodes that do not hold their cables under torque.
         remarks: Missing capabilities of the drives, a sentence each.
+        nodes: Node of each drive, as in the records.
     """
 
     denied: str
@@ -216,6 +217,7 @@ class Armed:
     restarted: tuple[int, ...] = ()
     released: tuple[int, ...] = ()
     remarks: tuple[str, ...] = ()
+    nodes: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -312,8 +314,11 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
             released = without_torque(drives.rig, master.status.status_words.tolist())
             if drives.group.capabilities.simulated and drives.true_pose is None:  # on a real bus
                 on_event(LoopEvent(0, 0.0, SIMULATED, "the drives report that they are simulated"))
-            armed = Armed(denied, loop.positions, drives.restarted, released, drives.remarks)
-            _send(link, armed)
+            nodes = tuple(drives.rig.drive_names)
+            _send(
+                link,
+                Armed(denied, loop.positions, drives.restarted, released, drives.remarks, nodes),
+            )
             with before_motion():
                 message = master.cycle_until(lambda: _poll(link))
         except Exception:

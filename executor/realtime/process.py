@@ -11,6 +11,7 @@ from multiprocessing.connection import wait
 
 from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus
+from drivers.factory import shows_no_torque
 from executor.realtime.child import (
     CYCLE_SLOTS,
     EVENT_SLOTS,
@@ -94,7 +95,8 @@ class RealTimeProcess:
         self._cycles, self._events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)
         self._records: Records | None = None
         self._last: CycleRecord | None = None
-        self._released: tuple[int, ...] = ()
+        self._nodes: tuple[int, ...] = ()
+        self._never_enabled: tuple[int, ...] = ()
         self._ended = False
         context = multiprocessing.get_context("spawn")
         self._link, far_end = context.Pipe()
@@ -122,7 +124,7 @@ class RealTimeProcess:
             if wait([self._link, self._process.sentinel], POLL_INTERVAL):
                 message = self._receive()
                 if isinstance(message, Armed):
-                    self._released = message.released
+                    self._nodes, self._never_enabled = message.nodes, message.released
                     for remark in message.remarks:
                         self._listener.remark(remark)
                         records.take_event(LoopEvent(0, 0.0, REMARK, remark))
@@ -161,10 +163,8 @@ class RealTimeProcess:
             self.report_event(_event_code(error), error.what)
         else:
             self.report_event("real_time_lost", error.what)
-        never_enabled = () if self._last else self._released
-        doubt = self._check_drives(
-            never_enabled
-        )  # the others should hold on their own without SYNC
+        # The others should hold on their own without SYNC.
+        doubt = self._check_drives(self._never_enabled)
         if doubt:
             self.report_event("not_held", doubt)
         cause = f"{error.what}; {doubt}" if doubt else error.what
@@ -240,12 +240,21 @@ class RealTimeProcess:
         """Takes everything received since the last call; cycles first, as they carry the time."""
         for content in self._cycles.take():
             self._last, true_pose = self._wire.unpack(content)
+            self._never_enabled = self._still_disabled(self._last)
             self._record(partial(records.take_cycle, self._last, true_pose))
         for content in self._events.take():
             self._record(partial(records.take_event, unpack_event(content)))
         lost = self._cycles.lost + self._events.lost
         if lost:
+            self._never_enabled = ()
             self._board.complain(f"{lost} records of the run were lost: they arrived too fast")
+
+    def _still_disabled(self, record: CycleRecord) -> tuple[int, ...]:
+        """Drives never enabled up to this cycle; one whose reply is missing may have been."""
+        words = {} if record.missing else dict(zip(self._nodes, record.words, strict=True))
+        return tuple(
+            node for node in self._never_enabled if node in words and shows_no_torque(words[node])
+        )
 
     def _record(self, take: Callable[[], None]) -> None:
         """A record that cannot be kept causes a path stop; supervision continues."""

@@ -258,6 +258,12 @@ class ProfileDocument(Document):
         """Whether drives get heartbeats to monitor."""
         return self.heartbeat_loss == "quick stop" and "1016h:01" not in self.absent
 
+    def usable_heartbeats(self, entries: int) -> int:
+        """Number of entries of 1016h to use in a drive that states this number of them."""
+        if not self.watches_heartbeats:
+            return 0
+        return entries if self.heartbeat_entries is None else min(entries, self.heartbeat_entries)
+
     def has(self, index: int, sub: int) -> bool:
         """Whether the drive has an object, according to the profile."""
         return object_name(index, sub) not in self.absent

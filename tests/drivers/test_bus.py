@@ -11,7 +11,7 @@ import pytest
 from can.interfaces.udp_multicast import bus as udp_bus
 
 from drivers import can_bus as bus_module
-from drivers.can_bus import BusSettings, SentFrame, open_bus
+from drivers.can_bus import BusSettings, InProcessBus, KernelInterface, SentFrame, open_bus
 from drivers.can_load import bus_load, check_bus_load, cycle_bits, heartbeat_cycles
 from model.errors import BadInput, HardwareMissing, Refused
 from model.files.rig_file import RigDocument
@@ -67,6 +67,34 @@ def test_a_kernel_interface_that_is_down_or_short_of_queue_is_reported(
         open_bus(BusSettings("socketcan", "can0"))
     assert what in caught.value.what
     assert "txqueuelen" in caught.value.next_step
+
+
+@pytest.mark.parametrize(("rate", "refused"), [(500_000, True), (1_000_000, False), (None, False)])
+def test_a_kernel_interface_at_another_bit_rate_is_not_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: int | None, refused: bool
+) -> None:
+    """The load of its bus would be twice the one that was checked; a serial adapter states none."""
+    folder = tmp_path / "can0"
+    folder.mkdir()
+    (folder / "flags").write_text("0x40081\n")
+    (folder / "tx_queue_len").write_text("128\n")
+    monkeypatch.setattr(bus_module, "INTERFACES", tmp_path)
+    found = (
+        KernelInterface("can1", "can", True, 128, 125_000, ""),
+        KernelInterface("can0", "can", True, 128, rate, ""),
+    )
+    monkeypatch.setattr(bus_module, "can_interfaces", lambda: found)
+    monkeypatch.setattr(can, "Bus", lambda **_options: InProcessBus("same-rate"))
+    settings = BusSettings("socketcan", "can0", 1_000_000)
+    if not refused:
+        open_bus(settings).shutdown()
+        return
+    with pytest.raises(
+        HardwareMissing, match="500000 bit/s; the rig file states 1000000"
+    ) as caught:
+        open_bus(settings)
+    assert "bus.bitrate" in caught.value.next_step
+    assert "ip link set can0 down" in caught.value.next_step
 
 
 def test_what_a_back_end_raises_becomes_hardware_missing() -> None:

@@ -131,7 +131,8 @@ def test_the_frames_of_a_cycle_are_those_of_the_standard() -> None:
 OF_ANOTHER_MASTER = {
     (0x000, 0x01): "sends NMT commands on this bus",
     (0x080, None): "sends SYNC on this bus",
-    (0x77F, 0x05): "sends the master's heartbeat on this bus",
+    (0x77F, 0x05): "sends the master's heartbeat on this bus, or a device has the node id 127, as"
+    " new drives may: give it another one",
     (0x201, 0x0F): "sends set-points to drive 1",
     (0x208, 0x40): "sends set-points to drive 8",
     (0x601, 0x2F): "writes objects of drive 1",  # download

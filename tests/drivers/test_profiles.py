@@ -144,6 +144,26 @@ def test_an_akd_limits_its_current_as_it_has_no_6072h(rig: Rig) -> None:
     assert all((0x6072, 0) not in drive.values for drive in bus.drives.values())
 
 
+@pytest.mark.parametrize("name", ["akd", "epos4"])
+@pytest.mark.parametrize("held", [0, 1199, 1200, 5000])
+def test_a_torque_limit_that_the_profile_denies_must_not_hold_another_value(
+    rig: Rig, name: str, held: int
+) -> None:
+    """A drive whose firmware has 6072h after all would get no limit there, or no torque."""
+    bus, theirs = eight_of(name), with_profile(rig, name)
+    bus.drives[5].objects[0x6072, 0] = bus.drives[5].objects[0x6040, 0]  # another UNSIGNED16
+    bus.drives[5].values[0x6072, 0] = held
+    (row,) = (row for row in examined(theirs, bus).rows if row.object.startswith("6072h"))
+    assert row.verdict == ("ok" if held == 1200 else "wrong")
+    if held == 1200:
+        set_up(theirs, bus)
+        return
+    with pytest.raises(Refused, match=f"absent; the drive has it with {held}, 1200 is") as caught:
+        set_up(theirs, bus)
+    assert caught.value.where == "drive 5, object 6072h:00 max torque"
+    assert not downloads(bus)
+
+
 def test_a_torque_limit_that_is_a_share_of_nothing_is_refused_before_anything_is_written(
     rig: Rig,
 ) -> None:
@@ -269,6 +289,29 @@ def test_a_cycle_that_the_drives_cannot_take_is_refused(rig: Rig) -> None:
     document["bus"]["cycle_ms"] = 4.5
     with pytest.raises(BadInput, match="interpolate"):
         set_up(rig_from_document(RigDocument.model_validate(document)), eight_of("nanotec-c5e"))
+
+
+@pytest.mark.parametrize("exponent", [None, 0, -3])
+@pytest.mark.parametrize("cycle_ms", [10.0, 25.6])
+def test_drives_without_an_interpolation_time_take_any_cycle(
+    rig: Rig, tmp_path: Path, cycle_ms: float, exponent: int | None
+) -> None:
+    """60C2h holds 10 ms, not 25.6 ms; a drive that has it after all must hold the cycle."""
+    document = rig.document.model_dump()
+    document["drives"]["profile"] = lab_profile(tmp_path, 'absent: ["60C2h:01", "60C2h:02"]')
+    document["bus"]["cycle_ms"] = cycle_ms
+    theirs, bus = rig_from_document(RigDocument.model_validate(document)), eight_of("cia402")
+    for node, drive in bus.drives.items():
+        if exponent is None or node != 3:
+            drive.aborts |= {(0x60C2, 1): 0x06020000, (0x60C2, 2): 0x06020000}
+        else:
+            drive.values |= {(0x60C2, 1): 10, (0x60C2, 2): exponent}
+    if exponent is None or (cycle_ms, exponent) == (10.0, -3):
+        assert set_up(theirs, bus) == ()
+        return
+    with pytest.raises(Refused, match=r"60C2h:0.*the profile declares it absent"):
+        set_up(theirs, bus)
+    assert not downloads(bus)
 
 
 def test_another_unit_of_position_is_refused_before_anything_is_written(rig: Rig) -> None:
@@ -581,6 +624,14 @@ def keyed(rig: Rig, tmp_path: Path, key: str) -> Rig:
         ({}, {0x6092: (360_000, 1)}, "states_scale: true", "360000 by 6092h/6091h"),
         ({0x608F: (TURN, 1)}, {0x6092: (360_000, 1)}, "states_scale: false", ""),
         ({0x608F: (TURN, 1)}, {0x608F: (TURN, 1), 0x6092: (1, 1)}, "", ""),  # not set
+        ({0x608F: (TURN, 1)}, {0x608F: (TURN, 1), 0x6092: (7, 7), 0x6091: (10, 1)}, "", ""),
+        ({}, {0x6092: (1, 1), 0x6091: (10, 1)}, "states_scale: true", ""),
+        (
+            {0x6091: (10, 1)},
+            {0x6092: (1, 1), 0x608F: (4096, 1)},
+            "states_scale: true",
+            "4096 by 608Fh",
+        ),
         ({0x608F: (TURN, 1)}, {0x608F: (4096, 1), 0x6092: (TURN, 1)}, "", ""),  # another encoder
     ],
 )
@@ -768,6 +819,35 @@ def test_drives_that_let_go_without_a_heartbeat_are_given_none(
     assert "monitor none" in remark
     for drive in bus.drives.values():
         assert [drive.values[0x1016, sub] for sub in range(1, entries + 1)] == [0] * entries
+
+
+ABSENT_SUB, FIXED = 0x06090011, 0x06010002
+
+
+@pytest.mark.parametrize(
+    ("code", "left", "kept"),
+    [(None, 0x050032, 0), (ABSENT_SUB, 0, 0), (FIXED, 0, 0), (FIXED, 0x050032, None)],
+)
+def test_entries_of_another_program_that_are_not_used_are_cleared(
+    tmp_path: Path, rig: Rig, code: int | None, left: int, kept: int | None
+) -> None:
+    """The loss of a node that no longer exists would stop the drive, in a run or after its end."""
+    theirs = with_profile(rig, lab_profile(tmp_path, "heartbeat_entries: 2"))
+    bus = eight_of("cia402")
+    third = bus.drives[3]
+    third.values[0x1016, 0] = 8
+    third.values |= {(0x1016, sub): left for sub in range(1, 9)}
+    if code == FIXED:
+        third.objects[0x1016, 5] = third.objects[0x1000, 0]  # read-only
+    elif code:
+        third.aborts |= {(0x1016, sub): code for sub in range(3, 9)}
+    if kept is None:
+        with pytest.raises(Refused, match="drive 3, object 1016h:05"):
+            set_up(theirs, bus)
+        return
+    assert all("1016h has 2 heartbeat entries" in remark for remark in set_up(theirs, bus))
+    entries = [third.values[0x1016, sub] for sub in range(1, 9)]
+    assert entries == [0x7F0064, 0x010064, *[kept] * 6]
 
 
 def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from executor.hold_to_run.line import FIRST_ROWS, MOST_ROWS, JogLine, JogProver,
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
 from executor.hold_to_run.session import jog_session
 from executor.jogging import with_speed
+from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedMemory
 from executor.remote.protocol import STEPS_MM
 from executor.state_machine import CycleRecord, State
@@ -320,6 +322,24 @@ def test_a_session_ends_on_its_own_when_nothing_is_held(monkeypatch: pytest.Monk
     monkeypatch.setattr(sessions, "IDLE", 0.8)
     records = Script([], 99.0).run(scene())
     assert 0.8 < records[-1].at < 2.0
+
+
+def test_the_set_up_of_the_drives_is_no_time_without_a_held_control(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Many drives with slow SDO answers take minutes: the session ended with its first cycle."""
+    make_mover = sessions.winch_mover
+
+    def after_a_minute(*parts: Any, clock: SimulatedClock, **options: Any) -> Any:
+        for _ in range(round(60.0 / rig().cycle)):
+            clock.next_cycle()
+        return make_mover(*parts, clock=clock, **options)
+
+    monkeypatch.setattr(sessions, "winch_mover", after_a_minute)
+    monkeypatch.setattr(sessions, "IDLE", 5.0)
+    records = Script([], 99.0).run(scene())
+    assert 60.0 < records[0].at < 62.0
+    assert 5.0 < records[-1].at - records[0].at < 7.0
 
 
 def test_a_line_is_checked_as_a_whole_would_be() -> None:

@@ -62,7 +62,7 @@ def test_there_is_no_press_zero() -> None:
 def test_a_new_board_holds_nothing_and_ends_nothing(board: PressBoard, time: Time) -> None:
     said = PressReader(board.memory, time).read()
     assert said == PressState(0, 1.0, ends=False, cable=0, pays_out=False, step=None)
-    assert board.last_heard == time.now
+    assert board.last_heard == -math.inf
     assert board.held() is None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
 from typing import Any
@@ -13,9 +14,9 @@ import pytest
 
 from drivers.can_errors import BusDown
 from executor.realtime import process as real_time_process
-from executor.realtime.child import Armed, Ended, Failed
-from executor.realtime.shared_memory import SharedRequests
-from executor.state_machine import LoopEvent, State
+from executor.realtime.child import CYCLE_SLOTS, Armed, Ended, Failed
+from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedRequests
+from executor.state_machine import CycleRecord, LoopEvent, State
 from model.errors import Fault, HardwareMissing
 
 
@@ -132,6 +133,61 @@ def test_a_drive_that_never_held_is_no_doubt_about_a_motion_that_did_not_begin(
             check_drives=lambda released: "" if lets_go in released else f"drive {lets_go} let go",
         ) as process:
             process.arm(SimpleNamespace(take_event=lambda _event: None))  # type: ignore[arg-type]
+            ended = process.run()
+    finally:
+        board.close()
+    assert (ended.state, ended.holding) == (State.LATCHED, holding)
+
+
+RESTS, READIES, BRAKED, ENABLED, QUICK, FAULT, UNKNOWN = (
+    0x0250, 0x0231, 0x0233, 0x0237, 0x0217, 0x0218, 0x0201
+)  # fmt: skip
+
+
+def dies_after(words: list[int], missing: int, job: Any, link: Connection, _pid: int) -> None:
+    """Drive 1 holds, the others have brakes; all but drive 2 only approach the last state."""
+    nodes, codec = tuple(range(1, 9)), CycleRecordCodec(8)
+    ring = Ring(job.cycles, CYCLE_SLOTS)
+    rest = (0,) * 8
+    for cycle, word in enumerate(words):
+        shown = (QUICK, word, *[BRAKED] * 6)
+        record = CycleRecord(
+            cycle, 0.004 * cycle, State.ENABLING, 0.0, 0.0, rest, rest, rest, shown, missing, 0, 0,
+            0.0, 0.0,
+        )  # fmt: skip
+        ring.put(codec.pack(record, None))
+    link.send(Armed("", (0,) * 8, released=nodes[1:], nodes=nodes))
+    link.recv()
+
+
+@pytest.mark.parametrize(
+    ("words", "missing", "lets_go", "holding"),
+    [
+        ([RESTS, READIES, BRAKED], 0, 2, True),
+        ([RESTS, READIES, BRAKED], 0, 1, False),
+        ([BRAKED, ENABLED, RESTS], 0, 2, False),
+        ([BRAKED, ENABLED, RESTS], 0, 3, True),
+        ([BRAKED, FAULT], 0, 2, False),
+        ([BRAKED, UNKNOWN, BRAKED], 0, 2, False),
+        ([BRAKED], 1, 2, False),
+        ([BRAKED] * (CYCLE_SLOTS + 1), 0, 2, False),
+    ],
+)
+def test_a_process_that_dies_while_enabling_casts_doubt_only_on_drives_that_had_torque(
+    monkeypatch: pytest.MonkeyPatch, words: list[int], missing: int, lets_go: int, holding: bool
+) -> None:
+    """A lost or unknown status word counts as torque, and so does a record that was lost."""
+    monkeypatch.setattr(real_time_process, "serve", partial(dies_after, words, missing))
+    board = SharedRequests()
+    records: Any = SimpleNamespace(take_event=lambda _: None, take_cycle=lambda *_: None)
+    motion_on_board: Any = (Still(), print, board)
+    try:
+        with real_time_process.real_time_process(
+            *motion_on_board,
+            need_real_time=False,
+            check_drives=lambda released: "" if lets_go in released else f"drive {lets_go} let go",
+        ) as process:
+            process.arm(records)
             ended = process.run()
     finally:
         board.close()
