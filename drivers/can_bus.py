@@ -218,10 +218,7 @@ def _is_multicast(group: str) -> bool:
 
 
 def _check_kernel_interface(settings: BusSettings) -> None:
-    """Checks what python-can notices only at the first frame, or never: the bit rate.
-
-    The kernel does not know that of a serial adapter (``slcand``).
-    """
+    """Checks what python-can notices only at the first frame, or never: the bit rate."""
     folder = INTERFACES / settings.channel
     if not settings.channel or not folder.exists():
         present = sorted(p.name for p in INTERFACES.glob("*can*"))
@@ -247,7 +244,10 @@ def _check_kernel_interface(settings: BusSettings) -> None:
             next_step=f"sudo ip link set {settings.channel} txqueuelen 128",
             values={"tx_queue_len": queue},
         )
-    rate = {each.name: each.bitrate for each in can_interfaces()}.get(settings.channel)
+    rates: dict[str, int | None] = {settings.channel: None}  # as of a serial adapter (slcand)
+    with suppress(HardwareMissing):  # without `ip`, which `cdpr doctor` reports
+        rates |= {each.name: each.bitrate for each in can_interfaces()}
+    rate = rates[settings.channel]
     if rate not in (None, settings.bitrate):
         raise HardwareMissing(
             f"{settings.channel} runs at {rate} bit/s; the rig file states {settings.bitrate}",

@@ -83,8 +83,11 @@ def test_a_kernel_interface_at_another_bit_rate_is_not_opened(
         KernelInterface("can1", "can", True, 128, 125_000, ""),
         KernelInterface("can0", "can", True, 128, rate, ""),
     )
-    monkeypatch.setattr(bus_module, "can_interfaces", lambda: found)
     monkeypatch.setattr(can, "Bus", lambda **_options: InProcessBus("same-rate"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(bus_module, "SYSTEM_FOLDERS", ())
+    open_bus(BusSettings("socketcan", "can0", 1_000_000)).shutdown()  # no `ip` shows the rate
+    monkeypatch.setattr(bus_module, "can_interfaces", lambda: found)
     settings = BusSettings("socketcan", "can0", 1_000_000)
     if not refused:
         open_bus(settings).shutdown()

@@ -92,7 +92,7 @@ def test_names_that_are_not_utf8_can_be_written_down(tmp_path: Path, camera: Cam
     ):
         data = cv2.imencode(".png", np.zeros(size, np.uint8))[1].tobytes()
         Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name)).write_bytes(data)
-    calibrated, measured = OneCamerasPictures(tmp_path, (64, 48)), ImageFolder(tmp_path, camera)
+    calibrated, measured = SingleCameraImages(tmp_path, (64, 48)), ImageFolder(tmp_path, camera)
     names = ["bild_\\udce4.png", "c.png"]
     assert [name for name, _ in calibrated] == [*calibrated.names] == names
     assert [frame.name for frame in measured] == names
