@@ -19,6 +19,7 @@ from model.statics.wrench_sets import rms_anchor_radius
 from planner.check import NEAR_AXIS, SLOWER, least_axis_distance
 from planner.check_report import CheckReport
 from planner.costs import capacity_margins, external_wrenches
+from planner.path import LENGTH_ROUND_OFF
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
 SAME_ROTATION = 1e-7
@@ -62,7 +63,7 @@ def require_feasible_length(scene: Scene, longest: float) -> None:
         BadInput: The longest path is too short.
     """
     straight = scene.start.distance_to(scene.goal)
-    if longest >= straight - 1e-9:
+    if longest >= straight - LENGTH_ROUND_OFF:
         return
     raise BadInput(
         f"no path of at most {longest * 1e3:.1f} mm joins start and goal: the straight line is"

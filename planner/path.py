@@ -58,6 +58,8 @@ class LengthLimit:
         path: The best path found that is short enough, shape (k, n); None without one.
     """
 
+LENGTH_ROUND_OFF = 1e-9
+"""Tolerance of a longest path, [m]: one of exactly the straight distance is a path."""
     def __init__(self, longest: float, unit: float) -> None:
         """Begins without a price of length.
 
@@ -83,7 +85,7 @@ class LengthLimit:
         Returns:
             Whether the price has changed.
         """
-        short_enough = length <= self._longest
+        short_enough = length <= self._longest + LENGTH_ROUND_OFF
         if short_enough:
             self._keep(path, cost())
         self._rounds += 1
