@@ -41,13 +41,21 @@ class Route:
 # The best path within a length limit: a price λ of length is raised until the limit is kept.
 #
 # With the objective plus λ times the length, a higher λ gives a shorter path. Every few rounds λ is
-# bisected towards the smallest value that keeps the limit; the best path within the limit is kept.
+# raised where the best path is too long, else lowered, by steps halved towards the smallest λ that
+# keeps the limit; the best path within the limit is kept. A path not yet polished may mislead, so
+# steps grow again where λ has to move in one direction for long.
 
 
 _ROUNDS = 6
 """Between changes of λ."""
-_MOST = 64.0
-"""λ at which practically only the length counts, for weights of scale 1."""
+_FIRST, _LEAST, _MOST = 2.0**-2, 2.0**-10, 64.0
+"""The first and the smallest λ above 0, in costs of a metre by the objective; and the λ at which
+practically only the length counts, for weights of scale 1."""
+_FINEST, _COARSEST = 2.0**-5, 2.0
+"""Steps of λ, in powers of 2."""
+_PERSISTENT, _GROWTH = 4, 1.5
+"""Steps in one direction from which they grow, and by how much: halved steps nearly reach the λ at
+which the direction changed, but not past it."""
 
 
 class LengthLimit:
@@ -70,7 +78,7 @@ LENGTH_ROUND_OFF = 1e-9
         self.price = 0.0
         self.path: Array | None = None
         self._longest, self._unit = longest, unit
-        self._low, self._high = 0.0, math.inf
+        self._step, self._repeated, self._was_short = _COARSEST, _PERSISTENT - 1, False
         self._rounds = 0
         self._least = math.inf
 
@@ -96,16 +104,15 @@ LENGTH_ROUND_OFF = 1e-9
             self._least, self.path = cost, path
 
     def _moved(self, short_enough: bool) -> bool:
-        if short_enough:
-            self._high = self.price
-        else:
-            self._low = self.price
-        if self._high == 0.0:
-            return False  # the objective alone keeps the limit
-        if self._high == math.inf:
-            self.price = min(max(4.0 * self.price, 0.25 * self._unit), _MOST)
-        else:
-            self.price = (self._low + self._high) / 2.0
+        self._repeated = self._repeated + 1 if short_enough == self._was_short else 1
+        self._was_short = short_enough
+        factor = _GROWTH if self._repeated >= _PERSISTENT else 0.5
+        self._step = min(max(factor * self._step, _FINEST), _COARSEST)
+        if self.price == 0.0:
+            self.price = 0.0 if short_enough else min(_FIRST * self._unit, _MOST)
+            return not short_enough  # else the objective alone keeps the limit
+        wanted = self.price * 2.0 ** (-self._step if short_enough else self._step)
+        self.price = min(max(wanted, _LEAST * self._unit), _MOST)
         return True
 
 
