@@ -38,6 +38,18 @@ class Route:
     edge_checks: int
 
 
+def smallest_gap(first: Array, second: Array) -> float:
+    """The smallest distance between the nodes of two trees, [m].
+
+    Row by row: all pairs of two full trees at once take 1 GB.
+
+    Args:
+        first: Positions, shape (i, 3), [m].
+        second: Positions, shape (j, 3), [m].
+    """
+    return min(float(np.linalg.norm(second - node, axis=-1).min()) for node in first)
+
+
 # The best path within a length limit: a price λ of length is raised until the limit is kept.
 #
 # With the objective plus λ times the length, a higher λ gives a shorter path. Every few rounds λ is
@@ -46,6 +58,8 @@ class Route:
 # steps grow again where λ has to move in one direction for long.
 
 
+LENGTH_ROUND_OFF = 1e-9
+"""Tolerance of a longest path, [m]: one of exactly the straight distance is a path."""
 _ROUNDS = 6
 """Between changes of λ."""
 _FIRST, _LEAST, _MOST = 2.0**-2, 2.0**-10, 64.0
@@ -66,8 +80,6 @@ class LengthLimit:
         path: The best path found that is short enough, shape (k, n); None without one.
     """
 
-LENGTH_ROUND_OFF = 1e-9
-"""Tolerance of a longest path, [m]: one of exactly the straight distance is a path."""
     def __init__(self, longest: float, unit: float) -> None:
         """Begins without a price of length.
 

@@ -25,7 +25,7 @@ from planner.anytime_6d.problem import RotatingProblem, build_objective, move_le
 from planner.collision.world import build_robot, build_world
 from planner.costs import KinematicCost
 from planner.edge_checks import REASONS
-from planner.path import LengthLimit, Progress, Route
+from planner.path import LengthLimit, Progress, Route, smallest_gap
 from planner.settings import (
     CLEARANCE_RESERVE,
     MARGIN_RESERVE,
@@ -121,7 +121,7 @@ class RotatingSearch:
         first, second = (self._trees[k, : max(self._grown[k], 1), :3] for k in (0, 1))
         if self._grown[0] == 0:
             first, second = self._ends[:1, :3], self._ends[1:, :3]
-        return float(np.linalg.norm(first[:, None, :] - second[None, :, :], axis=-1).min())
+        return smallest_gap(first, second)
 
     def advance(self) -> None:
         """Does one round."""
