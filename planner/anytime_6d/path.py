@@ -182,8 +182,9 @@ class RotatingSearch:
 Clock = Callable[[], float]
 
 _REPORT_EVERY = 20
-_ROTATION_ROUND_OFF = 5e-8
-"""Added to the rotation limits, [rad]: half of the check's tolerance for round-off in files."""
+_ROTATION_ROUND_OFF = 2.5e-6
+"""Added to the rotation limits, [rad]: ends at a limit may exceed it by round-off in files of up to
+2e-6; the check tolerates 3e-6."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
