@@ -323,9 +323,8 @@ class ClearanceModel:
         shifted = ShiftedBodies(self.rig, middle.rotation, positions)
         least = np.inf
         for obstacle in self._obstacles:
-            least = min(least, obstacle.at_least(bodies, shifted, self._radii, wanted))
-            if least < wanted:
-                break
+            needed = min(wanted, least)  # of the others no more where one is nearer
+            least = min(least, obstacle.at_least(bodies, shifted, self._radii, needed))
         return least
 
     def self_clearance(self, pose: Pose) -> Nearest:

@@ -88,6 +88,21 @@ class CdprError(Exception):
         }
 
 
+def distinct_figures(values: Sequence[float], digits: int, kind: str = "f") -> list[str]:
+    """Numbers as text, with more digits where those that differ would look alike.
+
+    Args:
+        values: The numbers.
+        digits: Fewest decimals, or fewest significant digits with ``kind`` "g".
+        kind: Of the format: "f" or "g".
+    """
+    for enough in range(digits, 18):
+        texts = [f"{value:z.{enough}{kind}}" for value in values]
+        if len({*texts}) == len({*values}):
+            break
+    return texts
+
+
 def _finite(value: object) -> object:
     """The value for JSON, which has no number for infinity."""
     return None if isinstance(value, float) and not math.isfinite(value) else value

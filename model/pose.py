@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.errors import BadInput
+from model.errors import BadInput, distinct_figures
 
 Array = NDArray[np.float64]
 
@@ -379,8 +379,8 @@ class PlatformMotion:
 # Limits on the platform's tilt and turn, exact along whole moves.
 
 
-_AT_LIMIT = 1e-7
-"""Tolerance of a limit, [rad]: round-off of quaternions in files."""
+_AT_LIMIT = 3e-6
+"""Tolerance of a limit, [rad]: six decimals of a quaternion in a file round by up to 2e-6."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -421,8 +421,8 @@ class Excess:
 
     def sentence(self) -> str:
         """In words, with figures."""
-        measured, limit = math.degrees(self.measured), math.degrees(self.limit)
-        return f"{self.how} by {measured:.4g} deg, rotation_limits allow {limit:.4g} deg"
+        measured, limit = distinct_figures(np.degrees([self.measured, self.limit]).tolist(), 4, "g")
+        return f"{self.how} by {measured} deg, rotation_limits allow {limit} deg"
 
 
 def largest_rotations(start: Array, end: Array) -> tuple[float, float]:

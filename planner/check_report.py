@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from model.clearance import Nearest
-from model.errors import Refused
+from model.errors import Refused, distinct_figures
 from model.pages.page import html_table
 from model.plan import Plan
 from model.pose import Array, Pose
@@ -77,21 +77,14 @@ class Violation:
         """The violation in words, with figures and platform position."""
         x, y, z = (float(c) * 1000.0 for c in self.position)
         figures = (self.measured, self.limit, *(() if self.proved is None else (self.proved,)))
-        measured, limit, *proved = _told_apart([figure * _SCALE[self.unit] for figure in figures])
+        measured, limit, *proved = distinct_figures(
+            [figure * _SCALE[self.unit] for figure in figures], 4, "g"
+        )
         bound = f", proved {proved[0]} {self.unit}" if proved else ""
         return (
             f"{self.what}: {measured} {self.unit}{bound} (limit {limit} {self.unit})"
             f" with the platform at [{x:.1f}, {y:.1f}, {z:.1f}] mm"
         )
-
-
-def _told_apart(values: list[float]) -> list[str]:
-    """Numbers with four digits, or as many as show which of them differ."""
-    for digits in range(4, 18):
-        texts = [f"{value:.{digits}g}" for value in values]
-        if len({*texts}) == len({*values}):
-            break
-    return texts
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ inverse volume of the force set, each scaled to 0..1 between its extremes over t
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
@@ -117,13 +118,14 @@ class KinematicCost:
         return self.mean_along_poses([Pose(point, self._rotation) for point in waypoints])
 
     def mean_along_poses(self, poses: Sequence[Pose]) -> float:
-        """Mean of c over the length of a path that may rotate the platform, exact at samples.
+        """Mean of c over the length of a path, exact at samples; rotation counts as length.
 
-        The scaling stays that of the orientation given to the constructor.
+        A radian counts as the root mean square radius of the anchors. The scaling stays that of the
+        orientation given to the constructor.
         """
-        total, length = 0.0, 0.0
+        total, length, radian = 0.0, 0.0, rms_anchor_radius(self.rig.anchors)
         for start, end in pairwise(poses):
-            part = start.distance_to(end)
+            part = math.hypot(start.distance_to(end), radian * start.angle_to(end))
             count = max(2, int(np.ceil(part / _SAMPLING)) + 1)
             samples = [interpolate(start, end, s) for s in np.linspace(0.0, 1.0, count).tolist()]
             values = self._at_poses(samples)

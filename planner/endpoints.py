@@ -7,7 +7,7 @@ from math import comb
 import numpy as np
 
 from model.clearance import PLATFORM, ClearanceModel, Nearest, SelfModel, cable_name
-from model.errors import BadInput
+from model.errors import BadInput, distinct_figures
 from model.files.new_rig import CABLES_MOST
 from model.kinematics import axis_distances, structure_matrix
 from model.pose import Pose
@@ -19,6 +19,7 @@ from model.statics.wrench_sets import rms_anchor_radius
 from planner.check import NEAR_AXIS, SLOWER, least_axis_distance
 from planner.check_report import CheckReport
 from planner.costs import capacity_margins, external_wrenches
+from planner.path import LENGTH_ROUND_OFF
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
 SAME_ROTATION = 1e-7
@@ -62,11 +63,11 @@ def require_feasible_length(scene: Scene, longest: float) -> None:
         BadInput: The longest path is too short.
     """
     straight = scene.start.distance_to(scene.goal)
-    if longest >= straight - 1e-9:
+    if longest >= straight - LENGTH_ROUND_OFF:
         return
+    most, least = distinct_figures((longest * 1e3, straight * 1e3), 1)
     raise BadInput(
-        f"no path of at most {longest * 1e3:.1f} mm joins start and goal: the straight line is"
-        f" {straight * 1e3:.1f} mm long",
+        f"no path of at most {most} mm joins start and goal: the straight line is {least} mm long",
         where=f"scene {scene.name}",
         next_step="allow a longer path with `longest=`, or leave it out",
         values={"longest_mm": longest * 1e3, "straight_mm": straight * 1e3},
@@ -159,9 +160,11 @@ def _require_in_workspace(rig: Rig, name: str, pose: Pose) -> None:
         return
     axis = int(np.argmax(np.maximum(below, above)))
     low, high = rig.workspace_lower[axis] * 1e3, rig.workspace_upper[axis] * 1e3
+    at, *_ = distinct_figures((float(pose.position[axis]) * 1e3, low, high), 1)
+    by, _ = distinct_figures((outside * 1e3, 0.0), 1)
     raise BadInput(
-        f"the {name} is {outside * 1e3:.1f} mm outside the workspace:"
-        f" {'xyz'[axis]} = {pose.position[axis] * 1e3:.1f} mm, limits {low:g} to {high:g} mm",
+        f"the {name} is {by} mm outside the workspace: {'xyz'[axis]} = {at} mm,"
+        f" limits {low:g} to {high:g} mm",
         where=f"scene {name}",
         next_step=f"move the {name} into the workspace box of the rig file",
         values={"outside_mm": outside * 1e3},
@@ -174,9 +177,10 @@ def _require_off_pulley_axes(rig: Rig, name: str, pose: Pose) -> None:
     cable = int(np.argmin(reach))
     if reach[cable] >= needed:
         return
+    distance, least = distinct_figures((float(reach[cable]) * 1e3, needed * 1e3), 1)
     raise BadInput(
-        f"at the {name} the anchor of cable {cable + 1} is {reach[cable] * 1e3:.1f} mm from the"
-        f" swivel axis of its pulley, less than the required {needed * 1e3:.1f} mm",
+        f"at the {name} the anchor of cable {cable + 1} is {distance} mm from the swivel axis of"
+        f" its pulley, less than the required {least} mm",
         where=f"scene {name}",
         why=_NEAR_AXIS_WHY,
         next_step=f"move the {name}, or the outlet in the rig file",
@@ -201,9 +205,10 @@ def _clearance_error(name: str, near: Nearest, needed: float, key: str, rig: Rig
         depth = f" (overlap {-distance:.1f} mm)" if distance < -0.05 else ""
         what = f"at the {name} {near.first} touches {near.second}{depth}"
     else:
+        gap, least = distinct_figures((distance, limit), 2)
         what = (
-            f"at the {name} {near.first} is {distance:.2f} mm from {near.second},"
-            f" less than the required {limit:.2f} mm"
+            f"at the {name} {near.first} is {gap} mm from {near.second},"
+            f" less than the required {least} mm"
         )
     why = f"the scene's clearance.{key} plus 0.05 mm that the planner keeps in reserve"
     next_step = f"move the {name} or the obstacle, or reduce the clearance"
@@ -267,10 +272,11 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
         external_wrenches(rig, scene, pose.rotation),
         rms_anchor_radius(rig.anchors),
     )
+    has, needs, _ = distinct_figures((margin, reserve, 0.0), 2)
     if margin >= 0.0:
         raise BadInput(
             f"at the {name} the cables can hold the platform, but the capacity margin is"
-            f" {margin:.2f} N, less than the planner's reserve of {reserve:.2f} N",
+            f" {has} N, less than the planner's reserve of {needs} N",
             where=f"scene {name}",
             why=f"with less than {MARGIN_RESERVE:.1%} of max_tension_n, wrench feasibility between"
             " poses is seldom proved",
@@ -280,8 +286,8 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
             values=values,
         )
     raise BadInput(
-        f"at the {name} the cables cannot hold the platform: the capacity margin is"
-        f" {margin:.2f} N, required {reserve:.2f} N",
+        f"at the {name} the cables cannot hold the platform: the capacity margin is {has} N,"
+        f" required {needs} N",
         where=f"scene {name}",
         why="weight, payload and disturbances need tensions outside min_tension_n..max_tension_n",
         next_step=f"{remedy(*binding)}, or move the {name} inward",

@@ -38,16 +38,38 @@ class Route:
     edge_checks: int
 
 
+def smallest_gap(first: Array, second: Array) -> float:
+    """The smallest distance between the nodes of two trees, [m].
+
+    Row by row: all pairs of two full trees at once take 1 GB.
+
+    Args:
+        first: Positions, shape (i, 3), [m].
+        second: Positions, shape (j, 3), [m].
+    """
+    return min(float(np.linalg.norm(second - node, axis=-1).min()) for node in first)
+
+
 # The best path within a length limit: a price λ of length is raised until the limit is kept.
 #
 # With the objective plus λ times the length, a higher λ gives a shorter path. Every few rounds λ is
-# bisected towards the smallest value that keeps the limit; the best path within the limit is kept.
+# raised where the best path is too long, else lowered, by steps halved towards the smallest λ that
+# keeps the limit; the best path within the limit is kept. A path not yet polished may mislead, so
+# steps grow again where λ has to move in one direction for long.
 
 
+LENGTH_ROUND_OFF = 1e-9
+"""Tolerance of a longest path, [m]: one of exactly the straight distance is a path."""
 _ROUNDS = 6
 """Between changes of λ."""
-_MOST = 64.0
-"""λ at which practically only the length counts, for weights of scale 1."""
+_FIRST, _LEAST, _MOST = 2.0**-2, 2.0**-10, 64.0
+"""The first and the smallest λ above 0, in costs of a metre by the objective; and the λ at which
+practically only the length counts, for weights of scale 1."""
+_FINEST, _COARSEST = 2.0**-5, 2.0
+"""Steps of λ, in powers of 2."""
+_PERSISTENT, _GROWTH = 4, 1.5
+"""Steps in one direction from which they grow, and by how much: halved steps nearly reach the λ at
+which the direction changed, but not past it."""
 
 
 class LengthLimit:
@@ -68,7 +90,7 @@ class LengthLimit:
         self.price = 0.0
         self.path: Array | None = None
         self._longest, self._unit = longest, unit
-        self._low, self._high = 0.0, math.inf
+        self._step, self._repeated, self._was_short = _COARSEST, _PERSISTENT - 1, False
         self._rounds = 0
         self._least = math.inf
 
@@ -83,7 +105,7 @@ class LengthLimit:
         Returns:
             Whether the price has changed.
         """
-        short_enough = length <= self._longest
+        short_enough = length <= self._longest + LENGTH_ROUND_OFF
         if short_enough:
             self._keep(path, cost())
         self._rounds += 1
@@ -94,16 +116,15 @@ class LengthLimit:
             self._least, self.path = cost, path
 
     def _moved(self, short_enough: bool) -> bool:
-        if short_enough:
-            self._high = self.price
-        else:
-            self._low = self.price
-        if self._high == 0.0:
-            return False  # the objective alone keeps the limit
-        if self._high == math.inf:
-            self.price = min(max(4.0 * self.price, 0.25 * self._unit), _MOST)
-        else:
-            self.price = (self._low + self._high) / 2.0
+        self._repeated = self._repeated + 1 if short_enough == self._was_short else 1
+        self._was_short = short_enough
+        factor = _GROWTH if self._repeated >= _PERSISTENT else 0.5
+        self._step = min(max(factor * self._step, _FINEST), _COARSEST)
+        if self.price == 0.0:
+            self.price = 0.0 if short_enough else min(_FIRST * self._unit, _MOST)
+            return not short_enough  # else the objective alone keeps the limit
+        wanted = self.price * 2.0 ** (-self._step if short_enough else self._step)
+        self.price = min(max(wanted, _LEAST * self._unit), _MOST)
         return True
 
 

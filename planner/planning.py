@@ -5,14 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from model.errors import BadInput, Fault, NoSolution, require_text, require_types, sequence_of
+from model.errors import (
+    BadInput,
+    CdprError,
+    Fault,
+    NoSolution,
+    require_text,
+    require_types,
+    sequence_of,
+)
 from model.files.documents import PoseDocument
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import StopDocument
@@ -268,14 +276,14 @@ def plan_path(
 ) -> PlanDocument:
     """As `make_plan`, with progress reports, also while the planner is compiled.
 
-    After compiling, a short search is made and discarded, so that the plan's figures do not count
-    the compiler.
+    Where code must be compiled, a short search is made first and its outcome discarded, so that the
+    plan's figures do not count the compiler.
     """
     settings = settings or OptimalSettings()
     make = partial(make_plan, rig, scene, settings, rounds=rounds, done=done)
     with planner_compilation(_work(settings), listener) as compiled:
         if not compiled:
-            with suppress(NoSolution):
+            with suppress(CdprError):
                 make_plan(rig, scene, _short(settings))
             return make()
         if isinstance(settings, PlannerSettings):
@@ -393,15 +401,10 @@ def _planner(settings: Settings, path: MultiSegmentPath) -> dict[str, Any]:
 
 
 def _anytime_planner(settings: AnytimeSettings, path: MultiSegmentPath) -> dict[str, Any]:
-    weights, longest = settings.weights, settings.longest
+    longest = settings.longest
     return {
         "name": "turning" if isinstance(settings, TurningSettings) else "optimal",
-        "weights": {
-            "length": weights.length,
-            "kinematic": weights.kinematic,
-            "clearance": weights.clearance,
-            "capacity": weights.capacity,
-        },
+        "weights": asdict(settings.weights),
         "seed": settings.seed,
         "rounds": list(path.rounds),
         "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,

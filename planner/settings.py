@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from model.errors import BadInput, NoSolution, real_number
+from model.errors import BadInput, NoSolution, distinct_figures, real_number
 from model.files.documents import LARGEST, SEED_LARGEST, WHOLE_LARGEST
 from planner.path import Progress
 from planner.rrt.variants import DEFAULT, AlgorithmVariant, ConeDraw, FailureRate, Focus, Steer
@@ -246,15 +246,15 @@ class AnytimeSettings:
         self, where: str, found: float, straight: float, values: dict[str, float | str]
     ) -> NoSolution:
         """The error where no path is short enough; lengths of best path and straight line, [m]."""
-        limit, length = self.longest * 1e3, found * 1e3
+        figures = self.longest * 1e3, found * 1e3
+        limit, length = distinct_figures(figures, 1)
         return NoSolution(
-            f"no path of at most {limit:.1f} mm was found",
+            f"no path of at most {limit} mm was found",
             where=where,
-            why=f"the path found is {length:.1f} mm long, the straight line"
-            f" {straight * 1e3:.1f} mm",
+            why=f"the path found is {length} mm long, the straight line {straight * 1e3:.1f} mm",
             next_step=f"allow a longer path, or {self.longer}; `cost='length'` without a limit"
             " shows how short paths can be",
-            values={**values, "longest_mm": limit, "found_mm": length},
+            values={**values, "longest_mm": figures[0], "found_mm": figures[1]},
         )
 
 

@@ -26,6 +26,7 @@ from planner.edge_checks import REASONS, edge_problem
 from planner.kernels.jit import kernel
 from planner.kernels.primitives import Vector, plus
 from planner.kernels.scene_arrays import MESH, World, arm, outlet
+from planner.path import smallest_gap
 from planner.settings import OptimalSettings
 
 Array = NDArray[np.float64]
@@ -198,8 +199,7 @@ def _gap(search: AnytimeSearch) -> float:
     first, second = (search.trees[k, : search.grown[k]] for k in (0, 1))
     if not len(first) or not len(second):
         return float(np.linalg.norm(search.ends[1] - search.ends[0]))
-    gaps = np.linalg.norm(first[:, None, :] - second[None, :, :], axis=-1)
-    return float(gaps.min())
+    return smallest_gap(first, second)
 
 
 def _blocking_pairs(rig: Rig, scene: Scene, problem: PathProblem, search: AnytimeSearch) -> str:

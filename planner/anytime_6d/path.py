@@ -25,7 +25,7 @@ from planner.anytime_6d.problem import RotatingProblem, build_objective, move_le
 from planner.collision.world import build_robot, build_world
 from planner.costs import KinematicCost
 from planner.edge_checks import REASONS
-from planner.path import LengthLimit, Progress, Route
+from planner.path import LengthLimit, Progress, Route, smallest_gap
 from planner.settings import (
     CLEARANCE_RESERVE,
     MARGIN_RESERVE,
@@ -121,7 +121,7 @@ class RotatingSearch:
         first, second = (self._trees[k, : max(self._grown[k], 1), :3] for k in (0, 1))
         if self._grown[0] == 0:
             first, second = self._ends[:1, :3], self._ends[1:, :3]
-        return float(np.linalg.norm(first[:, None, :] - second[None, :, :], axis=-1).min())
+        return smallest_gap(first, second)
 
     def advance(self) -> None:
         """Does one round."""
@@ -182,8 +182,9 @@ class RotatingSearch:
 Clock = Callable[[], float]
 
 _REPORT_EVERY = 20
-_ROTATION_ROUND_OFF = 5e-8
-"""Added to the rotation limits, [rad]: half of the check's tolerance for round-off in files."""
+_ROTATION_ROUND_OFF = 2.5e-6
+"""Added to the rotation limits, [rad]: ends at a limit may exceed it by round-off in files of up to
+2e-6; the check tolerates 3e-6."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -350,3 +350,20 @@ def test_the_cable_radius_reduces_every_distance() -> None:
         - thick_model.self_clearance(scene.start).distance
     )
     assert difference == pytest.approx(0.004)
+
+
+@given(seeds, st.floats(0.0, 0.3))
+def test_a_bound_over_a_translation_holds_for_every_obstacle(seed: int, wanted: float) -> None:
+    """Also for those that come after one whose bound fails."""
+    rng = np.random.default_rng(seed)
+    positions = rng.uniform([-0.2, -0.2, 0.25], [0.2, 0.2, 0.5], (2, 3))
+    spheres = [
+        {"name": f"sphere {k}", "position_mm": at, "sphere": {"radius_mm": 20.0}}
+        for k, at in enumerate((rng.uniform(-0.3, 0.6, (4, 3)) * 1e3).tolist())
+    ]
+    model = ClearanceModel(GACHON, scene_with(*spheres))
+    bound = model.at_least(Pose.level(positions.mean(axis=0)), positions, wanted)
+    for share in np.linspace(0.0, 1.0, 9):
+        nearest = model.smallest(Pose.level(positions[0] + share * (positions[1] - positions[0])))
+        assert nearest is not None
+        assert nearest.distance >= bound - 1e-9

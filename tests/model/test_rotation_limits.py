@@ -78,3 +78,26 @@ def test_a_turn_without_limit_may_go_around_the_back() -> None:
     first, last = (pose_of(Rotation.from_euler("z", a, degrees=True)) for a in (170, -170))
     assert RotationLimits(0.1, math.pi).excess(first, last) is None
     assert RotationLimits(0.1, math.radians(175.0)).excess(first, last) is not None
+
+
+@given(st.floats(0.5, 89.0), st.floats(-math.pi, math.pi), st.floats(0.5, 170.0))
+def test_a_pose_at_its_limits_keeps_them_with_six_decimals(
+    tilt: float, about: float, turn: float
+) -> None:
+    """As its quaternion is written in a scene file."""
+    axis = np.array([math.cos(about), math.sin(about), 0.0])
+    rotation = Rotation.from_rotvec(math.radians(tilt) * axis)
+    rotation *= Rotation.from_rotvec([0.0, 0.0, math.radians(turn)])
+    x, y, z, w = rotation.as_quat().round(6)
+    written = np.array([w, x, y, z])
+    pose = Pose.from_quaternion(np.zeros(3), written / np.linalg.norm(written))
+    limits = RotationLimits(math.radians(tilt), math.radians(turn))
+    assert limits.excess(pose, pose) is None
+
+
+def test_an_excess_of_a_thousandth_of_a_degree_shows_in_its_figures() -> None:
+    level = pose_of(Rotation.identity())
+    tipped = pose_of(Rotation.from_euler("y", 10.0004, degrees=True))
+    excess = RotationLimits(math.radians(10.0), math.pi).excess(level, tipped)
+    assert excess is not None
+    assert excess.sentence() == "tilted by 10.0004 deg, rotation_limits allow 10 deg"

@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from model import jit as machine_code
 from model.clearance import ClearanceModel
-from model.errors import BadInput, NoSolution
+from model.errors import BadInput, CdprError, Fault, NoSolution
 from model.files.rig_file import RigDocument
+from model.jit import KernelSet, compilation, is_compiled
 from model.plan import plan_from_document
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Rig, rig_from_document
@@ -22,7 +24,7 @@ from planner.check import verify
 from planner.costs import capacity_margins
 from planner.endpoints import require_usable_ends
 from planner.path import Route
-from planner.planning import make_plan, plan_from_waypoints
+from planner.planning import make_plan, plan_from_waypoints, plan_path
 from planner.settings import (
     CLEARANCE_RESERVE,
     MARGIN_RESERVE,
@@ -407,3 +409,24 @@ def test_a_path_near_a_pulleys_axis_is_refused_by_cable_and_pose(hall, monkeypat
     monkeypatch.setattr(planning, "plan_segments", lambda *_: found)
     with pytest.raises(BadInput, match=r"^.*cable 5 .* pulley's axis.*at \[.*, 450.0, 1100.0\] mm"):
         make_plan(rig, scene)
+
+
+@pytest.mark.parametrize("refusal", [BadInput, NoSolution, Fault])
+def test_a_refusal_of_the_path_made_while_compiling_does_not_matter(
+    gachon, scene_with, monkeypatch, tmp_path, refusal: type[CdprError]
+) -> None:
+    """As of a short search's path near a pulley's axis, which more rounds avoid."""
+    task, plan = KernelSet("optimal", (tmp_path,)), object()
+
+    def make(rig, scene, settings, **options):
+        if settings.rounds == 1:
+            raise refusal("a path of one round")
+        return plan
+
+    monkeypatch.setattr(machine_code, "cache_folder", lambda *_: tmp_path)
+    monkeypatch.setattr(
+        planning, "planner_compilation", lambda _, listener: compilation(task, "", "", listener)
+    )
+    monkeypatch.setattr(planning, "make_plan", make)
+    assert plan_path(gachon, scene_with(), OptimalSettings(rounds=2)) is plan
+    assert is_compiled(task)

@@ -14,7 +14,7 @@ from model.files.plan_file import PlanDocument
 from model.plan import load_plan, plan_facts, plan_from_document, save_plan
 from model.pose import Pose
 from model.rig import Rig
-from model.scene import Scene, load_scene
+from model.scene import Scene, empty_scene, load_scene
 from model.statics.wrench_sets import rms_anchor_radius
 from planner.anytime_6d.path import RotatingRoute, rotating_route
 from planner.check import check_path, verify
@@ -185,3 +185,12 @@ def test_a_plan_survives_its_file(tmp_path) -> None:
 def test_unusable_settings_are_refused(wrong) -> None:
     with pytest.raises(BadInput):
         TurningSettings(**wrong)
+
+
+def test_ends_at_the_limit_with_six_decimals_are_planned_between() -> None:
+    """As a user writes them: this quaternion tilts by 1.2e-6 rad more than 5 degrees."""
+    scene = empty_scene(GACHON).as_dict() | {"rotation_limits": {"tilt_deg": 5.0, "turn_deg": 2.0}}
+    tilted = [0.999048, 0.030844, 0.030844, 0.0]
+    for end, position in (("start", [-40.0, 0.0, 400.0]), ("goal", [40.0, 20.0, 430.0])):
+        scene[end] = {"position_mm": position, "rotation_wxyz": tilted}
+    proved(GACHON, Scene.from_dict(scene), TurningSettings(rounds=6))
