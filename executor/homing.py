@@ -36,6 +36,7 @@ from model.errors import (
     sequence_of,
     truth_value,
 )
+from model.kinematics import cable_lengths
 from model.pages.page import FactsDisplay
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
@@ -48,6 +49,8 @@ from tracking.clearance import require_stated_errors
 FURTHEST, FASTEST = 0.200, 0.010
 #: Defaults: reach [m], speed [m/s], number of images, and slack of simulated cables, [m].
 REACH, SPEED, PICTURES, SLACK = 0.050, 0.002, 20, 0.005
+#: Longest duration of winding in, [s].
+LONGEST = 3600.0
 #: Largest pretension, as a share of the limit.
 _SHARE_OF_LIMIT = 0.8
 #: Smallest and largest number of images for the pose.
@@ -103,8 +106,8 @@ def home(
     """Pretensions all cables, then references the drives at a known pose.
 
     All winches wind in slowly and together, each until its cable carries the pretension. A tension
-    above the limit, or a cable still slack after the full reach, stops all. Give exactly one of
-    `at_home`, `pose` and `camera`.
+    above the limit, or a cable still slack after the full reach and its elastic stretch, stops all.
+    Give exactly one of `at_home`, `pose` and `camera`.
 
     Args:
         rig: The robot and its bus.
@@ -114,7 +117,7 @@ def home(
         tension: Pretension, [N]; None for the tensions planned at a stated pose, at most 80 % of
             the limit, or with a camera for twice the rig's smallest tension.
         limit: Largest tension of any cable, [N]; None for 60 % of the rig's range.
-        reach: Largest length of cable wound in, [m].
+        reach: Largest length of cable wound in besides its elastic stretch, [m].
         speed: Largest winch speed, [m/s].
         pictures: Number of images for the pose.
         simulated_slack: Largest slack of simulated cables, [m].
@@ -172,7 +175,9 @@ def home(
         interlock.require_free()
         if source is not None:  # check that it delivers images before anything moves
             measure_at_rest(rig, source, 1, rig.home, commands.require_no_stop, listener)
-        fastest = float(wind_in_speed(rig, targets, limit, speed).max())
+        speeds = wind_in_speed(rig, targets, limit, speed)
+        _require_soon(rig, reach, float(speeds.min()))
+        fastest = float(speeds.max())
         proposal = HomingProposal(rig, targets, limit, reach, speed, fastest, source)
         require_confirmed(confirm, proposal)
         motion = WinchMotion(
@@ -180,7 +185,14 @@ def home(
             pose=known or rig.home,
             limit=limit,
             speed=speed,
-            make_law=partial(PretensionLaw, targets=targets, limit=limit, reach=reach, speed=speed),
+            make_law=partial(
+                PretensionLaw,
+                targets=targets,
+                limit=limit,
+                reach=reach,
+                speed=speed,
+                stretch=_stretch(rig, known or rig.home, targets),
+            ),
             lost_power=lost_power,
             realtime=realtime,
             need_real_time_rights=need_real_time_rights,
@@ -241,6 +253,29 @@ def _require_slow(reach: float, speed: float) -> None:
                 where="home",
                 next_step=f"give a smaller {name}",
             )
+
+
+def _require_soon(rig: Rig, reach: float, slowest: float) -> None:
+    """Requires that winding in, [m] at [m/s], ends within `LONGEST`.
+
+    Raises:
+        Refused: It would take longer, as with a stiffness in Pa.
+    """
+    if reach > LONGEST * slowest:
+        raise Refused(
+            f"winding in {reach * 1000:g} mm would take {reach / slowest / 3600.0:.2g} hours",
+            where="home",
+            why=f"a cable with E·A = {rig.cable_stiffness.max():.3g} N gains tension so fast that"
+            f" it is wound in at {slowest * 1e6:.2g} µm/s",
+            next_step="check cables.stiffness_n, which is E·A in N, not E in Pa; or give a higher"
+            " limit or a shorter reach; nothing was moved",
+        )
+
+
+def _stretch(rig: Rig, pose: Pose, tensions: Array) -> Array:
+    """Elastic stretch of whole cables at a pose under tensions, [N], shape (m,), [m]."""
+    lengths = cable_lengths(rig, pose) + [winch.drum_to_outlet for winch in rig.winches]
+    return np.asarray(lengths * tensions / (rig.cable_stiffness + tensions))
 
 
 def _stated_pose(rig: Rig, pose: Pose | None) -> Pose:

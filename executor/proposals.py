@@ -182,7 +182,10 @@ class HomingProposal:
         return [
             ("rig", self.rig.name),
             ("pretension", f"{pull} N per cable, at most {self.limit:g} N"),
-            ("winches", f"all together, at most {fastest:.2f} mm/s and {reach:g} mm each"),
+            (
+                "winches",
+                f"all together, at most {fastest:.2f} mm/s and {reach:g} mm each, plus stretch",
+            ),
             ("pose", measured),
             ("bus", f"{bus.interface} {bus.channel}".strip()),
         ]

@@ -390,6 +390,15 @@ def test_a_reach_beyond_the_position_limits_is_refused_before_anything_moves() -
     assert asked
 
 
+def test_winding_in_that_would_take_hours_is_refused() -> None:
+    document = load_rig(RIG).document
+    stiff = document.cables.model_copy(update={"stiffness_n": 9e8})
+    rig = rig_from_document(document.model_copy(update={"cables": stiff}))
+    with pytest.raises(Refused, match="hours") as refused:
+        home(rig, at_home=True, realtime=False)
+    assert "not E in Pa" in refused.value.next_step
+
+
 def test_one_cable_alone_moves_freely_only_while_it_hangs_slack() -> None:
     with after_power_loss(lost(3, 6.0, on_a_stand=True)) as bench:
         law = CableStep(
