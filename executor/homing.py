@@ -16,6 +16,7 @@ from executor.cameras.client import static_pose
 from executor.cameras.open import measure_at_rest
 from executor.cameras.sources import choose_one_camera, require_synthetic_images
 from executor.control.winch_laws import PretensionLaw, wind_in_speed
+from executor.control.winch_loop import MakeLaw
 from executor.control.winch_motion import WinchResult
 from executor.drives import is_simulated, require_own_time
 from executor.interlock.interlock import MotionInterlock
@@ -157,6 +158,7 @@ def home(
     limit = limit_of(rig, limit)
     targets = _targets(rig, tension, known, limit)
     speed = min(speed, rig.motion.speed)
+    law = _winding_in(rig, known or rig.home, targets, limit, reach, speed)
     interlock = MotionInterlock(rig)
     made: list[HomingReference] = []
 
@@ -175,9 +177,7 @@ def home(
         interlock.require_free()
         if source is not None:  # check that it delivers images before anything moves
             measure_at_rest(rig, source, 1, rig.home, commands.require_no_stop, listener)
-        speeds = wind_in_speed(rig, targets, limit, speed)
-        _require_soon(rig, reach, float(speeds.min()))
-        fastest = float(speeds.max())
+        fastest = float(wind_in_speed(rig, targets, limit, speed).max())
         proposal = HomingProposal(rig, targets, limit, reach, speed, fastest, source)
         require_confirmed(confirm, proposal)
         motion = WinchMotion(
@@ -185,14 +185,7 @@ def home(
             pose=known or rig.home,
             limit=limit,
             speed=speed,
-            make_law=partial(
-                PretensionLaw,
-                targets=targets,
-                limit=limit,
-                reach=reach,
-                speed=speed,
-                stretch=_stretch(rig, known or rig.home, targets),
-            ),
+            make_law=law,
             lost_power=lost_power,
             realtime=realtime,
             need_real_time_rights=need_real_time_rights,
@@ -255,12 +248,15 @@ def _require_slow(reach: float, speed: float) -> None:
             )
 
 
-def _require_soon(rig: Rig, reach: float, slowest: float) -> None:
-    """Requires that winding in, [m] at [m/s], ends within `LONGEST`.
+def _winding_in(
+    rig: Rig, pose: Pose, targets: Array, limit: float, reach: float, speed: float
+) -> MakeLaw:
+    """The law that winds in slack up to the reach, [m], and the cables' stretch at a pose.
 
     Raises:
-        Refused: It would take longer, as with a stiffness in Pa.
+        Refused: It would take longer than `LONGEST`, as with a stiffness in Pa.
     """
+    slowest = float(wind_in_speed(rig, targets, limit, speed).min())
     if reach > LONGEST * slowest:
         raise Refused(
             f"winding in {reach * 1000:g} mm would take {reach / slowest / 3600.0:.2g} hours",
@@ -270,12 +266,11 @@ def _require_soon(rig: Rig, reach: float, slowest: float) -> None:
             next_step="check cables.stiffness_n, which is E·A in N, not E in Pa; or give a higher"
             " limit or a shorter reach; nothing was moved",
         )
-
-
-def _stretch(rig: Rig, pose: Pose, tensions: Array) -> Array:
-    """Elastic stretch of whole cables at a pose under tensions, [N], shape (m,), [m]."""
     lengths = cable_lengths(rig, pose) + [winch.drum_to_outlet for winch in rig.winches]
-    return np.asarray(lengths * tensions / (rig.cable_stiffness + tensions))
+    stretch = lengths * targets / (rig.cable_stiffness + targets)
+    return partial(
+        PretensionLaw, targets=targets, limit=limit, reach=reach, speed=speed, stretch=stretch
+    )
 
 
 def _stated_pose(rig: Rig, pose: Pose | None) -> Pose:

@@ -165,7 +165,7 @@ class RobotView:
             planned = working_tensions(self.rig, found.pose, self.scene.load).tensions
         except CdprError:
             return None
-        # As recorded: tensions unlike the planned ones stretch cables in ways that no pose has.
+        # As recorded: tensions unlike the planned ones stretch cables as no pose does.
         more_stretch = float(np.linalg.norm(lengths - self._winches.strained(unstrained, planned)))
         motion = self.rig.motion
         if not found.worst <= motion.start_tolerance + motion.following_error + more_stretch:
