@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from calibration.targets.boards import Board, DetectedBoard
-from drivers.cameras.files import PICTURE_ENDINGS, ImageFolder, OneCamerasPictures
+from drivers.cameras.files import PICTURE_ENDINGS, ImageFolder, SingleCameraImages
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from executor.cameras.sources import require_camera_source
 from model.cameras import generic_camera
@@ -237,7 +237,7 @@ def open_images(folder: Path) -> ImageSet:
     """
     if folder.is_file():
         return _sampled(VideoFile(folder, generic_camera(video_size(folder))), VIDEO_IMAGES)
-    images = OneCamerasPictures(folder)
+    images = SingleCameraImages(folder)
     return ImageSet(images, len(images.names), images.unused)
 
 
@@ -266,7 +266,7 @@ def open_source(
                 where=str(source),
                 next_step="leave it out: all images of a folder are used",
             )
-        folder = OneCamerasPictures(path, (camera.width, camera.height))
+        folder = SingleCameraImages(path, (camera.width, camera.height))
         return ImageSet(folder, len(folder.names), folder.unused)
     if path.is_file():
         return _sampled(VideoFile(path, camera), most)

@@ -105,8 +105,6 @@ class ResultDocument(Document, ABC):
 
     order: ClassVar[int]
     """Results of lower order are applied first: those of higher order depend on them."""
-    added: ClassVar[tuple[str, ...]] = ()
-    """Keys that older files lack: left at their defaults they are not part of the hash."""
 
     schema_version: Literal[1] = 1
     kind: str
@@ -137,9 +135,7 @@ class ResultDocument(Document, ABC):
 
     def sealed(self) -> Self:
         """The result with its hash, which detects later edits."""
-        fields = type(self).model_fields
-        unset = {key for key in self.added if getattr(self, key) == fields[key].default}
-        return self.model_copy(update={"hash": document_hash(self, {"hash"} | unset)})
+        return self.model_copy(update={"hash": document_hash(self, {"hash"})})
 
     @property
     def stated(self) -> dict[str, Interval]:
@@ -167,18 +163,17 @@ class ResultDocument(Document, ABC):
             BadInput: The result is not about this rig.
         """
 
-    def require_basis(self, parts: object, what: str, *former: object) -> None:
+    def require_basis(self, parts: object, what: str) -> None:
         """Refuses a rig whose parts differ from those this result depends on.
 
         Args:
             parts: The JSON-like parts of the rig file that the result takes as known.
             what: Their names, for the message.
-            former: The same parts as former versions took them.
 
         Raises:
             BadInput: They differ.
         """
-        if self.rests_on not in map(content_hash, (parts, *former)):
+        if self.rests_on != content_hash(parts):
             raise BadInput(
                 f"this result was made with {what} that differ from the rig's",
                 where=f"calibration {self.kind} {self.name}, {self.date}",

@@ -219,7 +219,7 @@ class CyclicGroup(ABC):
         """Latches faults; the group stops if there are any."""
 
     @abstractmethod
-    def _look_for_faults(self) -> None:
+    def _check_faults(self) -> None:
         """Faults that the drives reported in this cycle."""
 
     @abstractmethod
@@ -248,7 +248,7 @@ class CyclicGroup(ABC):
             self._latch_bus(fault)
             raise
         self._listener.end_cycle()
-        self._look_for_faults()
+        self._check_faults()
         self._advance()
         return self._status()
 

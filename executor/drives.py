@@ -100,7 +100,7 @@ def require_simulated_start(rig: Rig, start: Pose | None) -> None:
     """
     if start is not None and not is_simulated(rig):
         raise BadInput(
-            "only a platform simulated in this process can be placed",
+            "a start pose can be set only for a platform simulated in this process",
             where="`start=`",
             next_step="leave it out, or use the interface 'virtual'",
         )

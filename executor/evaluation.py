@@ -279,8 +279,8 @@ def rewrite_report(folder: RunFolder) -> None:
     Raises:
         BadInput: A file of the run was changed, or the folder cannot be written to.
     """
-    if folder.is_whole and (not folder.has(COURSE) or all(map(folder.has, (FUSED, MCAP)))):
-        build_report(folder)  # all is there, or the run is of an earlier version
+    if folder.is_whole and all(map(folder.has, (FUSED, MCAP))):
+        build_report(folder)
     else:
         write_results(folder, evaluate_folder(folder))
 

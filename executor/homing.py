@@ -21,7 +21,7 @@ from executor.control.winch_motion import WinchResult
 from executor.drives import is_simulated, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
-from executor.proposals import Facts, ForgetProposal, HomingProposal, require_confirmed
+from executor.proposals import Facts, Proposal, forget_proposal, homing_proposal, require_confirmed
 from executor.realtime.scheduling import require_imported_script
 from executor.remote.command_server import commands_from_start
 from executor.supervision import RequestBoard, Supervisor
@@ -101,7 +101,7 @@ def home(
     realtime: bool = True,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
-    confirm: Callable[[HomingProposal], bool] | None = None,
+    confirm: Callable[[Proposal], bool] | None = None,
     supervisor: Supervisor | None = None,
 ) -> HomeResult:
     """Pretensions all cables, then references the drives at a known pose.
@@ -178,7 +178,7 @@ def home(
         if source is not None:  # check that it delivers images before anything moves
             measure_at_rest(rig, source, 1, rig.home, commands.require_no_stop, listener)
         fastest = float(wind_in_speed(rig, targets, limit, speed).max())
-        proposal = HomingProposal(rig, targets, limit, reach, speed, fastest, source)
+        proposal = homing_proposal(rig, targets, limit, reach, fastest, source)
         require_confirmed(confirm, proposal)
         motion = WinchMotion(
             rig=rig,
@@ -199,9 +199,7 @@ def home(
     return HomeResult(reference, None if in_process else interlock.file.path)
 
 
-def use_rig_file_counts(
-    rig: Rig, *, confirm: Callable[[ForgetProposal], bool] | None = None
-) -> None:
+def use_rig_file_counts(rig: Rig, *, confirm: Callable[[Proposal], bool] | None = None) -> None:
     """Discards the reference: absolute encoders count as in the rig file. Moves nothing.
 
     Raises:
@@ -211,7 +209,7 @@ def use_rig_file_counts(
     require_imported_script()
     interlock = MotionInterlock(rig)
     interlock.require_rig_file_counts()
-    require_confirmed(confirm, ForgetProposal(interlock))
+    require_confirmed(confirm, forget_proposal(interlock))
     interlock.use_rig_file_counts()
 
 

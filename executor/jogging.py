@@ -15,7 +15,7 @@ from executor.control.preconditions import require_still_referenced
 from executor.control.winch_laws import CableStep
 from executor.drives import current_pose, is_simulated, read_snapshot, require_own_time
 from executor.interlock.interlock import MotionInterlock
-from executor.proposals import CableProposal, Facts, MotionProposal, require_confirmed
+from executor.proposals import Facts, Proposal, cable_proposal, require_confirmed
 from executor.recording.record_files import free_folder
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.command_server import commands_from_start
@@ -64,7 +64,7 @@ def jog(
     realtime: bool = True,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
-    confirm: Callable[[MotionProposal], bool] | None = None,
+    confirm: Callable[[Proposal], bool] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     supervisor: Supervisor | None = None,
 ) -> RunResult:
@@ -218,7 +218,7 @@ def _require_jog(length_mm: float, turn_deg: float) -> None:
             f" {MOST_DEG:g}°",
             where="cdpr jog",
             why="longer motions need a plan that avoids obstacles",
-            next_step="jog less far, or plan a path from here with `cdpr plan --start-mm`",
+            next_step="jog a shorter distance, or plan a path from here: `cdpr plan --start-mm`",
         )
 
 
@@ -292,7 +292,7 @@ def jog_cable(
     realtime: bool = True,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
-    confirm: Callable[[CableProposal], bool] | None = None,
+    confirm: Callable[[Proposal], bool] | None = None,
     supervisor: Supervisor | None = None,
 ) -> CableJog:
     """Moves one winch alone slowly by a short length, for commissioning.
@@ -328,7 +328,7 @@ def jog_cable(
     fastest = slow.motion.speed
     with commands_from_start("jog", slow, supervisor, realtime=realtime) as commands:
         MotionInterlock(slow).require_free()
-        require_confirmed(confirm, CableProposal(slow, cable, length, limit, fastest))
+        require_confirmed(confirm, cable_proposal(slow, cable, length, limit, fastest))
         motion = WinchMotion(
             rig=slow,
             pose=slow.home,

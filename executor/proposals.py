@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any
 
 from drivers.can_bus import IN_PROCESS
 from executor.interlock.fault_latch import LatchedFault
@@ -27,26 +27,24 @@ if TYPE_CHECKING:
 Facts = list[tuple[str, str]]
 """Human-readable names and values."""
 
+_NOT_MOVED, _NOT_ENABLED = "nothing was moved", "nothing was enabled"
 
-class Proposal(Protocol):
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Proposal:
     """An action that needs confirmation; a `confirm` callback shows it and answers.
 
     Attributes:
+        title: The proposed action.
         question: To the operator.
         otherwise: Outcome after a no, such as ``nothing was moved``.
+        facts: Returns conditions and limits; empty if the title is enough.
     """
 
-    question: ClassVar[str]
-    otherwise: ClassVar[str]
-
-    @property
-    def title(self) -> str:
-        """The proposed action."""
-        ...
-
-    def facts(self) -> Facts:
-        """Conditions and limits; empty if the title is enough."""
-        ...
+    title: str
+    question: str
+    otherwise: str
+    facts: Callable[[], Facts] = list
 
 
 def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal) -> None:
@@ -64,39 +62,29 @@ def require_confirmed(confirm: Callable[[Any], bool] | None, proposal: Proposal)
         raise BadInput(
             f"confirm must return True or False, it returned {answer!r:.60}",
             where=proposal.title,
-            why=f"any other answer may be a no; {proposal.otherwise}",
-            next_step="return True to go on, or False to cancel",
+            why=f"any other answer could mean no; {proposal.otherwise}",
+            next_step="return True to continue, or False to cancel",
         )
     if not answer:
         raise StoppedByOperator(proposal.otherwise, next_step="run it again and confirm")
 
 
-def _shown(camera: Camera, source: str) -> str:
-    return f"{camera.name} ({without_passwords(source)})"
+# A run.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionProposal:
-    """Proposal of a run; see `Proposal`.
+def motion_proposal(
+    prepared: PreparedRun, cameras: Mapping[Camera, str], clearance_stop: bool
+) -> Proposal:
+    """Proposal of a run.
 
-    Attributes:
+    Args:
         prepared: The checked run.
         cameras: In use, with their sources.
         clearance_stop: Whether too small a measured clearance stops the run.
     """
 
-    question: ClassVar[str] = "Move the platform now?"
-    otherwise: ClassVar[str] = "nothing was moved"
-    title: ClassVar[str] = "ready to run"
-
-    prepared: PreparedRun
-    cameras: Mapping[Camera, str]
-    clearance_stop: bool
-
-    def facts(self) -> Facts:
-        """See `Proposal`."""
-        prepared, scene = self.prepared, self.prepared.scene
-        rig, table = prepared.rig, prepared.checked.table
+    def facts() -> Facts:
+        rig, scene, table = prepared.rig, prepared.scene, prepared.checked.table
         bus = rig.document.bus
         simulated = ", simulated drives" if bus.interface == IN_PROCESS else ""
         start, goal = scene.start.position * 1000, scene.goal.position * 1000
@@ -111,109 +99,101 @@ class MotionProposal:
                 f" at most {rig.motion.speed * 1000:g} mm/s",
             ),
             ("set-points", f"{len(table)} cycles of {table.cycle * 1000:g} ms, all checked"),
-            *self._reference(),
-            ("cameras", self._cameras()),
-            ("clearance stop", self._clearance()),
+            *_reference_facts(rig),
+            ("cameras", _describe_cameras(rig, cameras)),
+            ("clearance stop", _describe_clearance_stop(scene, cameras, clearance_stop)),
             ("bus", f"{bus.interface} {bus.channel}{simulated}"),
         ]
 
-    def _clearance(self) -> str:
-        """Threshold of the clearance stop, or why it is off."""
-        scene = self.prepared.scene
-        if not self.clearance_stop:
-            return "off (--no-clearance-stop)"
-        if not self.cameras:
-            return "off (no camera)"
-        if not scene.obstacles:
-            return "off (no obstacles in the scene)"
-        return f"below {scene.obstacle_clearance * 1000:g} mm, measured by the cameras"
-
-    def _cameras(self) -> str:
-        """Cameras in use, and those of the rig file that are not."""
-        names = {camera.name for camera in self.cameras}
-        unused = [one.name for one in self.prepared.rig.cameras if one.name not in names]
-        used = ", ".join(_shown(*one) for one in self.cameras.items())
-        parts = [used] if used else []
-        parts += [f"not used: {', '.join(unused)}"] if unused else []
-        return "; ".join(parts) or "none"
-
-    def _reference(self) -> Facts:
-        """The homing reference in use, if it is not the rig file's own."""
-        interlock = MotionInterlock(self.prepared.rig)
-        reference = interlock.kept_reference()
-        if reference is None or not reference.made:
-            return []
-        return [("reference", f"{reference.made}, {reference.how}; {interlock.file.path}")]
+    return Proposal("ready to run", "Move the platform now?", _NOT_MOVED, facts)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HomingProposal:
-    """Proposal of a homing; see `Proposal`.
+def _reference_facts(rig: Rig) -> Facts:
+    """The homing reference in use, if it is not the rig file's own."""
+    interlock = MotionInterlock(rig)
+    reference = interlock.kept_reference()
+    if reference is None or not reference.made:
+        return []
+    return [("reference", f"{reference.made}, {reference.how}; {interlock.file.path}")]
 
-    Attributes:
+
+def _describe_cameras(rig: Rig, cameras: Mapping[Camera, str]) -> str:
+    """Cameras in use, and those of the rig file that are not."""
+    names = {camera.name for camera in cameras}
+    unused = [one.name for one in rig.cameras if one.name not in names]
+    used = ", ".join(_shown(*one) for one in cameras.items())
+    parts = [used] if used else []
+    parts += [f"not used: {', '.join(unused)}"] if unused else []
+    return "; ".join(parts) or "none"
+
+
+def _describe_clearance_stop(
+    scene: Scene, cameras: Mapping[Camera, str], clearance_stop: bool
+) -> str:
+    """Threshold of the clearance stop, or why it is off."""
+    if not clearance_stop:
+        return "off (--no-clearance-stop)"
+    if not cameras:
+        return "off (no camera)"
+    if not scene.obstacles:
+        return "off (no obstacles in the scene)"
+    return f"below {scene.obstacle_clearance * 1000:g} mm, measured by the cameras"
+
+
+def _shown(camera: Camera, source: str) -> str:
+    return f"{camera.name} ({without_passwords(source)})"
+
+
+# Homing, and its reference.
+
+
+def homing_proposal(
+    rig: Rig,
+    targets: Array,
+    limit: float,
+    reach: float,
+    fastest: float,
+    camera: tuple[Camera, str] | None,
+) -> Proposal:
+    """Proposal of a homing.
+
+    Args:
         rig: The robot.
         targets: Pretension of each cable, shape (m,), [N].
         limit: Largest tension, [N].
         reach: Largest length of cable wound in, [m].
-        speed: Fastest winch, [m/s].
         fastest: Largest winding-in speed, limited by the reaction time, [m/s].
         camera: Camera for the pose, and its source; None if the pose is stated.
     """
 
-    question: ClassVar[str] = "Wind the cables in now?"
-    otherwise: ClassVar[str] = "nothing was moved"
-    title: ClassVar[str] = "ready to pretension"
-
-    rig: Rig
-    targets: Array
-    limit: float
-    reach: float
-    speed: float
-    fastest: float
-    camera: tuple[Camera, str] | None
-
-    def facts(self) -> Facts:
-        """See `Proposal`."""
-        source, bus = self.camera, self.rig.document.bus
-        fastest, reach = self.fastest * 1000.0, self.reach * 1000.0
-        low, high = self.targets.min(), self.targets.max()
+    def facts() -> Facts:
+        bus, low, high = rig.document.bus, targets.min(), targets.max()
         pull = f"{low:g}" if low == high else f"{low:.1f} to {high:.1f}"
-        measured = f"measured, camera {_shown(*source)}" if source else "stated, held by a jig"
+        speed = f"at most {fastest * 1000:.2f} mm/s and {reach * 1000:g} mm each"
+        measured = f"measured, camera {_shown(*camera)}" if camera else "stated, held by a jig"
         return [
-            ("rig", self.rig.name),
-            ("pretension", f"{pull} N per cable, at most {self.limit:g} N"),
-            (
-                "winches",
-                f"all together, at most {fastest:.2f} mm/s and {reach:g} mm each, plus stretch",
-            ),
+            ("rig", rig.name),
+            ("pretension", f"{pull} N per cable, at most {limit:g} N"),
+            ("winches", f"all together, {speed}, plus stretch"),
             ("pose", measured),
             ("bus", f"{bus.interface} {bus.channel}".strip()),
         ]
 
+    return Proposal("ready to pretension", "Wind the cables in now?", _NOT_MOVED, facts)
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ForgetProposal:
-    """Proposal to discard a homing reference; see `Proposal`.
 
-    Attributes:
-        interlock: Of its bus.
-    """
+def forget_proposal(interlock: MotionInterlock) -> Proposal:
+    """Proposal to discard the homing reference of a bus."""
+    status = reference_status(interlock)
+    gone = "the present homing reference, which would be discarded"
+    return Proposal(
+        f"{gone if status.file else 'homing reference'}: {status}",
+        "Do all drive positions match the rig file?",
+        "the homing reference was not changed",
+    )
 
-    question: ClassVar[str] = "Do all drive positions match the rig file?"
-    otherwise: ClassVar[str] = "the homing reference was not changed"
 
-    interlock: MotionInterlock
-
-    @property
-    def title(self) -> str:
-        """See `Proposal`."""
-        status = reference_status(self.interlock)
-        gone = "the present homing reference, which would be discarded"
-        return f"{gone if status.file else 'homing reference'}: {status}"
-
-    def facts(self) -> Facts:
-        """See `Proposal`."""
-        return []
+# Jogs.
 
 
 def _tension_fact(limit: float) -> tuple[str, str]:
@@ -225,11 +205,10 @@ def _held_fact(rig: Rig) -> tuple[str, str]:
     return "motion", f"at most {speed:g} mm/s, as long as a control is held"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CableProposal:
-    """Proposal to move one winch; see `Proposal`.
+def cable_proposal(rig: Rig, cable: int, length: float, limit: float, speed: float) -> Proposal:
+    """Proposal to move one winch.
 
-    Attributes:
+    Args:
         rig: The robot.
         cable: Its number, from 1.
         length: To pay out, [m]; negative winds in.
@@ -237,88 +216,84 @@ class CableProposal:
         speed: Of the winch, [m/s].
     """
 
-    question: ClassVar[str] = "Move this cable now?"
-    otherwise: ClassVar[str] = "nothing was moved"
-    title: ClassVar[str] = "ready to move one cable"
-
-    rig: Rig
-    cable: int
-    length: float
-    limit: float
-    speed: float
-
-    def facts(self) -> Facts:
-        """See `Proposal`."""
-        rig, mm, speed = self.rig, self.length * 1000.0, self.speed * 1000.0
+    def facts() -> Facts:
+        mm, direction = abs(length * 1000.0), "out" if length > 0 else "in"
         return [
             ("rig", rig.name),
-            ("cable", rig.drive_names[rig.winches[self.cable - 1].node_id]),
-            ("motion", f"{abs(mm):g} mm {'out' if mm > 0 else 'in'}, at most {speed:g} mm/s"),
-            _tension_fact(self.limit),
+            ("cable", rig.drive_names[rig.winches[cable - 1].node_id]),
+            ("motion", f"{mm:g} mm {direction}, at most {speed * 1000.0:g} mm/s"),
+            _tension_fact(limit),
         ]
 
+    return Proposal("ready to move one cable", "Move this cable now?", _NOT_MOVED, facts)
 
-@dataclass(frozen=True, slots=True, eq=False)
-class JogProposal:
-    """Proposal of a jog session; see `Proposal`.
 
-    Attributes:
+def jog_proposal(rig: Rig, scene: Scene, start: Pose) -> Proposal:
+    """Proposal of a jog session.
+
+    Args:
         rig: The robot; its motion has the jog speed.
         scene: Obstacles and load.
         start: Present platform pose, ``world_from_platform``.
     """
 
-    question: ClassVar[str] = "Enable the drives for jogging now?"
-    otherwise: ClassVar[str] = "nothing was enabled"
-    title: ClassVar[str] = "ready to enable the drives for jogging"
-
-    rig: Rig
-    scene: Scene
-    start: Pose
-
-    def facts(self) -> Facts:
-        """See `Proposal`."""
-        x, y, z = self.start.position * 1000.0
+    def facts() -> Facts:
+        x, y, z = start.position * 1000.0
         return [
-            ("rig", self.rig.name),
+            ("rig", rig.name),
             ("platform", f"at {x:.1f}, {y:.1f}, {z:.1f} mm"),
-            ("obstacles", ", ".join(one.name for one in self.scene.obstacles) or "none"),
-            _held_fact(self.rig),
+            ("obstacles", ", ".join(one.name for one in scene.obstacles) or "none"),
+            _held_fact(rig),
         ]
 
+    title = "ready to enable the drives for jogging"
+    return Proposal(title, "Enable the drives for jogging now?", _NOT_ENABLED, facts)
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ResetProposal:
-    """Proposal to reset a fault; see `Proposal`.
 
-    Attributes:
+def cables_proposal(rig: Rig, limit: float) -> Proposal:
+    """Proposal of a session of single-cable jogs.
+
+    Args:
+        rig: The robot; its motion has the jog speed.
+        limit: Largest tension of any cable, [N].
+    """
+
+    def facts() -> Facts:
+        return [
+            ("rig", rig.name),
+            ("cables", f"{rig.cable_count}, one at a time"),
+            _held_fact(rig),
+            _tension_fact(limit),
+            ("not checked", "obstacles, workspace and the platform's pose"),
+            ("reference", "stays as it is; a run begins only where drive positions fit a pose"),
+        ]
+
+    title = "ready to enable the drives for jogs of single cables"
+    question = "Enable the drives to jog one cable at a time now?"
+    return Proposal(title, question, _NOT_ENABLED, facts)
+
+
+# Resets and releases.
+
+
+def reset_proposal(bus: str, latched: LatchedFault | None) -> Proposal:
+    """Proposal to reset a fault.
+
+    Args:
         bus: Interface and channel.
         latched: The latched fault, if any.
     """
-
-    question: ClassVar[str] = "Is the cause removed and the platform safe?"
-    otherwise: ClassVar[str] = "nothing was reset"
-
-    bus: str
-    latched: LatchedFault | None
-
-    @property
-    def title(self) -> str:
-        """See `Proposal`."""
-        fault = self.latched
-        cause = f"latched since {fault.since}: {fault.cause}" if fault else "no fault latched"
-        return f"bus {self.bus}: {cause}"
-
-    def facts(self) -> Facts:
-        """See `Proposal`."""
-        return []
+    cause = f"latched since {latched.since}: {latched.cause}" if latched else "no fault latched"
+    question = "Is the cause removed and the platform safe?"
+    return Proposal(f"bus {bus}: {cause}", question, "nothing was reset")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ReleaseProposal:
-    """Proposal to release the drives; see `Proposal`.
+def release_proposal(
+    rig: Rig, bus: str, braked: bool, reference: ReferenceStatus, in_fault: tuple[str, ...]
+) -> Proposal:
+    """Proposal to release the drives.
 
-    Attributes:
+    Args:
         rig: The robot.
         bus: Interface and channel.
         braked: Whether brakes hold the drums afterwards.
@@ -326,54 +301,17 @@ class ReleaseProposal:
         in_fault: Names of drives that stay in fault, and cannot be reset before the release.
     """
 
-    question: ClassVar[str] = "Is the platform supported, so that no cable carries it?"
-    otherwise: ClassVar[str] = "the drives hold as before"
-    title: ClassVar[str] = "ready to release the drives"
-
-    rig: Rig
-    bus: str
-    braked: bool
-    reference: ReferenceStatus
-    in_fault: tuple[str, ...] = ()
-
-    def facts(self) -> Facts:
-        """See `Proposal`."""
-        held = "the brakes hold the drums" if self.braked else "nothing holds the cables"
+    def facts() -> Facts:
+        held = "the brakes hold the drums" if braked else "nothing holds the cables"
         gone = "discarded: run `cdpr home` before the next motion"
-        stays = f"{', '.join(self.in_fault)}: not enabled, stays so until `cdpr reset RIG`"
-        return [
-            ("rig", self.rig.name),
-            ("bus", self.bus),
-            *([("in fault", stays)] if self.in_fault else []),
-            ("afterwards", held),
-            ("reference", str(self.reference) if self.braked else gone),
-        ]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CablesProposal:
-    """Proposal of a session of single-cable jogs; see `Proposal`.
-
-    Attributes:
-        rig: The robot; its motion has the jog speed.
-        limit: Largest tension of any cable, [N].
-    """
-
-    question: ClassVar[str] = "Enable the drives to jog one cable at a time now?"
-    otherwise: ClassVar[str] = "nothing was enabled"
-    title: ClassVar[str] = "ready to enable the drives for jogs of single cables"
-
-    rig: Rig
-    limit: float
-
-    def facts(self) -> Facts:
-        """See `Proposal`."""
-        rig = self.rig
+        stays = f"{', '.join(in_fault)}: not enabled, stays so until `cdpr reset RIG`"
         return [
             ("rig", rig.name),
-            ("cables", f"{rig.cable_count}, one at a time"),
-            _held_fact(rig),
-            _tension_fact(self.limit),
-            ("not checked", "obstacles, workspace and the platform's pose"),
-            ("reference", "stays as it is; a run begins only where drive positions fit a pose"),
+            ("bus", bus),
+            *([("in fault", stays)] if in_fault else []),
+            ("afterwards", held),
+            ("reference", str(reference) if braked else gone),
         ]
+
+    question = "Is the platform supported, so that no cable carries it?"
+    return Proposal("ready to release the drives", question, "the drives hold as before", facts)

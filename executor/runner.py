@@ -34,7 +34,7 @@ from executor.drives import (
 from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
 from executor.interlock.interlock import MotionInterlock
 from executor.kernels import ready_for_simulating_process
-from executor.proposals import MotionProposal, require_confirmed
+from executor.proposals import Proposal, motion_proposal, require_confirmed
 from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import RunCourse, dated_folder
@@ -78,7 +78,7 @@ class RunOptions:
     clearance_stop: bool = True
     need_real_time_rights: bool = True
     listener: Listener = SILENT
-    confirm: Callable[[MotionProposal], bool] | None = None
+    confirm: Callable[[Proposal], bool] | None = None
     on_event: Callable[[RunEvent], None] | None = None
 
 
@@ -93,7 +93,7 @@ def run(
     clearance_stop: bool = True,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
-    confirm: Callable[[MotionProposal], bool] | None = None,
+    confirm: Callable[[Proposal], bool] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     supervisor: Supervisor | None = None,
     plan_file: Path | str = "plan",
@@ -184,7 +184,7 @@ def run_prepared(
     """
     commands.require_no_stop()
     require_readable_record(prepared)
-    proposal = MotionProposal(prepared, cameras, options.clearance_stop)
+    proposal = motion_proposal(prepared, cameras, options.clearance_stop)
     require_confirmed(options.confirm, proposal)
     commands.require_no_stop()
     with options.listener.waiting("loading the report generator"):

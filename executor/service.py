@@ -45,7 +45,7 @@ from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.interlock.locks import SetUpLock
 from executor.interlock.reference import RESTARTED, ReferenceStatus
-from executor.proposals import Facts, ReleaseProposal, ResetProposal, require_confirmed
+from executor.proposals import Facts, Proposal, release_proposal, require_confirmed, reset_proposal
 from executor.realtime.process import RealTimeProcess, real_time_process
 from executor.realtime.scheduling import require_imported_script
 from executor.realtime.shared_memory import SharedRequests
@@ -76,7 +76,7 @@ class StatusResult(FactsDisplay):
         being_set_up: Another program configures or reads the drives.
         reference: Homing reference of the drives.
         drives: The drives that answered, in the order of the rig file.
-        pose: By the drives, without a load, ``world_from_platform``.
+        pose: From the encoders, without a load, ``world_from_platform``.
         why_no_pose: Why there is no pose, though the drives were read.
         missing: Why drives could not be read; the reference is unknown then, unless it is lost.
         silent: Nodes of the drives that did not answer.
@@ -294,7 +294,7 @@ class ResetResult(FactsDisplay):
 def reset(
     rig: Rig,
     *,
-    confirm: Callable[[ResetProposal], bool] | None = None,
+    confirm: Callable[[Proposal], bool] | None = None,
     listener: Listener = SILENT,
 ) -> ResetResult:
     """Clears a latched fault after its cause is removed: resets drives in fault; moves nothing.
@@ -319,7 +319,7 @@ def reset(
     latch = FaultLatch(settings, rig.drive_names)
     latched = latch.read()
     latch.require_no_run()
-    require_confirmed(confirm, ResetProposal(str(settings), latched))
+    require_confirmed(confirm, reset_proposal(str(settings), latched))
     interlock, motion = MotionInterlock(rig), StandstillMotion.of(FaultReset, rig)
     make_drives = partial(resting_drives_of, rig.document, to_reset=True)
     with latch.held_for_reset(rig.name, latched):
@@ -369,7 +369,7 @@ def release(
     *,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
-    confirm: Callable[[ReleaseProposal], bool] | None = None,
+    confirm: Callable[[Proposal], bool] | None = None,
     supervisor: Supervisor | None = None,
 ) -> ReleaseResult:
     """Closes the brakes and switches off the torque of all drives; the platform must be supported.
@@ -398,7 +398,7 @@ def release(
     with commands_from_start("release", rig, supervisor, realtime=True) as commands:
         under, in_fault = faults_to_release_under(rig)
         bus, braked = str(BusSettings.of(rig)), is_braked(rig)
-        proposal = ReleaseProposal(rig, bus, braked, reference_status(interlock), in_fault)
+        proposal = release_proposal(rig, bus, braked, reference_status(interlock), in_fault)
         require_confirmed(confirm, proposal)
         commands.require_no_stop()
         process = partial(

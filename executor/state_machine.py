@@ -24,9 +24,9 @@ class State(Enum):
     SECURING = "securing"
     """At rest; the drives change to holding on their own (quick stop active)."""
     FINISHED = "finished"
-    """At the goal, held by the drives."""
+    """At the goal; the drives hold."""
     STOPPED = "stopped"
-    """Stopped by the operator on the path, held by the drives."""
+    """Stopped by the operator on the path; the drives hold."""
     LATCHED = "latched"
     """Stopped by a fault; this run is over, and a new command is needed for another."""
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.cameras.files import ImageFolder, PictureOutput, first_gap, natural_order
+from drivers.cameras.files import ImageFolder, ImageOutput, first_gap, natural_order
 from drivers.cameras.live import Frame, LiveCamera, VideoFile
 from executor.cameras.sources import (
     SYNTHETIC,
@@ -35,10 +35,10 @@ from planner.check import verify
 from simulation.camera.camera import ImageSequence
 from simulation.factory import make_synthetic_camera
 from tracking.measurement import FrameRate, PoseMeasurement
-from tracking.pose_log import LoggedPicture, write_pose_log
+from tracking.pose_log import LoggedImage, write_pose_log
 from tracking.track import (
     MultiCameraCount,
-    Picture,
+    SourceImage,
     TrackCount,
     draw_measurement,
     track,
@@ -48,6 +48,11 @@ from tracking.tracker import Tracker
 
 #: Images without a tag after which tracking with a live camera ends.
 PATIENCE = 50
+_LABELS = {  # of key figures in text; their names in JSON stay
+    "moments_apart": "frame sets with images too far apart in time",
+    "moments_without_speed": "frame sets with a pose of unknown velocity",
+    "common_deviation_mm": "deviation common to all images mm",
+}
 
 
 @dataclass(slots=True)
@@ -65,8 +70,8 @@ class TrackResult(FactsDisplay):
         seconds: Total time, [s].
     """
 
-    pictures: list[LoggedPicture] = field(default_factory=list)
-    by_camera: dict[str, list[LoggedPicture]] = field(default_factory=dict)
+    pictures: list[LoggedImage] = field(default_factory=list)
+    by_camera: dict[str, list[LoggedImage]] = field(default_factory=dict)
     count: TrackCount = field(default_factory=TrackCount)
     together: MultiCameraCount | None = None
     unused: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -86,8 +91,8 @@ class TrackResult(FactsDisplay):
 
     def facts(self) -> list[tuple[str, str]]:
         """The summary as text."""
-        known = self.summary().items()
-        return [(name.replace("_", " "), "–" if v is None else str(v)) for name, v in known]
+        known = ((_LABELS.get(k, k.replace("_", " ")), v) for k, v in self.summary().items())
+        return [(k.replace("picture", "image"), "–" if v is None else str(v)) for k, v in known]
 
     def summary(self) -> dict[str, int | float | None]:
         """Key figures, with units in their names; None where there is no pose or no image."""
@@ -105,10 +110,9 @@ class TrackResult(FactsDisplay):
             facts["pictures_without_partner"] = self.together.without_partner
             facts["moments_apart"] = self.together.apart
             facts["moments_without_speed"] = self.together.without_speed
-        common = [np.sqrt(np.diag(p.shared)[:3]) for p in poses if not p.unstated]
+        common = [float(np.sqrt(np.trace(p.shared[:3, :3]))) for p in poses if not p.unstated]
         if common:
-            deviation = float(np.median(np.linalg.norm(common, axis=1)))
-            facts["common_deviation_mm"] = round(deviation * 1000, 4)
+            facts["common_deviation_mm"] = _median(common, 1000, 4)
         clearances = [p.clearance for p in logged if p.clearance is not None]
         if clearances:
             nearest = min(clearances, key=lambda c: c.distance)
@@ -226,24 +230,22 @@ def track_sources(
         for camera, source in sources.items()
     ]
     opened, within = _simultaneous(list(sources), opened, listener)
-    totals = [total for _, total in opened if total is not None]
-    total = max(totals) if len(totals) == len(opened) else None
     is_live = any(length is None for _, length in opened)  # then times are of the monotonic clock
+    total = None if is_live else max(length or 0 for _, length in opened)
     result.began = time.time_ns() - (time.monotonic_ns() if is_live else 0)
     with ExitStack() as drawing, listener.progress("tracking", pictures or total) as advance:
-        streams: dict[str, Iterator[LoggedPicture]] = {}
+        streams: dict[str, Iterator[LoggedImage]] = {}
         for camera, (frames, length) in zip(sources, opened, strict=True):
             target = own_drawing(overlay, camera.name) if overlay and several else overlay
             rate = frames.rate if isinstance(frames, VideoFile) else camera.rate
+            draw = drawing.enter_context(_overlay(target, rig, camera, rate, replace_overlay))
             streams[camera.name] = track(
                 takewhile(lambda _: not stopped(), islice(frames, pictures)),
                 Tracker(rig, camera),
                 result.count,
                 give_up_after=PATIENCE if length is None and not several else None,
                 model=model,
-                on_picture=drawing.enter_context(
-                    _overlay(target, rig, camera, rate, replace_overlay)
-                ),
+                on_picture=draw,
             )
         try:
             _measure(_together(streams, within, result.together, model), result, advance)
@@ -260,9 +262,9 @@ def track_sources(
 
 def _simultaneous(
     cameras: Sequence[Camera],
-    opened: list[tuple[Iterable[Picture], int | None]],
+    opened: list[tuple[Iterable[SourceImage], int | None]],
     listener: Listener,
-) -> tuple[list[tuple[Iterable[Picture], int | None]], float]:
+) -> tuple[list[tuple[Iterable[SourceImage], int | None]], float]:
     """The opened sources with times common to all cameras.
 
     Returns:
@@ -346,7 +348,7 @@ def _report_different_videos(videos: Mapping[str, VideoFile], listener: Listener
 
 
 def _measure(
-    measured: Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]],
+    measured: Iterator[tuple[LoggedImage, dict[str, LoggedImage]]],
     result: TrackResult,
     advance: Callable[[float, str], None],
 ) -> None:
@@ -354,43 +356,40 @@ def _measure(
     pace, began = FrameRate(), time.monotonic()
     for found, alone in measured:
         result.pictures.append(found)
-        for name, own in result.by_camera.items():
-            if name in alone:
-                own.append(alone[name])
+        for name in result.by_camera.keys() & alone:
+            result.by_camera[name].append(alone[name])
         now = time.monotonic()
         result.seconds = now - began
         pace.take(now, result.count.seconds[-1])
-        seen = found.observation
-        tags = len(seen.tags) if isinstance(seen, PoseMeasurement) else 0
-        advance(len(result.pictures), pace.text(tags))
+        tags = found.observation.tags if isinstance(found.observation, PoseMeasurement) else ()
+        advance(len(result.pictures), pace.text(len(tags)))
 
 
 def _together(
-    streams: dict[str, Iterator[LoggedPicture]],
+    streams: dict[str, Iterator[LoggedImage]],
     within: float,
     count: MultiCameraCount | None,
     model: ClearanceModel | None,
-) -> Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]]:
+) -> Iterator[tuple[LoggedImage, dict[str, LoggedImage]]]:
     """Fused measurements, with those of each camera."""
     if count is not None:
         yield from track_cameras(streams, within, count, model)
         return
     for name, stream in streams.items():
-        for found in stream:
-            yield found, {name: found}
+        yield from ((found, {name: found}) for found in stream)
 
 
 @contextmanager
 def _overlay(
     target: Path | None, rig: Rig, camera: Camera, rate: float, replace: bool
-) -> Iterator[Callable[[Picture, LoggedPicture], None] | None]:
+) -> Iterator[Callable[[SourceImage, LoggedImage], None] | None]:
     """A function that writes images with measurements drawn in; None without a target."""
     if target is None:
         yield None
         return
-    with PictureOutput(target, rate, replace) as out:
+    with ImageOutput(target, rate, replace) as out:
 
-        def draw(picture: Picture, logged: LoggedPicture) -> None:
+        def draw(picture: SourceImage, logged: LoggedImage) -> None:
             found, clearance = logged.observation, logged.clearance
             out.write(draw_measurement(picture.image, rig, camera, found, clearance), picture.name)
 
@@ -406,7 +405,7 @@ def _opened(
     unused: dict[str, str],
     stopped: Callable[[], bool],
     listener: Listener,
-) -> tuple[Iterable[Picture], int | None]:
+) -> tuple[Iterable[SourceImage], int | None]:
     """The images of a source, and their number if known."""
     if source == SYNTHETIC:
         if plan is None or scene is None:
@@ -444,7 +443,7 @@ def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Po
 
 def _rendered(
     rig: Rig, scene: Scene, camera: Camera, timed_poses: list[tuple[float, Pose]]
-) -> Iterable[Picture]:
+) -> Iterable[SourceImage]:
     film = ImageSequence(make_synthetic_camera(rig, scene, camera))
     for number, (at, pose) in enumerate(timed_poses):
         yield Frame(at, film.picture(at, pose, number), f"rendered {number}", number)

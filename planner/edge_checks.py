@@ -11,13 +11,18 @@ from model.pose import Array
 from model.rig import Rig
 from model.scene import Scene
 from planner.collision.edges import edge_clearance, in_workspace, obstacles_free
-from planner.collision.rotating_edges import turning_edge_free
+from planner.collision.rotating_edges import rotating_edge_free
 from planner.collision.self_collision_regions import Robot
-from planner.collision.world import build_robot, build_world, self_edge_free, self_turning_edge_free
+from planner.collision.world import (
+    build_robot,
+    build_world,
+    self_edge_free,
+    self_rotating_edge_free,
+)
 from planner.kernels.jit import kernel
 from planner.kernels.scene_arrays import World
 from planner.wrench.capacity import LoadArrays, build_load
-from planner.wrench.rotation import turning_edge_held
+from planner.wrench.rotation import rotating_edge_held
 from planner.wrench.translation import Holding, build_holding, edge_held
 
 FREE: Final = 0
@@ -69,7 +74,7 @@ def edge_problems(
 
 
 @kernel
-def turning_edge_problem(
+def rotating_edge_problem(
     world: World,
     robot: Robot,
     load: LoadArrays,
@@ -94,11 +99,11 @@ def turning_edge_problem(
     before, after = (start[0], start[1], start[2]), (end[0], end[1], end[2])
     if not (in_workspace(world, before) and in_workspace(world, after)):
         return WORKSPACE
-    if not turning_edge_free(world, start, end, rotation, turn):
+    if not rotating_edge_free(world, start, end, rotation, turn):
         return OBSTACLE
-    if not self_turning_edge_free(world, robot, start, end, rotation, turn):
+    if not self_rotating_edge_free(world, robot, start, end, rotation, turn):
         return SELF
-    if not turning_edge_held(world, load, reserve, start, end, rotation, turn):
+    if not rotating_edge_held(world, load, reserve, start, end, rotation, turn):
         return WRENCH
     return FREE
 

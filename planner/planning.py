@@ -43,7 +43,7 @@ from planner.space import PoseSpace, Space, TranslationSpace
 
 if TYPE_CHECKING:
     from planner.anytime.path import OptimalRoute
-    from planner.anytime_6d.path import TurningRoute
+    from planner.anytime_6d.path import RotatingRoute
 
 
 # The whole path through a scene: its legs planned one after the other, and joined.
@@ -92,7 +92,7 @@ def plan_segments(
         NoSolution: A leg has no path, or its search ended at its limit; the error names the leg.
     """
     routes: list[Route] = []
-    found: list[OptimalRoute | TurningRoute] = []
+    found: list[OptimalRoute | RotatingRoute] = []
     for leg, own in zip(legs, settings, strict=True):
         try:
             # Planners are imported only when used: their kernels take long to load.
@@ -102,9 +102,9 @@ def plan_segments(
                 found.append(optimal_route(rig, leg.scene, own, kinematic, progress, clock))
                 routes.append(found[-1].route)
             elif isinstance(own, TurningSettings):
-                from planner.anytime_6d.path import turning_route
+                from planner.anytime_6d.path import rotating_route
 
-                found.append(turning_route(rig, leg.scene, own, kinematic, progress, clock))
+                found.append(rotating_route(rig, leg.scene, own, kinematic, progress, clock))
                 routes.append(found[-1].route)
             else:
                 from planner.rrt.path import paper_route

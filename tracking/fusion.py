@@ -17,7 +17,7 @@ import numpy as np
 from model.cameras import Z_95
 from model.pose import Array, Pose, interpolate, moved, read_only, step_between
 from tracking.measurement import MEMORY, NoPose, Observation, PoseMeasurement, extrapolate
-from tracking.pose_log import LoggedPicture
+from tracking.pose_log import LoggedImage
 
 #: Standard deviation of a camera's pose from lens, extrinsics and tags where not stated; always
 #: added when poses are compared, [m] and [rad].
@@ -278,8 +278,8 @@ class ClockComparison:
 
 
 def synchronize_frames(
-    streams: Mapping[str, Iterator[LoggedPicture]], within: float
-) -> Iterator[dict[str, LoggedPicture]]:
+    streams: Mapping[str, Iterator[LoggedImage]], within: float
+) -> Iterator[dict[str, LoggedImage]]:
     """Groups the images of all cameras into frame sets, in order of time.
 
     A frame set has the oldest remaining image and, of each other camera, the nearest one: taken no
@@ -293,7 +293,7 @@ def synchronize_frames(
     Returns:
         Frame sets by the cameras' names, in their order, each image once, until all streams end.
     """
-    queues: dict[str, deque[LoggedPicture]] = {name: deque() for name in streams}
+    queues: dict[str, deque[LoggedImage]] = {name: deque() for name in streams}
     open_streams = dict(streams)
     while True:
         # In rounds, so that live cameras are read in turn, never twice in a row.
@@ -310,7 +310,7 @@ def synchronize_frames(
         yield {name: queues[name].popleft() for name in queues if name in members}
 
 
-def _frame_set(queues: Mapping[str, deque[LoggedPicture]], within: float) -> list[str]:
+def _frame_set(queues: Mapping[str, deque[LoggedImage]], within: float) -> list[str]:
     """The cameras whose oldest images form a frame set, the oldest first."""
     by_age = sorted((n for n, queue in queues.items() if queue), key=lambda n: _time(queues[n][0]))
     members = by_age[:1]
@@ -324,11 +324,11 @@ def _frame_set(queues: Mapping[str, deque[LoggedPicture]], within: float) -> lis
     return members
 
 
-def _is_nearer_to_the_next(queue: deque[LoggedPicture], time: float) -> bool:
+def _is_nearer_to_the_next(queue: deque[LoggedImage], time: float) -> bool:
     return len(queue) > 1 and _time(queue[1]) - time < time - _time(queue[0])
 
 
-def _time(picture: LoggedPicture) -> float:
+def _time(picture: LoggedImage) -> float:
     return picture.observation.time
 
 

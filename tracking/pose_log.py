@@ -50,7 +50,7 @@ CLEARANCE_COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LoggedPicture:
+class LoggedImage:
     """Name and measurement of one image.
 
     Attributes:
@@ -66,7 +66,7 @@ class LoggedPicture:
     frame: int = 0
 
 
-def pose_row(logged: LoggedPicture) -> tuple[str, ...]:
+def pose_row(logged: LoggedImage) -> tuple[str, ...]:
     """Values of one row, in the order of `POSE_COLUMNS`; empty without a pose."""
     found = logged.observation
     head = (str(logged.frame), f"{found.time:.6f}")
@@ -88,7 +88,7 @@ def pose_row(logged: LoggedPicture) -> tuple[str, ...]:
 
 
 def write_pose_log(
-    path: Path, pictures: Sequence[LoggedPicture], with_clearance: bool = False
+    path: Path, pictures: Sequence[LoggedImage], with_clearance: bool = False
 ) -> None:
     """Writes ``poses.csv`` atomically.
 

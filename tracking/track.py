@@ -25,12 +25,12 @@ from tracking.detection.tags import mounted_rotated, tag_corners
 from tracking.estimator import ROTATED, UNCERTAIN, UNSHARP
 from tracking.fusion import DISAGREE, MultiCameraFusion, synchronize_frames
 from tracking.measurement import Observation, PoseMeasurement
-from tracking.pose_log import LoggedPicture
+from tracking.pose_log import LoggedImage
 from tracking.shared_errors import PERHAPS_MOVED
 from tracking.tracker import Tracker
 
 
-class Picture(Protocol):
+class SourceImage(Protocol):
     """An image of a source, such as a `drivers.cameras.live.Frame`."""
 
     @property
@@ -70,13 +70,13 @@ class TrackCount:
 
 
 def track(
-    source: Iterable[Picture],
+    source: Iterable[SourceImage],
     tracker: Tracker,
     count: TrackCount | None = None,
     give_up_after: int | None = None,
     model: ClearanceModel | None = None,
-    on_picture: Callable[[Picture, LoggedPicture], None] | None = None,
-) -> Iterator[LoggedPicture]:
+    on_picture: Callable[[SourceImage, LoggedImage], None] | None = None,
+) -> Iterator[LoggedImage]:
     """Measures the images of a source one by one.
 
     Args:
@@ -96,7 +96,7 @@ def track(
         require_stated_errors(tracker.rig, [tracker.camera])
     count = count or TrackCount()
     reasons = NoPoseReasons()
-    last: Picture | None = None
+    last: SourceImage | None = None
     seen: set[int] = set()
     for picture in source:
         start = monotonic()
@@ -111,7 +111,7 @@ def track(
             reasons.add(observation.reason)
             seen.update(observation.seen)
             last = picture
-        logged = LoggedPicture(picture.name, observation, clearance, picture.number)
+        logged = LoggedImage(picture.name, observation, clearance, picture.number)
         if on_picture is not None:
             on_picture(picture, logged)
         yield logged
@@ -144,7 +144,11 @@ class NoPoseReasons:
 
 
 def _nothing_seen(
-    tracker: Tracker, pictures: int, reasons: NoPoseReasons, last: Picture | None, seen: set[int]
+    tracker: Tracker,
+    pictures: int,
+    reasons: NoPoseReasons,
+    last: SourceImage | None,
+    seen: set[int],
 ) -> NoPlatformSeen:
     where = f"camera {tracker.camera.name!r}"
     if last is None:
@@ -183,7 +187,7 @@ def _nothing_seen(
     )
 
 
-def _rotated_tags(tracker: Tracker, picture: Picture) -> tuple[str, str] | None:
+def _rotated_tags(tracker: Tracker, picture: SourceImage) -> tuple[str, str] | None:
     """Cause and remedy, if two or more platform tags fit rotated about their normals."""
 
     def fit(tags: tuple[Tag, ...]) -> bool:
@@ -215,11 +219,11 @@ class MultiCameraCount:
 
 
 def track_cameras(
-    streams: Mapping[str, Iterator[LoggedPicture]],
+    streams: Mapping[str, Iterator[LoggedImage]],
     within: float,
     count: MultiCameraCount,
     model: ClearanceModel | None = None,
-) -> Iterator[tuple[LoggedPicture, dict[str, LoggedPicture]]]:
+) -> Iterator[tuple[LoggedImage, dict[str, LoggedImage]]]:
     """The fused pose of all cameras, by frame set, until the last source ends.
 
     Args:
@@ -251,7 +255,7 @@ def track_cameras(
             clearance = clearance_of(model, found) if model is not None else None
         else:
             reason = found.reason
-        yield LoggedPicture(next(iter(alone.values())).name, found, clearance, frame), alone
+        yield LoggedImage(next(iter(alone.values())).name, found, clearance, frame), alone
     count.clocks = common.clock_remarks()
     if not poses:
         next_step = (
@@ -271,7 +275,7 @@ def track_cameras(
         )
 
 
-def _ignoring_no_platform(stream: Iterator[LoggedPicture]) -> Iterator[LoggedPicture]:
+def _ignoring_no_platform(stream: Iterator[LoggedImage]) -> Iterator[LoggedImage]:
     """Ends the stream of a camera without any pose silently: the others may have poses."""
     try:
         yield from stream

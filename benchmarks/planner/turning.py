@@ -18,7 +18,7 @@ from model.files.scene_file import SceneDocument
 from model.pose import Array
 from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene, scene_from_document
-from planner.anytime_6d.path import RotatingSearch, turning_problem
+from planner.anytime_6d.path import RotatingSearch, rotating_problem
 from planner.anytime_6d.problem import (
     RotatingProblem,
     matrix_of,
@@ -26,12 +26,12 @@ from planner.anytime_6d.problem import (
     put_rotated,
     turn_between,
 )
-from planner.collision.rotating_edges import turning_edge_free
-from planner.collision.world import self_turning_edge_free
+from planner.collision.rotating_edges import rotating_edge_free
+from planner.collision.world import self_rotating_edge_free
 from planner.costs import KinematicCost
 from planner.settings import OBJECTIVES
 from planner.space import PoseSpace
-from planner.wrench.rotation import turning_edge_held
+from planner.wrench.rotation import rotating_edge_held
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 DISTANCE, ANGLE = 0.040, np.radians(2.0)
@@ -86,9 +86,9 @@ def edges(problem: RotatingProblem) -> None:
     tallies = np.zeros(6, dtype=np.int64)
     world, robot, load, reserve = problem.world, problem.robot, problem.load, problem.reserve
     parts: dict[str, Callable[[int], object]] = {
-        "obstacles": lambda k: turning_edge_free(world, *given[k]),
-        "self": lambda k: self_turning_edge_free(world, robot, *given[k]),
-        "wrenches": lambda k: turning_edge_held(world, load, reserve, *given[k]),
+        "obstacles": lambda k: rotating_edge_free(world, *given[k]),
+        "self": lambda k: self_rotating_edge_free(world, robot, *given[k]),
+        "wrenches": lambda k: rotating_edge_held(world, load, reserve, *given[k]),
         "all": lambda k: move_allowed(problem, *moves[k], tallies),
     }
     times = ", ".join(f"{name} {microseconds(f, len(moves)):.1f}" for name, f in parts.items())
@@ -131,7 +131,7 @@ def main() -> None:
     for rig, scene in (ready, hall()):
         print(f"{rig.name}, {scene.name}")
         kinematic = KinematicCost(rig, scene.start.rotation)
-        problem = turning_problem(rig, scene, OBJECTIVES["length"], kinematic)
+        problem = rotating_problem(rig, scene, OBJECTIVES["length"], kinematic)
         edges(problem)
         searches(rig, scene, problem, seeds)
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from itertools import product
-from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -157,7 +156,6 @@ class ExtrinsicsResult(ResultDocument):
     """A camera's pose, in the keys of the rig file's ``cameras`` section."""
 
     order: ClassVar[int] = 2
-    added: ClassVar[tuple[str, ...]] = ("pose_covariance", "pose_by_lens", "reference_camera")
 
     kind: Literal["extrinsics"] = "extrinsics"
     by: Literal["frame tags", "rig motion", "another camera"]
@@ -207,15 +205,8 @@ class ExtrinsicsResult(ResultDocument):
                 camera's differ.
         """
         camera = camera_named(rig, self.name)
-        latencies = (camera.latency_ms, 0.0)  # stated now, or not yet in a former version
-        self.require_basis(
-            _basis(rig, self.name, self.by, self.reference_camera),
-            f"parameters of the camera or {self.by}",
-            *(
-                _basis(rig, self.name, self.by, self.reference_camera, {"latency_ms": one})
-                for one in latencies
-            ),
-        )
+        basis = _basis(rig, self.name, self.by, self.reference_camera)
+        self.require_basis(basis, f"parameters of the camera or {self.by}")
         keys = ("world_from_camera", "pose_covariance", "pose_by_lens")
         return with_camera(rig, camera.model_copy(update={k: getattr(self, k) for k in keys}))
 
@@ -223,6 +214,9 @@ class ExtrinsicsResult(ResultDocument):
 _NOT_OF_THE_LENS = (
     *("world_from_camera", "rate_hz", "pose_covariance", "error_mm", "readout_ms"),
     *("latency_ms", "lens_covariance", "pose_by_lens"),
+)
+_OF_ANOTHER_CAMERA = (
+    *("name", "lens", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "world_from_camera"),
 )
 
 
@@ -279,35 +273,21 @@ def pose_rows(stated: Mapping[str, Interval]) -> list[tuple[str, str]]:
     ]
 
 
-def _basis(
-    rig: RigDocument,
-    name: str,
-    by: str,
-    reference: str | None,
-    more: Mapping[str, float] = MappingProxyType({}),
-) -> dict[str, Any]:
+def _basis(rig: RigDocument, name: str, by: str, reference: str | None) -> dict[str, Any]:
     """Parts of the rig file that the result takes as known.
 
     Args:
         rig: The rig file's content.
         name: The camera.
         by: See `ExtrinsicCalibration`.
-        reference: The other camera; None in former versions, whose results took all as known.
-        more: More of the camera's keys.
+        reference: The other camera, if any.
     """
     camera = camera_named(rig, name).model_dump(mode="json")
-    of_camera = {k: v for k, v in camera.items() if k not in _NOT_OF_THE_LENS} | dict(more)
-    if of_camera["lens"] == "pinhole":  # as in results of versions without a choice
-        del of_camera["lens"]
+    of_camera = {k: v for k, v in camera.items() if k not in _NOT_OF_THE_LENS}
+    if reference is not None:
+        other = camera_named(rig, reference).model_dump(mode="json")
+        return {"camera": of_camera, "others": [{k: other[k] for k in _OF_ANOTHER_CAMERA}]}
     tags = rig.tags.model_dump(mode="json") if rig.tags else {}
-    if by == "another camera":
-        keys: tuple[str, ...]
-        keys = ("name", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "world_from_camera")
-        others = [one for one in rig.cameras if one.name != name]
-        if reference is not None:
-            keys, others = (*keys, "lens"), [camera_named(rig, reference)]
-        plain = [one.model_dump(mode="json") for one in others]
-        return {"camera": of_camera, "others": [{k: one[k] for k in keys} for one in plain]}
     which = "frame" if by == "frame tags" else "platform"
     return {"camera": of_camera, "family": tags.get("family"), "tags": tags.get(which)}
 

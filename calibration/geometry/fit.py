@@ -325,7 +325,7 @@ def poses_from_lengths(
 def _nearest_poses(
     rig: Rig, lengths: Array, data: RigMeasurements, turn: float, poses: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Damped least squares from given poses, each damped by itself; see `_pose_systems`."""
+    """Damped least squares from given poses, each damped separately; see `_pose_systems`."""
     damping = np.full(len(lengths), 1e-3)
     here = _pose_systems(rig, lengths, data, turn, poses)
     squares, system = here[0], here[1:]

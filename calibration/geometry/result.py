@@ -26,10 +26,6 @@ class RigResult(ResultDocument):
     """Outlets, anchors, pulleys, winches and cables' stiffness, in the keys of the rig file."""
 
     order: ClassVar[int] = 3
-    added: ClassVar[tuple[str, ...]] = (
-        *("outlets_error_mm", "anchors_error_mm"),
-        *("cable_stiffness_n", "sensor_residuals_deg"),
-    )
 
     kind: Literal["rig"] = "rig"
     outlets_mm: list[Vector]

@@ -220,7 +220,6 @@ class CameraResult(ResultDocument):
     """A camera's matrix and distortion, in the keys of the rig file's ``cameras`` section."""
 
     order: ClassVar[int] = 0
-    added: ClassVar[tuple[str, ...]] = ("lens", "lens_covariance")
 
     kind: Literal["camera"] = "camera"
     width_px: Pixels

@@ -70,7 +70,7 @@ class TagsResult(ResultDocument):
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with the tags at these poses.
 
-        Their error counts only if all were located: the others keep the drawing's poses.
+        Their error counts only if all were located: the others keep their nominal poses.
 
         Raises:
             BadInput: The rig's tags differ in number, size or family.
@@ -227,7 +227,7 @@ def layout_facts(found: TagLayout) -> list[tuple[str, str]]:
         (name, f"moved {shift} mm, rotated {turn}° from the rig file; {count}")
         for name, shift, turn, _, count in change_rows(found)
     ]
-    return [("pictures", used), *moved]
+    return [("images", used), *moved]
 
 
 def _pose_rows(document: TagsResult) -> list[tuple[str, ...]]:

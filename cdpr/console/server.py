@@ -230,7 +230,7 @@ class ConsoleServer:
     async def _serve_page(self, page: WebSocket) -> None:
         """Serves a page until it disconnects; reading its socket waits for nothing else.
 
-        Else reports of a held control could queue, and go on moving the robot after its release.
+        Else reports of a held control could queue, and keep moving the robot after its release.
         """
         await page.accept()
         number = self._console.control.join("?" if page.client is None else page.client.host)

@@ -52,7 +52,7 @@ from cdpr.console.view import (
     plan_id,
     pose_data,
 )
-from cdpr.console.watch import CameraPictures, RobotWatch, RunWatch
+from cdpr.console.watch import CameraImages, RobotWatch, RunWatch
 from executor.drives import is_simulated
 from executor.jogging import FASTEST
 from executor.remote.client import stop_runs
@@ -86,7 +86,7 @@ class Console:
         only = self.rig.name if is_simulated(self.rig) else None
         self.watch = RunWatch(bus_name(self.rig), only)
         self.view = RobotView(files.rig, self.scene)
-        self.pictures = CameraPictures()
+        self.pictures = CameraImages()
         self.poses = TaughtPoses(MADE / "poses.json")
         self.plan = LoadedPlan(self.rig)
         self._control_lock, self._one_at_a_time = threading.Lock(), threading.RLock()
@@ -242,7 +242,7 @@ class Console:
     def _command(self, page: int, message: Message, arrived: float) -> str:
         if isinstance(message, TakeCommand):
             if message.force and message.held_by != self.control.holder_name():
-                return "control has changed hands meanwhile: look who has it"
+                return "another page has taken control: check which one"
             moving = self.watch.last.status is not None
             why_not = self._bus_control.take(page, moving=moving, force=message.force)
             if not why_not:
@@ -335,7 +335,7 @@ class Console:
         if self.plan.preview is None or not self.plan.preview["passed"]:
             return "load a plan that passes its check first"
         if self.plan.preview["hash"] != shown:
-            return "another plan is loaded now: look at it first"
+            return "a different plan is loaded: review it first"
         if (here := self.robot.pose_at_rest()) is not None and (off := self.plan.off_start(here)):
             return f"the platform is {off} from the plan's start: plan from its current pose"
         cameras = [text for source in self.files.cameras for text in ("--camera", source)]

@@ -229,11 +229,11 @@ def commanded_pose(rig: Rig, jog: dict[str, Any], robot: RobotNow) -> Pose:
     Args:
         rig: The robot.
         jog: See `executor.remote.status`.
-        robot: By its drives.
+        robot: From the encoders.
 
     Raises:
-        Refused: A cable has another length by the drives than commanded, beyond the tolerance at
-            the start of a run.
+        Refused: A cable's length from the encoders is not the commanded one, beyond the tolerance
+            at the start of a run.
     """
     pose = Pose.from_quaternion(millimetres(jog["position_mm"]), jog["quaternion"])
     off = float(np.max(np.abs(cable_lengths(rig, pose) - cable_lengths(rig, robot.pose))))

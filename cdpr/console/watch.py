@@ -233,7 +233,7 @@ class RobotSeen:
 
 
 class RobotWatch:
-    """The robot of the run that reports; at rest, by its drives when they were read last.
+    """The robot of the run that reports; at rest, from the last reading of its drives.
 
     At rest the drives are read after each motion and when `ask` is called, not repeatedly: a drive
     answers one reader at a time, which may be a program of another computer, and a serial adapter
@@ -266,7 +266,7 @@ class RobotWatch:
         self._due = 0.0
 
     def pose(self, status: dict[str, Any] | None) -> Pose:
-        """The pose commanded by a jog, or by the drives, which are read at rest.
+        """The pose commanded by a jog, or else from the encoders, which are read at rest.
 
         Args:
             status: See `executor.remote.status`; None at rest.
@@ -288,7 +288,7 @@ class RobotWatch:
         return seen.robot.pose if jog is None else commanded_pose(self._view.rig, jog, seen.robot)
 
     def pose_at_rest(self) -> Pose | None:
-        """The pose by the drives, which are read; None if unknown, or if a run simulates them.
+        """The pose from the encoders, read now; None if unknown, or if a run simulates the drives.
 
         An old reading must not refuse a run: the platform may have been moved since.
         """
@@ -363,7 +363,7 @@ def _local_time() -> str:
 WIDEST, QUALITY = 640, 70
 
 
-class CameraPictures:
+class CameraImages:
     """The newest image of each camera; thread-safe.
 
     Compression takes a few milliseconds of this process, none of the run's. A request during a

@@ -91,7 +91,7 @@ class ImageFolder:
             raise _wrong_sizes(self._folder, self.unused, wanted)
 
 
-class OneCamerasPictures:
+class SingleCameraImages:
     """The images of a folder with one size, rotated by the rule of `read_picture`.
 
     Files that cannot be used are listed in `unused`.
@@ -325,7 +325,7 @@ def first_gap(names: Sequence[str]) -> tuple[str, str] | None:
 VIDEO_CODES = {".mp4": "mp4v", ".avi": "MJPG"}
 
 
-class PictureOutput:
+class ImageOutput:
     """Context manager that writes colour images to a folder or a video.
 
     What was written before a user-visible error or Ctrl-C is kept.
@@ -361,7 +361,7 @@ class PictureOutput:
                 "the folder cannot be created", where=str(path), why=error.strerror or str(error)
             ) from None
 
-    def __enter__(self) -> PictureOutput:
+    def __enter__(self) -> ImageOutput:
         return self
 
     def __exit__(

@@ -58,7 +58,7 @@ class Arrived:
     picture: NDArray[np.generic]
 
 
-class PictureReader:
+class FrameReader:
     """Opens a camera and reads all its images in a thread.
 
     A copy of the image before is not a new one: noise makes images of a camera differ, but a
@@ -292,7 +292,7 @@ class LiveCamera:
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
             return capture
 
-        self._reader = PictureReader(opened, clock)
+        self._reader = FrameReader(opened, clock)
         # A caller that only iterates does not close it, and the thread must not outlive it.
         self._finalizer = weakref.finalize(self, self._reader.close)
         try:

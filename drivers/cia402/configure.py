@@ -120,7 +120,7 @@ def configure_drives(
         max_tension: Tension that sets the torque limit, [N]; the rig's if None.
         to_reset: Accepts drives in fault too, which will be reset.
         on_restarted: Called, before anything is written, with the nodes that lost the
-            configuration or never had it; once more if a drive restarts during the set-up.
+            configuration or never had it; again if a drive restarts during the set-up.
 
     Returns:
         What was configured, with remarks.

@@ -271,7 +271,7 @@ class Cia402Group(CyclicGroup):
                 left = 0.0
             self._cyclic.take_replies(AnswerListener(self._watch.take, jobs), left)
         self._watch.take_states(jobs.values)
-        self._look_for_faults()
+        self._check_faults()
         return self._status()
 
     def _ask(self, jobs: SdoJobs | ModeCheck | StatePoll, most: int) -> None:
@@ -307,7 +307,7 @@ class Cia402Group(CyclicGroup):
                 stops = self._frames.set_points(self._words, self._targets)
             self._cyclic.send((*stops, self._frames.sync))
 
-    def _look_for_faults(self) -> None:
+    def _check_faults(self) -> None:
         powered = self._goal in (Goal.ENABLE, Goal.RELEASE)
         warnings = self._watch.warnings()
         self._warnings = warnings if powered else ()

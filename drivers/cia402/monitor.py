@@ -1,4 +1,4 @@
-"""State reported by the drives, and the resulting group faults. No bus, no clock."""
+"""State that the drives report, and the resulting group faults. No bus, no clock."""
 
 from __future__ import annotations
 

@@ -65,9 +65,8 @@ TIMED_OUT, WRITE_ONLY = 0x05040000, 0x06010001
 Key = tuple[int, int, int]
 """Kind of an answer, index and sub-index."""
 
-_UPLOAD, _DOWNLOAD, _SEGMENT = 0x40, 0x60, 0x00
+_UPLOAD, _DOWNLOAD, _SEGMENT, _ABORT = 0x40, 0x60, 0x00, 0x80
 _SEGMENTS = (_SEGMENT, _SEGMENT | 0x10)
-_ABORT = 0x80
 _KIND = 0xE0
 _HEAD = struct.Struct("<BHB")
 
@@ -167,16 +166,22 @@ class SetupNetwork:
     def _await(self, clients: Sequence[Client], deadline: float) -> None:
         """Receives answers until all have arrived or the deadline has passed."""
         while any(client.waits for client in clients):
-            left = deadline - self.clock()
-            if left <= 0.0 or (not self.process_frame(left) and self._pump is not None):
+            if not self.receive_until(deadline) and (self._pump or self.clock() >= deadline):
                 return
 
     def nodes_answering_twice(self) -> list[int]:
         """Nodes that sent more answers than they got requests."""
         deadline = self.clock() + ECHO_WAIT
-        while (left := deadline - self.clock()) > 0.0 and self.process_frame(left):
+        while self.receive_until(deadline):
             pass
         return [node for node, client in self._clients.items() if client.has_surplus]
+
+    def receive_until(self, deadline: float) -> bool:
+        """Processes one frame; past the deadline all that arrived while the program was held up."""
+        if (left := deadline - self.clock()) > 0.0:
+            return self.process_frame(left)
+        self.process_waiting()
+        return False
 
     def process_waiting(self) -> None:
         """Processes all frames received so far."""
@@ -214,17 +219,15 @@ class SetupNetwork:
                     raise DriveRestarted(node)
             if message.arbitration_id - EMCY_BASE in self._nodes:
                 self.emergencies[message.arbitration_id] = bytes(message.data)
-            client = self._clients.get(message.arbitration_id - SDO_REPLY_BASE)
-            if client is not None:
+            if client := self._clients.get(message.arbitration_id - SDO_REPLY_BASE):
                 client.take(bytes(message.data))
         return True
 
     def wait(self, seconds: float) -> None:
         """Processes frames for some time; returns at once with simulated drives."""
         deadline = self.clock() + seconds
-        while (left := deadline - self.clock()) > 0.0:
-            if not self.process_frame(left) and self._pump is not None:
-                return
+        while self.receive_until(deadline) or (self._pump is None and self.clock() < deadline):
+            pass
 
     def _refuse_foreign(self, message: can.Message) -> None:
         if self._own.is_foreign(message.arbitration_id):
@@ -376,8 +379,7 @@ class Client:
         self._ask(request, wanted)
         deadline = self._network.clock() + self._network.timeout
         while self._answer is None:
-            left = deadline - self._network.clock()
-            if left <= 0.0 or not self._network.process_frame(left):
+            if not self._network.receive_until(deadline) and self._answer is None:
                 self.give_up()
                 raise _NoAnswer
         answer, self._wanted, self._answer = self._answer, None, None

@@ -275,7 +275,7 @@ class OdriveGroup(CyclicGroup):
     def _last(self) -> list[int]:
         return self._recent[-1] if self._recent else list(self._watch.positions)
 
-    def _look_for_faults(self) -> None:
+    def _check_faults(self) -> None:
         if self._resetting:
             self._resetting -= 1
             return

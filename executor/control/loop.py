@@ -204,7 +204,7 @@ class Loop:
         self._fault("hold_timeout", f"the drives did not hold within {within:.3g} s")
 
     def _leave(self, held: CycleStatus) -> None:
-        """Ends monitoring of drives that hold on their own, and reads their state once more."""
+        """Ends monitoring of drives that hold on their own, and reads their state again."""
         left = self._master.leave(self._one_more_at_rest)
         if self.machine.state is not State.SECURING:
             return

@@ -15,7 +15,7 @@ from executor.control.preconditions import require_still_referenced
 from executor.control.sync_master import SyncMaster
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
-from executor.realtime.child import MakeDrives, ReadyDrives
+from executor.realtime.child import MakeDrives, MotionTask, ReadyDrives
 from executor.realtime.process import CheckDrives, real_time_process
 from executor.realtime.scheduling import Clock
 from executor.realtime.shared_memory import SharedMemory, SharedRequests
@@ -33,13 +33,11 @@ from model.scene import Load
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PathMotion:
-    """See `MotionTask` in `executor.realtime.child`.
+class PathMotion(MotionTask):
+    """A motion along a checked path.
 
     Attributes:
         rig: The rig file.
-        cables: Number of cables.
-        cycle: [s].
         hash: Fingerprint of the set-points when they were checked.
         setpoints: The set-points, int32, shape (n, m), sealed.
         pose_every: Cycles between true poses of the simulated platform; 0 for none.
@@ -48,8 +46,6 @@ class PathMotion:
     """
 
     rig: RigDocument
-    cables: int
-    cycle: float
     hash: str
     setpoints: SharedMemory
     pose_every: int

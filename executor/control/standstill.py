@@ -16,7 +16,7 @@ from executor.control.preconditions import require_capabilities
 from executor.control.sync_master import ReplyTimeout, SyncMaster, changed_states, late_fault
 from executor.interlock.fault_latch import LatchedFault
 from executor.interlock.interlock import MotionInterlock
-from executor.realtime.child import Armed, Ended, ReadyDrives
+from executor.realtime.child import Armed, Ended, MotionTask, ReadyDrives
 from executor.realtime.process import RealTimeProcess
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import OperatorRequests
@@ -249,23 +249,19 @@ class FaultReset(Standstill):
 
 
 @dataclass(frozen=True, slots=True)
-class StandstillMotion:
-    """A procedure as a job of the real-time process; see `MotionTask` there.
+class StandstillMotion(MotionTask):
+    """A procedure without motion.
 
     Attributes:
         kind: Class of the procedure.
-        cables: Number of cables.
-        cycle: [s].
     """
 
     kind: type[Release] | type[FaultReset]
-    cables: int
-    cycle: float
 
     @classmethod
     def of(cls, kind: type[Release] | type[FaultReset], rig: Rig) -> StandstillMotion:
         """The procedure for the drives of a rig."""
-        return cls(kind, rig.cable_count, rig.cycle)
+        return cls(rig.cable_count, rig.cycle, kind)
 
     def loop(
         self,
@@ -278,16 +274,6 @@ class StandstillMotion:
     ) -> Standstill:
         """See `MotionTask`."""
         return self.kind(drives.rig, master, requests, on_cycle)
-
-    def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
-        """See `MotionTask`; any state is allowed."""
-
-    def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `MotionTask`; nothing moves."""
-        return None
-
-    def close(self) -> None:
-        """See `MotionTask`; no memory is shared."""
 
 
 # In the real-time process, with their effect on latch and reference.

@@ -220,7 +220,7 @@ class SyncMaster:
         """Ends the cycle in order; the drives hold on their own or by command.
 
         Their monitoring of this master is switched off while SYNC continues, heartbeat first, SYNC
-        last. Then SYNC and heartbeat cease, and the state of every drive is read once more; where
+        last. Then SYNC and heartbeat cease, and the state of every drive is read again; where
         monitoring could not be switched off, only after its time-out.
 
         Args:

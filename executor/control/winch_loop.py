@@ -27,7 +27,6 @@ from executor.state_machine import CycleRecord, Event, LoopEvent, State
 from executor.supervision import OperatorRequests, RequestBoard
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
 from model.errors import Refused, StoppedByOperator
-from model.pose import Pose
 from model.rig import Rig
 from model.winches import WinchMap
 
@@ -109,19 +108,15 @@ class WinchMover(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LawMotion:
-    """A motion by a law as a job of the real-time process; see `MotionTask` there.
+class LawMotion(MotionTask):
+    """A motion by a law.
 
     Attributes:
-        cables: Number of cables.
-        cycle: [s].
         make_law: Makes the winch law; picklable.
         limit: Largest tension, [N].
         speed: Fastest winch, [m/s].
     """
 
-    cables: int
-    cycle: float
     make_law: MakeLaw
     limit: float
     speed: float
@@ -140,16 +135,6 @@ class LawMotion:
         law = self.make_law(rig, master.read_positions().positions.tolist())
         _require_reach_allowed(drives.rig, law)
         return WinchLoop(rig, law, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
-
-    def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
-        """See `MotionTask`; any state is allowed."""
-
-    def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `MotionTask`; no pose is needed without a path."""
-        return None
-
-    def close(self) -> None:
-        """See `MotionTask`; no memory is shared."""
 
 
 def _require_reach_allowed(rig: Rig, law: WinchLaw) -> None:

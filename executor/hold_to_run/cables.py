@@ -27,13 +27,12 @@ from executor.control.winch_laws import (
     tension_reserve,
 )
 from executor.hold_to_run.presses import CablePress, Press, PressReader, PressState
-from executor.realtime.child import ReadyDrives
+from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, LoopEvent, State
 from executor.supervision import OperatorRequests
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
-from model.pose import Pose
 from model.rig import Rig
 from model.winches import WinchMap
 
@@ -157,7 +156,7 @@ class CableLoop(Loop):
         self._law = make(
             self._rig, here, cable=cable, length=travel, limit=limit, speed=speed, reserve=reserve
         )
-        # A step speeds up and slows down by itself.
+        # A step speeds up and slows down on its own.
         self._feed = self._feed_at(0.0 if held.step is None else held.share)
         self._sender.allow(np.array(self._law.reach, dtype=np.int32))
         self._press, self._cable, self._from = held.press, cable, here[cable]
@@ -197,20 +196,16 @@ class CableLoop(Loop):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CableMotion:
-    """A session of jogs of single cables; see `MotionTask` in `executor.realtime.child`.
+class CableMotion(MotionTask):
+    """A session of jogs of single cables, which owns the memory.
 
     Attributes:
-        cables: Number of cables.
-        cycle: [s].
         limit: Largest tension, [N].
         speed: Fastest winch, [m/s].
         longest: Largest travel of one press, [m].
         presses: See `PressBoard`.
     """
 
-    cables: int
-    cycle: float
     limit: float
     speed: float
     longest: float
@@ -238,16 +233,6 @@ class CableMotion:
             on_cycle=on_cycle,
             on_event=on_event,
         )
-
-    def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
-        """See `MotionTask`; any state is allowed."""
-
-    def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `MotionTask`; no pose is needed without a path."""
-        return None
-
-    def close(self) -> None:
-        """See `MotionTask`; the session owns the memory."""
 
 
 class CableTravel:

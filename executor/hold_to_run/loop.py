@@ -19,7 +19,7 @@ from executor.control.sync_master import SyncMaster
 from executor.hold_to_run.line import Piece, PieceRing
 from executor.hold_to_run.presses import PressReader, PressState
 from executor.interlock.reference import HomingReference
-from executor.realtime.child import ReadyDrives
+from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, LoopEvent, State
@@ -27,7 +27,6 @@ from executor.supervision import OperatorRequests
 from executor.trajectory.setpoints import CheckedSetpoints, Setpoints, fingerprint
 from model.errors import Fault
 from model.files.rig_file import RigDocument
-from model.pose import Pose
 from model.rig import rig_from_document
 
 #: Checked rows to keep beyond the point of rest, [rows].
@@ -142,13 +141,11 @@ def _meet(row: Setpoints, others: Sequence[int]) -> bool:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JogMotion:
-    """A session of jogs; see `MotionTask` in `executor.realtime.child`.
+class JogMotion(MotionTask):
+    """A session of jogs, which owns the memory.
 
     Attributes:
         rig: The rig file, with the jog speed.
-        cables: Number of cables.
-        cycle: [s].
         begin: Required positions of the drives, [counts].
         presses: See `PressBoard`.
         pieces: See `PieceRing`.
@@ -156,8 +153,6 @@ class JogMotion:
     """
 
     rig: RigDocument
-    cables: int
-    cycle: float
     begin: tuple[int, ...]
     presses: SharedMemory
     pieces: SharedMemory
@@ -189,10 +184,3 @@ class JogMotion:
     def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
         """See `MotionTask`."""
         require_still_referenced(drives.rig, self.reference, drives.group.restarted, seen)
-
-    def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
-        """See `MotionTask`; no true pose is needed."""
-        return None
-
-    def close(self) -> None:
-        """See `MotionTask`; the session owns the memory."""

@@ -58,7 +58,7 @@ class PressState:
         ends: The session is to end.
         cable: Number of the cable to move, from 1; 0 for the platform.
         pays_out: Whether the cable is paid out, otherwise wound in.
-        step: Cable length of a jog that ends by itself, [m]; None to move while it is held.
+        step: Cable length of a jog that ends on its own, [m]; None to move while it is held.
     """
 
     press: int
@@ -75,7 +75,7 @@ class Press:
 
     Attributes:
         number: From 1, rising.
-        step: Length of a jog that ends by itself, [m]; None to move while it is held.
+        step: Length of a jog that ends on its own, [m]; None to move while it is held.
         free_since: Time since which no earlier press was held, [s].
     """
 

@@ -27,7 +27,7 @@ from executor.hold_to_run.loop import JogMotion
 from executor.hold_to_run.presses import PressBoard
 from executor.interlock.interlock import MotionInterlock
 from executor.jogging import FASTEST, LONGEST_MM, measured_pose, with_speed
-from executor.proposals import CablesProposal, JogProposal, require_confirmed
+from executor.proposals import Proposal, cables_proposal, jog_proposal, require_confirmed
 from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedMemory
@@ -56,7 +56,7 @@ def jog_session(
     realtime: bool = True,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
-    confirm: Callable[[JogProposal], bool] | None = None,
+    confirm: Callable[[Proposal], bool] | None = None,
     supervisor: Supervisor | None = None,
     on_cycle: Callable[[CycleRecord, PressBoard, JogProver], None] | None = None,
 ) -> None:
@@ -97,7 +97,7 @@ def jog_session(
         around = (empty_scene(slow) if scene is None else scene).changed(stops=())
         known = (start or ready.home) if is_simulated(ready) else None
         start = known or measured_pose(ready, around)
-        require_confirmed(confirm, JogProposal(ready, around, start))
+        require_confirmed(confirm, jog_proposal(ready, around, start))
         session = _Session(
             ready,
             _PlatformJogs(ready, around, start, on_cycle),
@@ -116,7 +116,7 @@ def cable_session(
     realtime: bool = True,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
-    confirm: Callable[[CablesProposal], bool] | None = None,
+    confirm: Callable[[Proposal], bool] | None = None,
     supervisor: Supervisor | None = None,
     on_cycle: Callable[[CycleRecord, PressBoard, CableTravel], None] | None = None,
 ) -> None:
@@ -150,7 +150,7 @@ def cable_session(
     limit = limit_of(slow, limit)
     with commands_from_start("jog", slow, supervisor, realtime=realtime) as commands:
         MotionInterlock(slow).require_free()
-        require_confirmed(confirm, CablesProposal(slow, limit))
+        require_confirmed(confirm, cables_proposal(slow, limit))
         session = _Session(
             slow,
             _CableJogs(slow, limit, on_cycle),

@@ -17,7 +17,7 @@ import os
 import weakref
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -45,7 +45,7 @@ class LatchedFault:
         since: Time, ISO 8601, UTC.
         folder: Run folder.
         process: ID of the process that ran it.
-        nodes: Node IDs of the rig's drives; empty if unknown, as in files of earlier versions.
+        nodes: Node IDs of the rig's drives; empty if unknown.
     """
 
     bus: str
@@ -54,7 +54,7 @@ class LatchedFault:
     since: str
     folder: str
     process: int
-    nodes: tuple[int, ...] = ()
+    nodes: tuple[int, ...]
 
 
 class FaultLatch:
@@ -81,15 +81,14 @@ class FaultLatch:
 
     def _read(self, path: Path) -> LatchedFault:
         try:
-            content = json.loads(read_state_file(path))
-            nodes = tuple(map(int, content.pop("nodes", ())))
-            return LatchedFault(**content, nodes=nodes)
+            latched = LatchedFault(**json.loads(read_state_file(path)))
+            return replace(latched, nodes=tuple(map(int, latched.nodes)))
         except FileNotFoundError:
             raise
         except (OSError, ValueError, TypeError, AttributeError, RecursionError, Refused) as error:
             why = f"{error.where}: {error.what}" if isinstance(error, Refused) else error
             cause = f"the latch file cannot be read: {why}"
-            return LatchedFault(self._bus, _UNKNOWN, cause, _UNKNOWN, _UNKNOWN, 0)
+            return LatchedFault(self._bus, _UNKNOWN, cause, _UNKNOWN, _UNKNOWN, 0, ())
 
     def read_in_motion(self) -> tuple[LatchedFault | None, bool]:
         """The latched fault, and whether it is that of an active motion, consistently."""
@@ -146,7 +145,7 @@ class FaultLatch:
             raise Refused(
                 f"the fault is of rig {shown.rig!r}, not of {rig!r}",
                 where=f"bus {self._bus}",
-                why="its drives are not all known here, and would not be looked at",
+                why="its drives are not all known here, and would not be checked",
                 next_step=f"run `cdpr reset` with the rig file of {shown.rig!r}; if it was"
                 " renamed, write its former name there for the reset",
             )
@@ -155,7 +154,7 @@ class FaultLatch:
                 f"the fault is also of drives that are not in the rig file: node"
                 f" {', '.join(map(str, unknown))}",
                 where=f"bus {self._bus}",
-                why="they would not be looked at",
+                why="they would not be checked",
                 next_step="run `cdpr reset` with the rig file it happened with; a drive that was"
                 " replaced needs its former node id for the reset",
             )

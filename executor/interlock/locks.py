@@ -83,7 +83,7 @@ def open_lock(path: Path, *, create: bool = False) -> int:
     """
     try:
         lock = open_state_file(path, os.O_RDWR | (os.O_CREAT if create else 0))
-    except PermissionError:  # another user's, of an earlier version
+    except PermissionError:  # of a user who may only read the folder
         return open_state_file(path)
     if create and os.fstat(lock).st_uid == os.geteuid():
         os.fchmod(lock, 0o664)  # whatever the umask
@@ -256,8 +256,8 @@ class SetUpLock:
 # has no other user.
 
 
-#: The holder looks this often whether another console asks for control, [s].
-LOOKS_WITHIN = 1.0
+#: The holder checks this often whether another console asks for control, [s].
+POLLED_WITHIN = 1.0
 #: Readers release the lock within this time, [s].
 _READ_WITHIN = 0.2
 _LONGEST_NAME = 400
@@ -307,7 +307,7 @@ class ControlLock:
                         return holder
                     if not locked_within(wish, _READ_WITHIN):
                         return "another console asks for control, too: try again"
-                    if not locked_within(handle, LOOKS_WITHIN):
+                    if not locked_within(handle, POLLED_WITHIN):
                         return f"{holder}: the robot moves, or that console does not answer"
                 os.truncate(handle, 0)
                 os.pwrite(handle, name.encode()[:_LONGEST_NAME], 0)

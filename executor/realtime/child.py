@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
@@ -95,19 +96,19 @@ class Procedure(Protocol):
         ...
 
 
-class MotionTask(Protocol):
-    """A task for ready drives; picklable, to be passed to a new process."""
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionTask(ABC):
+    """A task for ready drives; picklable, to be passed to a new process.
 
-    @property
-    def cables(self) -> int:
-        """Number of cables."""
-        ...
+    Attributes:
+        cables: Number of cables.
+        cycle: SYNC period, [s].
+    """
 
-    @property
-    def cycle(self) -> float:
-        """SYNC period, [s]."""
-        ...
+    cables: int
+    cycle: float
 
+    @abstractmethod
     def loop(
         self,
         drives: ReadyDrives,
@@ -122,23 +123,20 @@ class MotionTask(Protocol):
         Raises:
             CdprError: It cannot begin at the present positions; nothing was enabled.
         """
-        ...
 
-    def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
-        """Checks the state of the drives when arming.
+    def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:  # noqa: B027
+        """Checks the state of the drives when arming; unless overridden, any is allowed.
 
         Raises:
             Refused: The check failed; nothing was enabled.
         """
-        ...
 
     def after(self, record: CycleRecord, drives: ReadyDrives) -> Pose | None:
         """Called after a cycle; the simulated platform's true pose if due, else None."""
-        ...
+        return None
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027
         """Releases the shared memory that it made."""
-        ...
 
 
 class Records(Protocol):

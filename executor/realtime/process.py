@@ -89,7 +89,7 @@ class RealTimeProcess:
         self, job: Job, board: SharedRequests, check_drives: CheckDrives, listener: Listener
     ) -> None:
         """Starts the process, which opens the drives."""
-        self._board, self._look_again, self._listener = board, check_drives, listener
+        self._board, self._check_drives, self._listener = board, check_drives, listener
         self._wire = CycleRecordCodec(job.motion.cables)
         self._cycles, self._events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)
         self._records: Records | None = None
@@ -162,7 +162,9 @@ class RealTimeProcess:
         else:
             self.report_event("real_time_lost", error.what)
         never_enabled = () if self._last else self._released
-        doubt = self._look_again(never_enabled)  # the others should hold on their own without SYNC
+        doubt = self._check_drives(
+            never_enabled
+        )  # the others should hold on their own without SYNC
         if doubt:
             self.report_event("not_held", doubt)
         cause = f"{error.what}; {doubt}" if doubt else error.what

@@ -2,8 +2,8 @@
 
 Written when a run ends, and compared whenever its folder is opened: a file that was edited, damaged
 or mixed up with that of another run is named. It proves nothing against one who also rewrites the
-checksums. Images and the report are left out; runs of earlier versions have none. A file that is
-missing counts as changed, unless `cdpr report` makes it again (`REBUILT`).
+checksums. Images and the report are left out; a killed run has none. A file that is missing counts
+as changed, unless `cdpr report` makes it again (`REBUILT`).
 """
 
 from __future__ import annotations

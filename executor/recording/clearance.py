@@ -154,9 +154,9 @@ class ClearanceTable:
             body=table.texts("body"),
             obstacle=table.texts("obstacle"),
             planned_distance=table.floats("planned_distance_mm", _MM),
-            obstacles=tuple(_UNIT.sub("", table.names[i]) for i in table.pairs_from(_FACTS)),
-            distances=table.matrix_at(table.pairs_from(_FACTS), _MM),
-            planned_distances=table.matrix_at(range(_FACTS + 1, len(table.names), 2), _MM),
+            obstacles=tuple(_UNIT.sub("", name) for name in table.pairs_from(_FACTS)[0]),
+            distances=table.matrix(table.pairs_from(_FACTS)[0], _MM),
+            planned_distances=table.matrix(table.pairs_from(_FACTS)[1], _MM),
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -107,8 +108,8 @@ class TableFile:
         text: Its content, if already read.
 
     Raises:
-        BadInput: It cannot be read, is larger than `TABLE_LIMIT`, or a row has more or fewer values
-            than the header.
+        BadInput: It cannot be read, is larger than `TABLE_LIMIT`, a row has more or fewer values
+            than the header, or two columns have the same name.
     """
 
     def __init__(self, path: Path, text: str | None = None) -> None:
@@ -118,6 +119,9 @@ class TableFile:
         if not rows:
             raise self._bad("the file is empty; the first line must name the columns")
         self.names = tuple(rows[0])
+        for name, times in Counter(self.names).most_common(1):
+            if times > 1:
+                raise self._bad(f"{times} columns have the name {name!r}")
         for number, row in zip(file.lines[1:], rows[1:], strict=True):
             if len(row) != len(self.names):
                 raise self._bad(
@@ -130,15 +134,15 @@ class TableFile:
         """Number of columns whose name fully matches a regular expression."""
         return sum(1 for name in self.names if re.fullmatch(pattern, name))
 
-    def pairs_from(self, first: int) -> range:
-        """Indices of the first columns of pairs, from the index ``first`` on.
+    def pairs_from(self, first: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Names of the first and of the second columns of pairs, from the index ``first`` on.
 
         Raises:
             BadInput: The last column has no partner.
         """
         if (len(self.names) - first) % 2:
             raise self._bad(f"the last column {self.names[-1]!r} lacks its partner")
-        return range(first, len(self.names), 2)
+        return self.names[first::2], self.names[first + 1 :: 2]
 
     def texts(self, name: str) -> tuple[str, ...]:
         """A column of texts.
@@ -182,17 +186,6 @@ class TableFile:
             return np.empty((len(self._columns[0]), 0))
         return np.column_stack([self.floats(name, scale) for name in names])
 
-    def matrix_at(self, indices: range, scale: float = 1.0) -> Array:
-        """As `matrix`, with columns selected by index, as names may appear twice.
-
-        Raises:
-            BadInput: A value is no number or beyond ±1e15.
-        """
-        if not indices:
-            return np.empty((len(self._columns[0]), 0))
-        columns = [self._numbers(self.names[i], self._columns[i]) for i in indices]
-        return np.column_stack(columns) / scale
-
     def int_matrix(self, names: Sequence[str]) -> Integers:
         """Columns of whole numbers side by side, shape (n, len(names)).
 
@@ -204,13 +197,11 @@ class TableFile:
     def columns(self) -> dict[str, NDArray[Any]]:
         """All columns by name, each shape (n,) and read-only; their types depend on the names only.
 
-        Of columns with the same name, in tables of earlier versions, the first is returned.
-
         Raises:
             BadInput: A value is not of its column's type, or beyond ±1e15.
         """
         found: dict[str, NDArray[Any]] = {}
-        for name in dict.fromkeys(self.names):
+        for name in self.names:
             values: NDArray[Any]
             if name in _TEXTS:
                 values = np.array(self.texts(name), dtype=np.str_)

@@ -36,7 +36,7 @@ from executor.recording.verdict import faults_among
 from model.errors import Fault
 from tracking.clearance import COVERAGE, MeasuredClearance
 from tracking.measurement import NoPose
-from tracking.pose_log import LoggedPicture
+from tracking.pose_log import LoggedImage
 
 # Camera messages of ``run.mcap``: poses, reasons for missing poses, kept images.
 
@@ -269,8 +269,8 @@ def _events(context: RunContext, start: int) -> Iterator[Message]:
 
 def write_track_mcap(
     path: Path,
-    pictures: Sequence[LoggedPicture],
-    alone: Mapping[str, Sequence[LoggedPicture]],
+    pictures: Sequence[LoggedImage],
+    alone: Mapping[str, Sequence[LoggedImage]],
     start: int,
 ) -> None:
     """Writes ``/tag_pose``, ``/tag_status`` and ``/clearance``, also for each of several cameras.
@@ -290,7 +290,7 @@ def write_track_mcap(
     write_messages(path, messages, start)
 
 
-def _messages(pictures: Sequence[LoggedPicture], start: int, camera: str) -> Iterator[Message]:
+def _messages(pictures: Sequence[LoggedImage], start: int, camera: str) -> Iterator[Message]:
     pose_topic, status_topic, clearance_topic = (
         topic_of(channel, camera) for channel in ("/tag_pose", "/tag_status", "/clearance")
     )

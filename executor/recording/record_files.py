@@ -213,7 +213,7 @@ class CourseDocument(_Record):
     interface: str
     simulated: bool
     fast: bool
-    versions: dict[str, str] = {}
+    versions: dict[str, str]
     final_state: str
     cause: str
     cycles: Count
@@ -345,7 +345,7 @@ class RunCourse:
         interface: Of the bus.
         simulated: The drives are simulated in the run's own process.
         fast: Simulated time.
-        versions: Of programs and libraries, by name; empty in files of earlier versions.
+        versions: Of programs and libraries, by name.
         final_state: Of the motion; empty until its end.
         cause: Why it did not finish, if it did not.
         cycles: Number of cycles; 0 until the end.

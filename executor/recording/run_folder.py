@@ -40,9 +40,9 @@ PLAN, RIG, COURSE = "plan.json", "rig.json", "run.json"
 SUMMARY, EVENTS, POSES, POSES_OF = "summary.json", "events.jsonl", "poses.csv", "poses-{}.csv"
 CYCLES, CLEARANCE, FUSED = "cycles.csv", "clearance.csv", "fused.csv"
 MCAP, REPORT, PICTURES = "run.mcap", "report.html", "pictures"
-NEEDED = (PLAN, RIG, CYCLES, POSES, CLEARANCE, SUMMARY, EVENTS)
 #: Written before anything moves.
 BEGUN = (PLAN, RIG, COURSE, EVENTS)
+NEEDED = (*BEGUN, CYCLES, POSES, CLEARANCE, SUMMARY)
 JPEG_QUALITY = 88
 
 
@@ -137,7 +137,7 @@ class RunFolder:
         """
         folder = cls(path)
         if folder.is_whole or folder._missing(BEGUN):
-            return cls.open(path)  # ended, of an earlier version, or raises with what is missing
+            return cls.open(path)  # ended, or raises with what is missing
         require_unchanged(path)
         if folder._lost() or folder.is_active():
             raise folder._incomplete(folder._lost())

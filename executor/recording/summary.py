@@ -210,7 +210,7 @@ def _tag_error(poses: PoseTable, path_began: float) -> dict[str, float | int | N
 
 
 def _clearance(clearance: ClearanceTable, required: float) -> dict[str, Any] | None:
-    """The smallest clearance, measured by the camera if it measured there, else by the encoders."""
+    """The smallest clearance: the camera's if it measured there, else from the encoders."""
     for source in _measuring(clearance):
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():

@@ -323,7 +323,7 @@ def _against_plan(rows: ClearanceTable) -> Check:
 def encoder_pose(cycles: CycleTable) -> list[Check]:
     """A failed check where no pose of the platform fits the drives on the path; else none.
 
-    Clearances by the encoders are unknown there. After a lost reply a position is an older one.
+    Clearances from the encoders are unknown there. After a lost reply a position is an older one.
     """
     lost = cycles.on_path & ~cycles.has_encoder_pose & (cycles.missing == 0)
     if not lost.any():

@@ -136,7 +136,7 @@ def final_status(run: RunConnection) -> dict[str, Any] | None:
 
 
 def _line(link: socket.socket) -> bytes:
-    """The newest line: a run sends its status once more when it ends."""
+    """The newest line: a run sends its status again when it ends."""
     got = b""
     while not got.endswith(b"\n"):
         chunk = link.recv(_CHUNK)

@@ -410,7 +410,7 @@ function sceneViewer(canvas, data, shown = () => true) {
   };
 }
 
-/** Says so in the scene's place; whatever else the page has goes on. */
+/** Says so in the scene's place; everything else on the page continues. */
 function withoutWebGL(canvas) {
   const text = document.createElement("p");
   text.className = "without";

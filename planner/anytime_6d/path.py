@@ -187,7 +187,7 @@ _ROTATION_ROUND_OFF = 5e-8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TurningRoute:
+class RotatingRoute:
     """A route, and the rounds that reproduce it.
 
     Attributes:
@@ -201,7 +201,7 @@ class TurningRoute:
     search_time: float
 
 
-def turning_problem(
+def rotating_problem(
     rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCost
 ) -> RotatingProblem:
     """The problem of a scene, with the reserves that `planner.settings` documents.
@@ -230,14 +230,14 @@ def turning_problem(
     )
 
 
-def turning_route(
+def rotating_route(
     rig: Rig,
     scene: Scene,
     settings: TurningSettings,
     kinematic: KinematicCost,
     progress: Progress | None = None,
     clock: Clock = time.perf_counter,
-) -> TurningRoute:
+) -> RotatingRoute:
     """Finds a path and improves it until the budget is spent.
 
     Args:
@@ -253,7 +253,7 @@ def turning_route(
         NoSolution: No path was found, or none is short enough.
     """
     weights = settings.weights.normalized()
-    problem = turning_problem(rig, scene, weights, kinematic)
+    problem = rotating_problem(rig, scene, weights, kinematic)
     space = PoseSpace(rig)
     start, goal = space.coordinates(scene.start), space.coordinates(scene.goal)
     _load(RotatingSearch(problem, start, goal, settings.seed), weights)
@@ -280,7 +280,7 @@ def turning_route(
         iterations=search.rounds,
         edge_checks=int(search.tallies.sum()),
     )
-    return TurningRoute(route, search.rounds, clock() - began)
+    return RotatingRoute(route, search.rounds, clock() - began)
 
 
 def _load(search: RotatingSearch, weights: Weights) -> None:

@@ -18,7 +18,7 @@ from model.statics.wrench_sets import rms_anchor_radius
 from planner.collision.self_collision_regions import Robot
 from planner.collision.swept_pair import points_distance, put_corners
 from planner.costs import KinematicCost
-from planner.edge_checks import FREE, turning_edge_problem
+from planner.edge_checks import FREE, rotating_edge_problem
 from planner.kernels.jit import kernel
 from planner.kernels.primitives import Vector, dot, plus, rotated, row
 from planner.kernels.scene_arrays import World, anchor, exit_point
@@ -379,7 +379,7 @@ def move_allowed(problem: RotatingProblem, start: Array, end: Array, tallies: In
         return False
     world, robot, load = problem.world, problem.robot, problem.load
     rotation = matrix_of(start)
-    found = turning_edge_problem(
+    found = rotating_edge_problem(
         world, robot, load, problem.reserve, start[:3], end[:3], rotation, turn
     )
     tallies[found] += 1

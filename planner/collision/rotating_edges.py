@@ -29,7 +29,9 @@ _DEEPEST = 64
 
 
 @kernel
-def turning_edge_free(world: World, start: Array, end: Array, rotation: Array, turn: Array) -> bool:
+def rotating_edge_free(
+    world: World, start: Array, end: Array, rotation: Array, turn: Array
+) -> bool:
     """Whether the platform may move straight from ``start`` to ``end`` at a steady rotation.
 
     It stays in the workspace box, and platform and cables keep the clearance to every obstacle.
@@ -70,7 +72,7 @@ def _pair_free(
     rotation: Array,
     turn: Array,
 ) -> bool:
-    """Whether one body keeps its distance to one piece; arguments as of `turning_edge_free`."""
+    """Whether one body keeps its distance to one piece; arguments as of `rotating_edge_free`."""
     piece, body = world.pairs[pair, 0], world.pairs[pair, 1]
     delta, needed = minus(after, before), world.bodies[body, 0]
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)

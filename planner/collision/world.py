@@ -220,7 +220,7 @@ def is_open(world: World, robot: Robot, start: Vector, end: Vector) -> bool:
 
 
 @kernel
-def self_turning_edge_free(
+def self_rotating_edge_free(
     world: World, robot: Robot, start: Array, end: Array, rotation: Array, turn: Array
 ) -> bool:
     """Whether the cables keep the self clearance while the platform is moved and rotated.

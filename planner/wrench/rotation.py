@@ -36,7 +36,7 @@ which takes ten times as long with ten cables."""
 
 
 @kernel
-def turning_edge_held(
+def rotating_edge_held(
     world: World,
     load: LoadArrays,
     reserve: float,

@@ -14,6 +14,7 @@ from drivers import ImageFolder
 from executor.track import TrackResult
 from model.plan import plan_facts
 from tests.executor import fake_run
+from tracking.track import MultiCameraCount
 from tracking.tracker import Tracker
 
 ROOT = Path(__file__).parents[2]
@@ -44,6 +45,15 @@ def test_a_result_without_images_has_figures_that_are_unknown() -> None:
     }
     assert result._repr_html_().count("–") == 4
     assert dict(result.facts())["measuring ms"] == "–"
+
+
+def test_figures_of_several_cameras_have_names_that_explain_themselves() -> None:
+    result = TrackResult(together=MultiCameraCount(without_partner=3, apart=2, without_speed=1))
+    facts = dict(result.facts())
+    assert facts["images without partner"] == "3"
+    assert facts["frame sets with images too far apart in time"] == "2"
+    assert facts["frame sets with a pose of unknown velocity"] == "1"
+    assert not [name for name in facts if "picture" in name or "_" in name]
 
 
 def test_the_poses_to_measure_at_are_a_table_with_their_plan() -> None:

@@ -30,6 +30,19 @@ def imported_for_types(package: str) -> dict[str, str]:
     return {alias.name: str(node.module) for node in imports for alias in node.names}
 
 
+def loaded_from(package: str) -> dict[str, str]:
+    """Public names of a package, with the modules that its table loads them from."""
+    tree = ast.parse((ROOT / package / "__init__.py").read_text())
+    (table,) = (node for node in ast.walk(tree) if isinstance(node, ast.Dict))
+    origins: dict[str, str] = ast.literal_eval(table)
+    return {name: module for module, names in origins.items() for name in names.split()}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_names_are_loaded_from_the_module_that_editors_open(package: str) -> None:
+    assert loaded_from(package) == imported_for_types(package)
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_every_public_name_is_what_editors_see_under_it(package: str) -> None:
     module: Any = importlib.import_module(package)

@@ -11,7 +11,7 @@ import pytest
 from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
 from calibration.intrinsics.quality import judge_camera
 from calibration.targets.boards import Charuco, Chessboard
-from drivers.cameras.files import OneCamerasPictures, read_picture
+from drivers.cameras.files import SingleCameraImages, read_picture
 from tests.calibration.exif import jpeg, rotated_by_exif
 from tracking.detection.detector import TagDetector
 
@@ -76,7 +76,7 @@ def test_rotated_and_coloured_photographs_show_the_same(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(rotated_by_exif(grey))
     cv2.imwrite(str(tmp_path / "b.png"), cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
     expected = BOARD.find(grey).corners
-    for name, image in OneCamerasPictures(tmp_path):
+    for name, image in SingleCameraImages(tmp_path):
         assert image.shape == (480, 640), name
         assert np.abs(BOARD.find(image).corners - expected).max() < 0.3, name
 
@@ -88,10 +88,10 @@ def test_orientations_that_change_between_images_are_those_of_a_camera_that_poin
     grey = read_picture(chessboards()[0])
     for name, orientation in (("a", 1), ("b", 3)):
         (tmp_path / f"{name}.jpg").write_bytes(jpeg(grey, orientation))
-    one, other = (image for _, image in OneCamerasPictures(tmp_path))
+    one, other = (image for _, image in SingleCameraImages(tmp_path))
     assert np.array_equal(one, other)
     (tmp_path / "a.jpg").write_bytes(jpeg(grey, 3))
-    for _, image in OneCamerasPictures(tmp_path):
+    for _, image in SingleCameraImages(tmp_path):
         assert np.abs(image.astype(int) - grey).mean() < 2.0, "as stored, whatever they state"
 
 

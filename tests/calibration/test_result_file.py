@@ -171,8 +171,8 @@ def test_a_verdict_says_each_next_step_once() -> None:
     assert str(CalibrationVerdict.of(5e-4, 1e-3, "at 1 m", [])) == "good enough for 0.5 mm at 1 m"
 
 
-def test_a_camera_result_from_before_there_were_lens_models_is_read(tmp_path: Path) -> None:
-    """It has no key `lens`, and its hash does not include one."""
+def test_a_key_with_its_default_may_be_left_out_and_another_value_may_not(tmp_path: Path) -> None:
+    """A default is no part of the hash."""
     path = write_result(tmp_path, camera_result_of())
     text = path.read_text()
     assert "lens: pinhole\n" in text

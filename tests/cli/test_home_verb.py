@@ -87,7 +87,7 @@ AT, AT_WXYZ = ("--simulated-start-mm", 0, 0, 445), ("--simulated-start-wxyz",)
         (AT, "--hold-to-run"),
         ((*HELD, *AT_WXYZ, 1, 0, 0, 0), "without a position"),
         ((*HELD, *AT, *AT_WXYZ, 0, 0, 0, 0), "length"),
-        ((*HELD, *AT, "--interface", "udp_multicast"), "simulated in this process can be placed"),
+        ((*HELD, *AT, "--interface", "udp_multicast"), "start pose can be set only for"),
     ],
 )
 def test_a_pose_is_stated_for_drives_that_a_session_simulates_only(

@@ -1058,7 +1058,7 @@ def test_one_page_at_a_time_operates(served: Served) -> None:
         assert command(first, "home")["ok"]
         assert [verb for verb, _ in served.started] == ["home"]
         late = command(second, "take_control", force=True, held_by="page 9 on elsewhere")
-        assert "changed hands" in late["what"]
+        assert "taken control" in late["what"]
         holder = state(second)["control"]["held_by"]
         assert command(second, "take_control", force=True, held_by=holder)["ok"]
         assert not command(first, "home")["ok"]
@@ -1353,7 +1353,7 @@ def test_nothing_runs_that_was_not_seen_to_pass(served: Served) -> None:
         assert state(page)["preview"] == f"short.json {shown['hash']}"
         assert shown["passed"]
         assert len(shown["moments"]) == len(shown["curves"]["time_s"])
-        assert "another plan" in command(page, "run", plan="of another tab")["what"]
+        assert "a different plan" in command(page, "run", plan="of another tab")["what"]
         assert not served.started
         assert command(page, "run", plan=shown["hash"])["ok"]
         verb, arguments = served.started[-1]

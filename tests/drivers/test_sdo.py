@@ -72,6 +72,19 @@ def test_an_abort_that_comes_late_is_not_blamed_on_the_next_object() -> None:
     assert reads(network, 0x1400, 1) == 0x200 + NODE
 
 
+def test_answers_that_arrived_while_the_program_was_held_up_count() -> None:
+    """It goes on ten seconds after it asked: the drives answered in time, it reads that late."""
+
+    def held_up(_node: int, _key: tuple[int, int]) -> tuple[float]:
+        bus.now += 10.0
+        return (-9.9,)
+
+    network, bus = network_of(held_up, 3, 5)
+    assert network.silent_nodes([3, 5]) == []
+    assert reads(network, 0x6502) == 0x80
+    assert len(bus.sent) == 3  # and are asked once
+
+
 def test_no_answer_never_means_that_an_object_is_absent() -> None:
     network, _ = network_of(lambda _node, _key: ())
     with pytest.raises(HardwareMissing, match="drive 3 does not answer"):

@@ -12,6 +12,7 @@ import numpy as np
 
 from executor.recording.clearance import ClearanceTable
 from executor.recording.mcap import write_mcap
+from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.recording.summary import RunContext, summarize
 from executor.recording.tables import CycleTable, PoseTable, fused_table
@@ -58,6 +59,8 @@ def write(run: FakeRun, path: Path, pictures: bool = True) -> RunFolder:
     folder = RunFolder.create(path)
     folder.write_plan(run.context.plan.document)
     folder.write_rig(run.context.rig.document)
+    started, cycles = run.context.started, len(run.cycles)
+    folder.write_course(RunCourse(started, "virtual", True, True, "finished", "", cycles))
     poses = run.poses
     if pictures:
         rows = set(range(0, len(poses), 20))

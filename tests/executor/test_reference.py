@@ -25,7 +25,7 @@ from executor.homing import use_rig_file_counts
 from executor.interlock import locks as state_folder
 from executor.interlock.interlock import MotionInterlock, reference_status
 from executor.interlock.reference import HomingReference, as_in_the_file, reference_at
-from executor.proposals import ForgetProposal
+from executor.proposals import Proposal
 from executor.realtime.child import Armed, Ended, Records
 from executor.realtime.process import RealTimeProcess
 from executor.state_machine import State
@@ -91,7 +91,7 @@ def test_the_next_step_without_one_names_the_ways_to_state_the_pose() -> None:
 def test_a_reference_is_not_announced_as_discarded_where_none_will_be() -> None:
     asked: list[str] = []
 
-    def confirm(proposal: ForgetProposal) -> bool:
+    def confirm(proposal: Proposal) -> bool:
         asked.append(proposal.title)
         return True
 
@@ -237,8 +237,9 @@ def test_a_set_up_that_releases_a_cable_loses_it(
 def test_homing_that_does_not_come_to_its_end_leaves_no_reference(ended: State) -> None:
     rig = rig_with("incremental")
     interlock = MotionInterlock(rig)
-    interlock.file.write(reference_of(rig))
-    interlock.begin(Path("run"), reference_of(rig), rehome=True)
+    reference = reference_of(rig)
+    interlock.file.write(reference)
+    interlock.begin(Path("run"), reference, rehome=True)
     interlock.end(ended, "stopped", Path("run"), holding=True, positions=range(8))
     interlock.cancel()
     with pytest.raises(Refused, match="homing reference is lost") as caught:
@@ -251,8 +252,9 @@ def test_an_end_that_cannot_be_kept_leaves_the_bus_latched(
 ) -> None:
     rig = rig_with("incremental")
     interlock = MotionInterlock(rig)
-    interlock.file.write(reference_of(rig))
-    interlock.begin(Path("run"), reference_of(rig))
+    reference = reference_of(rig)
+    interlock.file.write(reference)
+    interlock.begin(Path("run"), reference)
 
     def full(_reference: object) -> None:
         raise Refused("the homing reference cannot be written")

@@ -19,7 +19,6 @@ from mcap.reader import make_reader
 import cdpr
 from executor.evaluation import evaluate_folder, rewrite_report, write_end
 from executor.recording.clearance import ClearanceTable
-from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunFolder
 from executor.run_result import RunResult
 from model.errors import BadInput, Fault
@@ -33,10 +32,6 @@ def finished(path: Path, *, camera: bool) -> RunFolder:
     """A finished run with every file, made by the writers of a run."""
     run = fake_run.make(rate_hz=2.0, every=20, camera=camera)
     folder = fake_run.write(run, path, pictures=camera)
-    cycles = len(run.cycles)
-    folder.write_course(
-        RunCourse(run.context.started, "virtual", True, True, "finished", "", cycles)
-    )
     rewrite_report(RunFolder.open_cut_short(path))
     return folder
 
@@ -251,12 +246,14 @@ def test_a_clearance_that_cameras_measured_is_not_replaced_by_that_of_the_encode
     assert {path.name for path in folder.path.iterdir()} == before
 
 
-def test_a_run_of_an_earlier_version_needs_neither_its_course_nor_checksums(
-    filmed: RunFolder, tmp_path: Path
+@pytest.mark.parametrize("others", [(), ("fused.csv",)])
+def test_a_run_without_its_course_is_refused(
+    filmed: RunFolder, tmp_path: Path, others: tuple[str, ...]
 ) -> None:
-    folder = without(filmed, tmp_path / "run", "run.json", "SHA256SUMS", "fused.csv")
-    assert call("report", folder.path).code == 0
-    assert cdpr.load_run(folder.path).passed
+    folder = without(filmed, tmp_path / "run", "run.json", "SHA256SUMS", *others)
+    one_message(call("report", folder.path), 2, "run.json missing")
+    with pytest.raises(BadInput, match=r"run\.json missing"):
+        cdpr.load_run(folder.path)
 
 
 # Columns of obstacles.

@@ -34,7 +34,7 @@ from executor.cameras.process import (
     sample_without_pose,
 )
 from executor.cameras.sources import cycles_per_image
-from executor.proposals import HomingProposal
+from executor.proposals import homing_proposal
 from executor.remote.client import camera_line
 from model.clearance import ClearanceModel
 from model.errors import BadInput, Fault
@@ -540,12 +540,11 @@ def test_the_names_of_the_images_name_the_camera(tmp_path: Path) -> None:
 def test_the_password_of_a_camera_is_neither_sent_nor_recorded_nor_shown() -> None:
     client = CameraClient(Scripted("front", [0]), "rtsp://user:s3cret@h/x")  # type: ignore[arg-type]
     assert client.as_dict(0.0)["source"] == client.record().source == "rtsp://user:***@h/x"
-    facts = HomingProposal(
+    facts = homing_proposal(
         _RIG,
         np.full(8, 10.0),
         50.0,
         0.05,
-        0.002,
         0.002,
         (_RIG.cameras[0], "rtsp://user:s3cret@h/x"),
     ).facts()

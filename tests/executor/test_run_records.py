@@ -105,6 +105,16 @@ def test_a_course_that_no_run_writes_is_named(tmp_path: Path, key: str, value: A
         RunCourse.load(path)
 
 
+def test_a_course_without_versions_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.json"
+    RunCourse(datetime(2026, 1, 1, tzinfo=UTC), "virtual", True, False).save(path)
+    kept = json.loads(path.read_text())
+    del kept["versions"]
+    path.write_text(json.dumps(kept))
+    with pytest.raises(InvalidFile, match="versions"):
+        RunCourse.load(path)
+
+
 @pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"schema_version": 2}', "\0"])
 def test_a_summary_that_is_invalid_is_refused(folder: RunFolder, text: str) -> None:
     (folder.path / "summary.json").write_text(text)

@@ -193,7 +193,7 @@ def test_a_latch_outlives_the_change_to_a_folder_for_all_users(
 
 
 def test_a_fault_is_not_reset_with_the_file_of_another_rig(tmp_path: Path) -> None:
-    """Of fewer drives, say: the one in fault would not be looked at."""
+    """Of fewer drives, say: the one in fault would not be checked."""
     latch = FaultLatch(BUS)
     latch.engage("eight cables", tmp_path, "drive 8 is in fault")
     with (
@@ -218,7 +218,7 @@ def engaged_by(nodes: tuple[int, ...], folder: Path) -> LatchedFault:
 def test_a_fault_is_not_reset_with_a_file_of_its_name_that_lacks_drives(
     tmp_path: Path, others: tuple[int, ...]
 ) -> None:
-    """A copy for four of eight cables, say: drive 8, in fault, would not be looked at."""
+    """A copy for four of eight cables, say: drive 8, in fault, would not be checked."""
     shown, other = engaged_by(tuple(range(1, 9)), tmp_path), FaultLatch(BUS, others)
     assert not other.is_of(shown, "rig")
     with (
@@ -243,7 +243,7 @@ def test_a_fault_is_reset_with_a_file_of_its_name_and_drives(
     latch.require_disengaged()
 
 
-def test_a_fault_of_an_earlier_version_which_noted_no_drives_is_reset(tmp_path: Path) -> None:
+def test_a_fault_without_its_drives_counts_as_engaged_and_is_reset(tmp_path: Path) -> None:
     engaged_by((1, 2), tmp_path)
     latch = FaultLatch(BUS, (1, 2))
     content = json.loads(latch.path.read_text())
@@ -251,7 +251,8 @@ def test_a_fault_of_an_earlier_version_which_noted_no_drives_is_reset(tmp_path: 
     latch.path.write_text(json.dumps(content))
     shown = latch.read()
     assert shown is not None
-    assert (shown.cause, shown.nodes) == ("drive 8 is in fault", ())
+    assert "cannot be read" in shown.cause
+    assert "nodes" in shown.cause
     with latch.held_for_reset("rig", shown):
         pass
     latch.require_disengaged()

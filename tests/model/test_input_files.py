@@ -100,9 +100,15 @@ def test_a_number_that_no_run_records_is_reported(tmp_path: Path, value: str) ->
     (tmp_path / "a.csv").write_text(f"x_mm,y_mm\n1,2\nnan,{value}\n")
     table = TableFile(tmp_path / "a.csv")
     assert table.floats("x_mm")[0] == 1.0
-    for read in (lambda: table.floats("y_mm"), lambda: table.matrix_at(range(1, 2))):
+    for read in (lambda: table.floats("y_mm"), lambda: table.matrix(["y_mm"])):
         with pytest.raises(BadInput, match="'y_mm' has a value beyond"):
             read()
+
+
+def test_a_table_with_two_columns_of_one_name_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x_mm,y_mm,x_mm\n1,2,3\n")
+    with pytest.raises(BadInput, match="2 columns have the name 'x_mm'"):
+        TableFile(tmp_path / "a.csv")
 
 
 def changed(tmp_path: Path, name: str, old: str, new: str) -> Path:

@@ -40,6 +40,18 @@ WENT = {
     "stands twice": "appears twice",
     "come to its end": "finish",
     "came to its end": "finished",
+    "likewise": "the same for",
+    "once more": "again",
+    "by itself": "on its own, separately",
+    "by themselves": "on their own, separately",
+    "by the drives": "from the encoders, that the drives …",
+    "by its drives": "from the encoders",
+    "look at": "check, inspect, review",
+    "looked at": "checked, inspected, reviewed",
+    "look who": "check which",
+    "go on": "continue, keep",
+    "goes on": "continues",
+    "going on": "continuing, active",
 }
 #: Words with a plain meaning, such as "in place", that once stood for twenty others.
 MOST_RARE_LINES = 60

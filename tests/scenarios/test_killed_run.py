@@ -38,7 +38,7 @@ from tests.executor import fake_run
 from tests.scenarios.test_real_time import moving_over_udp, real_time_process, wait_until_gone
 
 RUN = fake_run.make(rate_hz=1.0, every=100, camera=False)
-KEPT = ("plan.json", "rig.json", "cycles.csv", "events.jsonl")
+KEPT = ("plan.json", "rig.json", "run.json", "cycles.csv", "events.jsonl")
 ENDED = (*(name for name in NEEDED if name not in KEPT),)
 
 
@@ -225,16 +225,6 @@ def test_a_killed_run_has_the_start_of_its_motion_and_the_versions_that_ran_it(
     context = evaluate_folder(RunFolder(killed)).context
     assert (context.started, context.versions) == (moved, {"cdpr": "0.0.9"})
     assert RunFolder(run).summary()["versions"] == {"cdpr": "0.0.9"}
-
-
-def test_a_run_json_of_an_earlier_version_names_no_versions(
-    killed: RunFolder, tmp_path: Path
-) -> None:
-    folder = cut(killed, tmp_path / "run")
-    kept = json.loads((folder.path / "run.json").read_text())
-    kept.pop("versions")
-    (folder.path / "run.json").write_text(json.dumps(kept))
-    assert evaluate_folder(folder).summary["versions"] == {}
 
 
 def test_a_kill_during_the_evaluation_loses_neither_the_end_nor_the_camera_poses(

@@ -27,6 +27,7 @@ from model.rig import rig_from_document
 from model.scene import empty_scene
 from tests.cli.plans import RIG
 from tests.cli.program import call
+from tests.drivers.drive_bench import free_udp_channel
 from tests.scenarios.test_real_time import (
     drives_on,
     moving_over_udp,
@@ -188,8 +189,9 @@ def test_without_a_folder_for_the_latch_nothing_moves(
 
 
 def test_a_latched_bus_is_refused_by_the_program(short_plan: Path, tmp_path: Path) -> None:
-    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41999")
-    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41999")).engage("gachon_8_6", tmp_path)
+    channel = free_udp_channel()
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    FaultLatch(BusSettings("udp_multicast", channel)).engage("gachon_8_6", tmp_path)
     run = tmp_path / "run"
     answer = call("run", short_plan, "--rig", RIG, "-o", run, *bus, "--no-camera", "--yes")
     assert answer.code == 3
@@ -198,9 +200,10 @@ def test_a_latched_bus_is_refused_by_the_program(short_plan: Path, tmp_path: Pat
 
 
 def test_reset_asks_and_a_no_leaves_it_engaged(tmp_path: Path) -> None:
-    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41998")
-    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41998")).engage("gachon_8_6", tmp_path)
-    latch = FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41998"))
+    channel = free_udp_channel()
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    FaultLatch(BusSettings("udp_multicast", channel)).engage("gachon_8_6", tmp_path)
+    latch = FaultLatch(BusSettings("udp_multicast", channel))
     for answers, code in (("n\n", 130), ("", 2)):
         assert call("reset", RIG, *bus, answers=answers).code == code
         assert latch.read() is not None
@@ -208,9 +211,10 @@ def test_reset_asks_and_a_no_leaves_it_engaged(tmp_path: Path) -> None:
 
 
 def test_reset_of_drives_that_do_not_answer_leaves_it_engaged(tmp_path: Path) -> None:
-    bus = ("--interface", "udp_multicast", "--channel", "239.74.163.23:41997")
-    FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41997")).engage("gachon_8_6", tmp_path)
-    latch = FaultLatch(BusSettings("udp_multicast", "239.74.163.23:41997"))
+    channel = free_udp_channel()
+    bus = ("--interface", "udp_multicast", "--channel", channel)
+    FaultLatch(BusSettings("udp_multicast", channel)).engage("gachon_8_6", tmp_path)
+    latch = FaultLatch(BusSettings("udp_multicast", channel))
     assert call("reset", RIG, *bus, "--yes").code == 4
     assert latch.read() is not None
 

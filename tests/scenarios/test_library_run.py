@@ -16,7 +16,7 @@ import pytest
 from executor import jogging, runner
 from executor.homing import home
 from executor.interlock.interlock import MotionInterlock
-from executor.proposals import MotionProposal
+from executor.proposals import Proposal
 from executor.recording import recorder
 from executor.recording.run_folder import RunEvent, RunFolder
 from model.errors import BadInput, StoppedByOperator
@@ -41,7 +41,7 @@ def plan(short_plan: Path) -> Plan:
 def test_a_run_whose_record_could_not_be_read_does_not_begin(
     plan: Plan, rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[MotionProposal] = []
+    asked: list[Proposal] = []
     monkeypatch.setattr(recorder, "TABLE_LIMIT", 100_000)
     with pytest.raises(BadInput, match="split the plan") as caught:
         runner.run(
@@ -77,7 +77,7 @@ def test_a_run_gives_its_verdict_its_tables_and_its_events(
 def test_a_no_before_the_motion_leaves_nothing(plan: Plan, rig: Rig, tmp_path: Path) -> None:
     asked: list[str] = []
 
-    def refuse(proposal: MotionProposal) -> bool:
+    def refuse(proposal: Proposal) -> bool:
         asked.append(proposal.question)
         return False
 

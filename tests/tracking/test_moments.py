@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from tracking.fusion import synchronize_frames
 from tracking.measurement import NoPose
-from tracking.pose_log import LoggedPicture
+from tracking.pose_log import LoggedImage
 
 TIMES = st.lists(st.integers(0, 60), max_size=20, unique=True).map(sorted)
 
 
 def grouped(times: Mapping[str, Sequence[float]], within: float) -> list[dict[str, float]]:
     streams = {
-        name: iter([LoggedPicture("", NoPose(time, "")) for time in own])
+        name: iter([LoggedImage("", NoPose(time, "")) for time in own])
         for name, own in times.items()
     }
     return [

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.cameras.files import PictureOutput, read_picture
+from drivers.cameras.files import ImageOutput, read_picture
 from model.errors import Fault
 from model.files.reading import MOST_PIXELS, is_too_large, stated_size
 
@@ -93,7 +93,7 @@ def test_a_full_disk_leaves_no_empty_picture(
     def full(_: int) -> NoReturn:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    with PictureOutput(tmp_path / "drawn", 10.0) as out:
+    with ImageOutput(tmp_path / "drawn", 10.0) as out:
         out.write(IMAGE, "a.png")
         monkeypatch.setattr(os, "fsync", full)
         with pytest.raises(Fault, match="cannot be written") as caught:
@@ -104,7 +104,7 @@ def test_a_full_disk_leaves_no_empty_picture(
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.avi"])
 def test_a_video_has_its_name_once_it_is_whole(tmp_path: Path, name: str) -> None:
-    with PictureOutput(tmp_path / name, 10.0) as out:
+    with ImageOutput(tmp_path / name, 10.0) as out:
         for _ in range(3):
             out.write(IMAGE, "")
         assert not (tmp_path / name).exists()
@@ -115,7 +115,7 @@ def test_a_video_has_its_name_once_it_is_whole(tmp_path: Path, name: str) -> Non
 def test_a_video_ended_by_an_error_has_the_images_until_then(
     tmp_path: Path, error: BaseException
 ) -> None:
-    out = PictureOutput(tmp_path / "a.mp4", 10.0)
+    out = ImageOutput(tmp_path / "a.mp4", 10.0)
     out.write(IMAGE, "")
     out.__exit__(type(error), error, None)
     capture = cv2.VideoCapture(str(tmp_path / "a.mp4"))
@@ -127,7 +127,7 @@ def test_a_video_without_an_encoder_is_not_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("drivers.cameras.files.VIDEO_CODES", {".mp4": "none"})
-    out = PictureOutput(tmp_path / "a.mp4", 10.0)
+    out = ImageOutput(tmp_path / "a.mp4", 10.0)
     with pytest.raises(Fault, match="cannot be written") as caught:
         out.write(IMAGE, "")
     assert "no encoder" in caught.value.why
@@ -137,7 +137,7 @@ def test_a_video_without_an_encoder_is_not_kept(
 
 def test_a_video_that_a_full_disk_cut_short_is_not_kept(tmp_path: Path) -> None:
     """OpenCV does not report write failures; the video's images are counted afterwards."""
-    out = PictureOutput(tmp_path / "a.avi", 10.0)
+    out = ImageOutput(tmp_path / "a.avi", 10.0)
     for _ in range(3):
         out.write(IMAGE, "")
     out._count = 5
@@ -149,7 +149,7 @@ def test_a_video_that_a_full_disk_cut_short_is_not_kept(tmp_path: Path) -> None:
 
 def test_a_video_that_was_not_finished_leaves_what_was_there(tmp_path: Path) -> None:
     (tmp_path / "a.avi").write_bytes(b"before")
-    out = PictureOutput(tmp_path / "a.avi", 10.0, force=True)
+    out = ImageOutput(tmp_path / "a.avi", 10.0, force=True)
     out.write(IMAGE, "")
     out.__exit__(RuntimeError, RuntimeError(), None)
     assert (tmp_path / "a.avi").read_bytes() == b"before"
@@ -157,7 +157,7 @@ def test_a_video_that_was_not_finished_leaves_what_was_there(tmp_path: Path) -> 
 
 
 def test_pictures_whose_names_differ_only_in_their_ending_are_both_kept(tmp_path: Path) -> None:
-    with PictureOutput(tmp_path / "drawn", 10.0) as out:
+    with ImageOutput(tmp_path / "drawn", 10.0) as out:
         for name in ("a.jpg", "a.png", "a.jpg"):
             out.write(IMAGE, name)
     assert sorted(p.name for p in (tmp_path / "drawn").iterdir()) == ["a.png", "a.png.png"]

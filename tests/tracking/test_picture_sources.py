@@ -12,7 +12,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from drivers.cameras.files import ImageFolder, OneCamerasPictures, first_gap
+from drivers.cameras.files import ImageFolder, SingleCameraImages, first_gap
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from model.errors import BadInput, HardwareMissing
 from model.pose import Pose
@@ -114,14 +114,14 @@ def test_a_measurement_sees_the_pixels_that_a_calibration_saw(
     for name, orientation in zip("ab", orientations, strict=True):
         (tmp_path / f"{name}.jpg").write_bytes(jpeg(pixels, orientation))
     (tmp_path / "c.jpg").write_bytes(b"not an image")
-    calibrated = OneCamerasPictures(tmp_path)
+    calibrated = SingleCameraImages(tmp_path)
     assert calibrated.names == ("a.jpg", "b.jpg")
     # In the same position the pixels of two images differ only by the compression.
     first, second = (image.astype(int) for _, image in calibrated)
     assert np.abs(first - second).max() < 8
     camera = replace(camera, width=calibrated.size[0], height=calibrated.size[1])
     measured = ImageFolder(tmp_path, camera)
-    again = OneCamerasPictures(tmp_path, calibrated.size)
+    again = SingleCameraImages(tmp_path, calibrated.size)
     for frame, (name, expected), other in zip(measured, calibrated, again, strict=True):
         assert (frame.name, other[0]) == (name, name)
         np.testing.assert_array_equal(frame.image, expected)
@@ -143,7 +143,7 @@ def test_images_of_the_cameras_size_are_as_the_sensor_stored_them(
     camera = replace(camera, width=64, height=48)
     for frame in ImageFolder(tmp_path, camera):
         assert np.abs(frame.image.astype(int) - CORNER).max() < 8
-    for _, image in OneCamerasPictures(tmp_path, (64, 48)):
+    for _, image in SingleCameraImages(tmp_path, (64, 48)):
         assert np.abs(image.astype(int) - CORNER).max() < 8
 
 
@@ -163,7 +163,7 @@ def test_images_in_portrait_are_rotated_as_stated(
     (frame,) = ImageFolder(tmp_path, replace(camera, width=48, height=64))
     assert np.abs(frame.image.astype(int) - expected).max() < 8
     if not beside:
-        assert OneCamerasPictures(tmp_path).size == (48, 64)
+        assert SingleCameraImages(tmp_path).size == (48, 64)
 
 
 DEGREES = {0: (1, 0, 0, 1), 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}
@@ -415,8 +415,8 @@ def test_floating_point_images_are_refused_with_the_reason(
     reason = f"has values of type {kind.__name__}; only integers of 8 to 16 bits can be used"
     source = ImageFolder(folder, camera)
     assert len(list(source)) == len(TRUTH)
-    assert source.unused == OneCamerasPictures(folder).unused == {"a.tiff": reason}
-    for read in (lambda: OneCamerasPictures(only), lambda: list(ImageFolder(only, camera))):
+    assert source.unused == SingleCameraImages(folder).unused == {"a.tiff": reason}
+    for read in (lambda: SingleCameraImages(only), lambda: list(ImageFolder(only, camera))):
         with pytest.raises(BadInput, match="none of the 1 files is a readable image") as caught:
             read()
         assert caught.value.why == f"a.tiff {reason}"

@@ -176,7 +176,7 @@ def _state(folder: Path) -> None:
     pose = Pose(np.array([0.0, 0.0, 0.4]), np.eye(3))
     reference = reference_at(rig, pose, counts, tensions, "stated", 0.001)
     (folder / "reference.json").write_text(reference.model_dump_json(indent=1))
-    latched = LatchedFault("virtual", rig.name, "EMCY", "2026-01-01T00:00:00Z", "runs/a", 1)
+    latched = LatchedFault("virtual", rig.name, "EMCY", "2026-01-01T00:00:00Z", "runs/a", 1, ())
     (folder / "latched.json").write_text(json.dumps(asdict(latched)))
 
 

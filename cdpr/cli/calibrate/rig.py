@@ -145,7 +145,7 @@ class Accuracies:
 
     length_mm: float = _deviation("cable lengths from the encoders", 0.1)
     pose_mm: float = _deviation("positions, which all samples may share, besides their file's", 0.1)
-    pose_deg: float = _deviation("orientations, likewise", 0.02)
+    pose_deg: float = _deviation("the same for orientations", 0.02)
     swivel_deg: float = _deviation("swivel angles", 0.1)
     imu_deg: float = _deviation("the vertical by an IMU", 0.1)
 

@@ -30,7 +30,7 @@ from drivers.can_bus import IN_PROCESS
 from executor import runner
 from executor.drives import is_simulated
 from executor.evaluation import rewrite_report
-from executor.proposals import MotionProposal
+from executor.proposals import Proposal
 from executor.recording.run_folder import RunFolder
 from executor.report.run_data import missing_images
 from executor.runner import RunResult
@@ -89,7 +89,7 @@ def run(
         raise BadInput(
             "the plan's file was replaced after it was shown",
             where=str(plan),
-            next_step="load it again, look at it, then run it",
+            next_step="reload and review it, then run it",
         )
     if rig is None:
         the_rig = calibrated_rig(_simulated(the_plan.rig, interface, channel), calibration)
@@ -127,7 +127,7 @@ def supervise(
     ask = confirmation(asks=not (is_simulated(rig) or yes), as_json=as_json)
     with RunSupervisor(lambda result: show(result, as_json)) as supervisor:
 
-        def confirm(proposal: MotionProposal) -> bool:
+        def confirm(proposal: Proposal) -> bool:
             agreed = ask(proposal)
             if agreed:
                 supervisor.take_over()

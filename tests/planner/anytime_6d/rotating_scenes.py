@@ -17,7 +17,7 @@ from model.scene import Scene, load_scene, scene_from_document
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench
 from model.statics.wrench_sets import rms_anchor_radius
-from planner.anytime_6d.path import turning_problem
+from planner.anytime_6d.path import rotating_problem
 from planner.anytime_6d.problem import RotatingProblem
 from planner.costs import KinematicCost
 from planner.settings import OBJECTIVES, Weights
@@ -39,7 +39,7 @@ def turning(name: str, tilt_deg: float, turn_deg: float, **parts: Any) -> Scene:
 
 def problem_of(rig: Rig, scene: Scene, weights: Weights = OBJECTIVES["length"]) -> RotatingProblem:
     """The problem of a scene."""
-    return turning_problem(rig, scene, weights, KinematicCost(rig, scene.start.rotation))
+    return rotating_problem(rig, scene, weights, KinematicCost(rig, scene.start.rotation))
 
 
 def quaternion(x_deg: float, y_deg: float, z_deg: float = 0.0) -> list[float]:

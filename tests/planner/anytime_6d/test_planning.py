@@ -16,7 +16,7 @@ from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, load_scene
 from model.statics.wrench_sets import rms_anchor_radius
-from planner.anytime_6d.path import TurningRoute, turning_route
+from planner.anytime_6d.path import RotatingRoute, rotating_route
 from planner.check import check_path, verify
 from planner.costs import KinematicCost
 from planner.planning import make_plan
@@ -36,8 +36,8 @@ RAMP = load_scene(CONFIGS / "turn.yaml")
 
 def routed(
     scene: Scene, settings: TurningSettings, clock: Callable[[], float] = time.perf_counter
-) -> TurningRoute:
-    return turning_route(
+) -> RotatingRoute:
+    return rotating_route(
         GACHON, scene, settings, KinematicCost(GACHON, scene.start.rotation), clock=clock
     )
 

@@ -14,7 +14,7 @@ from model.kinematics import cables_to
 from model.pose import Pose
 from model.rig import Rig, load_rig
 from planner.collision.edges import edge_clearance, edge_free
-from planner.collision.rotating_edges import rotated_by, turning_edge_free
+from planner.collision.rotating_edges import rotated_by, rotating_edge_free
 from planner.collision.world import build_world
 from planner.kernels.scene_arrays import exit_point, exit_travel
 from tests.planner.collision.sampled_oracle import KINDS, CoalScene, random_scene
@@ -63,7 +63,7 @@ def test_turning_edges_agree_with_coal_at_dense_poses(rig: Rig) -> None:
                 start + rng.normal(size=3) * 0.02, rig.workspace_lower, rig.workspace_upper
             )
             first, turn = Rotation.from_rotvec(rng.normal(size=3) * 0.2), rng.normal(size=3) * 0.1
-            free = turning_edge_free(world, start, end, first.as_matrix(), turn)
+            free = rotating_edge_free(world, start, end, first.as_matrix(), turn)
             least = min(
                 oracle.pose_distance(
                     rig,
@@ -93,7 +93,7 @@ def test_an_edge_without_turn_is_decided_as_a_translation() -> None:
         for _ in range(4):
             start = rng.uniform(GACHON.workspace_lower, GACHON.workspace_upper)
             end = rng.uniform(GACHON.workspace_lower, GACHON.workspace_upper)
-            as_turning = turning_edge_free(world, start, end, np.eye(3), still)
+            as_turning = rotating_edge_free(world, start, end, np.eye(3), still)
             near_limit = abs(edge_clearance(world, start, end)[0] - 0.01) < 1e-8
             assert as_turning == edge_free(world, start, end) or near_limit
 
@@ -101,8 +101,8 @@ def test_an_edge_without_turn_is_decided_as_a_translation() -> None:
 def test_a_turn_that_is_not_a_number_is_never_free() -> None:
     world = build_world(GACHON, random_scene(np.random.default_rng(0), GACHON, 0), np.eye(3), 0.0)
     home = GACHON.home.position
-    assert turning_edge_free(world, home, home, np.eye(3), np.array([0.1, 0.0, 0.0]))
-    assert not turning_edge_free(world, home, home, np.eye(3), np.array([np.nan, 0.0, 0.0]))
+    assert rotating_edge_free(world, home, home, np.eye(3), np.array([0.1, 0.0, 0.0]))
+    assert not rotating_edge_free(world, home, home, np.eye(3), np.array([np.nan, 0.0, 0.0]))
 
 
 def test_a_platform_that_only_turns_into_an_obstacle_is_refused() -> None:
@@ -117,4 +117,4 @@ def test_a_platform_that_only_turns_into_an_obstacle_is_refused() -> None:
         pytest.fail("choose a seed whose ball is inside the workspace")
     world = build_world(GACHON, scene, np.eye(3), 0.0)
     quarter = np.array([0.0, 0.0, np.pi / 2.0])
-    assert not turning_edge_free(world, position, position, np.eye(3), quarter)
+    assert not rotating_edge_free(world, position, position, np.eye(3), quarter)

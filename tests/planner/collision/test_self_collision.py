@@ -21,7 +21,7 @@ from planner.collision.world import (
     build_world,
     self_edge_free,
     self_edges_free,
-    self_turning_edge_free,
+    self_rotating_edge_free,
 )
 from planner.kernels.primitives import segment_pair_squared
 from tests.planner.collision.sampled_oracle import changed_rig, random_scene
@@ -116,7 +116,7 @@ def test_turning_edges_keep_the_self_clearance_they_are_accepted_with(rig: Rig) 
         end = np.clip(start + rng.normal(size=3) * 0.05, low, high)
         first = Rotation.from_rotvec(rng.normal(size=3) * 0.05)
         turn = rng.normal(size=3) * 0.1
-        allowed = self_turning_edge_free(world, robot, start, end, first.as_matrix(), turn)
+        allowed = self_rotating_edge_free(world, robot, start, end, first.as_matrix(), turn)
         turns = (first * Rotation.from_rotvec(shares[:, None] * turn)).as_matrix()
         least = float(gaps(rig, start + shares[:, None] * (end - start), turns).min())
         answers.append(allowed)

@@ -18,7 +18,7 @@ from planner.collision.world import (
     build_robot,
     build_world,
     self_edges_free,
-    self_turning_edge_free,
+    self_rotating_edge_free,
     unproved_robot,
 )
 from tests.planner.collision.random_builds import GACHON, Build, random_build, rig_of
@@ -102,7 +102,7 @@ def test_rigs_with_anchors_off_the_box_of_their_platform_have_free_edges() -> No
         assert model.self_clearances(positions, level).min() > 0.005
     assert self_edges_free(world, robot, np.tile(home, (3, 1)), ends).all()
     turn = np.array([0.0, 0.0, 0.01])
-    assert self_turning_edge_free(world, robot, home, ends[1], np.eye(3), turn)
+    assert self_rotating_edge_free(world, robot, home, ends[1], np.eye(3), turn)
 
 
 @pytest.mark.parametrize("turns", [False, True])
@@ -120,10 +120,10 @@ def test_edges_of_every_build_are_free_up_to_touching_and_no_further(turns: bool
             if least > close:
                 tested["free"] += 1
                 robot = unproved_robot(rig, world, least - close)
-                assert self_turning_edge_free(world, robot, *args)
+                assert self_rotating_edge_free(world, robot, *args)
             tested["refused"] += 1
             robot = unproved_robot(rig, world, max(least, 0.0) + CLOSE)
-            assert not self_turning_edge_free(world, robot, *args)
+            assert not self_rotating_edge_free(world, robot, *args)
     assert min(tested.values()) > 60
 
 

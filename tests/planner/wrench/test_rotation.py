@@ -21,7 +21,7 @@ from model.statics.wrench_sets import rms_anchor_radius
 from planner.collision.world import build_world
 from planner.kernels.scene_arrays import World
 from planner.wrench.capacity import LoadArrays, build_load, load_at, margin_at
-from planner.wrench.rotation import column_motion, turning_edge_held
+from planner.wrench.rotation import column_motion, rotating_edge_held
 from planner.wrench.translation import build_holding, edge_held
 from tests.planner.collision.sampled_oracle import changed_rig
 
@@ -115,7 +115,7 @@ def test_turning_edges_that_are_held_keep_the_reserve_at_every_sample(
     held_count, refused = 0, 0
     for edge, margins in margins_along_edges(rig, scene):
         reserve, least = max(share * margins[12], 0.0), margins.min()
-        if turning_edge_held(world, load, reserve, *edge):
+        if rotating_edge_held(world, load, reserve, *edge):
             held_count += 1
             assert least >= reserve - 1e-9 * rig.max_tension
         else:
@@ -161,7 +161,7 @@ def test_without_a_turn_the_answer_is_that_of_translations() -> None:
     answers = []
     for _ in range(60):
         start, end, _, _ = random_edge(rng, GACHON)
-        still = turning_edge_held(world, load, 6.0, start, end, np.eye(3), np.zeros(3))
+        still = rotating_edge_held(world, load, 6.0, start, end, np.eye(3), np.zeros(3))
         answers.append((still, edge_held(world, load, bare, start, end)))
     assert len(set(answers)) == 2
     assert all(one == other for one, other in answers)
@@ -170,8 +170,8 @@ def test_without_a_turn_the_answer_is_that_of_translations() -> None:
 def test_a_turn_that_is_not_a_number_is_never_held() -> None:
     world, load = made(GACHON, PAPER)
     home, turn = GACHON.home.position, np.array([0.0, np.nan, 0.0])
-    assert turning_edge_held(world, load, 0.0, home, home, np.eye(3), np.zeros(3))
-    assert not turning_edge_held(world, load, 0.0, home, home, np.eye(3), turn)
+    assert rotating_edge_held(world, load, 0.0, home, home, np.eye(3), np.zeros(3))
+    assert not rotating_edge_held(world, load, 0.0, home, home, np.eye(3), turn)
 
 
 def test_a_turn_too_far_for_the_cables_is_refused() -> None:
@@ -179,4 +179,4 @@ def test_a_turn_too_far_for_the_cables_is_refused() -> None:
     world, load = made(GACHON, PAPER)
     home = GACHON.home.position
     once_around = np.array([2.0 * np.pi, 0.0, 0.0])
-    assert not turning_edge_held(world, load, 0.0, home, home, np.eye(3), once_around)
+    assert not rotating_edge_held(world, load, 0.0, home, home, np.eye(3), once_around)
