@@ -79,7 +79,13 @@ def _watchdog(drives: OdriveDocument) -> float:
 
 
 def coasting_distance(
-    rig: Rig, loads: Sequence[Load], positions: Array, rotations: Array, margin: float
+    rig: Rig,
+    loads: Sequence[Load],
+    positions: Array,
+    rotations: Array,
+    margin: float,
+    *,
+    turns: bool,
 ) -> float:
     """How far inertia carries a point of the platform after its winches have stopped, [m].
 
@@ -93,6 +99,7 @@ def coasting_distance(
         positions: Of the platform's origin along the path, world frame, shape (n, 3), [m].
         rotations: ``world_from_platform``, shape (n, 3, 3).
         margin: Smallest capacity margin of the path, F, [N].
+        turns: Whether the platform rotates along it.
     """
     radius = rms_anchor_radius(rig.anchors)
     anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
@@ -106,7 +113,6 @@ def coasting_distance(
         return inf
     mass = rig.mass + max((load.payload_mass for load in loads), default=0.0)
     lever = max((largest_lever(rig, load) for load in loads), default=rig.reach)
-    turns = bool(np.abs(rotations - rotations[0]).max() > 0.0)
     spread = hypot(1.0, lever / radius) if turns else 1.0
     energy = 0.5 * mass * (spread * rig.motion.speed) ** 2
     return hypot(1.0, rig.reach / radius) * (sqrt(2.0 * energy / weakest) + energy / margin)

@@ -390,7 +390,8 @@ def stopping_text(rig: Rig) -> str:
 
     lost, home = lost_master(rig), rig.home
     margin = rig.at(home).capacity_margin
-    coasting = coasting_distance(rig, (), home.position[None], home.rotation[None], margin)
+    at_home = home.position[None], home.rotation[None]
+    coasting = coasting_distance(rig, (), *at_home, margin, turns=False)
     return (
         f"without the master, drives stop by {lost.noticed_by} after {lost.notice * 1000:.0f} ms:"
         f" up to {lost.distance * 1000:.1f} mm at {rig.motion.speed * 1000:g} mm/s,"

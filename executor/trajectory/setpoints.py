@@ -272,8 +272,9 @@ def check_table(rig: Rig, scene: Scene, table: Trajectory) -> CheckedTrajectory:
         )
     loads = [leg.scene.load for leg in legs_of(scene)]
     margin, clearance = report.proved_capacity_margin, report.proved_obstacle_clearance
-    coasting = coasting_distance(rig, loads, table.positions, table.rotations, margin)
-    require_stopping_room(rig, clearance, coasting, turns=table.turns)
+    path, turns = (table.positions, table.rotations), table.turns
+    coasting = coasting_distance(rig, loads, *path, margin, turns=turns)
+    require_stopping_room(rig, clearance, coasting, turns=turns)
     return CheckedTrajectory(table, rig, table.hash, report, WinchMap(rig), _PROOF)
 
 

@@ -721,9 +721,10 @@ def test_inertia_carries_the_platform_no_farther_than_the_coasting_distance(
         farthest = max(farthest, float(np.linalg.norm(travel)))
     positions, rotations = heavy.home.position[None], heavy.home.rotation[None]
     margin = heavy.at(heavy.home).capacity_margin
-    bound = coasting_distance(heavy, (), positions, rotations, margin)
+    bound = coasting_distance(heavy, (), positions, rotations, margin, turns=False)
     assert 0.0 < farthest <= bound < math.inf
-    assert coasting_distance(heavy, (), positions, rotations, 0.0) == math.inf
+    unheld = coasting_distance(heavy, (), positions, rotations, 0.0, turns=False)
+    assert unheld == math.inf
 
 
 def test_impatient_drives_are_said_to_stop_sooner(rig: Rig, tmp_path: Path) -> None:
