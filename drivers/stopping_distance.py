@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import hypot
+from math import hypot, inf, sqrt
+
+import numpy as np
 
 from drivers.can_load import heartbeat_timeout
 from model.errors import Refused
 from model.files.rig_file import Cia402Document, OdriveDocument
+from model.kinematics import cables_to, structure_matrix_of
+from model.pose import Array
 from model.rig import Rig
-from model.statics.wrench_sets import rms_anchor_radius
+from model.scene import Load
+from model.statics.gravity import largest_lever
+from model.statics.wrench_sets import rms_anchor_radius, with_scaled_moments
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +26,8 @@ class LostMaster:
     Attributes:
         noticed_by: Missing message: SYNC, the heartbeat, or set-points.
         notice: Time until the last drive begins to stop, [s].
-        distance: Travel of every point of the platform until it stops, without rotation, [m].
+        distance: Travel of every point of the platform until the winches stop, without rotation,
+            [m]; its inertia adds `coasting_distance`.
         distance_turning: Largest travel of any point where the platform rotates, [m].
     """
 
@@ -70,19 +78,60 @@ def _watchdog(drives: OdriveDocument) -> float:
     return (drives.watchdog_ms or 0.0) / 1000.0
 
 
-def require_stopping_room(rig: Rig, clearance: float, *, turns: bool) -> None:
+def coasting_distance(
+    rig: Rig,
+    loads: Sequence[Load],
+    positions: Array,
+    rotations: Array,
+    margin: float,
+    *,
+    turns: bool,
+) -> float:
+    """How far inertia carries a point of the platform after its winches have stopped, [m].
+
+    The cables stretch until they have taken up the kinetic energy E of platform and payload, with
+    at least the stiffness k of the weakest direction, and at most the force F that the tension
+    limits leave: √(2 E / k) + E / F. The first alone holds for small E, the second for large.
+
+    Args:
+        rig: The robot, whose motion has the path's speed.
+        loads: Payloads carried along the path.
+        positions: Of the platform's origin along the path, world frame, shape (n, 3), [m].
+        rotations: ``world_from_platform``, shape (n, 3, 3).
+        margin: Smallest capacity margin of the path, F, [N].
+        turns: Whether the platform rotates along it.
+    """
+    radius = rms_anchor_radius(rig.anchors)
+    anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
+    cables = cables_to(rig, anchors)
+    columns = with_scaled_moments(structure_matrix_of(cables, positions), radius)
+    behind = np.array([winch.drum_to_outlet for winch in rig.winches])
+    per_metre = rig.cable_stiffness / (cables.lengths + behind)
+    stiffness = (columns * per_metre[:, None, :]) @ columns.swapaxes(1, 2)
+    weakest = float(np.linalg.eigvalsh(stiffness)[:, 0].min())
+    if not (margin > 0.0 and weakest > 0.0):
+        return inf
+    mass = rig.mass + max((load.payload_mass for load in loads), default=0.0)
+    lever = max((largest_lever(rig, load) for load in loads), default=rig.reach)
+    spread = hypot(1.0, lever / radius) if turns else 1.0
+    energy = 0.5 * mass * (spread * rig.motion.speed) ** 2
+    return hypot(1.0, rig.reach / radius) * (sqrt(2.0 * energy / weakest) + energy / margin)
+
+
+def require_stopping_room(rig: Rig, clearance: float, coasting: float, *, turns: bool) -> None:
     """Requires that the platform stops before it touches an obstacle after a loss of the master.
 
     Args:
         rig: The robot.
         clearance: Proved for the whole path, [m]; infinite without obstacles.
+        coasting: The `coasting_distance` along it, [m].
         turns: Whether the platform rotates along it.
 
     Raises:
         Refused: The clearance is smaller than the distance to a stop.
     """
     lost = lost_master(rig)
-    distance = lost.distance_turning if turns else lost.distance
+    distance = coasting + (lost.distance_turning if turns else lost.distance)
     if clearance >= distance:
         return
     where = " along a path that rotates the platform" if turns else ""
@@ -91,7 +140,7 @@ def require_stopping_room(rig: Rig, clearance: float, *, turns: bool) -> None:
         f" platform travels up to {distance * 1000:.1f} mm",
         where="set-point table",
         why=f"the drives detect the loss by {lost.noticed_by} after {lost.notice * 1000:.0f} ms, at"
-        f" {rig.motion.speed * 1000:g} mm/s{where}",
+        f" {rig.motion.speed * 1000:g} mm/s{where}; its inertia adds {coasting * 1000:.2g} mm",
         next_step="plan with a larger clearance, or lower motion.speed_mm_s; nothing was armed",
         values={"clearance_mm": clearance * 1000.0, "distance_mm": distance * 1000.0},
     )

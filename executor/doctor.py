@@ -378,11 +378,15 @@ def examine(rig: Rig) -> Examined:
 
 def stopping_text(rig: Rig) -> str:
     """Stopping distance after loss of the master, which plans must keep as clearance."""
-    from drivers.stopping_distance import lost_master  # needs python-can
+    from drivers.stopping_distance import coasting_distance, lost_master  # needs python-can
 
-    lost = lost_master(rig)
+    lost, home = lost_master(rig), rig.home
+    margin = rig.at(home).capacity_margin
+    at_home = home.position[None], home.rotation[None]
+    coasting = coasting_distance(rig, (), *at_home, margin, turns=False)
     return (
         f"without the master, drives stop by {lost.noticed_by} after {lost.notice * 1000:.0f} ms:"
         f" up to {lost.distance * 1000:.1f} mm at {rig.motion.speed * 1000:g} mm/s,"
-        f" {lost.distance_turning * 1000:.1f} mm where the platform rotates"
+        f" {lost.distance_turning * 1000:.1f} mm where the platform rotates; its inertia adds"
+        f" {coasting * 1000:.2g} mm at home"
     )

@@ -16,6 +16,7 @@ from executor.cameras.client import static_pose
 from executor.cameras.open import measure_at_rest
 from executor.cameras.sources import choose_one_camera, require_synthetic_images
 from executor.control.winch_laws import PretensionLaw, wind_in_speed
+from executor.control.winch_loop import MakeLaw
 from executor.control.winch_motion import WinchResult
 from executor.drives import is_simulated, require_own_time
 from executor.interlock.interlock import MotionInterlock
@@ -36,6 +37,7 @@ from model.errors import (
     sequence_of,
     truth_value,
 )
+from model.kinematics import cable_lengths
 from model.pages.page import FactsDisplay
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
@@ -48,6 +50,8 @@ from tracking.clearance import require_stated_errors
 FURTHEST, FASTEST = 0.200, 0.010
 #: Defaults: reach [m], speed [m/s], number of images, and slack of simulated cables, [m].
 REACH, SPEED, PICTURES, SLACK = 0.050, 0.002, 20, 0.005
+#: Longest duration of winding in, [s].
+LONGEST = 3600.0
 #: Largest pretension, as a share of the limit.
 _SHARE_OF_LIMIT = 0.8
 #: Smallest and largest number of images for the pose.
@@ -103,8 +107,8 @@ def home(
     """Pretensions all cables, then references the drives at a known pose.
 
     All winches wind in slowly and together, each until its cable carries the pretension. A tension
-    above the limit, or a cable still slack after the full reach, stops all. Give exactly one of
-    `at_home`, `pose` and `camera`.
+    above the limit, or a cable still slack after the full reach and its elastic stretch, stops all.
+    Give exactly one of `at_home`, `pose` and `camera`.
 
     Args:
         rig: The robot and its bus.
@@ -114,7 +118,7 @@ def home(
         tension: Pretension, [N]; None for the tensions planned at a stated pose, at most 80 % of
             the limit, or with a camera for twice the rig's smallest tension.
         limit: Largest tension of any cable, [N]; None for 60 % of the rig's range.
-        reach: Largest length of cable wound in, [m].
+        reach: Largest length of cable wound in besides its elastic stretch, [m].
         speed: Largest winch speed, [m/s].
         pictures: Number of images for the pose.
         simulated_slack: Largest slack of simulated cables, [m].
@@ -154,6 +158,7 @@ def home(
     limit = limit_of(rig, limit)
     targets = _targets(rig, tension, known, limit)
     speed = min(speed, rig.motion.speed)
+    law = _winding_in(rig, known or rig.home, targets, limit, reach, speed)
     interlock = MotionInterlock(rig)
     made: list[HomingReference] = []
 
@@ -180,7 +185,7 @@ def home(
             pose=known or rig.home,
             limit=limit,
             speed=speed,
-            make_law=partial(PretensionLaw, targets=targets, limit=limit, reach=reach, speed=speed),
+            make_law=law,
             lost_power=lost_power,
             realtime=realtime,
             need_real_time_rights=need_real_time_rights,
@@ -239,6 +244,31 @@ def _require_slow(reach: float, speed: float) -> None:
                 where="home",
                 next_step=f"give a smaller {name}",
             )
+
+
+def _winding_in(
+    rig: Rig, pose: Pose, targets: Array, limit: float, reach: float, speed: float
+) -> MakeLaw:
+    """The law that winds in slack up to the reach, [m], and the cables' stretch at a pose.
+
+    Raises:
+        Refused: It would take longer than `LONGEST`, as with a stiffness in Pa.
+    """
+    slowest = float(wind_in_speed(rig, targets, limit, speed).min())
+    if reach > LONGEST * slowest:
+        raise Refused(
+            f"winding in {reach * 1000:g} mm would take {reach / slowest / 3600.0:.2g} hours",
+            where="home",
+            why=f"a cable with E·A = {rig.cable_stiffness.max():.3g} N gains tension so fast that"
+            f" it is wound in at {slowest * 1e6:.2g} µm/s",
+            next_step="check cables.stiffness_n, which is E·A in N, not E in Pa; or give a higher"
+            " limit or a shorter reach; nothing was moved",
+        )
+    lengths = cable_lengths(rig, pose) + [winch.drum_to_outlet for winch in rig.winches]
+    stretch = lengths * targets / (rig.cable_stiffness + targets)
+    return partial(
+        PretensionLaw, targets=targets, limit=limit, reach=reach, speed=speed, stretch=stretch
+    )
 
 
 def _stated_pose(rig: Rig, pose: Pose | None) -> Pose:

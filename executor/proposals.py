@@ -174,7 +174,7 @@ def homing_proposal(
         return [
             ("rig", rig.name),
             ("pretension", f"{pull} N per cable, at most {limit:g} N"),
-            ("winches", f"all together, {speed}"),
+            ("winches", f"all together, {speed}, plus stretch"),
             ("pose", measured),
             ("bus", f"{bus.interface} {bus.channel}".strip()),
         ]

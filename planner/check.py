@@ -7,16 +7,18 @@ sampled along the path, and bounded between samples by how fast it can change (`
   rotation and pulleys by separating planes over whole intervals;
 * self clearance: by what two points of the robot can move relative to each other, per metre of
   translation and per radian of rotation;
-* capacity margin: by the sum of what each cable's wrench can change at its largest tension.
+* capacity margin, which must cover the motion's inertia: by the sum of what each cable's wrench can
+  change at its largest tension.
 
-Tensions and cable speeds are those at the samples, at most 5 mm apart; the capacity margin proves
-that tensions within the limits exist everywhere between. Where the platform rotates, the scene's
-rotation limits are compared in closed form.
+Tensions, at rest, and cable speeds are those at the samples, at most 5 mm apart; the capacity
+margin proves that tensions within the limits exist everywhere between. Where the platform rotates,
+the scene's rotation limits are compared in closed form.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -29,7 +31,12 @@ from model.pose import Array, Pose, interpolate
 from model.rig import Rig
 from model.scene import Scene, legs_of
 from model.statics.feasibility import WrenchBox, capacity_margin
-from model.statics.gravity import STANDARD_GRAVITY, weight_wrench, working_tensions
+from model.statics.gravity import (
+    STANDARD_GRAVITY,
+    inertial_wrench,
+    weight_wrench,
+    working_tensions,
+)
 from model.statics.tension_distribution import TensionInfeasible
 from model.statics.wrench_sets import rms_anchor_radius
 from planner.bounds import Smallest, smallest_along, smallest_over_intervals
@@ -51,6 +58,8 @@ NEAR_AXIS = "is too close to its pulley's axis to bound its motion"
 """Violation of that distance, after the cable's name."""
 SLOWER = "reduce motion.speed_mm_s, or correct winches[].max_speed_mm_s, in the rig file"
 """What to do about winches that are slower than a path needs at the rig's path speed."""
+GENTLER = "reduce motion.acceleration_mm_s2, or motion.speed_mm_s, in the rig file"
+"""What to do about cables that hold the platform, but cannot also accelerate it."""
 CLEARANCE_TOLERANCE = 0.1e-3
 """Tolerance of the smallest clearances, [m]."""
 SELF_CLEARANCE_SHARE = 0.01
@@ -77,11 +86,10 @@ def verify(plan: Plan, rig: Rig | None = None) -> VerifiedPlan:
     """
     report = check_path(rig or plan.rig, plan.scene, plan.waypoints, plan.stops)
     if not report.passed:
-        too_fast = all(violation.unit == "mm/s" for violation in report.violations)
         raise PlanRejected(
             report,
             where=f"plan for {plan.rig.name} in {plan.scene.name}",
-            next_step=f"{SLOWER if too_fast else 'plan again with `cdpr plan`'}; nothing has moved",
+            next_step=f"{report.cure or 'plan again with `cdpr plan`'}; nothing has moved",
         )
     return verified(plan, report)
 
@@ -147,6 +155,7 @@ class _Check:
         self.model = ClearanceModel(rig, scene)
         self.violations: list[Violation] = []
         self.length_unit = rms_anchor_radius(rig.anchors)
+        self.inertia = inertial_wrench(rig, scene.load, turns=path.turns)
         is_far = self._check_workspace()
         self.samples = np.empty(0) if is_far else path.samples(SPACING)
         self._poses = {sample: path.pose(sample) for sample in self.samples.tolist()}
@@ -163,21 +172,18 @@ class _Check:
         own, own_proof = self._self_clearance()
         margin = self._margin()
         tensions, speed = self._tensions(), self._cable_speed()
-        return CheckReport(
-            length=self.path.length,
+        return replace(
+            self._unchecked(),
             samples=obstacle_proof.samples if obstacle_proof else own_proof.samples,
             obstacle_clearance=obstacle,
             proved_obstacle_clearance=obstacle_proof.proved if obstacle_proof else float("inf"),
-            required_obstacle_clearance=self.scene.obstacle_clearance,
             self_clearance=own,
             proved_self_clearance=own_proof.proved,
-            required_self_clearance=self.scene.self_clearance,
             min_tension=tensions[0],
             max_tension=tensions[1],
             capacity_margin=margin.value,
             proved_capacity_margin=margin.proved,
             max_cable_speed=speed,
-            violations=tuple(self.violations),
         )
 
     def _unchecked(self) -> CheckReport:
@@ -185,18 +191,10 @@ class _Check:
         first = self.path.poses[0]
         return CheckReport(
             length=self.path.length,
-            samples=0,
-            obstacle_clearance=None,
-            proved_obstacle_clearance=-np.inf,
             required_obstacle_clearance=self.scene.obstacle_clearance,
             self_clearance=Closest(self.model.self_clearance(first), first, 0.0),
-            proved_self_clearance=-np.inf,
             required_self_clearance=self.scene.self_clearance,
-            min_tension=np.nan,
-            max_tension=np.nan,
-            capacity_margin=-np.inf,
-            proved_capacity_margin=-np.inf,
-            max_cable_speed=np.inf,
+            required_capacity_margin=self.inertia,
             violations=tuple(self.violations),
         )
 
@@ -346,15 +344,17 @@ class _Check:
         self._smallest_violation(what, proof, required, "mm")
 
     def _smallest_violation(
-        self, what: tuple[str, str], proof: Smallest, limit: float, unit: str
+        self, what: tuple[str, str], proof: Smallest, limit: float, unit: str, cure: str = ""
     ) -> None:
         """``what`` is said of a sample below the limit, and of a bound below it between samples."""
         below, unproved = what
         position = self._pose(proof.at).position
         if not proof.value >= limit:
-            self._violation(below, proof.value, limit, unit, position)
+            found = Violation(below, proof.value, limit, unit, position, cure=cure)
+            self.violations.append(found)
         elif not proof.proved >= limit:
-            self._violation(unproved, proof.value, limit, unit, position, proof.proved)
+            found = Violation(unproved, proof.value, limit, unit, position, proof.proved)
+            self.violations.append(found)
 
     def _margin(self) -> Smallest:
         load = self.scene.load
@@ -370,12 +370,18 @@ class _Check:
             )
 
         tolerance = MARGIN_TOLERANCE * self.rig.max_tension
-        found = smallest_along(self.samples, evaluate, self._margin_change(), 0.0, tolerance)
-        what = (
-            "the cables cannot hold every required load: capacity margin",
-            "capacity margin not proved between samples",
-        )
-        self._smallest_violation(what, found, 0.0, "N")
+        change = self._margin_change()
+        found = smallest_along(self.samples, evaluate, change, self.inertia, tolerance)
+        below, limit, cure = "hold every required load", 0.0, ""
+        if found.value >= 0.0:
+            below, limit, cure = (
+                "accelerate the platform by its motion limits",
+                self.inertia,
+                GENTLER,
+            )
+        below = f"the cables cannot {below}: capacity margin"
+        unproved = "capacity margin not proved between samples"
+        self._smallest_violation((below, unproved), found, limit, "N", cure)
         return found
 
     def _margin_change(self) -> Callable[[Array], Array]:
@@ -427,21 +433,15 @@ class _Check:
         at, cable = np.unravel_index(np.argmax(speeds - limits), speeds.shape)
         if not speeds[at, cable] <= limits[cable]:
             what = f"cable {cable + 1} would have to move faster than its winch can"
-            figures = speeds[at, cable], limits[cable]
-            self._violation(what, *figures, "mm/s", poses[at].position)
+            figures = float(speeds[at, cable]), float(limits[cable])
+            found = Violation(what, *figures, "mm/s", poses[at].position, cure=SLOWER)
+            self.violations.append(found)
         return float(speeds.max())
 
     def _violation(
-        self,
-        what: str,
-        measured: float,
-        limit: float,
-        unit: str,
-        position: Array,
-        proved: float | None = None,
+        self, what: str, measured: float, limit: float, unit: str, position: Array
     ) -> None:
-        figures = float(measured), float(limit)
-        self.violations.append(Violation(what, *figures, unit, position, proved))
+        self.violations.append(Violation(what, float(measured), float(limit), unit, position))
 
 
 def least_axis_distance(rig: Rig) -> float:

@@ -64,6 +64,7 @@ class Violation:
         unit: Unit of display: "mm", "mm/s", "°" or "N".
         position: Of the platform there, shape (3,), [m].
         proved: Lower bound of the value along the path, SI, where only that violates the limit.
+        cure: What to change in the rig file, where another path would not help; else empty.
     """
 
     what: str
@@ -72,6 +73,7 @@ class Violation:
     unit: str
     position: Array
     proved: float | None = None
+    cure: str = ""
 
     def sentence(self) -> str:
         """The violation in words, with figures and platform position."""
@@ -87,9 +89,9 @@ class Violation:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class CheckReport:
-    """The figures of a checked path, SI.
+    """The figures of a checked path, SI; those left out are of a path of which nothing is known.
 
     A ``proved`` value is a lower bound everywhere on the path, between samples too; the smallest
     sample is given beside it with its pose.
@@ -108,29 +110,37 @@ class CheckReport:
         max_tension: Largest working tension at samples, [N]; NaN where there are none.
         capacity_margin: The smallest at samples, [N].
         proved_capacity_margin: [N].
+        required_capacity_margin: Largest wrench that accelerates the platform, [N].
         max_cable_speed: At the rig's path speed, at samples, [m/s].
         violations: Limits that the path violates; empty when it passed.
     """
 
     length: float
-    samples: int
-    obstacle_clearance: Closest | None
-    proved_obstacle_clearance: float
+    samples: int = 0
+    obstacle_clearance: Closest | None = None
+    proved_obstacle_clearance: float = -math.inf
     required_obstacle_clearance: float
     self_clearance: Closest
-    proved_self_clearance: float
+    proved_self_clearance: float = -math.inf
     required_self_clearance: float
-    min_tension: float
-    max_tension: float
-    capacity_margin: float
-    proved_capacity_margin: float
-    max_cable_speed: float
+    min_tension: float = math.nan
+    max_tension: float = math.nan
+    capacity_margin: float = -math.inf
+    proved_capacity_margin: float = -math.inf
+    required_capacity_margin: float
+    max_cable_speed: float = math.inf
     violations: tuple[Violation, ...]
 
     @property
     def passed(self) -> bool:
         """Whether the path keeps every limit."""
         return not self.violations
+
+    @property
+    def cure(self) -> str:
+        """What to change in the rig file, if that alone remedies all violations; else empty."""
+        cures = {violation.cure: None for violation in self.violations}
+        return "" if "" in cures else "; ".join(cures)
 
     @property
     def exactness(self) -> float:
@@ -166,7 +176,8 @@ class CheckReport:
             ("tension", self._tensions()),
             (
                 "capacity margin",
-                f"{self.capacity_margin:.1f} N; proved {self.proved_capacity_margin:.1f} N",
+                f"{self.capacity_margin:.1f} N; proved {self.proved_capacity_margin:.1f} N,"
+                f" required {self.required_capacity_margin:.2g} N to accelerate the platform",
             ),
             ("cable speed", f"up to {self.max_cable_speed * 1000:.1f} mm/s at these poses"),
         ]
@@ -200,6 +211,7 @@ class CheckReport:
             "max_tension_n": _finite(self.max_tension),
             "capacity_margin_n": _finite(self.capacity_margin),
             "proved_capacity_margin_n": _finite(self.proved_capacity_margin),
+            "required_capacity_margin_n": self.required_capacity_margin,
             "max_cable_speed_mm_s": _finite(self.max_cable_speed * 1000.0),
         }
 
@@ -295,6 +307,7 @@ def joined(reports: Sequence[CheckReport], motions: Sequence[float]) -> CheckRep
         max_tension=float(np.max([r.max_tension for r in reports])),
         capacity_margin=min(r.capacity_margin for r in reports),
         proved_capacity_margin=min(r.proved_capacity_margin for r in reports),
+        required_capacity_margin=max(r.required_capacity_margin for r in reports),
         max_cable_speed=max(r.max_cable_speed for r in reports),
         violations=tuple(v for r in reports for v in r.violations),
     )

@@ -16,7 +16,7 @@ from model.scene import Leg, Scene, legs_of
 from model.statics.feasibility import limiting_cables
 from model.statics.tension_distribution import remedy
 from model.statics.wrench_sets import rms_anchor_radius
-from planner.check import NEAR_AXIS, SLOWER, least_axis_distance
+from planner.check import NEAR_AXIS, least_axis_distance
 from planner.check_report import CheckReport
 from planner.costs import capacity_margins, external_wrenches
 from planner.path import LENGTH_ROUND_OFF
@@ -78,8 +78,8 @@ def require_limits_not_searched(rig: Rig, report: CheckReport) -> None:
     """Refuses a path for what is checked but not searched for.
 
     Raises:
-        BadInput: An anchor comes too near its pulley's swivel axis, or all violations are of
-            winches that are slower than every path needs.
+        BadInput: An anchor comes too near its pulley's swivel axis, or all violations are of the
+            rig's motion: its winches are too slow for it, or its cables cannot give the force.
     """
     for violation in report.violations:
         if violation.what.endswith(NEAR_AXIS):
@@ -90,12 +90,12 @@ def require_limits_not_searched(rig: Rig, report: CheckReport) -> None:
                 next_step="add a stop to the scene that leads the platform around that pose, or"
                 " give waypoints to `cdpr.plan_from_waypoints`; no plan was written",
             )
-    if all(violation.unit == "mm/s" for violation in report.violations):
+    if report.cure:
         raise BadInput(
-            report.violations[0].sentence(),
+            "; ".join(violation.sentence() for violation in report.violations),
             where=f"rig {rig.name}",
-            why="the platform moves along every path at motion.speed_mm_s",
-            next_step=SLOWER,
+            why="the search does not avoid poses by the rig's motion limits",
+            next_step=report.cure,
         )
 
 

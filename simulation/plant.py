@@ -179,6 +179,9 @@ def _cross(a: Array, b: Array) -> Array:
 FORCE_TOLERANCE = 1e-7
 """Largest residual force [N] and moment over the platform's reach [N] at an equilibrium."""
 
+ROUND_OFF = 1e-14
+"""The same as a share of the largest E·A, where that is more: the round-off of lengths."""
+
 QUICK_STEPS = 12
 """Steps of Newton's method; it usually takes three, with pulleys more."""
 
@@ -204,6 +207,7 @@ class Plant:
         """
         self._rig = rig
         self.winch_map = WinchMap(rig, stiffness)
+        self._tolerance = max(FORCE_TOLERANCE, ROUND_OFF * float(np.max(self.winch_map.stiffness)))
         self._reach = float(np.max(np.linalg.norm(rig.anchors, axis=1)))
         self._is_supported = False
         self.miscounted: Array = np.zeros(rig.cable_count)
@@ -293,7 +297,7 @@ class Plant:
             rotation,
             tensions,
             self._reach,
-            FORCE_TOLERANCE,
+            self._tolerance,
             QUICK_STEPS,
         )
         if found:
@@ -333,7 +337,7 @@ class Plant:
 
     def _small(self, gradient: Array) -> bool:
         largest = max(np.abs(gradient[:3]).max(), np.abs(gradient[3:]).max() / self._reach)
-        return bool(largest < FORCE_TOLERANCE)
+        return bool(largest < self._tolerance)
 
     def _newton_step(self, pose: Pose, cables: Cables, tensions: Array, gradient: Array) -> Array:
         """A descent direction; damped until the stiffness is positive definite."""

@@ -158,15 +158,17 @@ class RobotView:
             return None
         counts = np.array([drive["position_counts"] for drive in drives], dtype=np.float64)
         tensions = np.array([drive["tension_n"] for drive in drives])
-        lengths = self._winches.strained(
-            self._winches.unstrained_from_counts(counts), np.maximum(tensions, 0.0)
-        )
+        unstrained = self._winches.unstrained_from_counts(counts)
+        lengths = self._winches.strained(unstrained, np.maximum(tensions, 0.0))
         try:
             found = forward_kinematics(self.rig, lengths, self._pose, tolerance=1e-6)
+            planned = working_tensions(self.rig, found.pose, self.scene.load).tensions
         except CdprError:
             return None
+        # As recorded: tensions unlike the planned ones stretch cables as no pose does.
+        more_stretch = float(np.linalg.norm(lengths - self._winches.strained(unstrained, planned)))
         motion = self.rig.motion
-        if not found.worst <= motion.start_tolerance + motion.following_error:
+        if not found.worst <= motion.start_tolerance + motion.following_error + more_stretch:
             return None  # the nearest pose is wrong: a cable is slack, slipped, or wound in alone
         self._pose = found.pose
         return RobotNow(self._pose, tensions.tolist(), self._near(self._pose))

@@ -168,7 +168,7 @@ class PretensionLaw:
 
     def __init__(
         self, rig: Rig, begin: Sequence[int], *, targets: Array, limit: float, reach: float,
-        speed: float,
+        speed: float, stretch: float | Array = 0.0,
     ) -> None:  # fmt: skip
         """Prepares the law.
 
@@ -177,11 +177,13 @@ class PretensionLaw:
             begin: Positions of the drives, [counts].
             targets: Tension at which each cable is taut, shape (m,), [N].
             limit: Largest tension of any cable, [N].
-            reach: Largest length of a cable wound in, [m].
+            reach: Largest length of a cable wound in besides its stretch, [m].
             speed: Largest cable speed, [m/s].
+            stretch: Of each cable at its target, shape (m,), [m].
         """
         self._rig, self._begin = rig, np.array(begin, dtype=np.float64)
-        self._targets, self._reach = targets, reach
+        self._targets, self._stretch = targets, np.full(rig.cable_count, stretch)
+        self._reach = reach + self._stretch
         self._room = TensionHeadroom(float(np.max(targets)), limit)
         self._per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
         self._step = wind_in_speed(rig, targets, limit, speed) * rig.cycle
@@ -216,7 +218,13 @@ class PretensionLaw:
             wanting, np.minimum(self._wound + pace * self._step, self._reach), self._wound
         )
         still_slack = (
-            not_taut(int(cable) + 1, float(pull[cable]), self._reach, self._targets[cable])
+            not_taut(
+                int(cable) + 1,
+                float(pull[cable]),
+                self._reach[cable],
+                self._targets[cable],
+                self._stretch[cable],
+            )
             for cable in np.flatnonzero(short)
         )
         return self._counts(self._wound), (*self._room.used_up(tensions), *still_slack)

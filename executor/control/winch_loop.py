@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from drivers.drive_group import CycleStatus
+from drivers.plausibility import position_limits
 from executor.control.cycle import Feed
 from executor.control.loop import Loop
 from executor.control.preconditions import with_reduced_limits
@@ -27,6 +28,7 @@ from executor.supervision import OperatorRequests, RequestBoard
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
 from model.errors import Refused, StoppedByOperator
 from model.rig import Rig
+from model.winches import WinchMap
 
 _ENDLESS = 10**9
 
@@ -131,7 +133,33 @@ class LawMotion(MotionTask):
         """See `MotionTask`."""
         rig = with_reduced_limits(drives.rig, limit=self.limit, speed=self.speed)
         law = self.make_law(rig, master.read_positions().positions.tolist())
+        _require_reach_allowed(drives.rig, law)
         return WinchLoop(rig, law, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
+
+
+def _require_reach_allowed(rig: Rig, law: WinchLaw) -> None:
+    """Requires that no drive would have to move beyond the limits it was configured with.
+
+    Raises:
+        Refused: A drive would stop at its limit, or take it as a fault.
+    """
+    winches = WinchMap(rig)
+    for drive, (first, farthest) in enumerate(zip(*law.reach, strict=True)):
+        low, high = position_limits(rig, drive, winches)
+        beyond = max(low - farthest, farthest - high)
+        if beyond > 0:
+            per_mm = abs(rig.winches[drive].counts_per_metre) / 1000.0
+            travel = abs(farthest - first) / per_mm
+            name = rig.drive_names[rig.winches[drive].node_id]
+            raise Refused(
+                f"{name} would move by up to {travel:.4g} mm, {beyond / per_mm:.2g} mm beyond its"
+                " position limits",
+                where="winches",
+                why="at the assumed pose no pose in the workspace needs such a cable length; the"
+                " drive would stop at its limit (607Dh), or with a fault (8612h)",
+                next_step="allow a shorter reach or length, or take a pose farther inside the"
+                " workspace box; nothing was enabled",
+            )
 
 
 class WinchesHere:

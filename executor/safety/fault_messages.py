@@ -91,11 +91,12 @@ def over_tension(cable: int, tension: float, limit: float) -> Alarm:
     return Alarm(StopReaction.PATH_STOP, "over_tension", text, cable)
 
 
-def not_taut(cable: int, tension: float, wound: float, target: float) -> Alarm:
-    """A cable is not taut, [N], after a length was wound in, [m]."""
+def not_taut(cable: int, tension: float, wound: float, target: float, stretch: float) -> Alarm:
+    """A cable is not taut, [N], after a length was wound in, its stretch to the target included."""
     text = (
-        f"cable {cable} carries {tension:.1f} N after {wound * 1000:g} mm were wound"
-        f" in; the target is {target:.1f} N. It may be off its drum or pulley, or broken"
+        f"cable {cable} carries {tension:.1f} N after {wound * 1000:.4g} mm were wound"
+        f" in; the target is {target:.1f} N, at which it is stretched by {stretch * 1000:.2g} mm."
+        " It may have more slack, be off its drum or pulley, or be broken"
     )
     return Alarm(StopReaction.PATH_STOP, "not_taut", text, cable)
 

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.stopping_distance import require_stopping_room
+from drivers.stopping_distance import coasting_distance, require_stopping_room
 from executor.trajectory.dwell import (
     Dwell,
     dwell_violations,
@@ -247,8 +247,9 @@ def check_table(rig: Rig, scene: Scene, table: Trajectory) -> CheckedTrajectory:
     Raises:
         Refused: A value is not finite or not an int32; a winch is too fast; a tension is outside
             the rig's limits or tensions do not hold the load; drive positions do not match the
-            poses; ends and dwells do not match the scene's start, stops and goal; or the executed
-            curve fails the independent check.
+            poses; ends and dwells do not match the scene's start, stops and goal; the executed
+            curve fails the independent check, or its clearance is less than the stopping distance
+            when the master is lost.
     """
     found = _number_violations(rig, table) or order_violations(scene, table.dwells, len(table))
     poses = [] if found else table.poses()
@@ -267,8 +268,13 @@ def check_table(rig: Rig, scene: Scene, table: Trajectory) -> CheckedTrajectory:
     if not report.passed:
         raise _refusal(
             [violation.sentence() for violation in report.violations],
-            "plan again, with a larger clearance if that is violated",
+            report.cure or "plan again, with a larger clearance if that is violated",
         )
+    loads = [leg.scene.load for leg in legs_of(scene)]
+    margin, clearance = report.proved_capacity_margin, report.proved_obstacle_clearance
+    path, turns = (table.positions, table.rotations), table.turns
+    coasting = coasting_distance(rig, loads, *path, margin, turns=turns)
+    require_stopping_room(rig, clearance, coasting, turns=turns)
     return CheckedTrajectory(table, rig, table.hash, report, WinchMap(rig), _PROOF)
 
 
@@ -402,8 +408,7 @@ def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:
     """Makes and checks the set-points of a plan.
 
     Raises:
-        Refused: The executed curve violates the scene or the rig, or its clearance is less than the
-            stopping distance when the master is lost.
+        Refused: The executed curve violates the scene or the rig, as for `check_table`.
         TensionInfeasible: A pose on it cannot be held.
     """
     plan = verified.plan
@@ -415,9 +420,7 @@ def prepare(verified: VerifiedPlan, rig: Rig) -> PreparedRun:
         legs.append((path, time_law(path, rig.motion)))
     cycle = rig.cycle
     table = build_table(rig, plan.scene, legs, cycle)
-    checked = check_table(rig, plan.scene, table)
-    require_stopping_room(rig, checked.report.proved_obstacle_clearance, turns=table.turns)
-    return PreparedRun(verified, rig, checked)
+    return PreparedRun(verified, rig, check_table(rig, plan.scene, table))
 
 
 def _keeps_clearance(rig: Rig, scene: Scene) -> IsAllowed:

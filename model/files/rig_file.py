@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
 from model.files.camera_file import CameraDocument, TagsDocument
 from model.files.documents import (
@@ -30,6 +30,15 @@ from model.tag_families import tags_in
 Period = Annotated[int, Field(ge=1, le=1000)]
 Identity = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 FileName = Annotated[str, Field(min_length=1)]
+
+
+def _in_newtons(stiffness: float) -> float:
+    if stiffness > 1e9:  # 80 mm of steel wire rope has 3e8 N
+        raise ValueError(f"must be E·A in N, at most 1e9; {stiffness:g} may be E in Pa")
+    return stiffness
+
+
+Stiffness = Annotated[Positive, AfterValidator(_in_newtons)]
 
 ODRIVE_LAST_NODE = 62
 """Of six bits; 63 is an ODrive without a node id."""
@@ -107,7 +116,7 @@ class CableDocument(Document):
     """Properties that all cables share."""
 
     radius_mm: NonNegative
-    stiffness_n: Positive = Field(description="axial stiffness E·A")
+    stiffness_n: Stiffness = Field(description="axial stiffness E·A")
     min_tension_n: Positive
     max_tension_n: Positive
 
@@ -160,7 +169,7 @@ class WinchDocument(Document):
     brake: bool = Field(
         default=False, description="a brake that closes when the drive has no torque"
     )
-    cable_stiffness_n: Positive | None = Field(
+    cable_stiffness_n: Stiffness | None = Field(
         default=None, description="E·A of its cable; left out, cables.stiffness_n"
     )
 
@@ -382,18 +391,10 @@ class RigDocument(Document):
         ]
 
     def _home_inside(self) -> list[Finding]:
-        box = zip(
-            "xyz",
-            self.workspace.lower_mm,
-            self.platform.home.position_mm,
-            self.workspace.upper_mm,
-            strict=True,
-        )
+        key, home = ("platform", "home", "position_mm"), self.platform.home.position_mm
+        box = zip("xyz", self.workspace.lower_mm, home, self.workspace.upper_mm, strict=True)
         return [
-            (
-                ("platform", "home", "position_mm"),
-                f"{axis} = {value:g} mm is outside the workspace [{low:g}, {high:g}] mm",
-            )
+            (key, f"{axis} = {value:g} mm is outside the workspace [{low:g}, {high:g}] mm")
             for axis, low, value, high in box
             if not low <= value <= high
         ]

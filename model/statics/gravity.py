@@ -1,7 +1,8 @@
-"""The wrench of gravity on platform and payload, and the commanded tensions."""
+"""Wrenches of gravity and inertia on platform and payload, and the commanded tensions."""
 
 from __future__ import annotations
 
+from math import hypot, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,7 @@ from model.errors import BadInput
 from model.kinematics import structure_matrix
 from model.pose import Array, Pose
 from model.statics.tension_distribution import TensionSolution, solve_tensions
+from model.statics.wrench_sets import rms_anchor_radius
 
 if TYPE_CHECKING:
     from model.rig import Rig
@@ -60,6 +62,55 @@ def _weight(mass: float, offset: ArrayLike, name: str) -> NDArray[np.float64]:
     wrench[..., 3] = -arm[..., 1] * weight
     wrench[..., 4] = arm[..., 0] * weight
     return wrench
+
+
+# Inertia. Planned tensions are those at rest; the cables must have this wrench left.
+
+
+RATE_CHANGES = 2.0
+"""A feed hold slows down by the path's acceleration, on top of the deceleration of the path."""
+_BENDING = 1.5
+"""Largest share of ω² in the acceleration of a point per metre: centripetal, and half of it in the
+angular acceleration, as rotation vectors are not added like rotations."""
+
+
+def largest_lever(rig: Rig, load: Load | None = None) -> float:
+    """Distance from the platform's origin within which all mass is, [m].
+
+    A payload counts as a point, or as inside the platform's reach.
+    """
+    centres = [rig.centre_of_mass, *([] if load is None else [load.payload_centre])]
+    return max(rig.reach, *(float(np.linalg.norm(centre)) for centre in centres))
+
+
+def inertial_wrench(rig: Rig, load: Load | None = None, *, turns: bool) -> float:
+    """Largest wrench that accelerates platform and payload along a path, [N].
+
+    Along the path and across it in corners the acceleration keeps to the motion's limit, and its
+    jerk lets it rise to at most √(2 j v), as no rounded corner turns by more than 2 rad.
+
+    Args:
+        rig: The robot, whose motion has the path's limits.
+        load: Payload; none when left out.
+        turns: Whether the platform rotates along the path.
+
+    Returns:
+        Norm of force and moment about the platform's origin, with moments divided by the RMS
+        distance ρ of the anchors: comparable with a capacity margin.
+    """
+    motion, radius = rig.motion, rms_anchor_radius(rig.anchors)
+    carried = 0.0 if load is None else load.payload_mass
+    mass = rig.mass + carried
+    most = RATE_CHANGES * min(motion.acceleration, sqrt(2.0 * motion.jerk * motion.speed))
+    if turns:
+        lever = largest_lever(rig, load)
+        per_length = hypot(1.0, lever / radius)
+        most = most * per_length + _BENDING * lever * (motion.speed / radius) ** 2
+        return mass * most * per_length
+    moment = rig.mass * rig.centre_of_mass
+    if load is not None:
+        moment = moment + carried * load.payload_centre
+    return most * hypot(mass, float(np.linalg.norm(moment)) / radius)
 
 
 # The commanded tensions: one rule for planner, check, executor and plant.

@@ -20,6 +20,7 @@ from scipy.special import chdtr
 from cdpr.console.state import jog_state
 from cdpr.console.view import (
     ELLIPSOID_SCALE,
+    RobotNow,
     RobotView,
     commanded_pose,
     measured_data,
@@ -42,7 +43,7 @@ from model.rig import load_rig
 from model.scene import load_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
-from tests.cli.plans import CONFIGS, RIG, write_short_plan
+from tests.cli.plans import CONFIGS, HALL, RIG, write_short_plan
 from tracking.clearance import clearance_at
 from tracking.measurement import PoseMeasurement
 
@@ -78,6 +79,32 @@ def test_the_closest_pair_is_shown_where_it_is() -> None:
     # The points are on the surfaces, but for the radius of a cable that is nearest.
     assert np.linalg.norm(first - second) == pytest.approx(shown["now"], abs=0.3)
     assert shown["required"] == pytest.approx(1e3 * SCENE.obstacle_clearance)
+
+
+def test_a_large_robot_is_shown_while_its_tensions_are_not_the_planned_ones() -> None:
+    """12 m of rope stretch by millimetres in motion: the record has this pose."""
+    rig = load_rig(HALL)
+    motion = replace(rig.motion, start_tolerance=0.001, following_error=0.002)  # the defaults
+    rig = replace(rig, motion=motion)
+    winches, tensions = WinchMap(rig), working_tensions(rig, rig.home).tensions
+    counts = winches.counts(winches.unstrained(cable_lengths(rig, rig.home), tensions))
+    drives = [
+        {"position_counts": round(float(count)), "tension_n": float(tension)}
+        for count, tension in zip(counts, tensions, strict=True)
+    ]
+
+    def seen_with(more: float, paid_out: float) -> RobotNow | None:
+        first = {
+            "tension_n": drives[0]["tension_n"] + more,
+            "position_counts": drives[0]["position_counts"]
+            + round(paid_out * rig.winches[0].counts_per_metre),
+        }
+        return RobotView(rig, None).take({"folder": "", "drives": [first, *drives[1:]]})
+
+    seen = seen_with(400.0, 0.0)
+    assert seen is not None
+    assert seen.pose.distance_to(rig.home) < 0.030
+    assert seen_with(0.0, 0.050) is None, "slipped"
 
 
 def test_a_run_that_is_under_way_is_seen_in_its_own_scene(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -28,10 +29,13 @@ from drivers.cia402.sdo import NOT_NOW, SetupNetwork
 from drivers.cia402.sdo_jobs import monitoring_off
 from drivers.factory import make_drive_group
 from drivers.plausibility import position_limits
-from drivers.stopping_distance import lost_master, require_stopping_room
+from drivers.stopping_distance import coasting_distance, lost_master, require_stopping_room
 from model.errors import BadInput, CdprError, InvalidFile, Refused
 from model.files.rig_file import RigDocument
+from model.kinematics import cables_at
+from model.pose import Pose
 from model.rig import Rig, rig_from_document
+from model.statics.gravity import STANDARD_GRAVITY, working_tensions
 from model.winches import WinchMap
 from tests.drivers.sdo_server import ScriptedBus, ScriptedDrive, downloads, eds_of
 
@@ -712,11 +716,11 @@ def test_without_sync_monitoring_the_platform_goes_further(
     distance = lost_master(theirs).distance
     assert distance == pytest.approx(millimetres / 1000.0)
     for turns, room in ((False, distance), (True, lost_master(theirs).distance_turning)):
-        require_stopping_room(theirs, room, turns=turns)
-        require_stopping_room(theirs, math.inf, turns=turns)
-        for clearance in (0.99 * room, math.nan):
+        require_stopping_room(theirs, room, 0.0, turns=turns)
+        require_stopping_room(theirs, math.inf, math.inf, turns=turns)
+        for clearance, coasting in ((0.99 * room, 0.0), (room, 0.01 * room), (math.nan, 0.0)):
             with pytest.raises(Refused, match="without its master"):
-                require_stopping_room(theirs, clearance, turns=turns)
+                require_stopping_room(theirs, clearance, coasting, turns=turns)
 
 
 @pytest.mark.parametrize("name", ["rig", "pulley_rig"])
@@ -738,6 +742,40 @@ def test_no_point_of_the_platform_travels_farther_than_the_stopping_distance(
         travels.append(time * speeds.max())
     assert lost.distance < max(travels) <= lost.distance_turning
     assert max(travels) > 0.9 * lost.distance_turning, "the bound is tight"
+
+
+@pytest.mark.parametrize(("mass", "speed"), [(0.4, 0.02), (20.0, 0.5), (60.0, 2.0)])
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.6, -0.64, 0.48)])
+def test_inertia_carries_the_platform_no_farther_than_the_coasting_distance(
+    rig: Rig, mass: float, speed: float, direction: tuple[float, float, float]
+) -> None:
+    """Oracle: a point mass on cables that stretch, and slip on their drums at the largest tension.
+
+    The platform is kept level, as a rotation takes up energy too.
+    """
+    motion = replace(rig.motion, speed=speed)
+    heavy = replace(rig, mass=mass, max_tension=800.0, motion=motion)
+    tensions = working_tensions(heavy, heavy.home).tensions
+    winches = WinchMap(heavy)
+    unstrained = winches.unstrained(cables_at(heavy, heavy.home).lengths, tensions)
+    travel, velocity, farthest = np.zeros(3), speed * np.array(direction), 0.0
+    step = 5e-5 * math.sqrt(mass)
+    while travel @ velocity >= 0.0:
+        cables = cables_at(heavy, Pose(heavy.home.position + travel, heavy.home.rotation))
+        pull = winches.tensions(unstrained, cables.lengths)
+        slipping = pull > heavy.max_tension
+        held = winches.unstrained(cables.lengths, np.full(len(pull), heavy.max_tension))
+        unstrained = np.where(slipping, held, unstrained)
+        force = cables.directions.T @ np.minimum(pull, heavy.max_tension)
+        velocity = velocity + step * (force / mass - (0.0, 0.0, STANDARD_GRAVITY))
+        travel = travel + step * velocity
+        farthest = max(farthest, float(np.linalg.norm(travel)))
+    positions, rotations = heavy.home.position[None], heavy.home.rotation[None]
+    margin = heavy.at(heavy.home).capacity_margin
+    bound = coasting_distance(heavy, (), positions, rotations, margin, turns=False)
+    assert 0.0 < farthest <= bound < math.inf
+    unheld = coasting_distance(heavy, (), positions, rotations, 0.0, turns=False)
+    assert unheld == math.inf
 
 
 def test_impatient_drives_are_said_to_stop_sooner(rig: Rig, tmp_path: Path) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from executor.trajectory.path import Path, rounded
+from executor.trajectory.path import Path as Curve
+from executor.trajectory.path import rounded
 from executor.trajectory.time_scaling import (
     TimeLaw,
     length_to_change,
@@ -20,14 +22,18 @@ from executor.trajectory.time_scaling import (
 )
 from model.errors import Fault
 from model.pose import Pose
-from model.rig import Motion
+from model.rig import Motion, load_rig
+from model.scene import Load
+from model.statics.gravity import RATE_CHANGES, inertial_wrench
+from model.statics.wrench_sets import rms_anchor_radius
 from tests.executor.routes import GACHON, HALL, WEIGHT, always, at_mm, polyline, random_route
 
+NO_LOAD = Load(0.0, np.zeros(3), np.zeros(3), np.zeros(3))
 seeds = st.integers(0, 2**32 - 1)
 motions = st.sampled_from([GACHON, HALL, replace(GACHON, jerk=0.05), replace(HALL, jerk=300.0)])
 
 
-def _sampled(path: Path, law: TimeLaw, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
+def _sampled(path: Curve, law: TimeLaw, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
     times = np.linspace(0.0, law.duration, count)
     return times, np.array([law.at(float(t)) for t in times])
 
@@ -37,7 +43,7 @@ def _largest(values: np.ndarray, order: int, step: float) -> float:
     return float(np.linalg.norm(np.diff(values, order, axis=0), axis=1).max()) / step**order
 
 
-def _route(seed: int, motion: Motion, rotated: bool) -> tuple[Path, TimeLaw]:
+def _route(seed: int, motion: Motion, rotated: bool) -> tuple[Curve, TimeLaw]:
     path = rounded(random_route(seed, rotated), motion.blend_tolerance, WEIGHT, always)
     return path, time_law(path, motion)
 
@@ -55,6 +61,30 @@ def test_speed_acceleration_and_jerk_in_space_keep_their_limits(seed, motion, ro
     # Third differences of a curve that is cubic piece by piece: 3 %.
     rounding = 1e-15 / step**3
     assert _largest(positions, 3, step) <= motion.jerk * 1.03 + rounding
+
+
+@given(seed=seeds, motion=motions, rotated=st.booleans())
+@settings(max_examples=25)
+def test_platform_and_payload_need_no_larger_wrench_than_the_check_asks_for(seed, motion, rotated):
+    """Differences of point masses' executed positions, without the share of a feed hold."""
+    path, law = _route(seed, motion, rotated)
+    rng = np.random.default_rng(seed)
+    rig = load_rig(Path(__file__).parents[2] / "configs" / "gachon_8_6.yaml")
+    anchors = rig.anchors * WEIGHT / rms_anchor_radius(rig.anchors)
+    rig = replace(rig, motion=motion, mass=5.0, anchors=anchors)
+    corners = rig.platform_corners
+    shares = rng.dirichlet(np.ones(len(corners)))
+    rig = replace(rig, centre_of_mass=shares @ corners)
+    load = replace(NO_LOAD, payload_mass=3.0, payload_centre=rng.uniform(-0.2, 0.2, 3))
+    step = law.duration / 4000
+    poses = path.at(np.array([law.at(float(t))[0] for t in np.linspace(0.0, law.duration, 4001)]))
+    points = np.vstack([corners, load.payload_centre])
+    arms = np.einsum("nij,kj->nki", poses[1], points)
+    forces = np.append(5.0 * shares, 3.0)[:, None] * np.diff(arms + poses[0][:, None], 2, axis=0)
+    moments = np.cross(arms[1:-1], forces).sum(axis=1) / WEIGHT
+    wrenches = np.hstack([forces.sum(axis=1), moments]) / step**2
+    needed = float(np.linalg.norm(wrenches, axis=1).max())
+    assert needed <= 1.001 * inertial_wrench(rig, load, turns=rotated) / RATE_CHANGES
 
 
 @given(seed=seeds, motion=motions)

@@ -144,6 +144,23 @@ def test_a_cable_that_stays_slack_is_reported():
     assert "0.3 N" in alarm.text
 
 
+def test_a_soft_cable_is_wound_in_by_its_reach_and_its_stretch():
+    """On a cable that stretches by more than its reach it was reported as slack or broken."""
+    rig = RIGS[0]
+    stretch = np.linspace(0.0, 0.0004, 8)
+    law = PretensionLaw(
+        rig, [0] * 8, targets=TAUT, limit=60.0, reach=1e-4, speed=0.002, stretch=stretch
+    )
+    found, wound = (), np.zeros(8)
+    while not any(alarm.drive == 8 for alarm in found):
+        assert (wound < 1e-4 + stretch - 1e-9)[7]
+        targets, found = law.next(1.0, [0.0] * 8)
+        wound = -np.array(targets) / per_metre(rig)
+    assert wound == pytest.approx(1e-4 + stretch, abs=1.0 / np.abs(per_metre(rig)).min())
+    assert -np.array(law.reach[1]) / per_metre(rig) == pytest.approx(wound)
+    assert "stretched by 0.4 mm" in found[-1].text
+
+
 @settings(max_examples=40, deadline=None)
 @given(length=st.floats(-0.05, 0.05).filter(lambda w: abs(w) > 1e-4), speed=st.floats(1e-3, 0.02))
 def test_one_cable_moves_smoothly_and_the_others_rest(length, speed):

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from planner.bounds import MOST_SAMPLES, smallest_along
-from planner.check import SELF_CLEARANCE_SHARE
+from planner.check import CLEARANCE_TOLERANCE, SELF_CLEARANCE_SHARE, SPACING
+from planner.settings import CLEARANCE_RESERVE
 
 
 def by_position(positions):
@@ -89,6 +90,21 @@ def test_a_plateau_too_long_for_its_tolerance_still_has_its_limit_proved() -> No
     found = smallest_along(positions, lambda x: np.full(len(x), 0.147), by_position, 0.140, 1e-6)
     assert found.proved >= 0.140
     assert found.samples <= 4 * MOST_SAMPLES  # every interval is bisected in the last round
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0])
+@pytest.mark.parametrize("length", [5.0, 12.6, 30.0])
+def test_a_long_path_at_the_planners_reserve_is_proved(length: float, rate: float) -> None:
+    """Along an obstacle for 12.5 m, with pulleys or rotation, a plan failed its own check."""
+    positions = np.linspace(0.0, length, int(np.ceil(length / SPACING)) + 1)
+    found = smallest_along(
+        positions,
+        lambda x: np.full(len(x), 0.010 + CLEARANCE_RESERVE),
+        lambda x: rate * x,
+        0.010,
+        CLEARANCE_TOLERANCE,
+    )
+    assert found.proved >= 0.010
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -26,6 +26,7 @@ from executor.control.winch_laws import CableStep, PretensionLaw, WinchLaw, wind
 from executor.control.winch_loop import LawMotion, WinchesHere
 from executor.control.winch_motion import WinchResult, move_winches, recording, require_held
 from executor.drives import current_pose
+from executor.homing import home
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at, referenced
@@ -371,6 +372,31 @@ def test_a_cable_that_stays_slack_after_its_reach_stops_all() -> None:
         found = next(e.cycle for e in bench.events if e.code == "not_taut")
         assert len({r.targets for r in bench.records if r.cycle >= found - 1}) == 1, "none goes on"
         assert bench.states == {HOLDING}
+
+
+def test_a_reach_beyond_the_position_limits_is_refused_before_anything_moves() -> None:
+    """At a corner of the workspace a cable may be 49 mm shorter than there; 607Dh ends there."""
+    rig = load_rig(RIG)
+    corner = Pose.level(rig.workspace_lower)
+    asked: list[object] = []
+
+    def confirm(_proposal: object) -> bool:
+        asked.append(_proposal)
+        return True
+
+    with pytest.raises(Refused, match=r"cable 7.* beyond its position limits") as refused:
+        home(rig, pose=corner, tension=20.0, reach=0.050, realtime=False, confirm=confirm)
+    assert "nothing was enabled" in refused.value.next_step
+    assert asked
+
+
+def test_winding_in_that_would_take_hours_is_refused() -> None:
+    document = load_rig(RIG).document
+    stiff = document.cables.model_copy(update={"stiffness_n": 9e8})
+    rig = rig_from_document(document.model_copy(update={"cables": stiff}))
+    with pytest.raises(Refused, match="hours") as refused:
+        home(rig, at_home=True, realtime=False)
+    assert "not E in Pa" in refused.value.next_step
 
 
 def test_one_cable_alone_moves_freely_only_while_it_hangs_slack() -> None:

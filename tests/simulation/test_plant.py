@@ -137,6 +137,16 @@ def test_stiff_cables_are_inverse_kinematics(rig: Rig) -> None:
     assert gaps[1] < 1e-6
 
 
+@pytest.mark.parametrize("stiffness", [1e7, 1e9])
+def test_the_stiffest_cables_of_a_rig_file_settle(rig: Rig, stiffness: float) -> None:
+    """A residual force below the round-off of their lengths was never reached."""
+    robot = changed(rig, "cables", stiffness_n=stiffness)
+    goal = Pose.level(robot.home.position + np.array([0.05, -0.03, 0.04]))
+    plant = Plant(robot, robot.home)
+    plant.settle_counts(plant.counts_for(goal, working_tensions(robot, goal).tensions))
+    assert plant.pose.distance_to(goal) < 1e-9
+
+
 def test_a_known_load_lowers_the_platform_by_force_over_stiffness(rig: Rig) -> None:
     """A payload of 0.1 kg against the stiffness taken from the structure matrix."""
     mass = 0.1
