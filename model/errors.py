@@ -201,10 +201,15 @@ def sequence_of(name: str, values: Iterable[T]) -> tuple[T, ...]:
     return tuple(values)
 
 
+def is_masked(value: object) -> bool:
+    """Whether it is a masked scalar of NumPy, which converts to the number behind its mask."""
+    return getattr(value, "shape", None) == () and bool(getattr(value, "mask", False))
+
+
 def is_truth_value(value: object) -> bool:
-    """Whether it is True or False, also NumPy's; ``"no"``, 0 and None are neither."""
+    """Whether it is True or False, also NumPy's; ``"no"``, 0, None and a masked one are neither."""
     of_numpy = getattr(value, "shape", None) == () and str(getattr(value, "dtype", "")) == "bool"
-    return isinstance(value, bool) or of_numpy
+    return isinstance(value, bool) or (of_numpy and not is_masked(value))
 
 
 def truth_value(name: str, value: object) -> bool:
@@ -222,10 +227,10 @@ def real_number(name: str, value: object, unit: str = "") -> float:
     """A number of any type, such as NumPy's, as a float; the caller checks its range.
 
     Raises:
-        BadInput: It is a text, a list or another object, or too large.
+        BadInput: It is a text, a list, masked or another object, or too large.
     """
     single = value.item() if getattr(value, "shape", None) == () else value  # type: ignore[attr-defined]
-    if isinstance(single, bool) or not isinstance(single, Real):
+    if is_masked(value) or isinstance(single, bool) or not isinstance(single, Real):
         raise _unusable(name, f"a number [{unit}]" if unit else "a number", value)
     try:
         return float(single)

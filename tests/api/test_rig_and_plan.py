@@ -184,6 +184,26 @@ def test_masked_values_are_not_used_as_numbers(rig: cdpr.Rig, as_rows: bool) -> 
     assert cdpr.Pose.level(bare).position.tolist() == home.position.tolist()
 
 
+@pytest.mark.parametrize("masked", [np.ma.masked, *(np.ma.array(x, mask=True) for x in (1.0, 1))])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("plan " + name for name in ("budget", "rounds", "seed", "longest", "clearance")),
+        *("plan weights", "workspace_map slices", "workspace_map step", "workspace_map workers"),
+        *("calibrate_rig wanted", "calibrate_rig tilt", "locate_tags wanted", "track pictures"),
+        *("home " + name for name in ("tension", "limit", "reach", "speed", "pictures")),
+        *("jog speed", "measurement_poses dwell", "plan free_rotation", "changed clearance"),
+    ],
+)
+def test_a_masked_scalar_is_not_the_number_behind_its_mask(
+    rig: cdpr.Rig, scene: cdpr.Scene, name: str, masked: Any
+) -> None:
+    """``np.ma.masked`` as a clearance had planned with 0 mm."""
+    inside = {"plan weights": {"length": masked}, "workspace_map slices": [("z", masked)]}
+    with pytest.raises(cdpr.BadInput, match=r"must be .*, it is (masked|--)"):
+        calls_with_a_wrong_argument(name)(rig, scene, inside.get(name, masked))
+
+
 def test_a_pose_that_cannot_be_held_says_so_and_has_no_tensions(rig: cdpr.Rig) -> None:
     above = cdpr.Pose.level(rig.outlets.max(axis=0) + 0.2)
     posed = rig.at(above)
