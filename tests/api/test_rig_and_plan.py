@@ -220,6 +220,15 @@ def test_another_bus_changes_nothing_that_a_plan_rests_on(rig: cdpr.Rig) -> None
     assert rig.document.bus.interface == "virtual"
 
 
+@pytest.mark.parametrize("wrong", [1, 1.5, b"can0", [], True, "x" * 201])
+def test_a_bus_that_cannot_be_is_refused_when_it_is_named(rig: cdpr.Rig, wrong: Any) -> None:
+    """``with_bus("virtual", 1)`` had failed later, in whatever used the rig."""
+    with pytest.raises(cdpr.BadInput, match="Rig.with_bus: channel: "):
+        rig.with_bus("virtual", wrong)
+    with pytest.raises(cdpr.BadInput, match="Rig.with_bus: interface: "):
+        rig.with_bus("" if wrong == "x" * 201 else wrong)
+
+
 def test_a_camera_is_found_by_its_name_or_refused_with_the_names_that_exist(rig: cdpr.Rig) -> None:
     assert rig.camera().name == rig.camera("front").name == "front"
     with pytest.raises(cdpr.BadInput, match="name one of: front"):
