@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from multiprocessing import current_process
 from numbers import Real
 from os import PathLike, fspath
 from pathlib import Path
@@ -188,6 +189,24 @@ def require_functions(**given: object) -> None:
     for name, value in given.items():
         if not (value is None or callable(value)):
             raise _unusable(name, "a function", value)
+
+
+def require_child_processes(use: str, or_else: str = "") -> None:
+    """Requires that this process may start others.
+
+    Args:
+        use: What they are for.
+        or_else: What a caller can do without them, as a clause.
+
+    Raises:
+        BadInput: It may not.
+    """
+    if current_process().daemon:
+        raise BadInput(
+            f"this process cannot start others, for {use}",
+            why="it is daemonic, as a worker of `multiprocessing.Pool` is",
+            next_step="use `concurrent.futures.ProcessPoolExecutor` instead" + or_else,
+        )
 
 
 def sequence_of(name: str, values: Iterable[T]) -> tuple[T, ...]:

@@ -223,9 +223,9 @@ def test_another_bus_changes_nothing_that_a_plan_rests_on(rig: cdpr.Rig) -> None
 @pytest.mark.parametrize("wrong", [1, 1.5, b"can0", [], True, "x" * 201])
 def test_a_bus_that_cannot_be_is_refused_when_it_is_named(rig: cdpr.Rig, wrong: Any) -> None:
     """``with_bus("virtual", 1)`` had failed later, in whatever used the rig."""
-    with pytest.raises(cdpr.BadInput, match="Rig.with_bus: channel: "):
+    with pytest.raises(cdpr.BadInput, match=r"Rig\.with_bus: channel: "):
         rig.with_bus("virtual", wrong)
-    with pytest.raises(cdpr.BadInput, match="Rig.with_bus: interface: "):
+    with pytest.raises(cdpr.BadInput, match=r"Rig\.with_bus: interface: "):
         rig.with_bus("" if wrong == "x" * 201 else wrong)
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from multiprocessing import current_process
 from pathlib import Path
 from typing import Any
 
@@ -289,6 +290,20 @@ def test_only_true_moves(plan: Plan, rig: Rig, tmp_path: Path, answer: Any) -> N
             confirm=lambda _: answer,
         )
     assert not (tmp_path / "run").exists()
+
+
+def test_a_daemonic_process_is_refused_only_where_a_run_needs_another(
+    plan: Plan, rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a worker of `multiprocessing.Pool`; it had been an AssertionError of Python."""
+    monkeypatch.setitem(current_process()._config, "daemon", True)  # type: ignore[attr-defined]
+    folder = tmp_path / "run"
+    for realtime, use in ((True, "drives in real time"), (False, "cameras")):
+        with pytest.raises(BadInput, match=f"cannot start others, for {use}") as caught:
+            runner.run(plan, rig, folder=folder, realtime=realtime)
+        assert "ProcessPoolExecutor" in caught.value.next_step
+        assert not folder.exists()
+    assert runner.run(plan, rig, folder=folder, cameras=(), realtime=False).passed
 
 
 def test_limits_of_the_verbs_are_those_of_the_library(rig: Rig) -> None:
