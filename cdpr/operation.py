@@ -181,7 +181,7 @@ def workspace_map(
         rotation: Of the platform, shape (3, 3) (default: the scene's start, else home).
         characteristic_length: Divides moments in the condition number, [m] (default: the anchors'
             root mean square radius, with which alone the costs are the planner's).
-        workers: Number of processes, at least 1 (default: one per core).
+        workers: Number of processes, at least 1 (default: one per core; one in a child process).
         listener: Receives the progress.
 
     Returns:
