@@ -16,9 +16,9 @@ from executor.control.winch_laws import CableStep
 from executor.drives import current_pose, is_simulated, read_snapshot, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.proposals import CableProposal, Facts, MotionProposal, require_confirmed
-from executor.recording.record_files import free_folder
-from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.run_folder import RunEvent
 from executor.remote.command_server import commands_from_start
+from executor.run_result import folder_maker
 from executor.runner import RunOptions, RunResult, run_prepared
 from executor.supervision import Supervisor
 from executor.trajectory.setpoints import prepare_plan
@@ -26,7 +26,6 @@ from executor.winch_runs import WinchMotion, limit_of, move_by_law
 from model.errors import (
     BadInput,
     Refused,
-    path_of,
     real_number,
     require_functions,
     require_types,
@@ -101,8 +100,7 @@ def jog(
         require_own_time(slow, realtime)
         require_distance(by, to_home=to_home)
         around = empty_scene(slow) if scene is None else scene.changed(stops=())
-        output = free_folder("jog") if folder is None else path_of(folder)
-        RunFolder.require_free(output)
+        make_folder = folder_maker(folder, "jog")
         interlock = MotionInterlock(slow)
         interlock.require_free()
         ready = interlock.referenced_rig()
@@ -118,7 +116,8 @@ def jog(
             confirm=confirm,
             on_event=on_event,
         )
-        return run_prepared(prepare_plan(plan, ready, listener), output, {}, options, commands)
+        prepared = prepare_plan(plan, ready, listener)
+        return run_prepared(prepared, make_folder, {}, options, commands)
 
 
 def with_speed(rig: Rig, speed: float) -> Rig:

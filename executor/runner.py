@@ -37,20 +37,19 @@ from executor.kernels import ready_for_simulating_process
 from executor.proposals import MotionProposal, require_confirmed
 from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
-from executor.recording.record_files import RunCourse, dated_folder
+from executor.recording.record_files import RunCourse, dated_name
 from executor.recording.recorder import Recorder, require_readable_record
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
 from executor.recording.summary import versions
 from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import RunStatus
-from executor.run_result import RunResult
+from executor.run_result import RunResult, folder_maker
 from executor.state_machine import LoopEvent, State
 from executor.supervision import Callbacks, GuardedListener, LocalRequests, Supervisor
 from executor.trajectory.setpoints import PreparedRun, prepare_plan
 from model.errors import (
     CdprError,
     StoppedByOperator,
-    path_of,
     require_functions,
     require_types,
     truth_value,
@@ -153,17 +152,16 @@ def run(
             is_sealed = rig.document.cameras == plan.rig.document.cameras
             require_stated_errors(rig, list(chosen), then=_PASS_THE_RIG if is_sealed else "")
         require_simulated_start(rig, start)
-        output = dated_folder() if folder is None else path_of(folder)
-        RunFolder.require_free(output)
+        make_folder = folder_maker(folder, dated_name())
         interlock = MotionInterlock(rig)
         interlock.require_free()
         prepared = prepare_plan(plan, interlock.referenced_rig(), listener)
-        return run_prepared(prepared, output, chosen, options, commands)
+        return run_prepared(prepared, make_folder, chosen, options, commands)
 
 
 def run_prepared(
     prepared: PreparedRun,
-    output: Path,
+    make_folder: Callable[[], RunFolder],
     cameras: Mapping[Camera, str],
     options: RunOptions,
     commands: Commands,
@@ -174,7 +172,7 @@ def run_prepared(
 
     Args:
         prepared: The checked run.
-        output: Run folder to create.
+        make_folder: See `executor.run_result.folder_maker`.
         cameras: From `resolve_cameras`; empty for none.
         options: Of the run.
         commands: Those taken since the start of the verb.
@@ -190,7 +188,7 @@ def run_prepared(
     with options.listener.waiting("loading the report generator"):
         _preload_results()
     commands.require_no_stop()
-    result = _recorded(_Job(prepared, RunFolder.create(output), cameras, options, commands))
+    result = _recorded(_Job(prepared, make_folder(), cameras, options, commands))
     commands.supervisor.finish()
     return result
 

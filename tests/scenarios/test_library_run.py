@@ -306,6 +306,32 @@ def test_a_daemonic_process_is_refused_only_where_a_run_needs_another(
     assert runner.run(plan, rig, folder=folder, cameras=(), realtime=False).passed
 
 
+def test_runs_that_begin_in_one_second_have_a_default_folder_each(
+    plan: Plan, rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The name is chosen at the end of the preparation: another run may have taken it meanwhile."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runner, "dated_name", lambda: "now")
+
+    def meanwhile(_proposal: MotionProposal) -> bool:
+        RunFolder.create(Path("runs/now"))
+        create = RunFolder.create.__func__  # type: ignore[attr-defined]
+
+        def create_late(kind: type[RunFolder], path: Path) -> RunFolder:
+            if path.name == "now-2" and not path.exists():
+                create(kind, path)
+            return create(kind, path)  # type: ignore[no-any-return]
+
+        monkeypatch.setattr(RunFolder, "create", classmethod(create_late))
+        return True
+
+    result = runner.run(plan, rig, cameras=(), realtime=False, confirm=meanwhile)
+    assert result.folder == Path("runs/now-3")
+    assert result.passed
+    with pytest.raises(BadInput, match="exists already"):
+        runner.run(plan, rig, folder="runs/now", cameras=(), realtime=False)
+
+
 def test_limits_of_the_verbs_are_those_of_the_library(rig: Rig) -> None:
     with pytest.raises(BadInput, match="speed"):
         home(rig, at_home=True, realtime=False, speed=0.011)
