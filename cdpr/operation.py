@@ -201,8 +201,10 @@ def workspace_map(
         name: None if corner is None else point_of(name, corner)
         for name, corner in (("lower", lower), ("upper", upper))
     }
+    length = characteristic_length
+    length = None if length is None else real_number("characteristic_length", length, "m")
     grids = workspace_grids(rig, planes, volume=volume, step=step, **corners)
-    question = Question.about(rig, scene, rotation, characteristic_length)
+    question = Question.about(rig, scene, rotation, length)
     return map_workspace(question, grids, workers=workers, listener=listener)
 
 

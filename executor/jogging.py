@@ -42,7 +42,7 @@ from model.rig import Rig, rig_from_document
 from model.scene import Scene, empty_scene, scene_from_document
 from planner.kernels.jit import KERNELS
 from planner.planning import make_plan
-from planner.settings import OptimalSettings, TurningSettings
+from planner.settings import OptimalSettings, TurningSettings, whole_number
 
 #: Largest length, [mm], and rotation, [deg], of a jog.
 LONGEST_MM, MOST_DEG = 50.0, 10.0
@@ -312,13 +312,16 @@ def jog_cable(
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
 
     Raises:
-        BadInput: There is no such cable, or the length is zero.
+        BadInput: There is no such cable, the length is zero, or an argument is of another type.
         Refused: The length is too long, or the bus is latched.
         Fault: A tension left its limits; all drives stopped together.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
+    require_types((rig, Rig), (listener, Listener))
+    require_functions(confirm=confirm)
     realtime = truth_value("realtime", realtime)
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
+    cable, length = whole_number("cable", cable), real_number("length", length, "m")
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     _require_cable(slow, cable, length)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from multiprocessing import current_process
-from numbers import Real
+from numbers import Integral, Real
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -255,6 +255,24 @@ def real_number(name: str, value: object, unit: str = "") -> float:
         return float(single)
     except OverflowError:
         raise BadInput(f"{name} is too large a number") from None
+
+
+def require_fields(thing: Any) -> None:
+    """Requires values of their types in the fields of a dataclass: text, numbers, truth values.
+
+    Raises:
+        BadInput: One is of another type.
+    """
+    for one in fields(thing):
+        value = getattr(thing, one.name)
+        if one.type == "str":
+            require_text(**{one.name: value})
+        elif one.type == "bool":
+            truth_value(one.name, value)
+        elif one.type == "int" and (isinstance(value, bool) or not isinstance(value, Integral)):
+            raise _unusable(one.name, "a whole number", value)
+        elif one.type == "float":
+            real_number(one.name, value)
 
 
 def positive_number(

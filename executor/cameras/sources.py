@@ -156,8 +156,10 @@ def parse_camera_sources(
         where: Origin of the sources, for messages.
 
     Raises:
-        BadInput: A source is empty, or a camera is unknown, named twice, or not named.
+        BadInput: No or an empty source; a camera is unknown, named twice, or not named.
     """
+    if not sources:
+        raise BadInput("no image source is given", where=where, next_step="name one, such as 0")
     names = [camera.name for camera in rig.cameras]
     for source in sources:
         require_not_empty("the image source", source)
