@@ -334,6 +334,7 @@ class CameraRecord:
 
 #: Initial size of the file, [bytes], so that the end of the run fits on a full disk.
 SIZE = 8192
+_CAMERA_KEYS = set(CameraRecordDocument.model_fields)
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,7 +382,7 @@ class RunCourse:
             kept.final_state,
             kept.cause,
             kept.cycles,
-            tuple(CameraRecord(**dict(camera)) for camera in kept.cameras),
+            tuple(CameraRecord(**one.model_dump(include=_CAMERA_KEYS)) for one in kept.cameras),
             tuple(kept.troubles),
             versions=kept.versions,
         )
