@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from model.errors import BadInput, require_not_empty, sequence_of
+from model.files.reading import is_folder
 from model.rig import Camera, Rig
 
 SYNTHETIC = "synthetic"
@@ -307,7 +308,7 @@ def require_one_kind(sources: Mapping[str, str]) -> None:
 
 
 def _kind(source: str) -> str:
-    if Path(source).is_dir():
+    if is_folder(Path(source)):
         return "a folder"
     if Path(source).is_file():
         return "a video"
