@@ -23,6 +23,7 @@ from executor.cameras.sources import require_camera_source
 from model.cameras import generic_camera
 from model.errors import BadInput, path_of
 from model.files.documents import write_bytes_atomic
+from model.files.reading import files_in, is_folder
 from model.pose import Array
 from model.progress import SILENT, Listener
 from model.rig import Camera
@@ -235,7 +236,7 @@ def open_images(folder: Path) -> ImageSet:
     Raises:
         BadInput: The folder is missing or has no images, or the file is not a video.
     """
-    if folder.is_file():
+    if not is_folder(folder) and folder.is_file():
         return _sampled(VideoFile(folder, generic_camera(video_size(folder))), VIDEO_IMAGES)
     images = SingleCameraImages(folder)
     return ImageSet(images, len(images.names), images.unused)
@@ -259,7 +260,7 @@ def open_source(
     """
     path = path_of(str(source) if isinstance(source, int) else source)
     most = wanted or usual
-    if path.is_dir():
+    if is_folder(path):
         if wanted is not None:
             raise BadInput(
                 "--pictures is for a video or a camera",
@@ -297,7 +298,7 @@ def open_timed_images(source: Path, camera: Camera, rate: float | None) -> Image
     Raises:
         BadInput: It is neither, or its images are of another size.
     """
-    if source.is_dir():
+    if is_folder(source):
         folder = ImageFolder(source, camera, rate)
         return ImageSet(_named_by_time(folder), len(folder), folder.unused)
     if rate is not None:
@@ -425,7 +426,7 @@ def _captured(folder: Path) -> list[Path]:
     Raises:
         BadInput: It has others too, which a calibration would mix with new ones.
     """
-    images = [path for path in folder.iterdir() if path.suffix.lower() in PICTURE_ENDINGS]
+    images = [path for path in files_in(folder) if path.suffix.lower() in PICTURE_ENDINGS]
     others = [path.name for path in images if not re.fullmatch(r"live_\d{3,}\.png", path.name)]
     if others:
         raise BadInput(

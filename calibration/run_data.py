@@ -18,6 +18,7 @@ from calibration.geometry.measurements import (
 from calibration.geometry.result import require_same_nominal
 from executor.recording.run_folder import RunFolder
 from model.errors import BadInput
+from model.files.reading import is_folder
 from model.pose import Pose, interpolate, matrix_from_quaternion
 from model.rig import Rig
 
@@ -28,7 +29,7 @@ def poses_by_picture(path: Path, camera: str) -> Mapping[str, Pose]:
     Raises:
         BadInput: It cannot be read, or the camera took no images in the run.
     """
-    return poses_of_run(path, camera) if path.is_dir() else read_poses(path)
+    return poses_of_run(path, camera) if is_folder(path) else read_poses(path)
 
 
 def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
@@ -74,10 +75,10 @@ def rig_measurements(rig: Rig, data: Sequence[Path]) -> tuple[Rig, RigMeasuremen
         BadInput: A file cannot be read, is of another rig, or is named twice.
     """
     _require_once(data)
-    runs = [(str(path), RunFolder.open(path).rig()) for path in data if path.is_dir()]
+    runs = [(str(path), RunFolder.open(path).rig()) for path in data if is_folder(path)]
     counted = require_same_nominal(rig, runs)
     parts = [
-        _at_rest(path) if path.is_dir() else read_rig_data(path, rig.cable_count) for path in data
+        _at_rest(path) if is_folder(path) else read_rig_data(path, rig.cable_count) for path in data
     ]
     return counted, joined(parts)
 

@@ -12,6 +12,7 @@ from drivers.cameras.live import LiveCamera, VideoFile
 from executor.cameras.sources import parse_camera_sources, require_camera_source
 from executor.track import TrackResult, track_sources
 from model.errors import path_of, require_functions, require_types
+from model.files.reading import is_folder
 from model.plan import Plan
 from model.progress import SILENT, Listener
 from model.rig import Rig
@@ -35,7 +36,7 @@ def open_camera(
     """
     require_types((rig, Rig))
     taken_by, path = rig.camera(camera), path_of(str(source))
-    if path.is_dir():
+    if is_folder(path):
         return ImageFolder(path, taken_by)
     if path.is_file():
         return VideoFile(path, taken_by)

@@ -181,7 +181,7 @@ def workspace_map(
         rotation: Of the platform, shape (3, 3) (default: the scene's start, else home).
         characteristic_length: Divides moments in the condition number, [m] (default: the anchors'
             root mean square radius, with which alone the costs are the planner's).
-        workers: Number of processes, at least 1 (default: one per core).
+        workers: Number of processes, at least 1 (default: one per core; one in a child process).
         listener: Receives the progress.
 
     Returns:
@@ -201,8 +201,10 @@ def workspace_map(
         name: None if corner is None else point_of(name, corner)
         for name, corner in (("lower", lower), ("upper", upper))
     }
+    length = characteristic_length
+    length = None if length is None else real_number("characteristic_length", length, "m")
     grids = workspace_grids(rig, planes, volume=volume, step=step, **corners)
-    question = Question.about(rig, scene, rotation, characteristic_length)
+    question = Question.about(rig, scene, rotation, length)
     return map_workspace(question, grids, workers=workers, listener=listener)
 
 

@@ -16,9 +16,9 @@ from executor.control.winch_laws import CableStep
 from executor.drives import current_pose, is_simulated, read_snapshot, require_own_time
 from executor.interlock.interlock import MotionInterlock
 from executor.proposals import Facts, Proposal, cable_proposal, require_confirmed
-from executor.recording.record_files import free_folder
-from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.run_folder import RunEvent
 from executor.remote.command_server import commands_from_start
+from executor.run_result import folder_maker
 from executor.runner import RunOptions, RunResult, run_prepared
 from executor.supervision import Supervisor
 from executor.trajectory.setpoints import prepare_plan
@@ -26,7 +26,6 @@ from executor.winch_runs import WinchMotion, limit_of, move_by_law
 from model.errors import (
     BadInput,
     Refused,
-    path_of,
     real_number,
     require_functions,
     require_types,
@@ -43,7 +42,7 @@ from model.rig import Rig, rig_from_document
 from model.scene import Scene, empty_scene, scene_from_document
 from planner.kernels.jit import KERNELS
 from planner.planning import make_plan
-from planner.settings import OptimalSettings, TurningSettings
+from planner.settings import OptimalSettings, TurningSettings, whole_number
 
 #: Largest length, [mm], and rotation, [deg], of a jog.
 LONGEST_MM, MOST_DEG = 50.0, 10.0
@@ -101,8 +100,7 @@ def jog(
         require_own_time(slow, realtime)
         require_distance(by, to_home=to_home)
         around = empty_scene(slow) if scene is None else scene.changed(stops=())
-        output = free_folder("jog") if folder is None else path_of(folder)
-        RunFolder.require_free(output)
+        make_folder = folder_maker(folder, "jog")
         interlock = MotionInterlock(slow)
         interlock.require_free()
         ready = interlock.referenced_rig()
@@ -118,7 +116,8 @@ def jog(
             confirm=confirm,
             on_event=on_event,
         )
-        return run_prepared(prepare_plan(plan, ready, listener), output, {}, options, commands)
+        prepared = prepare_plan(plan, ready, listener)
+        return run_prepared(prepared, make_folder, {}, options, commands)
 
 
 def with_speed(rig: Rig, speed: float) -> Rig:
@@ -313,13 +312,16 @@ def jog_cable(
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
 
     Raises:
-        BadInput: There is no such cable, or the length is zero.
+        BadInput: There is no such cable, the length is zero, or an argument is of another type.
         Refused: The length is too long, or the bus is latched.
         Fault: A tension left its limits; all drives stopped together.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
+    require_types((rig, Rig), (listener, Listener))
+    require_functions(confirm=confirm)
     realtime = truth_value("realtime", realtime)
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
+    cable, length = whole_number("cable", cable), real_number("length", length, "m")
     slow = with_speed(rig, speed)
     require_own_time(slow, realtime)
     _require_cable(slow, cable, length)

@@ -1,12 +1,12 @@
-"""Result of a run: verdict, files, and its tables as columns."""
+"""Result of a run: new folder, verdict, files, and its tables as columns."""
 
 from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from drivers.can_bus import IN_PROCESS
 from executor.recording.csv_columns import TableFile
+from executor.recording.record_files import free_folder
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
 from executor.recording.verdict import faults_among
-from model.errors import path_of
+from model.errors import BadInput, path_of
 from model.files.reading import TABLE_LIMIT
 from model.pages.page import html_table
 
@@ -177,3 +178,31 @@ def load_run(folder: str | Path) -> RunResult:
     opened = RunFolder.open(path_of(folder))
     page = opened.report if opened.report.is_file() else None
     return RunResult(opened.path, opened.summary(), report=page)
+
+
+# New run folders.
+
+
+def folder_maker(path: Path | str | None, name: str) -> Callable[[], RunFolder]:
+    """Creates a run folder when it is called, at the end of a long preparation.
+
+    Args:
+        path: Of the folder; None for ``runs/NAME``, with the first number that is free then.
+        name: For None.
+
+    Raises:
+        BadInput: It could not be created now.
+    """
+    given = free_folder(name) if path is None else path_of(path)
+    RunFolder.require_free(given)
+    return partial(_numbered, name) if path is None else partial(RunFolder.create, given)
+
+
+def _numbered(name: str) -> RunFolder:
+    while True:
+        path = free_folder(name)
+        try:
+            return RunFolder.create(path)
+        except BadInput:
+            if not path.exists():  # else another program created it meanwhile
+                raise

@@ -37,20 +37,19 @@ from executor.kernels import ready_for_simulating_process
 from executor.proposals import Proposal, motion_proposal, require_confirmed
 from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
-from executor.recording.record_files import RunCourse, dated_folder
+from executor.recording.record_files import RunCourse, dated_name
 from executor.recording.recorder import Recorder, require_readable_record
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
 from executor.recording.summary import versions
 from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import RunStatus
-from executor.run_result import RunResult
+from executor.run_result import RunResult, folder_maker
 from executor.state_machine import LoopEvent, State
-from executor.supervision import Callbacks, LocalRequests, Supervisor
+from executor.supervision import Callbacks, GuardedListener, LocalRequests, Supervisor
 from executor.trajectory.setpoints import PreparedRun, prepare_plan
 from model.errors import (
     CdprError,
     StoppedByOperator,
-    path_of,
     require_functions,
     require_types,
     truth_value,
@@ -153,17 +152,16 @@ def run(
             is_sealed = rig.document.cameras == plan.rig.document.cameras
             require_stated_errors(rig, list(chosen), then=_PASS_THE_RIG if is_sealed else "")
         require_simulated_start(rig, start)
-        output = dated_folder() if folder is None else path_of(folder)
-        RunFolder.require_free(output)
+        make_folder = folder_maker(folder, dated_name())
         interlock = MotionInterlock(rig)
         interlock.require_free()
         prepared = prepare_plan(plan, interlock.referenced_rig(), listener)
-        return run_prepared(prepared, output, chosen, options, commands)
+        return run_prepared(prepared, make_folder, chosen, options, commands)
 
 
 def run_prepared(
     prepared: PreparedRun,
-    output: Path,
+    make_folder: Callable[[], RunFolder],
     cameras: Mapping[Camera, str],
     options: RunOptions,
     commands: Commands,
@@ -174,7 +172,7 @@ def run_prepared(
 
     Args:
         prepared: The checked run.
-        output: Run folder to create.
+        make_folder: See `executor.run_result.folder_maker`.
         cameras: From `resolve_cameras`; empty for none.
         options: Of the run.
         commands: Those taken since the start of the verb.
@@ -190,7 +188,7 @@ def run_prepared(
     with options.listener.waiting("loading the report generator"):
         _preload_results()
     commands.require_no_stop()
-    result = _recorded(_Job(prepared, RunFolder.create(output), cameras, options, commands))
+    result = _recorded(_Job(prepared, make_folder(), cameras, options, commands))
     commands.supervisor.finish()
     return result
 
@@ -200,7 +198,9 @@ def _recorded(job: _Job) -> RunResult:
     prepared, folder = job.prepared, job.folder
     interface, simulated = prepared.rig.document.bus.interface, is_simulated(prepared.rig)
     now, fast = datetime.now(UTC), not job.options.realtime
-    moved = _MotionData(RunCourse(now, interface, simulated, fast, versions=versions()))
+    course = RunCourse(now, interface, simulated, fast, versions=versions())
+    callbacks = Callbacks(job.commands.board.ask_stop)
+    moved = _MotionData(course, callbacks, GuardedListener(job.options.listener, callbacks))
     try:
         folder.write_plan(prepared.plan.plan.document)
         folder.write_rig(prepared.rig.document)
@@ -209,13 +209,13 @@ def _recorded(job: _Job) -> RunResult:
             _move_and_measure(job, moved)
             result = job.commands.supervisor.conclude(partial(_conclude, job, moved))
     except StoppedByOperator:
-        moved.leave()
+        callbacks.leave()
         raise
     finally:
         moved.close()
         if not moved.begun:
             folder.discard()
-    moved.leave()
+    callbacks.leave()
     return result
 
 
@@ -236,26 +236,23 @@ class _MotionData:
 
     Attributes:
         course: Start of the run; its time is that of the motion once this begins.
+        callbacks: Functions of the caller.
+        listener: The caller's.
         begun: The platform was about to move.
         recorder: Of cycles and events.
         outcome: Of the motion.
         seen: Camera records.
         troubles: Missing data, and what a function of the caller raised late, a sentence each.
-        callbacks: Functions of the caller.
     """
 
     course: RunCourse
+    callbacks: Callbacks
+    listener: GuardedListener
     begun: bool = False
     recorder: Recorder | None = None
     outcome: Outcome | None = None
     seen: CameraRecords | None = None
     troubles: list[str] = field(default_factory=list)
-    callbacks: Callbacks | None = None
-
-    def leave(self) -> None:
-        """Raises what ended the program in a function of the caller."""
-        if self.callbacks is not None:
-            self.callbacks.leave()
 
     def take_event(self, code: str, text: str, at: float) -> None:
         """Records an event of another source than the loop.
@@ -304,19 +301,17 @@ def _move_and_measure(job: _Job, moved: _MotionData) -> None:
 
 def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _MotionData) -> None:
     """Moves while the command socket accepts requests such as `cdpr stop`."""
-    prepared, options = job.prepared, job.options
-    listener, fast = options.listener, not options.realtime
+    prepared, options, on_event = job.prepared, job.options, job.options.on_event
+    listener, fast = moved.listener, not options.realtime
     rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
     rate = asked_rate(job.cameras) if job.cameras else PROGRESS_RATE
     every = cycles_per_image(rate, cycle)
     status = RunStatus(prepared, job.folder.path, board, simulated_time=fast)
     opening = partial(open_cameras, prepared, job.cameras, job.folder.path, board)
-    guarded = (callbacks := Callbacks(board.ask_stop)).guarded
-    moved.callbacks = callbacks
     with ExitStack() as stack:
         stack.enter_context(job.commands.during_motion(status))
-        cameras = stack.enter_context(opening(simulated_time=fast, listener=listener))
-        with listener.progress("preparing, row", rows) as advance:
+        cameras = stack.enter_context(opening(simulated_time=fast, listener=options.listener))
+        with listener.progress("preparing, row", rows) as show:
             watch = (
                 CameraWatch(
                     cameras, status, board, moved.take_event,
@@ -325,8 +320,6 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
                 if cameras
                 else None
             )  # fmt: skip
-            show = guarded("listener.progress", advance)
-            on_event = options.on_event
             recorder = moved.recorder = Recorder(
                 prepared,
                 job.folder,
@@ -336,8 +329,8 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
                 progress=lambda row: show(
                     row, watch.rates if watch else "", f"{recorder.state.value}, row"
                 ),
-                announce=guarded("listener.note", listener.note),
-                on_event=None if on_event is None else guarded("on_event", on_event),
+                announce=listener.note,
+                on_event=on_event and moved.callbacks.guarded("on_event", on_event),
                 own_thread=options.realtime,
             )
             moved.outcome = _move(job, board, recorder, moved)
@@ -410,10 +403,27 @@ def _conclude(job: _Job, moved: _MotionData) -> RunResult:
     """Computes the verdict, reports it, then writes the result files."""
     outcome, supervisor = moved.outcome, job.commands.supervisor
     assert outcome is not None
-    late = moved.callbacks.error if moved.callbacks is not None else ""
-    if late and late not in outcome.cause:
+    with moved.listener.waiting("evaluating the run"):
+        course = _course(moved, outcome)
+        evaluated, summary = _evaluated(job, moved, outcome, course)
+    result = RunResult(job.folder.path, summary)
+    supervisor.on_verdict(result)
+    with moved.listener.waiting("writing the run folder and report"):
+        moved.close()
+        events, left_out = outcome.log.events, supervisor.leaves_files_out
+        missing = write_end(job.folder, course, evaluated, events, left_out)
+    if moved.callbacks.error not in " ".join((course.cause, *course.troubles)):
+        moved.listener.warning(f"{moved.callbacks.error}; the verdict does not depend on it")
+    has_report = evaluated is not None and REPORT not in missing
+    return replace(result, missing=missing, report=job.folder.report if has_report else None)
+
+
+def _course(moved: _MotionData, outcome: Outcome) -> RunCourse:
+    """The course with the end of the motion."""
+    late = moved.callbacks.error
+    if late and (outcome.state is State.STOPPED or late not in outcome.cause):
         moved.troubles.append(late)
-    course = replace(
+    return replace(
         moved.course,
         started=outcome.started,
         final_state=outcome.state.value,
@@ -422,15 +432,6 @@ def _conclude(job: _Job, moved: _MotionData) -> RunResult:
         cameras=() if moved.seen is None else tuple(moved.seen.cameras),
         troubles=tuple(moved.troubles),
     )
-    evaluated, summary = _evaluated(job, moved, outcome, course)
-    result = RunResult(job.folder.path, summary)
-    supervisor.on_verdict(result)
-    with job.options.listener.waiting("writing the run folder and report"):
-        moved.close()
-        events, left_out = outcome.log.events, supervisor.leaves_files_out
-        missing = write_end(job.folder, course, evaluated, events, left_out)
-    has_report = evaluated is not None and REPORT not in missing
-    return replace(result, missing=missing, report=job.folder.report if has_report else None)
 
 
 def _evaluated(
@@ -440,8 +441,7 @@ def _evaluated(
     assert moved.recorder is not None
     try:
         seen = moved.seen or CameraRecords()
-        with job.options.listener.waiting("evaluating the run"):
-            evaluated = evaluate(job.prepared, outcome, seen, course, moved.recorder)
+        evaluated = evaluate(job.prepared, outcome, seen, course, moved.recorder)
     except Exception as error:
         trouble = f"{type(error).__name__}: {error}".rstrip(": ")
         return None, not_evaluated(job.prepared, outcome, course, trouble)

@@ -6,11 +6,14 @@ The loop reads the operator's requests every cycle.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from model.errors import CdprError, Fault, StoppedByOperator
+from model.progress import Advance, Listener
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +129,8 @@ class Callbacks:
         leaving: `KeyboardInterrupt` or `SystemExit` of a function, to raise after the record.
     """
 
-    def __init__(self, ask_stop: Callable[[], None]) -> None:
-        """``ask_stop`` requests the operator's stop."""
+    def __init__(self, ask_stop: Callable[..., None]) -> None:
+        """``ask_stop`` is `RequestBoard.ask_stop`."""
         self.error = ""
         self.leaving: BaseException | None = None
         self._ask_stop = ask_stop
@@ -149,10 +152,61 @@ class Callbacks:
 
         return call
 
+    def attempt(self, name: str, function: Callable[[], object]) -> None:
+        """Calls the function, and raises nothing: a failure stops a motion."""
+        try:
+            self.guarded(name, function)()
+        except CallbackFailed as error:
+            self._ask_stop(StopReason("recorder", error.what))
+
     def leave(self) -> None:
         """Raises what ended the program in a function."""
         if self.leaving is not None:
             raise self.leaving
+
+
+class GuardedListener(Listener):
+    """The caller's listener during a run; what it raises loses no measurement and no file."""
+
+    def __init__(self, listener: Listener, callbacks: Callbacks) -> None:
+        """Reports to ``listener``; its exceptions go to ``callbacks``."""
+        self._listener, self._attempt = listener, callbacks.attempt
+
+    def note(self, text: str) -> None:
+        """See `Listener`."""
+        self._attempt("listener.note", lambda: self._listener.note(text))
+
+    def remark(self, text: str) -> None:
+        """See `Listener`."""
+        self._attempt("listener.remark", lambda: self._listener.remark(text))
+
+    def warning(self, text: str) -> None:
+        """See `Listener`."""
+        self._attempt("listener.warning", lambda: self._listener.warning(text))
+
+    @contextmanager
+    def waiting(self, text: str) -> Iterator[None]:
+        """See `Listener`."""
+        shown, attempt = ExitStack(), partial(self._attempt, "listener.waiting")
+        attempt(lambda: shown.enter_context(self._listener.waiting(text)))
+        try:
+            yield
+        finally:
+            attempt(shown.close)
+
+    @contextmanager
+    def progress(self, text: str, total: float | None) -> Iterator[Advance]:
+        """See `Listener`; its beginning raises, as nothing moves yet."""
+        shown, attempt = ExitStack(), partial(self._attempt, "listener.progress")
+        advance = shown.enter_context(self._listener.progress(text, total))
+
+        def show(value: float, note: str = "", text: str = "") -> None:
+            attempt(lambda: advance(value, note, text))
+
+        try:
+            yield show
+        finally:
+            attempt(shown.close)
 
 
 # Supervisor of a motion, for the calling program.

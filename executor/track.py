@@ -25,6 +25,7 @@ from executor.recording.mcap import write_track_mcap
 from executor.trajectory.setpoints import prepare
 from model.clearance import ClearanceModel
 from model.errors import BadInput, CdprError, StoppedByOperator, path_of
+from model.files.reading import is_folder
 from model.pages.page import FactsDisplay
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
@@ -156,8 +157,7 @@ def own_file(path: Path, name: str) -> Path:
 
 def own_drawing(overlay: Path, name: str) -> Path:
     """Overlay of one of several cameras: a video beside the given one, or a subfolder."""
-    is_folder = overlay.is_dir() or not overlay.suffix
-    return overlay / name if is_folder else own_file(overlay, name)
+    return overlay / name if is_folder(overlay) or not overlay.suffix else own_file(overlay, name)
 
 
 def require_plan_used(sources: Iterable[str], plan: object | None) -> None:
@@ -417,7 +417,7 @@ def _opened(
         timed_poses = _poses_in_time(rig, camera, plan)
         return _rendered(rig, scene, camera, timed_poses), len(timed_poses)
     path = path_of(source)
-    if path.is_dir():
+    if is_folder(path):
 
         def skipped(name: str, why: str) -> None:
             unused[name] = why

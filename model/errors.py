@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from numbers import Real
+from dataclasses import dataclass, fields
+from multiprocessing import current_process
+from numbers import Integral, Real
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -205,6 +206,24 @@ def require_functions(**given: object) -> None:
             raise _unusable(name, "a function", value)
 
 
+def require_child_processes(use: str, or_else: str = "") -> None:
+    """Requires that this process may start others.
+
+    Args:
+        use: What they are for.
+        or_else: What a caller can do without them, as a clause.
+
+    Raises:
+        BadInput: It may not.
+    """
+    if current_process().daemon:
+        raise BadInput(
+            f"this process cannot start others, for {use}",
+            why="it is daemonic, as a worker of `multiprocessing.Pool` is",
+            next_step="use `concurrent.futures.ProcessPoolExecutor` instead" + or_else,
+        )
+
+
 def sequence_of(name: str, values: Iterable[T]) -> tuple[T, ...]:
     """The values of any iterable, once.
 
@@ -216,10 +235,15 @@ def sequence_of(name: str, values: Iterable[T]) -> tuple[T, ...]:
     return tuple(values)
 
 
+def is_masked(value: object) -> bool:
+    """Whether it is a masked scalar of NumPy, which converts to the number behind its mask."""
+    return getattr(value, "shape", None) == () and bool(getattr(value, "mask", False))
+
+
 def is_truth_value(value: object) -> bool:
-    """Whether it is True or False, also NumPy's; ``"no"``, 0 and None are neither."""
+    """Whether it is True or False, also NumPy's; ``"no"``, 0, None and a masked one are neither."""
     of_numpy = getattr(value, "shape", None) == () and str(getattr(value, "dtype", "")) == "bool"
-    return isinstance(value, bool) or of_numpy
+    return isinstance(value, bool) or (of_numpy and not is_masked(value))
 
 
 def truth_value(name: str, value: object) -> bool:
@@ -237,15 +261,33 @@ def real_number(name: str, value: object, unit: str = "") -> float:
     """A number of any type, such as NumPy's, as a float; the caller checks its range.
 
     Raises:
-        BadInput: It is a text, a list or another object, or too large.
+        BadInput: It is a text, a list, masked or another object, or too large.
     """
     single = value.item() if getattr(value, "shape", None) == () else value  # type: ignore[attr-defined]
-    if isinstance(single, bool) or not isinstance(single, Real):
+    if is_masked(value) or isinstance(single, bool) or not isinstance(single, Real):
         raise _unusable(name, f"a number [{unit}]" if unit else "a number", value)
     try:
         return float(single)
     except OverflowError:
         raise BadInput(f"{name} is too large a number") from None
+
+
+def require_fields(thing: Any) -> None:
+    """Requires values of their types in the fields of a dataclass: text, numbers, truth values.
+
+    Raises:
+        BadInput: One is of another type.
+    """
+    for one in fields(thing):
+        value = getattr(thing, one.name)
+        if one.type == "str":
+            require_text(**{one.name: value})
+        elif one.type == "bool":
+            truth_value(one.name, value)
+        elif one.type == "int" and (isinstance(value, bool) or not isinstance(value, Integral)):
+            raise _unusable(one.name, "a whole number", value)
+        elif one.type == "float":
+            real_number(one.name, value)
 
 
 def positive_number(

@@ -23,7 +23,8 @@ class Listener:
     """Receives the reports of a library function; this one ignores them.
 
     A program that shows them overrides the methods it needs, as `cdpr.cli.output.Terminal` does.
-    Every method may be called from the thread that called the library, and must not raise.
+    The library calls them one at a time, but not always from the thread that called it: during and
+    after a motion they are called from others. They must return at once and not raise.
     """
 
     def note(self, text: str) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from model.cameras import Camera, Tag, camera_from, left_out_errors, tag_from
 from model.errors import BadInput, path_of, require_types
 from model.files.documents import document_hash, document_of, key_path, load_yaml, millimetres
-from model.files.rig_file import MotionDocument, RigDocument, WinchDocument
+from model.files.rig_file import BusDocument, MotionDocument, RigDocument, WinchDocument
 from model.pages.page import html_table
 from model.pose import Array, Pose, ReadOnly, floats_of, read_only
 from model.posed_rig import PosedRig, posed_rig
@@ -282,13 +282,15 @@ class Rig(ReadOnly):
         """The same rig on another CAN bus, in memory only; a plan does not depend on the bus.
 
         Args:
-            interface: As python-can names it: ``virtual``, ``udp_multicast``, ``socketcan`` …; that
-                of the rig file when left out.
+            interface: As python-can names it, such as ``socketcan``; the rig file's when left out.
             channel: Such as ``can0``; that of the rig file when left out.
+
+        Raises:
+            InvalidFile: One is not text, or cannot be in a rig file.
         """
         named = {"interface": interface, "channel": channel}
         given = {key: value for key, value in named.items() if value is not None}
-        bus = self.document.bus.model_copy(update=given)
+        bus = document_of(dict(self.document.bus) | given, BusDocument, "Rig.with_bus")
         return rig_from_document(self.document.model_copy(update={"bus": bus}))
 
     def with_calibration(self, *results: CalibrationResult, listener: Listener = SILENT) -> Rig:

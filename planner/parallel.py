@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing import current_process, parent_process
 from typing import TYPE_CHECKING, Any
 
-from model.errors import Fault
+from model.errors import Fault, require_child_processes
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -27,6 +28,11 @@ class Count:
         self._advance(self._done)
 
 
+def default_workers() -> int:
+    """Processes of a calculation: one per core, but one in a child, whose siblings use the rest."""
+    return os.cpu_count() or 1 if parent_process() is None or _is_importing() else 1
+
+
 @contextmanager
 def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
     """Executor of a Dask cluster or of local processes; None for this process alone.
@@ -36,7 +42,7 @@ def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
         dask: Address of a scheduler, instead of processes.
 
     Raises:
-        BadInput: Dask is not installed, or no scheduler answers.
+        BadInput: Dask is not installed, no scheduler answers, or this process cannot start others.
         Fault: The processes ended, as in a script without the guard of `multiprocessing`.
     """
     if dask is not None:
@@ -48,10 +54,11 @@ def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
         return
     from concurrent.futures import ProcessPoolExecutor
     from concurrent.futures.process import BrokenProcessPool
-    from multiprocessing import get_context, parent_process
+    from multiprocessing import get_context
 
-    if parent_process() is not None:
+    if _is_importing():
         raise _without_guard()
+    require_child_processes("`workers`", ", or pass workers=1")
     pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin_worker)
     try:
         yield pool
@@ -59,6 +66,11 @@ def worker_pool(workers: int, dask: str | None) -> Iterator[Executor | None]:
         raise _without_guard() from error
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _is_importing() -> bool:
+    """Whether this process still imports the script of the one that started it."""
+    return bool(getattr(current_process(), "_inheriting", False))
 
 
 def _without_guard() -> Fault:
@@ -80,7 +92,6 @@ def _begin_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    from multiprocessing import parent_process
     from multiprocessing.connection import wait
 
     parent = parent_process()

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from model.errors import BadInput, NoSolution, distinct_figures, real_number
+from model.errors import BadInput, NoSolution, distinct_figures, is_masked, real_number
 from model.files.documents import LARGEST, SEED_LARGEST, WHOLE_LARGEST
 from planner.path import Progress
 from planner.rrt.variants import DEFAULT, AlgorithmVariant, ConeDraw, FailureRate, Focus, Steer
@@ -47,11 +47,11 @@ def whole_number(name: str, value: int, least: int = 0, most: int = WHOLE_LARGES
         BadInput: It is not a whole number, or outside the limits.
     """
     try:
-        number = None if isinstance(value, bool) else operator.index(value)
+        number = None if isinstance(value, bool) or is_masked(value) else operator.index(value)
     except TypeError:
         number = None
     if number is None or not least <= number <= most:
-        raise BadInput(f"{name} must be a whole number from {least} to {most}, it is {value}")
+        raise BadInput(f"{name} must be a whole number from {least} to {most}, it is {value!s}")
     return number
 
 

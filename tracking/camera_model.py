@@ -227,8 +227,14 @@ def require_image_format(image: Image, camera: Camera, rig: str) -> None:
         rig: Name of the rig.
 
     Raises:
-        BadInput: It is not grey with 8 bits, not of the camera's size, or has masked pixels.
+        BadInput: It is not an array of grey 8-bit pixels of the camera's size, or some are masked.
     """
+    if not isinstance(image, np.ndarray):
+        raise BadInput(
+            f"expected an image as a NumPy array, not {type(image).__name__}",
+            where=f"rig {rig}, camera {camera.name!r}",
+            next_step="pass a grey image; `cv2.imread` returns None for a file it cannot read",
+        )
     require_unmasked(image)
     wanted = (camera.height, camera.width)
     if image.shape != wanted or image.dtype != np.uint8:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.cameras import Z_95
-from model.errors import BadInput
+from model.errors import BadInput, real_number, require_types
 from model.pose import Array, Pose, interpolate
 from model.rig import Camera, Rig
 from tracking.camera_model import Image, require_image_format
@@ -116,10 +116,11 @@ class Tracker:
         settings: Acceptance limits.
 
     Raises:
-        BadInput: The rig has no tags.
+        BadInput: The rig has no tags, or an argument is of another type.
     """
 
     def __init__(self, rig: Rig, camera: Camera, settings: TrackerSettings | None = None) -> None:
+        require_types((rig, Rig), (camera, Camera))
         if not rig.platform_tags:
             raise BadInput(
                 "the rig has no platform tags, so no camera can measure it",
@@ -161,11 +162,13 @@ class Tracker:
                 enter the measured pose.
 
         Raises:
-            BadInput: The image is not grey, or not of the camera's size.
+            BadInput: The image is not grey, or not of the camera's size; another type.
             CameraMoved: In two images, the frame tags are at the same wrong positions. The first of
                 them, and all until a check passes, give no pose.
         """
         require_image_format(image, self.camera, self.rig.name)
+        require_types(optional=[(by_drives, Pose)])
+        time = real_number("time", time, "s")
         self._pictures += 1
         result: Observation | None = None
         if self._last is not None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.live import silent_opencv
-from model.errors import BadInput, truth_value
+from model.errors import BadInput, require_fields
 from model.files.csv_table import CsvTable
 from model.pose import Array, read_only
 from model.rig import Camera
@@ -169,8 +169,9 @@ class Chessboard:
         """Refuses impossible boards.
 
         Raises:
-            BadInput: Fewer than three inner corners per side, or a side of a square not above 0.
+            BadInput: Too few inner corners, a square not above 0, or a value of another type.
         """
+        require_fields(self)
         require_board(
             min(self.columns, self.rows) >= 3,
             "a chessboard needs at least 3 inner corners per side",
@@ -285,7 +286,7 @@ class Charuco:
             BadInput: Too few squares, a marker that does not fit its square, a dictionary that is
                 unknown or has too few markers, or another value for ``legacy``.
         """
-        truth_value("legacy", self.legacy)
+        require_fields(self)
         require_board(min(self.columns, self.rows) >= 3, "a ChArUco board needs 3 squares per side")
         require_board(0.0 < self.marker < self.square, "a marker must be smaller than its square")
         require_board(

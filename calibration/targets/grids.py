@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from calibration.targets.boards import LEAST_POINTS, DetectedBoard, require_board
 from model.cameras import generic_camera
-from model.errors import truth_value
+from model.errors import require_fields
 from model.pose import Array
 from model.rig import Camera
 from model.tag_families import FAMILIES, tags_in
@@ -75,7 +75,7 @@ class CircleGrid:
             BadInput: Too few circles, a size not above 0, circles that touch, or another value for
                 ``asymmetric``.
         """
-        truth_value("asymmetric", self.asymmetric)
+        require_fields(self)
         require_board(min(self.columns, self.rows) >= 3, "a circle grid needs 3 circles per side")
         apart = self.spacing * (np.sqrt(2.0) if self.asymmetric else 1.0)
         require_board(0.0 < self.diameter < apart, "circles must be larger than 0 mm and not touch")
@@ -279,10 +279,10 @@ class TagGrid:
             BadInput: Too few tags, a size not above 0, an unknown family, or numbers outside the
                 family.
         """
+        require_fields(self)
         require_board(self.columns * self.rows >= 4, "a tag grid needs 4 tags")
         require_board(min(self.columns, self.rows) >= 1, "a tag grid needs a row and a column")
-        require_board(self.tag > 0.0, "the side of a tag must be above 0 mm")
-        require_board(self.gap > 0.0, "the gap between tags must be above 0 mm")
+        require_board(min(self.tag, self.gap) > 0.0, "tags, and gaps, must be larger than 0 mm")
         require_board(
             self.family in FAMILIES,
             f"unknown tag family {self.family!r}",

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from drivers.cameras.live import Frame, Image, eight_bits
 from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.documents import write_bytes_atomic
-from model.files.reading import PICTURE_LIMIT, is_too_large, read_bytes
+from model.files.reading import PICTURE_LIMIT, files_in, is_folder, is_too_large, read_bytes
 from model.rig import Camera
 
 #: Suffixes of image files, in lower case.
@@ -151,9 +151,9 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
     Raises:
         BadInput: The folder is missing or has none.
     """
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise BadInput("no such folder", where=str(folder), next_step="check the path")
-    found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURE_ENDINGS]
+    found = [p for p in files_in(folder) if p.suffix.lower() in PICTURE_ENDINGS]
     if not found:
         raise BadInput(
             "the folder has no images",

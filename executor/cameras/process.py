@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from executor.cameras.live_image import ImageBoard
 from executor.realtime.scheduling import ended_at_start, interrupts_blocked
 from executor.recording.run_folder import RunFolder
-from model.errors import CdprError, Fault
+from model.errors import CdprError, Fault, require_child_processes
 from model.pose import Pose
 from model.rig import Camera, Rig
 from tracking.clearance import MeasuredClearance
@@ -199,6 +199,7 @@ class CameraProcess:
         self._may_wait = self._waits = may_wait
         self._asked: FrameRequest | None = None
         self._is_open = self._closed = False
+        require_child_processes("cameras")
         context = multiprocessing.get_context("spawn")
         self._link, far_end = context.Pipe()
         self._process = context.Process(

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from model.errors import BadInput, require_not_empty, sequence_of
+from model.files.reading import is_folder
 from model.rig import Camera, Rig
 
 SYNTHETIC = "synthetic"
@@ -156,8 +157,10 @@ def parse_camera_sources(
         where: Origin of the sources, for messages.
 
     Raises:
-        BadInput: A source is empty, or a camera is unknown, named twice, or not named.
+        BadInput: No or an empty source; a camera is unknown, named twice, or not named.
     """
+    if not sources:
+        raise BadInput("no image source is given", where=where, next_step="name one, such as 0")
     names = [camera.name for camera in rig.cameras]
     for source in sources:
         require_not_empty("the image source", source)
@@ -305,7 +308,7 @@ def require_one_kind(sources: Mapping[str, str]) -> None:
 
 
 def _kind(source: str) -> str:
-    if Path(source).is_dir():
+    if is_folder(Path(source)):
         return "a folder"
     if Path(source).is_file():
         return "a video"

@@ -334,6 +334,7 @@ class CameraRecord:
 
 #: Initial size of the file, [bytes], so that the end of the run fits on a full disk.
 SIZE = 8192
+_CAMERA_KEYS = set(CameraRecordDocument.model_fields)
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,7 +382,7 @@ class RunCourse:
             kept.final_state,
             kept.cause,
             kept.cycles,
-            tuple(CameraRecord(**dict(camera)) for camera in kept.cameras),
+            tuple(CameraRecord(**one.model_dump(include=_CAMERA_KEYS)) for one in kept.cameras),
             tuple(kept.troubles),
             versions=kept.versions,
         )
@@ -439,11 +440,11 @@ RUNS = Path("runs")
 
 
 def free_folder(name: str) -> Path:
-    """``runs/NAME``, with the first free number if it exists; the caller creates it."""
+    """``runs/NAME``, with the first free number if it exists; another program may create it."""
     names = (RUNS / (name if n == 1 else f"{name}-{n}") for n in count(1))
     return next(path for path in names if not path.exists())
 
 
-def dated_folder() -> Path:
-    """``runs/`` with date and local time; see `free_folder`."""
-    return free_folder(datetime.now().strftime("%Y-%m-%d_%H%M%S"))
+def dated_name() -> str:
+    """Name of a run folder: date and local time."""
+    return datetime.now().strftime("%Y-%m-%d_%H%M%S")

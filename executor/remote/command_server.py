@@ -31,7 +31,7 @@ from executor.remote.command_socket import advertised_ahead, is_stopped_since
 from executor.remote.protocol import StatusSource, answer_to, status_answer
 from executor.remote.status import NO_PATH, MotionStatus
 from executor.supervision import LocalRequests, RequestBoard, Supervisor
-from model.errors import StoppedByOperator
+from model.errors import StoppedByOperator, require_child_processes
 from model.rig import Rig
 
 #: Largest length of a request, [bytes].
@@ -282,9 +282,12 @@ def commands_from_start(
     Raises:
         Refused: No stop would reach the verb.
         StoppedByOperator: A stop was requested before the motion.
+        BadInput: The motion needs a process of its own, which this one cannot start.
         SystemExit: This process still imports the script of another, which lacks the guard.
     """
     require_imported_script()
+    if realtime:
+        require_child_processes("drives in real time")
     began, operator = time.clock_gettime(time.CLOCK_BOOTTIME), supervisor or Supervisor()
     board: LocalRequests | SharedRequests = SharedRequests() if realtime else LocalRequests()
     with ExitStack() as outer:

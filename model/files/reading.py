@@ -121,6 +121,30 @@ def unreadable(path: Path, error: Exception) -> BadInput:
     return BadInput(what, where=shown(path), why=why, next_step=hint)
 
 
+def is_folder(path: Path) -> bool:
+    """Whether a folder exists there.
+
+    Raises:
+        BadInput: The operating system cannot answer, as in another user's folder.
+    """
+    try:
+        return path.is_dir()
+    except OSError as error:
+        raise unreadable(path, error) from None
+
+
+def files_in(folder: Path) -> list[Path]:
+    """What a folder contains.
+
+    Raises:
+        BadInput: It cannot be read.
+    """
+    try:
+        return list(folder.iterdir())
+    except OSError as error:
+        raise unreadable(folder, error) from None
+
+
 def shown(path: Path | str) -> str:
     """A path for a message, shortened in the middle if very long."""
     text = str(path)

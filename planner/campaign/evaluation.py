@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import math
-import os
 import platform
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
@@ -35,7 +34,7 @@ from planner.campaign.studies import (
 )
 from planner.campaign.trial import SHARES, Arm, Case, box_text, run_batch, with_box
 from planner.kernels.jit import planner_compilation
-from planner.parallel import Count, worker_pool
+from planner.parallel import Count, default_workers, worker_pool
 
 
 def run_campaign(
@@ -67,7 +66,7 @@ def run_campaign(
         run_batch(work[0])  # or every process would compile
     total = sum(len(batch.seeds) for batch in work)
     with (
-        worker_pool(workers or os.cpu_count() or 1, dask) as pool,
+        worker_pool(workers or default_workers(), dask) as pool,
         listener.progress("searching", total) as advance,
     ):
         return Results(run_all(work, pool, Count(advance).more))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from model.progress import SILENT, Listener
 from model.rig import Rig
 from planner.check import least_axis_distance
 from planner.kernels.jit import planner_compilation
-from planner.parallel import Count, worker_pool
+from planner.parallel import Count, default_workers, worker_pool
 from planner.workspace.grid import Grid, frame_box, slice_through
 from planner.workspace.grid import volume as grid_of_volume
 from planner.workspace.maps import OBSTACLE_CLEARANCE, Extremes, Question, Values, costs, values_at
@@ -221,21 +220,21 @@ def map_workspace(
     Args:
         question: Rig, scene, orientation and quantities.
         grids: Positions, see `workspace_grids`.
-        workers: Processes; one per core when left out.
+        workers: Processes; one per core when left out, in a child process one.
         dask: Address of a Dask cluster to use instead.
         listener: Receives progress.
 
     Raises:
-        BadInput: Dask is not installed, or no scheduler answers.
+        BadInput: Dask is not installed, no scheduler answers, or no process can be started.
     """
     with planner_compilation("maps", listener):
         extremes = Extremes.over_workspace(question)
         # Compiles once, or every process would.
         values_at(question, question.rig.home.position[None, :])
     total = sum(grid.count for grid in grids)
-    cores = 1 if total <= POINTS_FOR_ONE_PROCESS else os.cpu_count() or 1
+    usual = 1 if total <= POINTS_FOR_ONE_PROCESS else default_workers()
     with (
-        worker_pool(workers or cores, dask) as pool,
+        worker_pool(workers or usual, dask) as pool,
         listener.progress("mapping", total) as advance,
     ):
         done = Count(advance)

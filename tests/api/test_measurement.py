@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +91,48 @@ def test_a_source_of_images_is_opened_by_what_it_is(rig: cdpr.Rig) -> None:
     assert next(iter(images)).name == "place_01.jpg"
     with pytest.raises(cdpr.BadInput):
         cdpr.open_camera(rig, str(SESSION / "no-such-folder"))
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda rig, path: cdpr.open_camera(rig, path),
+        lambda rig, path: cdpr.track(rig, path),
+        lambda rig, path: cdpr.locate_camera(rig, path),
+        lambda rig, path: cdpr.locate_camera(rig, SESSION / "pictures", poses=path),
+        lambda rig, path: cdpr.locate_tags(rig, path),
+        lambda rig, path: cdpr.calibrate_rig(rig, path),
+        lambda rig, path: cdpr.calibrate_camera(path, cdpr.Chessboard(9, 6, 0.02)),
+        lambda rig, path: ImageFolder(path, rig.camera()),
+    ],
+)
+def test_a_folder_that_cannot_be_examined_is_bad_input(
+    rig: cdpr.Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[..., object]
+) -> None:
+    """Python 3.11 raises, where a later one takes it for missing."""
+    with pytest.raises(cdpr.BadInput):
+        use(rig, tmp_path / ("x" * 300))
+    examine = Path.stat
+
+    def denied(self: Path, **options: Any) -> os.stat_result:
+        if self.name == "theirs":
+            raise PermissionError(13, "Permission denied", str(self))
+        return examine(self, **options)
+
+    monkeypatch.setattr(Path, "stat", denied)
+    with pytest.raises(cdpr.BadInput, match="Permission denied"):
+        use(rig, tmp_path / "theirs")
+
+
+def test_a_folder_that_cannot_be_listed_is_bad_input(
+    rig: cdpr.Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(self: Path) -> Any:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", denied)
+    with pytest.raises(cdpr.BadInput, match="Permission denied"):
+        cdpr.open_camera(rig, tmp_path)
 
 
 def test_a_calibrated_rig_is_used_in_memory_and_kept_in_a_file(

@@ -21,6 +21,7 @@ import yaml
 
 import cdpr
 from executor.cameras.sources import choose_camera
+from executor.jogging import jog_cable
 from model.files.documents import PoseDocument
 from model.files.scene_file import StopDocument
 from model.kinematics import cable_lengths, forward_kinematics
@@ -184,6 +185,27 @@ def test_masked_values_are_not_used_as_numbers(rig: cdpr.Rig, as_rows: bool) -> 
     assert cdpr.Pose.level(bare).position.tolist() == home.position.tolist()
 
 
+@pytest.mark.parametrize("masked", [np.ma.masked, *(np.ma.array(x, mask=True) for x in (1.0, 1))])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("plan " + name for name in ("budget", "rounds", "seed", "longest", "clearance")),
+        *("plan weights", "workspace_map slices", "workspace_map step", "workspace_map workers"),
+        *("workspace_map characteristic_length", "jog_cable cable", "jog_cable length"),
+        *("calibrate_rig wanted", "calibrate_rig tilt", "locate_tags wanted", "track pictures"),
+        *("home " + name for name in ("tension", "limit", "reach", "speed", "pictures")),
+        *("jog speed", "measurement_poses dwell", "plan free_rotation", "changed clearance"),
+    ],
+)
+def test_a_masked_scalar_is_not_the_number_behind_its_mask(
+    rig: cdpr.Rig, scene: cdpr.Scene, name: str, masked: Any
+) -> None:
+    """``np.ma.masked`` as a clearance had planned with 0 mm."""
+    inside = {"plan weights": {"length": masked}, "workspace_map slices": [("z", masked)]}
+    with pytest.raises(cdpr.BadInput, match=r"must be .*, it is (masked|--)"):
+        calls_with_a_wrong_argument(name)(rig, scene, inside.get(name, masked))
+
+
 def test_a_pose_that_cannot_be_held_says_so_and_has_no_tensions(rig: cdpr.Rig) -> None:
     above = cdpr.Pose.level(rig.outlets.max(axis=0) + 0.2)
     posed = rig.at(above)
@@ -198,6 +220,15 @@ def test_another_bus_changes_nothing_that_a_plan_rests_on(rig: cdpr.Rig) -> None
     assert (bus.interface, bus.channel) == ("socketcan", "can0")
     assert other.plan_hash == rig.plan_hash
     assert rig.document.bus.interface == "virtual"
+
+
+@pytest.mark.parametrize("wrong", [1, 1.5, b"can0", [], True, "x" * 201])
+def test_a_bus_that_cannot_be_is_refused_when_it_is_named(rig: cdpr.Rig, wrong: Any) -> None:
+    """``with_bus("virtual", 1)`` had failed later, in whatever used the rig."""
+    with pytest.raises(cdpr.BadInput, match=r"Rig\.with_bus: channel: "):
+        rig.with_bus("virtual", wrong)
+    with pytest.raises(cdpr.BadInput, match=r"Rig\.with_bus: interface: "):
+        rig.with_bus("" if wrong == "x" * 201 else wrong)
 
 
 def test_a_camera_is_found_by_its_name_or_refused_with_the_names_that_exist(rig: cdpr.Rig) -> None:
@@ -436,6 +467,23 @@ def calls_with_a_wrong_argument(name: str) -> Callable[[cdpr.Rig, cdpr.Scene, An
         case "jog":
             refused = {"confirm": lambda _: False, "by": (0.0, 0.0, 0.001)}
             return lambda rig, _, x: cdpr.jog(rig, None, **{**refused, argument: x})
+        case "jog_cable":
+            refused = {"confirm": lambda _: False, "cable": 1, "length": 0.001}
+            return lambda rig, _, x: jog_cable(**{"rig": rig, **refused, argument: x})
+        case "tracker":
+            return lambda rig, _, x: cdpr.Tracker(
+                **{"rig": rig, "camera": rig.camera(), argument: x}
+            )
+        case "observe":
+            image = np.zeros((720, 1280), np.uint8)
+            quick = {"image": image, "time": 0.0, "by_drives": None}
+            return lambda rig, _, x: cdpr.Tracker(rig, rig.camera()).observe(
+                **{**quick, argument: x}
+            )
+        case "chessboard":
+            return lambda *given: cdpr.Chessboard(
+                **{"columns": 9, "rows": 6, "square": 0.02, argument: given[-1]}
+            )
         case "rig":
             return lambda rig, _, x: getattr(rig, argument)(x)
         case _:
@@ -458,7 +506,10 @@ def calls_with_a_wrong_argument(name: str) -> Callable[[cdpr.Rig, cdpr.Scene, An
         *("measurement_poses " + name for name in ("tilt", "turn", "dwell")),
         *("home " + name for name in ("tension", "limit", "reach", "speed", "pictures")),
         *("home simulated_slack", "home camera", "jog speed", "jog by"),
-        *("rig at", "rig clipped"),
+        *("rig at", "rig clipped", "rig with_bus", "workspace_map characteristic_length"),
+        *("jog_cable " + name for name in ("rig", "cable", "length", "limit", "speed")),
+        *("tracker rig", "tracker camera", "observe image", "observe time", "observe by_drives"),
+        *("chessboard " + name for name in ("columns", "rows", "square")),
         *("load_rig", "load_scene", "load_plan", "load_run", "load_calibration", "report"),
     ],
 )
@@ -482,6 +533,16 @@ def test_a_wrong_argument_is_named_with_its_value(
         (lambda: cdpr.plan(rig, scene, via=None), "via must be a list, it is None"),
         (lambda: cdpr.plan(rig, scene, via=rig.home), "via must be a list, it is Pose("),
         (lambda: cdpr.plan(rig, scene, weights="length=1"), "the weights must be a mapping"),
+        (lambda: cdpr.Chessboard("9", 6, 0.02), "columns must be a whole number, it is '9' (str)"),
+        (lambda: cdpr.Chessboard(9.0, 6.0, 0.02), "columns must be a whole number, it is 9.0"),
+        (lambda: cdpr.Tracker(rig, "front"), "expected a Camera, not text"),
+        (lambda: cdpr.Tracker(rig, rig.camera()).observe(None, 0.0), "not NoneType"),
+        (lambda: cdpr.track(rig, {}), "no image source is given"),
+        (lambda: jog_cable(rig, 1.0, 0.001), "cable must be a whole number"),
+        (
+            lambda: cdpr.workspace_map(rig, characteristic_length="0.1"),
+            "characteristic_length must be a number [m], it is '0.1' (str)",
+        ),
         (lambda: cdpr.workspace_map(rig, volume="no"), "volume must be True or False"),
         (lambda: cdpr.workspace_map(rig, workers=0), "workers must be a whole number from 1"),
         (lambda: cdpr.plan(rig, scene, rounds=True), "rounds must be a whole number from 1"),

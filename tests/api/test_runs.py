@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -21,6 +22,7 @@ from cdpr.operation import set_speed
 from executor.drives import DriveStatus
 from executor.interlock.reference import ReferenceStatus
 from executor.jogging import CableJog
+from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.command_socket import find_runs
 from executor.service import ReleaseResult, ResetResult, StatusResult
@@ -216,6 +218,19 @@ def test_a_camera_that_failed_fails_the_run_when_it_is_reported_again(tmp_path: 
     assert again.verdict == "FAILED"
     assert any("no answer since 0.30 s" in reason for reason in again.summary["reasons"])
     assert [camera["name"] for camera in again.summary["cameras"]] == ["front"]
+
+
+def test_a_report_ignores_keys_of_a_later_version(run: cdpr.RunResult, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(run.folder, folder)
+    camera = CameraRecord("front", "synthetic", 3, 2, 1, 4.5, "")
+    RunFolder(folder).write_course(replace(RunFolder(folder).course(), cameras=(camera,)))
+    data = json.loads((folder / "run.json").read_text())
+    data["later"] = data["cameras"][0]["later"] = 1
+    (folder / "run.json").write_text(json.dumps(data))
+    (folder / "SHA256SUMS").unlink()
+    assert RunFolder(folder).course().cameras == (camera,)
+    assert cdpr.report(folder) == folder / "report.html"
 
 
 def test_a_run_without_obstacles_needs_no_stated_errors(tmp_path: Path) -> None:

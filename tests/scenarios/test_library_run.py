@@ -6,7 +6,9 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from multiprocessing import current_process
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,13 @@ import numpy as np
 import pytest
 
 from executor import jogging, runner
+from executor.cameras.multi_camera import CameraNews, CameraRecords, RunCameras
 from executor.homing import home
 from executor.interlock.interlock import MotionInterlock
 from executor.proposals import Proposal
 from executor.recording import recorder
 from executor.recording.run_folder import RunEvent, RunFolder
+from executor.run_result import load_run
 from model.errors import BadInput, StoppedByOperator
 from model.plan import Plan, load_plan
 from model.progress import Advance, Listener
@@ -182,6 +186,87 @@ def test_a_failing_listener_is_named_too(plan: Plan, rig: Rig, tmp_path: Path) -
     assert "recording failed" not in text
 
 
+#: Reports after the platform has moved, and whether they come before the verdict.
+LATE_REPORTS = {
+    "end of preparing, row": True,
+    "waiting for the last images": True,
+    "remark": True,
+    "evaluating the run": True,
+    "end of evaluating the run": False,
+    "writing the run folder and report": False,
+    "end of writing the run folder and report": False,
+}
+
+
+class LateFailingListener(Listener):
+    """Raises at one of `LATE_REPORTS`."""
+
+    def __init__(self, at: str, error: BaseException) -> None:
+        self.at, self.error, self.warnings = at, error, list[str]()
+
+    def fail_at(self, report: str) -> None:
+        if report == self.at:
+            raise self.error
+
+    def remark(self, text: str) -> None:
+        self.fail_at("remark" if "images" in text else "")
+
+    def warning(self, text: str) -> None:
+        self.warnings.append(text)
+
+    @contextmanager
+    def waiting(self, text: str) -> Iterator[None]:
+        self.fail_at(text)
+        yield
+        self.fail_at(f"end of {text}")
+
+    @contextmanager
+    def progress(self, text: str, total: float | None) -> Iterator[Advance]:
+        yield lambda value, note="", text="": None
+        self.fail_at(f"end of {text}")
+
+
+@pytest.mark.parametrize(("report", "before_verdict"), LATE_REPORTS.items())
+def test_a_listener_that_fails_after_the_motion_loses_no_result(
+    plan: Plan, rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, report: str,
+    before_verdict: bool,
+) -> None:  # fmt: skip
+    """Verdict, measurements and files; it had left the folder without a summary."""
+    finish = RunCameras.finish
+
+    def finish_with_news(self: RunCameras, stopped: Callable[[], bool]) -> CameraRecords:
+        self._news.append(CameraNews("remark", "images were late"))
+        return finish(self, stopped)
+
+    monkeypatch.setattr(RunCameras, "finish", finish_with_news)
+    listener = LateFailingListener(report, RuntimeError("no terminal"))
+    folder, images = tmp_path / "run", "images" in report or report == "remark"
+    result = runner.run(
+        *(plan, rig),
+        folder=folder,
+        cameras=None if images else (),
+        realtime=False,
+        listener=listener,
+    )
+    assert result.verdict == ("FAILED" if before_verdict else "PASSED")
+    said = result.details() if before_verdict else listener.warnings
+    assert sum("listener" in text and "raised RuntimeError: no ter" in text for text in said) == 1
+    assert not result.missing
+    assert load_run(folder).verdict == result.verdict
+    assert np.isfinite(result.poses["x_mm"]).any() == images
+
+
+def test_leaving_the_program_in_a_late_report_keeps_the_record(
+    plan: Plan, rig: Rig, tmp_path: Path
+) -> None:
+    for k, report in enumerate(("evaluating the run", "writing the run folder and report")):
+        listener = LateFailingListener(report, SystemExit(7))
+        folder = tmp_path / str(k)
+        with pytest.raises(SystemExit, match="7"):
+            runner.run(plan, rig, folder=folder, cameras=(), realtime=False, listener=listener)
+        assert load_run(folder).passed
+
+
 @pytest.mark.parametrize("name", ["confirm", "on_event"])
 def test_a_callback_that_cannot_be_called_is_refused_before_anything_else(
     plan: Plan, rig: Rig, tmp_path: Path, name: str
@@ -205,6 +290,46 @@ def test_only_true_moves(plan: Plan, rig: Rig, tmp_path: Path, answer: Any) -> N
             confirm=lambda _: answer,
         )
     assert not (tmp_path / "run").exists()
+
+
+def test_a_daemonic_process_is_refused_only_where_a_run_needs_another(
+    plan: Plan, rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a worker of `multiprocessing.Pool`; it had been an AssertionError of Python."""
+    monkeypatch.setitem(current_process()._config, "daemon", True)  # type: ignore[attr-defined]
+    folder = tmp_path / "run"
+    for realtime, use in ((True, "drives in real time"), (False, "cameras")):
+        with pytest.raises(BadInput, match=f"cannot start others, for {use}") as caught:
+            runner.run(plan, rig, folder=folder, realtime=realtime)
+        assert "ProcessPoolExecutor" in caught.value.next_step
+        assert not folder.exists()
+    assert runner.run(plan, rig, folder=folder, cameras=(), realtime=False).passed
+
+
+def test_runs_that_begin_in_one_second_have_a_default_folder_each(
+    plan: Plan, rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The name is chosen at the end of the preparation: another run may have taken it meanwhile."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runner, "dated_name", lambda: "now")
+
+    def meanwhile(_proposal: Proposal) -> bool:
+        RunFolder.create(Path("runs/now"))
+        create = RunFolder.create.__func__  # type: ignore[attr-defined]
+
+        def create_late(kind: type[RunFolder], path: Path) -> RunFolder:
+            if path.name == "now-2" and not path.exists():
+                create(kind, path)
+            return create(kind, path)  # type: ignore[no-any-return]
+
+        monkeypatch.setattr(RunFolder, "create", classmethod(create_late))
+        return True
+
+    result = runner.run(plan, rig, cameras=(), realtime=False, confirm=meanwhile)
+    assert result.folder == Path("runs/now-3")
+    assert result.passed
+    with pytest.raises(BadInput, match="exists already"):
+        runner.run(plan, rig, folder="runs/now", cameras=(), realtime=False)
 
 
 def test_limits_of_the_verbs_are_those_of_the_library(rig: Rig) -> None:

@@ -7,16 +7,19 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing import current_process
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from model.clearance import ClearanceModel
+from model.errors import BadInput
 from model.kinematics import structure_matrix
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Rig
 from model.scene import empty_scene
+from planner import parallel
 from planner.check import NEAR_AXIS, check_path
 from planner.costs import KinematicCost, capacity_margins, finite_range
 from planner.workspace import compute as computing
@@ -57,6 +60,42 @@ def test_a_script_without_the_guard_is_told_of_it(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 1
     assert 'if __name__ == "__main__"' in done.stderr
+
+
+def test_a_daemonic_process_maps_alone_unless_workers_are_named(gachon, monkeypatch) -> None:
+    """A worker of `multiprocessing.Pool` was told that its script lacks the guard."""
+    monkeypatch.setattr(parallel, "parent_process", current_process)
+    monkeypatch.setattr(parallel.os, "cpu_count", lambda: 4)
+    monkeypatch.setitem(current_process()._config, "daemon", True)
+    monkeypatch.setattr(computing, "POINTS_FOR_ONE_PROCESS", 0)
+    rows = slice_through(2, 0.445, np.array([-0.1, -0.1, 0.3]), np.array([0.1, 0.1, 0.6]), 0.05)
+    question = Question.about(gachon)
+    (maps,) = computing.map_workspace(question, [rows])
+    assert np.isfinite(maps.values["capacity_margin"]).all()
+    with pytest.raises(BadInput, match="cannot start others") as caught:
+        computing.map_workspace(question, [rows], workers=2)
+    assert "workers=1" in caught.value.next_step
+
+
+NESTED = """
+from concurrent.futures import ProcessPoolExecutor
+from planner.parallel import default_workers, worker_pool
+def work(number):
+    with worker_pool(2, None) as pool:
+        return default_workers(), list(pool.map(abs, [number]))
+if __name__ == "__main__":
+    with ProcessPoolExecutor(1) as pool:
+        print(*pool.map(work, [-3]))
+"""
+
+
+def test_a_child_process_shares_its_work_only_where_workers_are_named(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(NESTED)
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py"], capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.stdout == "(1, [3])\n", done.stderr
 
 
 @pytest.fixture(scope="module")
